@@ -1,0 +1,31 @@
+"""The base of every configuration model: frozen, unknown keys refused, no NaN, no silent conversions."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+
+class Model(BaseModel):
+    """A frozen configuration record."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+Positive2 = tuple[Positive, Positive]
+
+
+def _ordered(span: Vector2) -> Vector2:
+    if not span[0] < span[1]:
+        raise ValueError(f"the first must be below the second, got {list(span)}")
+    return span
+
+
+Span = Annotated[Vector2, AfterValidator(_ordered)]

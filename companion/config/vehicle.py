@@ -1,0 +1,172 @@
+"""The vehicle file: the machine, its devices, its tether and its room."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from companion.config.base import Fraction, Model, NonNegative, Positive, Positive2, Span, Vector2, Vector3
+
+
+class Airframe(Model):
+    """The flying base, everything included except what the arm section lists."""
+
+    mass_kg: Positive
+    """Whole machine, arm and net included, ready to fly, without payload."""
+    thrust_max_n: Positive
+    """All rotors at full command, at the voltage of a charged battery."""
+    hover_thrust: Fraction | None = None
+    """Normalised thrust that holds `mass_kg`; absent: PX4's MPC_THR_HOVER is read and used."""
+    tilt_max_deg: Annotated[float, Field(gt=0, le=45)] = 20.0
+    """No attitude setpoint leans further than this."""
+    ground_clearance_m: Positive
+    """Height of the body origin above the floor when standing on the landing gear."""
+
+
+class Joint(Model):
+    """One servo and its joint, in the paper's angle."""
+
+    servo_id: Annotated[int, Field(ge=0, le=252)]
+    sign: Literal[-1, 1]
+    """Direction of the servo's counts against the joint angle."""
+    zero_count: Annotated[int, Field(ge=-1048575, le=1048575)]
+    """Present position (register 132) at joint angle 0."""
+    angle_deg: Span
+    """Walls of the joint."""
+    torque_max_nm: Annotated[float, Field(gt=0, le=3.0)]
+    velocity_max_deg_s: Positive = 300.0
+
+
+class Arm(Model):
+    """The 2R arm: link 1 from the shoulder, link 2 carries sensor and net."""
+
+    shoulder_body_m: Vector3
+    link_lengths_m: Positive2
+    """Shoulder to elbow, elbow to the net's centre."""
+    link_masses_kg: Positive2
+    """Link 1 with the elbow servo, link 2 without sensor and net."""
+    link_com_m: Positive2
+    """From the link's own joint outwards."""
+    torque_per_amp_nm_a: Positive = 1.3
+    joints: tuple[Joint, Joint]
+
+
+class Tool(Model):
+    """Force-torque sensor and net at the end of link 2."""
+
+    sensor_mass_kg: NonNegative
+    """The part of sensor and mount on the arm's side; not felt by the sensor."""
+    net_mass_kg: NonNegative
+    """Everything on the tool side of the sensor; its weight is taken out of the reading."""
+    net_radius_m: Positive
+    sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+    """Sensor frame in the frame of link 2 (x outwards along the link, y along the joint axis), ZYX roll, pitch, yaw."""
+
+
+class Tether(Model):
+    """The safety tether."""
+
+    anchor_world_m: Vector3
+    length_m: Positive
+    attachment_body_m: Vector3 = (0.0, 0.0, 0.0)
+    margin_m: NonNegative = 0.25
+    """No planned point comes nearer to the taut sphere than this."""
+
+
+class Room(Model):
+    """The flying volume; everything that moves stays inside it."""
+
+    x_m: Span
+    y_m: Span
+    z_m: Span
+
+
+class AutopilotDevice(Model):
+    """PX4 over MAVLink."""
+
+    address: str
+    """MAVSDK connection: udpin://0.0.0.0:14540, serial:///dev/ttyAMA0:921600, ..."""
+    discovery_timeout_s: Positive = 10.0
+
+
+class MocapDevice(Model):
+    """OptiTrack Motive over NatNet."""
+
+    server: str
+    """Address of the Motive machine."""
+    interface: str = "0.0.0.0"
+    """Local address that receives."""
+    transport: Literal["multicast", "unicast"] = "multicast"
+    multicast_group: str = "239.255.42.99"
+    command_port: Annotated[int, Field(gt=0, le=65535)] = 1510
+    data_port: Annotated[int, Field(gt=0, le=65535)] = 1511
+    natnet_version: Literal["3.0", "4.1"] | None = None
+    """Refuse a server that speaks another; absent: take what the server says, if it is one of the two."""
+    rigid_body_id: Annotated[int, Field(ge=0)]
+    up_axis: Literal["y", "z"] = "z"
+    """Motive's streaming setting."""
+    rate_hz: Positive = 200.0
+    """Expected frame rate."""
+
+
+class ArmDevice(Model):
+    """The Dynamixel bus behind a U2D2."""
+
+    port: str
+    baud: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 3000000
+    watchdog_ms: Annotated[int, Field(ge=20, le=2540)] = 100
+    """Bus watchdog (register 98), a multiple of 20 ms: the servos let go when the bus falls silent."""
+
+
+class ForceDevice(Model):
+    """The Robotous RFT60-HA01 on its serial port."""
+
+    port: str
+    baud: Literal[115200] = 115200
+    rate_hz: Literal[200, 333] = 200
+    force_max_n: Positive = 200.0
+
+
+class Devices(Model):
+    """Addresses of everything on a wire."""
+
+    autopilot: AutopilotDevice
+    mocap: MocapDevice
+    arm: ArmDevice
+    force: ForceDevice
+
+
+class Safety(Model):
+    """Limits after which the companion stops the mission by itself."""
+
+    mocap_timeout_s: Positive = 0.12
+    """Oldest mocap pose; beyond it the arm folds and PX4 lands on its own estimate."""
+    vehicle_timeout_s: Positive = 0.25
+    """Oldest attitude or position from PX4."""
+    heartbeat_timeout_s: Positive = 2.5
+    arm_timeout_s: Positive = 0.10
+    """Oldest joint state; beyond it the vehicle lands."""
+    force_timeout_s: Positive = 0.25
+    """Oldest force sample; beyond it the law flies on without force, and says so."""
+    estimate_disagreement_m: Positive = 0.30
+    """Between PX4's position and mocap, held for 0.2 s."""
+    tilt_abort_deg: Annotated[float, Field(gt=0, le=80)] = 40.0
+    tracking_error_abort_m: Positive = 0.8
+    battery_min: Fraction = 0.2
+    land_speed_m_s: Positive = 0.35
+    fold_arm_deg: Vector2 = (165.0, 140.0)
+
+
+class Vehicle(Model):
+    """One machine with its devices, tether and room."""
+
+    schema_version: Literal[1]
+    name: str
+    airframe: Airframe
+    arm: Arm
+    tool: Tool
+    tether: Tether
+    room: Room
+    devices: Devices
+    safety: Safety = Safety()

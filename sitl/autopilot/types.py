@@ -1,0 +1,48 @@
+"""Records inside the PX4 stub; frames are PX4's own: local NED, body FRD."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from companion.types import Quat, Vec3, Vec4
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """One IMU sample, noise and bias included."""
+
+    t_s: float
+    gyro_frd_rad_s: Vec3
+    accel_frd_m_s2: Vec3
+    """Specific force: (0, 0, -9.81) at rest, level."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Output of the EKF-like estimator."""
+
+    t_s: float
+    position_ned_m: Vec3
+    velocity_ned_m_s: Vec3
+    attitude_ned_frd: Quat
+    rates_frd_rad_s: Vec3
+    accel_frd_m_s2: Vec3
+    vision_fused: bool
+    """Vision arrived and was accepted within the last 0.55 s (as PX4's EV flags)."""
+    position_valid: bool
+    """xy_valid and z_valid of VEHICLE_LOCAL_POSITION: holds up to 4.5 s after the last fused vision."""
+    attitude_valid: bool
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeTarget:
+    """What the attitude loop follows."""
+
+    attitude_ned_frd: Quat
+    thrust: float
+    """Collective, 0 to 1."""
+    yaw_rate_rad_s: float = 0.0
+
+
+RotorCommands = Vec4
+"""Normalised rotor commands in PX4's quad-x order: front right, rear left, front left, rear right."""
