@@ -1,0 +1,3 @@
+"""companion: flies an aerial manipulator on PX4 with adaptive impedance control."""
+
+__version__ = "0.1.0"

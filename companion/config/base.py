@@ -4,13 +4,32 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+Location = tuple[str | int, ...]
+"""Keys and indices from a model down to the value meant."""
 
 
 class Model(BaseModel):
     """A frozen configuration record."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+def refuse(title: str, problems: list[tuple[Location, str]]) -> None:
+    """Raise what a model validator found, each problem at its own place, so that the user is shown the right line.
+
+    Raises:
+        ValidationError: if there is any problem. Pydantic adds the model's own place in the document in front.
+    """
+    if not problems:
+        return
+    details: list[InitErrorDetails] = [
+        {"type": PydanticCustomError("condition", "{text}", {"text": text}), "loc": location, "input": None}
+        for location, text in problems
+    ]
+    raise ValidationError.from_exception_data(title, details)
 
 
 Positive = Annotated[float, Field(gt=0)]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from companion.config.base import Model, NonNegative, Positive
+from companion.config.base import Location, Model, NonNegative, Positive, refuse
 
 Positive8 = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive, Positive]
 NonNegative8 = tuple[
@@ -59,11 +59,18 @@ class AdaptiveConfig(Model):
 
     @model_validator(mode="after")
     def _conditions(self) -> Self:
+        problems: list[tuple[Location, str]] = []
         rows = zip(self.inertia_md, self.damping_kd, self.phi, self.stiffness_kp, strict=True)
-        for i, (m_d, k_d, phi, k_p) in enumerate(rows):
+        for row, (m_d, k_d, phi, k_p) in enumerate(rows):
             if not k_d / m_d - phi > 0:
-                raise ValueError(f"row {i}: gain_new asks for K_d/M_d > Phi, got {k_d / m_d:g} <= {phi:g}")
+                problems.append(
+                    (("damping_kd", row), f"gain_new asks for K_d / M_d > Phi, got {k_d / m_d:g} <= {phi:g}")
+                )
+                continue
             wanted = (k_d - m_d * phi) * phi
             if abs(wanted - k_p) > 2e-3 * k_p:
-                raise ValueError(f"row {i}: gain_cond asks for K_p = (K_d - M_d Phi) Phi = {wanted:g}, got {k_p:g}")
+                problems.append(
+                    (("stiffness_kp", row), f"gain_cond asks for (K_d - M_d Phi) Phi = {wanted:g}, got {k_p:g}")
+                )
+        refuse("controller", problems)
         return self

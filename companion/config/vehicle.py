@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from companion.config.base import Fraction, Model, NonNegative, Positive, Positive2, Span, Vector2, Vector3
+from companion.config.base import (
+    Fraction,
+    Location,
+    Model,
+    NonNegative,
+    Positive,
+    Positive2,
+    Span,
+    Vector2,
+    Vector3,
+    refuse,
+)
 
 
 class Airframe(Model):
-    """The flying base, everything included except what the arm section lists."""
+    """The flying base."""
 
     mass_kg: Positive
     """Whole machine, arm and net included, ready to fly, without payload."""
@@ -22,6 +33,8 @@ class Airframe(Model):
     """No attitude setpoint leans further than this."""
     ground_clearance_m: Positive
     """Height of the body origin above the floor when standing on the landing gear."""
+    radius_m: Positive = 0.45
+    """Horizontal reach around the body origin, rotor disks included."""
 
 
 class Joint(Model):
@@ -118,6 +131,15 @@ class ArmDevice(Model):
     watchdog_ms: Annotated[int, Field(ge=20, le=2540)] = 100
     """Bus watchdog (register 98), a multiple of 20 ms: the servos let go when the bus falls silent."""
 
+    @model_validator(mode="after")
+    def _watchdog_steps(self) -> Self:
+        if self.watchdog_ms % 20:
+            refuse(
+                "arm device",
+                [(("watchdog_ms",), f"must be a multiple of 20 (the register's unit), got {self.watchdog_ms}")],
+            )
+        return self
+
 
 class ForceDevice(Model):
     """The Robotous RFT60-HA01 on its serial port."""
@@ -170,3 +192,30 @@ class Vehicle(Model):
     room: Room
     devices: Devices
     safety: Safety = Safety()
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        first, second = self.arm.joints
+        if first.servo_id == second.servo_id:
+            problems.append(
+                (("arm", "joints", 1, "servo_id"), f"both servos have the id {second.servo_id}; give each its own")
+            )
+        for index, (com_m, length_m) in enumerate(zip(self.arm.link_com_m, self.arm.link_lengths_m, strict=True)):
+            if com_m > length_m:
+                text = f"the centre of mass lies beyond the link's end: {com_m:g} m on {length_m:g} m"
+                problems.append((("arm", "link_com_m", index), text))
+        for index, (joint, angle_deg) in enumerate(zip(self.arm.joints, self.safety.fold_arm_deg, strict=True)):
+            low_deg, high_deg = joint.angle_deg
+            if not low_deg <= angle_deg <= high_deg:
+                text = f"{angle_deg:g} deg is outside the joint's walls, {low_deg:g} to {high_deg:g} deg"
+                problems.append((("safety", "fold_arm_deg", index), text))
+        carried_kg = sum(self.arm.link_masses_kg) + self.tool.sensor_mass_kg + self.tool.net_mass_kg
+        if carried_kg >= self.airframe.mass_kg:
+            text = f"{self.airframe.mass_kg:g} kg is the whole machine, but arm and tool alone weigh {carried_kg:g} kg"
+            problems.append((("airframe", "mass_kg"), text))
+        if self.airframe.thrust_max_n <= 9.81 * self.airframe.mass_kg:
+            text = f"{self.airframe.thrust_max_n:g} N do not lift {self.airframe.mass_kg:g} kg"
+            problems.append((("airframe", "thrust_max_n"), text))
+        refuse("vehicle", problems)
+        return self

@@ -25,7 +25,7 @@ class World(Model):
 
     payload_kg: Annotated[float, Field(ge=0, le=2)] = 0.2
     """0: nothing is thrown."""
-    seed: NonNegative = 1
+    seed: Annotated[int, Field(ge=0)] = 1
     catch_at_m: Vector2 = (0.0, 0.0)
     """Where the vehicle is when the payload arrives in the net; thrown on its first pass in the direction of +x."""
     throw_velocity_m_s: Vector3 = (-2.0, 0.15, -1.5)

@@ -1,0 +1,288 @@
+"""What pydantic found, in one line per problem: place, key, what was expected, what was found, what was probably meant.
+
+Expectations and known keys are read from the model's own JSON schema, so that they cannot differ from what is checked.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterator
+from typing import Any, TypeVar, cast
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from companion.config.base import Location, Model
+from companion.config.document import RANK_KEY, RANK_MISSING, RANK_VALUE, Data, Document, Origin, Problem, key_path
+
+M = TypeVar("M", bound=Model)
+_Node = dict[str, Any]
+
+UNITS = {
+    "m": "m", "mm": "mm", "cm": "cm", "km": "km", "ft": "ft", "feet": "ft", "in": "in", "inch": "in",
+    "s": "s", "ms": "ms", "us": "us", "min": "min", "sec": "s", "seconds": "s", "h": "h",
+    "deg": "deg", "rad": "rad", "degrees": "deg", "radians": "rad", "rpm": "rpm",
+    "m_s": "m/s", "m_s2": "m/s^2", "mm_s": "mm/s", "cm_s": "cm/s", "km_h": "km/h", "kmh": "km/h", "mps": "m/s", "mph": "mph",
+    "deg_s": "deg/s", "deg_s2": "deg/s^2", "rad_s": "rad/s", "rad_s2": "rad/s^2", "ft_s": "ft/s",
+    "kg": "kg", "g": "g", "lb": "lb", "lbs": "lb", "n": "N", "kn": "kN", "lbf": "lbf", "nm": "N m", "nms": "N m s", "nm_a": "N m/A",
+    "hz": "Hz", "khz": "kHz", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "c": "degC", "kgf": "kgf",
+}  # fmt: skip
+"""Unit suffixes a person may write behind a key, known here or not."""
+
+
+def validate(model: type[M], document: Document) -> M | None:
+    """Build a model from a document; problems are appended to `document.problems` and the answer is None.
+
+    Args:
+        model: what the document describes.
+        document: read and overridden.
+    """
+    schema = model.model_json_schema()
+    found = [
+        _problem(RANK_VALUE, document.origin(at), at, f"expected {describe(node, schema)}, got {_show(value)}")
+        for at, node, value in _booleans(schema, document.data, ())
+    ]
+    try:
+        built = model.model_validate_json(json.dumps(document.data), strict=True)
+    except ValidationError as error:
+        found += _problems(error, schema, document)
+        built = None
+    told = {(problem.origin, problem.text.split(": ")[0]) for problem in document.problems}
+    document.problems += [problem for problem in found if (problem.origin, problem.text.split(": ")[0]) not in told]
+    return None if document.problems else built
+
+
+def _problems(error: ValidationError, schema: _Node, document: Document) -> list[Problem]:
+    problems: list[Problem] = []
+    meant: set[Location] = set()
+    told: set[Location] = set()
+    missing: list[tuple[Location, str]] = []
+    for detail in error.errors(include_url=False):
+        at, node, parent = _walk(schema, detail["loc"])
+        if detail["type"] == "extra_forbidden":
+            text, instead = _unknown(at, parent, document)
+            problems.append(_problem(RANK_KEY, document.key_origin(at), at, text))
+            if instead is not None:
+                meant.add((*at[:-1], instead))
+            continue
+        if detail["type"] == "missing":
+            if isinstance(at[-1], int):  # a list that is too short is one problem of the list
+                at, node, _ = _walk(schema, detail["loc"][:-1])
+            else:
+                missing.append((at, describe(node, schema)))
+                continue
+        if at not in told:
+            told.add(at)
+            problems.append(_value_problem(detail, at, node, schema, document))
+    for at, expected in missing:
+        if at not in meant:
+            problems.append(_problem(RANK_MISSING, document.origin(at[:-1]), at, f"missing; expected {expected}"))
+    return problems
+
+
+def _value_problem(
+    detail: ErrorDetails, at: Location, node: _Node | None, schema: _Node, document: Document
+) -> Problem:
+    kind = detail["type"]
+    context = detail.get("ctx", {})
+    if kind in ("condition", "value_error"):
+        text = context["text"] if kind == "condition" else str(context["error"])
+        return _problem(RANK_VALUE, document.origin(at), at, text)
+    if kind in ("union_tag_invalid", "union_tag_not_found") and node is not None:
+        tags = list(node["discriminator"]["mapping"])
+        at = (*at, node["discriminator"]["propertyName"])
+        expected = f"one of {', '.join(tags)}"
+        if kind == "union_tag_not_found":
+            return _problem(RANK_MISSING, document.origin(at), at, f"missing; expected {expected}")
+        value = _get(document, at)
+        text = f"expected {expected}, got {_show(value)}{_did_you_mean(str(value), tags)}"
+        return _problem(RANK_VALUE, document.origin(at), at, text)
+    value = _get(document, at)
+    expected = describe(node, schema) if node is not None else str(detail["msg"])
+    return _problem(RANK_VALUE, document.origin(at), at, f"expected {expected}, got {_show(value)}{_hint(value, node)}")
+
+
+def _problem(rank: int, origin: Origin, at: Location, text: str) -> Problem:
+    """One line; the key is left out where the option that caused it has just named it."""
+    key = key_path(at)
+    if not key or (not origin.line and origin.source.endswith(f".{key}")):
+        return Problem(rank, origin, text)
+    return Problem(rank, origin, f"{key}: {text}")
+
+
+def describe(node: _Node | None, schema: _Node) -> str:
+    """What a JSON schema node accepts, in words."""
+    node = _resolve(node or {}, schema)
+    if "const" in node:
+        return _show(node["const"])
+    if "enum" in node:
+        return "one of " + ", ".join(_show(option) for option in node["enum"])
+    kind = node.get("type")
+    if kind in ("number", "integer"):
+        return ("a number" if kind == "number" else "a whole number") + _bounds(node)
+    if kind == "array":
+        if "prefixItems" in node:
+            items = [describe(item, schema) for item in node["prefixItems"]]
+            alike = len(set(items)) == 1
+            return f"a list of {len(items)} {_plural(items[0]) if alike else 'values'}"
+        return f"a list of at least {node['minItems']}" if node.get("minItems") else "a list"
+    if kind == "object":
+        keys = node.get("properties", {})
+        return f"a mapping with the keys {', '.join(keys)}" if keys else "a mapping"
+    if "discriminator" in node:
+        return f"a mapping with '{node['discriminator']['propertyName']}'"
+    return {"string": "text", "boolean": "true or false"}.get(str(kind), "another value")
+
+
+def nearest(word: str, known: list[str]) -> str | None:
+    """The known word that was most likely meant, if any is near."""
+    close = difflib.get_close_matches(word.lower(), known, n=1, cutoff=0.6)
+    return close[0] if close else None
+
+
+def _bounds(node: _Node) -> str:
+    low, high = node.get("minimum"), node.get("maximum")
+    above, below = node.get("exclusiveMinimum"), node.get("exclusiveMaximum")
+    if low is not None and high is not None:
+        return f" from {low:g} to {high:g}"
+    parts = [(">", above), (">=", low), ("<", below), ("<=", high)]
+    told = " and ".join(f"{sign} {bound:g}" for sign, bound in parts if bound is not None)
+    return f" {told}" if told else ""
+
+
+def _plural(item: str) -> str:
+    return re.sub(r"^(?:a|an) ((?:whole )?number)", r"\1s", item)
+
+
+def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[str, str | None]:
+    """Text about an unknown key, and the known key that was meant."""
+    key = str(at[-1])
+    known = list((parent or {}).get("properties", {}))
+    stem, unit = split_unit(key)
+    for candidate in known:
+        candidate_stem, candidate_unit = split_unit(candidate)
+        if candidate_unit is not None and candidate_stem == stem and candidate != key:
+            here = f", in {UNITS[candidate_unit]}"
+            what = f"not in {UNITS[unit]}" if unit is not None else "without a unit"
+            return f"unknown key; write {candidate}{here} ({what})", candidate
+    close = nearest(key, known)
+    if close is not None:
+        return f"unknown key; did you mean {close}?", close
+    given = _get(document, at[:-1])
+    free = [name for name in known if not (isinstance(given, dict) and name in given)]
+    return f"unknown key; known here: {', '.join(free or known)}", None
+
+
+def split_unit(key: str) -> tuple[str, str | None]:
+    """`duration_ms` -> ("duration", "ms"); the longest known suffix wins; no unit: (key, None)."""
+    parts = key.split("_")
+    for count in (3, 2, 1):
+        suffix = "_".join(parts[-count:]).lower()
+        if len(parts) > count and suffix in UNITS:
+            return "_".join(parts[:-count]), suffix
+    return key, None
+
+
+def _hint(value: Data, node: _Node | None) -> str:
+    """What to do about a value of the wrong kind."""
+    wanted = node or {}
+    options = wanted.get("enum", [])
+    if options:
+        if not isinstance(value, str) and any(isinstance(option, str) and option == str(value) for option in options):
+            return " (put it in quotes)"
+        return _did_you_mean(value, [str(option) for option in options]) if isinstance(value, str) else ""
+    if isinstance(value, str) and wanted.get("type") in ("number", "integer"):
+        number = re.match(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s0-9]*)", value)
+        if number and number[2]:
+            return f" (write {number[1]}; the key's name holds the unit)"
+        if number:
+            return f" (write {number[1]} without quotes)"
+    return ""
+
+
+def _did_you_mean(word: str, options: list[str]) -> str:
+    close = nearest(word, options)
+    return f" (did you mean {close}?)" if close else ""
+
+
+def _show(value: object) -> str:
+    """A value as YAML would have it, shortened."""
+    if isinstance(value, float) and value != value:
+        return ".nan"
+    if isinstance(value, float) and value in (float("inf"), float("-inf")):
+        return ".inf" if value > 0 else "-.inf"
+    if value is None:
+        return "nothing"
+    if isinstance(value, dict):
+        return "a mapping"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _get(document: Document, at: Location) -> Data:
+    try:
+        return document.get(at)
+    except (KeyError, IndexError):
+        return None
+
+
+def _resolve(node: _Node, schema: _Node) -> _Node:
+    """Follow references and take the part of an optional value that is not null."""
+    while True:
+        if "$ref" in node:
+            node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+        elif "anyOf" in node:
+            node = next(option for option in node["anyOf"] if option.get("type") != "null")
+        else:
+            return node
+
+
+def _step(node: _Node, step: str | int) -> _Node | None:
+    if isinstance(step, str):
+        return cast("_Node | None", node.get("properties", {}).get(step))
+    prefix = node.get("prefixItems", [])
+    return prefix[step] if step < len(prefix) else node.get("items")
+
+
+def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | None, _Node | None]:
+    """From pydantic's location to the document's (which has no union tags), the schema node there and its parent's."""
+    node: _Node | None = _resolve(schema, schema)
+    parent: _Node | None = None
+    at: list[str | int] = []
+    for step in loc:
+        tags = (node or {}).get("discriminator", {}).get("mapping", {})
+        if step in tags:
+            node = _resolve({"$ref": tags[step]}, schema)
+            continue
+        parent = node
+        node = _step(node, step) if node is not None else None
+        node = _resolve(node, schema) if node is not None else None
+        at.append(step)
+    return tuple(at), node, parent
+
+
+def _booleans(
+    node: _Node | None, data: Data, at: Location, root: _Node | None = None
+) -> Iterator[tuple[Location, _Node | None, Data]]:
+    """Every true/false that stands where the schema wants something else: JSON equality would let `true` pass for the constant 1."""
+    root = root if root is not None else node or {}
+    node = _resolve(node, root) if node is not None else None
+    if node is not None and "discriminator" in node and isinstance(data, dict):
+        tag = data.get(node["discriminator"]["propertyName"])
+        reference = node["discriminator"]["mapping"].get(tag) if isinstance(tag, str) else None
+        node = _resolve({"$ref": reference}, root) if reference else None
+    if isinstance(data, bool):
+        if node is not None and ("const" in node or "enum" in node):
+            yield at, node, data
+        return
+    children: Iterator[tuple[str | int, Data]]
+    if isinstance(data, dict):
+        children = iter(data.items())
+    elif isinstance(data, list):
+        children = iter(enumerate(data))
+    else:
+        return
+    for step, child in children:
+        yield from _booleans(_step(node, step) if node is not None else None, child, (*at, step), root)

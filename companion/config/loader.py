@@ -1,0 +1,196 @@
+"""From files and command line to one checked, frozen `FlightConfig`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import ValidationError
+
+from companion.config.base import Location, Model
+from companion.config.controller import AdaptiveConfig
+from companion.config.document import ConfigError, Data, Document, key_path, problem_lines
+from companion.config.explain import validate
+from companion.config.mission import ControllerChoice, Mission
+from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
+from companion.config.vehicle import Vehicle
+from companion.config.world import World
+from companion.config.yaml_strict import read_document
+
+M = TypeVar("M", bound=Model)
+
+PRESET_DIRECTORY = Path(__file__).parent / "presets"
+"""Built-in controller files are package data, so that they are found wherever the package is installed."""
+PRESETS: dict[str, tuple[str, ...]] = {"adaptive": ("paper", "recommended")}
+"""Built-in presets of each law, the default last."""
+
+
+class Sources(Model):
+    """Where the parts of a `FlightConfig` were written; for messages and for the log."""
+
+    mission: str
+    vehicle: str
+    controller: str
+    phases: tuple[str, ...]
+    """file:line:col of each phase of the mission."""
+    overrides: tuple[str, ...]
+
+
+class FlightConfig(Model):
+    """Everything that a flight is configured by. `model_validate_json(config.model_dump_json())` gives an equal one."""
+
+    mission: Mission
+    vehicle: Vehicle
+    controller: AdaptiveConfig
+    world: World
+    sources: Sources
+
+
+def load_flight(
+    mission_path: str | Path,
+    vehicle_path: str | Path | None = None,
+    controller_law: str | None = None,
+    preset: str | None = None,
+    overrides: Sequence[str] = (),
+) -> FlightConfig:
+    """Read, override and check everything.
+
+    Args:
+        mission_path: mission file.
+        vehicle_path: vehicle file instead of the one that the mission names.
+        controller_law: law instead of the one that the mission names (`adaptive`).
+        preset: built-in preset of the law instead of the mission's choice (`paper` or `recommended`).
+        overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked.
+
+    Raises:
+        ConfigError: one line per problem of all files together.
+    """
+    parsed = parse_overrides(overrides)
+    lines: list[str] = []
+    mission_file = read_document(mission_path)
+    mission = _check(Mission, mission_file, "mission", parsed, lines)
+
+    vehicle: Vehicle | None = None
+    vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, lines)
+    if vehicle_file is not None:
+        vehicle = _check(Vehicle, vehicle_file, "vehicle", parsed, lines)
+
+    controller: AdaptiveConfig | None = None
+    controller_file: Document | None = None
+    choice = mission.controller if mission is not None else _controller_choice(mission_file)
+    if controller_law is not None or preset is not None:
+        controller_file = _open_preset(controller_law, preset)
+    elif choice is not None and choice.file is not None:
+        controller_file = _open_named(mission_file, ("controller", "file"), None, lines)
+    elif choice is not None:
+        controller_file = _open_preset(choice.law, choice.preset)
+    if controller_file is not None:
+        controller = _check(AdaptiveConfig, controller_file, "controller", parsed, lines)
+
+    world = _check(World, Document("world", {}), "world", parsed, lines)
+    if lines or mission is None or vehicle is None or controller is None or world is None:
+        raise ConfigError(lines)
+    assert vehicle_file is not None
+    assert controller_file is not None
+    return FlightConfig(
+        mission=mission,
+        vehicle=vehicle,
+        controller=controller,
+        world=world,
+        sources=Sources(
+            mission=mission_file.source,
+            vehicle=vehicle_file.source,
+            controller=controller_file.source,
+            phases=tuple(str(mission_file.origin(("phases", index))) for index in range(len(mission.phases))),
+            overrides=tuple(overrides),
+        ),
+    )
+
+
+def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
+    """Read and check a vehicle file alone, with the `vehicle.` overrides.
+
+    Raises:
+        ConfigError: one line per problem.
+    """
+    lines: list[str] = []
+    vehicle = _check(Vehicle, read_document(path), "vehicle", parse_overrides(overrides), lines)
+    if vehicle is None:
+        raise ConfigError(lines)
+    return vehicle
+
+
+def load_world(overrides: Sequence[str] = ()) -> World:
+    """The simulated world of the `world.` overrides; there is no file of it.
+
+    Raises:
+        ConfigError: one line per problem.
+    """
+    lines: list[str] = []
+    world = _check(World, Document("world", {}), "world", parse_overrides(overrides), lines)
+    if world is None:
+        raise ConfigError(lines)
+    return world
+
+
+def _check(
+    model: type[M], document: Document, section: Section, overrides: list[Override], lines: list[str]
+) -> M | None:
+    """One document, overridden and validated; what is wrong with it is appended to `lines`."""
+    try:
+        apply_overrides(document, section, overrides)
+    except ConfigError as error:
+        lines += error.lines
+    built = validate(model, document)
+    lines += problem_lines(document.problems)
+    return built
+
+
+def _open_named(
+    mission_file: Document, location: Location, given: str | Path | None, lines: list[str]
+) -> Document | None:
+    """The document at `given`, else the one that the mission names; relative to the file that names it."""
+    if given is not None:
+        path, shown, where = Path(given), str(given), ""
+    else:
+        named = _value(mission_file, location)
+        if not isinstance(named, str):
+            return None  # missing or not text: said when the mission was checked
+        origin = mission_file.origin(location)
+        base = Path(mission_file.source).parent if origin.line else Path()
+        shown = os.path.normpath(base / named)
+        path, where = Path(shown), f"{origin}: {key_path(location)}: "
+    try:
+        return read_document(path, shown)
+    except ConfigError as error:
+        lines += [where + line for line in error.lines]
+        return None
+
+
+def _controller_choice(mission_file: Document) -> ControllerChoice | None:
+    """The choice of a mission that is wrong elsewhere, so that the controller's own problems are told too."""
+    try:
+        return ControllerChoice.model_validate(_value(mission_file, ("controller",)) or {})
+    except ValidationError:
+        return None
+
+
+def _open_preset(law: str | None, preset: str | None) -> Document:
+    law = law or next(iter(PRESETS))
+    if law not in PRESETS:
+        raise ConfigError([f"--controller {law}: no such controller; available: {', '.join(PRESETS)}"])
+    preset = preset or PRESETS[law][-1]
+    if preset not in PRESETS[law]:
+        raise ConfigError([f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}"])
+    path = PRESET_DIRECTORY / f"{law}_{preset}.yaml"
+    here = Path.cwd()
+    return read_document(path, str(path.relative_to(here)) if path.is_relative_to(here) else str(path))
+
+
+def _value(document: Document, location: Location) -> Data:
+    try:
+        return document.get(location)
+    except (KeyError, IndexError):
+        return None

@@ -1,0 +1,176 @@
+"""The mission file: where the machine starts, what it may do, and the phases it flies.
+
+Positions are of the body's origin in the world frame (z up, 0 on the floor); angles of the arm are the paper's.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from companion.config.base import Location, Model, NonNegative, Positive, Vector2, Vector3, refuse
+
+Duration = Annotated[float, Field(gt=0, le=600)]
+Delay = Annotated[float, Field(ge=0, le=600)]
+Name = Annotated[str, Field(min_length=1, max_length=60)]
+
+
+class Takeoff(Model):
+    """Straight up from where the machine stands."""
+
+    type: Literal["takeoff"]
+    name: Name | None = None
+    height_m: Positive
+    """Height of the body's origin above the floor at the end."""
+    duration_s: Duration
+
+
+class Hold(Model):
+    """Stay."""
+
+    type: Literal["hold"]
+    name: Name | None = None
+    duration_s: Duration
+
+
+class Line(Model):
+    """Straight to a point, from rest to rest; the arm may move on the way."""
+
+    type: Literal["line"]
+    name: Name | None = None
+    to_m: Vector3
+    duration_s: Duration
+    arm_deg: Vector2 | None = None
+    """Where the arm goes meanwhile; absent: it stays."""
+    arm_delay_s: Delay | None = None
+    """From the start of the line to the start of the arm's move; absent: 0."""
+    arm_duration_s: Duration | None = None
+    """Absent: until the end of the line."""
+
+    @model_validator(mode="after")
+    def _arm_moves_within_the_line(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        if self.arm_deg is None:
+            for key in ("arm_delay_s", "arm_duration_s"):
+                if getattr(self, key) is not None:
+                    problems.append(((key,), "says when the arm moves, but arm_deg, where it moves to, is missing"))
+        else:
+            end_s = (self.arm_delay_s or 0.0) + (self.arm_duration_s or 0.0)
+            if end_s > self.duration_s or (self.arm_delay_s or 0.0) >= self.duration_s:
+                key = "arm_delay_s" if self.arm_duration_s is None else "arm_duration_s"
+                text = f"the arm's move would end {end_s:g} s into a line of {self.duration_s:g} s; it must end within"
+                problems.append(((key,), text))
+        refuse("line", problems)
+        return self
+
+
+class ArmMove(Model):
+    """The vehicle stays, the arm moves."""
+
+    type: Literal["arm"]
+    name: Name | None = None
+    arm_deg: Vector2
+    duration_s: Duration
+
+
+class Land(Model):
+    """Straight down until touchdown."""
+
+    type: Literal["land"]
+    name: Name | None = None
+    speed_m_s: Annotated[float, Field(ge=0.05, le=1.0)]
+
+
+Phase = Annotated[Takeoff | Hold | Line | ArmMove | Land, Field(discriminator="type")]
+
+
+class Start(Model):
+    """Where the machine stands before take-off; checked against what is measured."""
+
+    position_m: Vector2
+    """x, y."""
+    tolerance_m: Positive = 0.15
+    """Also for the height, which is airframe.ground_clearance_m of the vehicle."""
+    yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    yaw_tolerance_deg: Positive = 15.0
+    arm_deg: Vector2
+    arm_tolerance_deg: Positive = 10.0
+
+
+class Limits(Model):
+    """What no planned motion may exceed."""
+
+    speed_max_m_s: Positive
+    acceleration_max_m_s2: Positive
+    arm_speed_max_deg_s: Positive
+    arm_acceleration_max_deg_s2: Positive
+    thrust_share_max: Annotated[float, Field(gt=0, le=1)] = 0.8
+    """Share of airframe.thrust_max_n that the plan may need, with the largest payload on board."""
+
+
+class Catch(Model):
+    """The payload that is thrown into the net: for checks and reports, unknown to the controller."""
+
+    expected_at_m: Vector2
+    """x, y of the vehicle when the payload arrives."""
+    payload_max_kg: NonNegative
+
+
+class ControllerChoice(Model):
+    """A controller file, or a law and one of its presets."""
+
+    law: Literal["adaptive"] = "adaptive"
+    preset: Literal["paper", "recommended"] | None = None
+    """Absent, and no file: recommended."""
+    file: str | None = None
+    """Relative to the mission file."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.file is not None and self.preset is not None:
+            refuse("controller", [(("preset",), "either a preset or a file, not both")])
+        return self
+
+
+class Mission(Model):
+    """One flight."""
+
+    schema_version: Literal[1]
+    name: Name
+    vehicle: str
+    """Vehicle file, relative to this one."""
+    controller: ControllerChoice = ControllerChoice()
+    start: Start
+    limits: Limits
+    catch: Catch | None = None
+    phases: Annotated[tuple[Phase, ...], Field(min_length=2, max_length=200)]
+
+    @model_validator(mode="after")
+    def _up_first_down_last(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        last = len(self.phases) - 1
+        for index, phase in enumerate(self.phases):
+            if (phase.type == "takeoff") != (index == 0):
+                text = "the first phase must be a takeoff" if index == 0 else "only the first phase can be a takeoff"
+                problems.append((("phases", index, "type"), text))
+            elif (phase.type == "land") != (index == last):
+                text = "the last phase must be a land" if index == last else "only the last phase can be a land"
+                problems.append((("phases", index, "type"), text))
+        refuse("mission", problems)
+        return self
+
+
+__all__ = [
+    "ArmMove",
+    "Catch",
+    "ControllerChoice",
+    "Hold",
+    "Land",
+    "Limits",
+    "Line",
+    "Mission",
+    "Phase",
+    "Start",
+    "Takeoff",
+]

@@ -1,0 +1,121 @@
+"""`--set section.key[index].key=value`: one value of one document replaced from the command line, before anything is validated."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from companion.config.base import Location
+from companion.config.document import ConfigError, Data, Document, Origin, key_path
+from companion.config.explain import nearest
+from companion.config.yaml_strict import parse_value
+
+Section = Literal["mission", "vehicle", "controller", "world"]
+SECTIONS: tuple[Section, ...] = ("mission", "vehicle", "controller", "world")
+
+_STEP = re.compile(r"\.?([A-Za-z_][A-Za-z0-9_]*)|\[(0|[1-9][0-9]{0,5})\]")
+_EXAMPLE = "expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One parsed `--set`."""
+
+    section: Section
+    location: Location
+    value: Data
+    origin: Origin
+
+
+def parse_overrides(texts: Iterable[str]) -> list[Override]:
+    """Parse `--set` options.
+
+    Raises:
+        ConfigError: one line per option that cannot be understood.
+    """
+    overrides: list[Override] = []
+    lines: list[str] = []
+    for text in texts:
+        try:
+            overrides.append(_parse(text))
+        except ConfigError as error:
+            lines += error.lines
+    if lines:
+        raise ConfigError(lines)
+    return overrides
+
+
+def apply_overrides(document: Document, section: Section, overrides: Iterable[Override]) -> None:
+    """Put the overrides of one section into its document, in the order given; the document notes where each value came from.
+
+    Raises:
+        ConfigError: one line per override that names a place which is not there. Keys are judged later, by the model.
+    """
+    lines: list[str] = []
+    for override in overrides:
+        if override.section != section:
+            continue
+        try:
+            _make_way(document, override)
+            document.replace(override.location, override.value, override.origin)
+        except ConfigError as error:
+            lines += error.lines
+    if lines:
+        raise ConfigError(lines)
+
+
+def _parse(text: str) -> Override:
+    name, equals, value_text = text.partition("=")
+    name = name.strip()
+    origin = Origin(f"--set {name}")
+    if not equals:
+        raise ConfigError([f"{origin}: no '='; {_EXAMPLE}"])
+    steps: list[str | int] = []
+    end = 0
+    while end < len(name):
+        match = _STEP.match(name, end)
+        if match is None or (match[0].startswith(".") != bool(steps) and match[1] is not None):
+            raise ConfigError([f"{origin}: cannot read the key from column {end + 1}; {_EXAMPLE}"])
+        steps.append(match[1] if match[1] is not None else int(match[2]))
+        end = match.end()
+    if not steps:
+        raise ConfigError([f"{origin}: no key; {_EXAMPLE}"])
+    section = steps[0]
+    if section not in SECTIONS:
+        close = nearest(str(section), list(SECTIONS))
+        hint = f"did you mean {close}?" if close else f"known are {', '.join(SECTIONS)}"
+        raise ConfigError([f"{origin}: unknown section '{section}'; {hint}"])
+    if len(steps) == 1:
+        raise ConfigError([f"{origin}: names a whole document; {_EXAMPLE}"])
+    if not value_text.strip():
+        raise ConfigError([f"{origin}: no value; {_EXAMPLE}"])
+    return Override(section, tuple(steps[1:]), parse_value(value_text, origin), origin)
+
+
+def _make_way(document: Document, override: Override) -> None:
+    """Create mappings on the way that the file left to their defaults; refuse indices that are not there."""
+    value: Data = document.data
+    for depth, step in enumerate(override.location):
+        last = depth == len(override.location) - 1
+        here = key_path((override.section, *override.location[:depth]))
+        if isinstance(step, int):
+            if not isinstance(value, list):
+                raise ConfigError([f"{override.origin}: {here} is not a list"])
+            if step >= len(value):
+                known = f"0 to {len(value) - 1}" if value else "none"
+                raise ConfigError([f"{override.origin}: {here} has no [{step}]; indices there: {known}"])
+            value = value[step]
+        else:
+            if not isinstance(value, dict):
+                raise ConfigError(
+                    [
+                        f"{override.origin}: {here} has no keys, it is {'a list' if isinstance(value, list) else 'a single value'}"
+                    ]
+                )
+            if last:
+                return
+            if value.get(step) is None:
+                document.replace(override.location[: depth + 1], {}, override.origin)
+            value = value[step]

@@ -1,0 +1,27 @@
+"""JSON Schemas of the configuration files, for editors; generated from the models that check the files."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from companion.config.base import Model
+from companion.config.controller import AdaptiveConfig
+from companion.config.mission import Mission
+from companion.config.vehicle import Vehicle
+from companion.config.world import World
+
+KINDS: dict[str, type[Model]] = {"mission": Mission, "vehicle": Vehicle, "controller": AdaptiveConfig, "world": World}
+
+
+def schema_json(kind: str) -> str:
+    """JSON Schema (2020-12) of one kind of file, as text without a final newline.
+
+    Raises:
+        KeyError: if the kind is none of `KINDS`.
+    """
+    model = KINDS[kind]
+    schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    schema |= model.model_json_schema()
+    schema["title"] = f"companion {kind}"
+    return json.dumps(schema, indent=2, ensure_ascii=False)

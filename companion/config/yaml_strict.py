@@ -1,0 +1,250 @@
+"""YAML as people mean it: the 1.2 core schema, nothing that wins silently, and the place of every value.
+
+PyYAML speaks YAML 1.1, where `1e3` is text, `on` is true, `12:30` is 750 and a duplicate key overwrites the first. Here the scalars are
+those of YAML 1.2's core schema (section 10.3.2); duplicate keys, aliases and tags are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from companion.config.base import Location
+from companion.config.document import (
+    RANK_KEY,
+    RANK_VALUE,
+    ConfigError,
+    Data,
+    Document,
+    Origin,
+    Problem,
+    key_path,
+)
+
+SIZE_MAX_BYTES = 256 * 1024
+DEPTH_MAX = 32
+
+_NULL = re.compile(r"~|null|Null|NULL|")
+_BOOL = re.compile(r"true|True|TRUE|false|False|FALSE")
+_INT = re.compile(r"[-+]?[0-9]+")
+_OCTAL = re.compile(r"0o[0-7]+")
+_HEX = re.compile(r"0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)")
+_NAN = re.compile(r"\.(nan|NaN|NAN)")
+_DIGITS_MAX = 400  # Python refuses to convert integers of more than 4300 digits with an exception of its own.
+
+
+class StrictLoader(yaml.SafeLoader):
+    """Composes nodes; scalars are resolved by `_scalar`, not by PyYAML's YAML 1.1 rules."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.yaml_implicit_resolvers = {}
+        self._depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Compose one node, refusing aliases and bottomless nesting before they cost anything."""
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        mark: Any = event.start_mark
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(
+                problem="aliases (*name) are not accepted; write the value out", problem_mark=mark
+            )
+        tag = getattr(event, "tag", None)
+        if tag is not None:
+            raise yaml.MarkedYAMLError(
+                problem=f"tags ({tag}) are not accepted; write the plain value", problem_mark=mark
+            )
+        if self._depth >= DEPTH_MAX:
+            raise yaml.MarkedYAMLError(problem=f"nested more than {DEPTH_MAX} levels deep", problem_mark=mark)
+        self._depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+
+def read_document(path: str | Path, shown_as: str | None = None) -> Document:
+    """Read one YAML file whose top level is a mapping.
+
+    Raises:
+        ConfigError: one line, if the file cannot be read or is not YAML. What is readable but refused (duplicate keys) is
+            collected in `Document.problems`, to be reported together with what the models find.
+    """
+    shown = shown_as or str(path)
+    try:
+        with Path(path).open("rb") as file:
+            raw = file.read(SIZE_MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ConfigError([f"{shown}: no such file"]) from None
+    except IsADirectoryError:
+        raise ConfigError([f"{shown}: is a directory, expected a YAML file"]) from None
+    except PermissionError:
+        raise ConfigError([f"{shown}: not readable: permission denied"]) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ConfigError([f"{shown}: not readable: {reason}"]) from None
+    if len(raw) > SIZE_MAX_BYTES:
+        raise ConfigError([f"{shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; is this a configuration file?"])
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ConfigError(
+            [f"{shown}:{line}: not UTF-8 (byte 0x{raw[error.start]:02x}); save the file as UTF-8"]
+        ) from None
+    document = Document(shown, {})
+    data = _parse(text, document, None)
+    if data is None:
+        raise ConfigError([f"{shown}: is empty"])
+    if not isinstance(data, dict):
+        raise ConfigError(
+            [f"{document.origin(())}: expected a mapping (key: value) at the top level, got {_kind(data)}"]
+        )
+    document.data = data
+    return document
+
+
+def parse_value(text: str, origin: Origin) -> Data:
+    """Parse the value of a command line override by the same rules.
+
+    Raises:
+        ConfigError: one line per problem.
+    """
+    if len(text) > SIZE_MAX_BYTES:
+        raise ConfigError([f"{origin}: longer than {SIZE_MAX_BYTES // 1024} KiB"])
+    document = Document(origin.source, {})
+    data = _parse(text, document, origin)
+    if document.problems:
+        raise ConfigError([str(problem) for problem in document.problems])
+    return data
+
+
+def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
+    """Text to plain data. `fixed`: the one origin of everything (an override), instead of places in a file."""
+
+    def origin(mark: yaml.Mark | None) -> Origin:
+        if fixed is not None or mark is None:
+            return fixed or Origin(document.source)
+        return Origin(document.source, mark.line + 1, mark.column + 1)
+
+    try:
+        loader = StrictLoader(text)
+        try:
+            node = loader.get_single_node()
+        finally:
+            loader.dispose()
+    except yaml.reader.ReaderError as error:
+        before = text[: error.position]
+        at = fixed or Origin(document.source, before.count("\n") + 1, error.position - (before.rfind("\n") + 1) + 1)
+        code = error.character if isinstance(error.character, int) else ord(error.character)
+        raise ConfigError([f"{at}: not YAML: control character U+{code:04X} is not allowed"]) from None
+    except yaml.MarkedYAMLError as error:
+        raise ConfigError([f"{origin(error.problem_mark or error.context_mark)}: not YAML: {_syntax(error)}"]) from None
+    return None if node is None else _Builder(document, origin).build(node, ())
+
+
+class _Builder:
+    """Composed nodes to plain data, noting places and collecting what is refused."""
+
+    def __init__(self, document: Document, origin: Callable[[yaml.Mark | None], Origin]) -> None:
+        self._document = document
+        self._at = origin
+
+    def _refuse(self, rank: int, mark: yaml.Mark, location: Location, text: str) -> None:
+        where = f"{key_path(location)}: " if location else ""
+        self._document.problems.append(Problem(rank, self._at(mark), where + text))
+
+    def build(self, node: yaml.Node, location: Location) -> Data:
+        """Data of one node and all below it."""
+        self._document.values[location] = self._at(node.start_mark)
+        if isinstance(node, yaml.MappingNode):
+            return self._mapping(node, location)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.build(item, (*location, index)) for index, item in enumerate(node.value)]
+        assert isinstance(node, yaml.ScalarNode)
+        text: str = node.value
+        if node.style is not None:  # quoted or block: text, whatever it looks like
+            return text
+        try:
+            return _scalar(text)
+        except ValueError as error:
+            self._refuse(RANK_VALUE, node.start_mark, location, str(error))
+            return None
+
+    def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Data]:
+        data: dict[str, Data] = {}
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                self._refuse(RANK_KEY, key_node.start_mark, location, "a key must be plain text")
+                continue
+            key: str = key_node.value
+            if key == "<<" and key_node.style is None:
+                self._refuse(
+                    RANK_KEY, key_node.start_mark, location, "merge keys (<<) are not accepted; write the keys out"
+                )
+                continue
+            at = (*location, key)
+            if key in data:
+                first = self._document.keys[at]
+                where = f" on line {first.line}" if first.line else ""
+                self._refuse(
+                    RANK_KEY, key_node.start_mark, at, f"duplicate key, already given{where}; remove one of the two"
+                )
+                continue
+            self._document.keys[at] = self._at(key_node.start_mark)
+            data[key] = self.build(value_node, at)
+        return data
+
+
+def _scalar(text: str) -> Data:
+    """A plain scalar by YAML 1.2's core schema."""
+    if _NULL.fullmatch(text):
+        return None
+    if _BOOL.fullmatch(text):
+        return text[0] in "tT"
+    if len(text) > _DIGITS_MAX and (
+        _INT.fullmatch(text) or _FLOAT.fullmatch(text) or _HEX.fullmatch(text) or _OCTAL.fullmatch(text)
+    ):
+        raise ValueError(f"a number of {len(text)} digits")
+    if _INT.fullmatch(text):
+        return int(text)
+    if _OCTAL.fullmatch(text) or _HEX.fullmatch(text):
+        return int(text, 0)
+    if _FLOAT.fullmatch(text):
+        return float(text)
+    if _INFINITE.fullmatch(text):
+        return float("-inf") if text[0] == "-" else float("inf")
+    if _NAN.fullmatch(text):
+        return float("nan")
+    return text
+
+
+def _syntax(error: yaml.MarkedYAMLError) -> str:
+    """PyYAML's message in one line, in the words of someone who edits a file."""
+    problem = error.problem or "syntax error"
+    if "'\\t'" in problem:
+        return "a tab; indent with spaces"
+    if "expected a single document" in (error.context or "") or "but found another document" in problem:
+        return "a second document (---); one per file"
+    if "mapping values are not allowed here" in problem:
+        return (
+            "a ':' that does not belong here; is the line above complete, is the text quoted, is the indentation right?"
+        )
+    if "could not find expected ':'" in problem:
+        return "a key without ':'"
+    if problem.startswith("expected <block end>"):
+        return "the indentation does not fit the lines above"
+    if problem.startswith(("aliases", "tags", "nested")):
+        return problem
+    context = f" {error.context}" if error.context else ""
+    return " ".join(f"{problem}{context}".split())
+
+
+def _kind(data: Data) -> str:
+    return "a list" if isinstance(data, list) else "a single value"

@@ -1,0 +1,360 @@
+"""What a user may get wrong in the files or on the command line, and the exact line that tells it."""
+
+# ruff: noqa: E501  (the lines are as long as users see them)
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from companion.config.document import ConfigError
+from companion.config.loader import PRESETS, FlightConfig, load_flight, load_vehicle, load_world
+
+ROOT = Path(__file__).parents[2]
+DATA = Path(__file__).parent / "data"
+CATCH = "configs/missions/catch.yaml"
+VEHICLE = "configs/vehicles/tarot650_2r.yaml"
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A mission and a vehicle in a current directory of its own; not the ones that are flown, which may be tuned."""
+    (tmp_path / CATCH).parent.mkdir(parents=True)
+    (tmp_path / VEHICLE).parent.mkdir(parents=True)
+    shutil.copy(DATA / "mission.yaml", tmp_path / CATCH)
+    shutil.copy(DATA / "vehicle.yaml", tmp_path / VEHICLE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def lines_of(load: Callable[[], object]) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        load()
+    assert all(line and "\n" not in line for line in caught.value.lines)
+    assert str(caught.value) == "\n".join(caught.value.lines)
+    return list(caught.value.lines)
+
+
+BAD_MISSION = [
+    (
+        "duration_s: 0.5",
+        "duration_s: -3",
+        [f"{CATCH}:34:17: phases[1].duration_s: expected a number > 0 and <= 600, got -3"],
+    ),
+    (
+        "duration_s: 0.5",
+        "duration_ms: 500",
+        [f"{CATCH}:34:5: phases[1].duration_ms: unknown key; write duration_s, in s (not in ms)"],
+    ),
+    (
+        "duration_s: 0.5",
+        "duration: 0.5",
+        [f"{CATCH}:34:5: phases[1].duration: unknown key; write duration_s, in s (without a unit)"],
+    ),
+    (
+        "height_m: 1.0",
+        "height_ft: 3",
+        [f"{CATCH}:30:5: phases[0].height_ft: unknown key; write height_m, in m (not in ft)"],
+    ),
+    (
+        "  arm_deg: [165.0, 140.0]       # folded",
+        "  arm_rad: [2.9, 2.4]",
+        [f"{CATCH}:15:3: start.arm_rad: unknown key; write arm_deg, in deg (not in rad)"],
+    ),
+    (
+        "speed_max_m_s: 0.8",
+        "speed_max_km_h: 0.8",
+        [f"{CATCH}:18:3: limits.speed_max_km_h: unknown key; write speed_max_m_s, in m/s (not in km/h)"],
+    ),
+    ("height_m: 1.0", "hieght_m: 1.0", [f"{CATCH}:30:5: phases[0].hieght_m: unknown key; did you mean height_m?"]),
+    (
+        "height_m: 1.0",
+        "height_m: 1.0\n    color: red",
+        [f"{CATCH}:31:5: phases[0].color: unknown key; known here: name"],
+    ),
+    (
+        "height_m: 1.0",
+        "height_m: 1 m",
+        [f'{CATCH}:30:15: phases[0].height_m: expected a number > 0, got "1 m" (write 1; the key\'s name holds the unit)'],
+    ),
+    (
+        "height_m: 1.0",
+        "height_m: '1.0'",
+        [f'{CATCH}:30:15: phases[0].height_m: expected a number > 0, got "1.0" (write 1.0 without quotes)'],
+    ),
+    ("height_m: 1.0", "height_m: .nan", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got .nan"]),
+    ("height_m: 1.0", "height_m: -.inf", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got -.inf"]),
+    ("height_m: 1.0", "height_m: 1e999", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got .inf"]),
+    ("height_m: 1.0", "height_m: true", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got true"]),
+    ("height_m: 1.0", "height_m: [1]", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got [1]"]),
+    ("height_m: 1.0", "height_m:", [f"{CATCH}:30:14: phases[0].height_m: expected a number > 0, got nothing"]),
+    ("    height_m: 1.0\n", "", [f"{CATCH}:29:5: phases[0].height_m: missing; expected a number > 0"]),
+    (
+        "to_m: [1.0, 0.0, 1.0]",
+        "to_m: [1.0, 0.0]",
+        [f"{CATCH}:37:11: phases[2].to_m: expected a list of 3 numbers, got [1.0, 0.0]"],
+    ),
+    (
+        "to_m: [1.0, 0.0, 1.0]",
+        "to_m: [1.0, 0.0, x]",
+        [f'{CATCH}:37:22: phases[2].to_m[2]: expected a number, got "x"'],
+    ),
+    (
+        "type: takeoff ",
+        "type: takeof ",
+        [
+            f'{CATCH}:29:11: phases[0].type: expected one of arm, hold, land, line, takeoff, got "takeof" '
+            "(did you mean takeoff?)"
+        ],
+    ),
+    (
+        "type: takeoff               # 0.0 s\n    height_m: 1.0",
+        "height_m: 1.0",
+        [f"{CATCH}:29:5: phases[0].type: missing; expected one of arm, hold, land, line, takeoff"],
+    ),
+    ("  - type: land                  # 18.0 s\n    speed_m_s: 0.35\n", "", [f"{CATCH}:51:11: phases[5].type: the last phase must be a land"]),
+    (
+        "arm_duration_s: 2.5",
+        "arm_duration_s: 7",
+        [
+            f"{CATCH}:40:21: phases[2].arm_duration_s: the arm's move would end 7 s into a line of 6 s; "
+            "it must end within"
+        ],
+    ),
+    (
+        "    arm_deg: [100.0, 60.0]      # unfolded by 6.0 s\n",
+        "",
+        [f"{CATCH}:39:21: phases[2].arm_duration_s: says when the arm moves, but arm_deg, where it moves to, is missing"],
+    ),
+    (
+        "preset: recommended",
+        "preset: recomended",
+        [
+            f'{CATCH}:9:37: controller.preset: expected one of "paper", "recommended", got "recomended" '
+            "(did you mean recommended?)"
+        ],
+    ),
+    ("schema_version: 1", "schema_version: 2", [f"{CATCH}:6:17: schema_version: expected 1, got 2"]),
+    ("schema_version: 1", "schema_version: true", [f"{CATCH}:6:17: schema_version: expected 1, got true"]),
+    ("name: catch\nvehicle", "name: catch\nname: x\nvehicle", [f"{CATCH}:8:1: name: duplicate key, already given on line 7; remove one of the two"]),
+    (
+        "../vehicles/tarot650_2r.yaml",
+        "../vehicles/none.yaml",
+        [f"{CATCH}:8:10: vehicle: configs/vehicles/none.yaml: no such file"],
+    ),
+    (
+        "{law: adaptive, preset: recommended}",
+        "{file: mine.yaml, preset: paper}",
+        [f"{CATCH}:9:39: controller.preset: either a preset or a file, not both"],
+    ),
+    (
+        "{law: adaptive, preset: recommended}",
+        "{file: ../controllers/none.yaml}",
+        [f"{CATCH}:9:20: controller.file: configs/controllers/none.yaml: no such file"],
+    ),
+    (
+        "name: settle\n    duration_s: 0.5",
+        "nmae: settle\n    duration_s: -1",
+        [
+            f"{CATCH}:33:5: phases[1].nmae: unknown key; did you mean name?",
+            f"{CATCH}:34:17: phases[1].duration_s: expected a number > 0 and <= 600, got -1",
+        ],
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), BAD_MISSION, ids=[repr(new)[:40] for _, new, _ in BAD_MISSION])
+def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]) -> None:
+    path = project / CATCH
+    text = path.read_text()
+    assert text.count(old) >= 1
+    path.write_text(text.replace(old, new, 1))
+    assert lines_of(lambda: load_flight(CATCH)) == expected
+
+
+BAD_VEHICLE = [
+    ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: both servos have the id 1; give each its own"]),
+    ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 (the register's unit), got 90"]),
+    ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
+    ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
+    ("up_axis: z ", "up_axis: x ", ['up_axis: expected one of "y", "z", got "x"']),
+    ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "4.1", got 3.0 (put it in quotes)']),
+    ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: the first must be below the second, got [2.2, -2.2]"]),
+    ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: 0.26 m on 0.2 m"]),
+    ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint's walls, -10 to 150 deg"]),
+    ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole machine, but arm and tool alone weigh 0.45 kg"]),
+    ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
+    ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
+    ("length_m: 3.0", "length_cm: 300", ["tether.length_cm: unknown key; write length_m, in m (not in cm)"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), BAD_VEHICLE, ids=[new for _, new, _ in BAD_VEHICLE])
+def test_bad_vehicle_file(project: Path, old: str, new: str, expected: list[str]) -> None:
+    path = project / VEHICLE
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    found = lines_of(lambda: load_flight(CATCH))
+    assert len(found) == len(expected)
+    for line, end in zip(found, expected, strict=True):
+        assert line.startswith(f"{VEHICLE}:")
+        assert line.endswith(end)
+
+
+BAD_OVERRIDES = [
+    ("world.paylod_kg=0.2", "--set world.paylod_kg: unknown key; did you mean payload_kg?"),
+    ("world.payload_g=200", "--set world.payload_g: unknown key; write payload_kg, in kg (not in g)"),
+    ("wrld.payload_kg=0.2", "--set wrld.payload_kg: unknown section 'wrld'; did you mean world?"),
+    ("x.y=1", "--set x.y: unknown section 'x'; known are mission, vehicle, controller, world"),
+    ("world.payload_kg", "--set world.payload_kg: no '='; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
+    ("world.payload_kg=", "--set world.payload_kg: no value; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
+    ("world=1", "--set world: names a whole document; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
+    ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
+    ("[0]=1", "--set [0]: unknown section '0'; known are mission, vehicle, controller, world"),
+    ("world.payload_kg=2 kg", '--set world.payload_kg: expected a number from 0 to 2, got "2 kg" (write 2; the key\'s name holds the unit)'),
+    ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
+    ("world.payload_kg=.inf", "--set world.payload_kg: expected a number from 0 to 2, got .inf"),
+    ("world.seed=1.5", "--set world.seed: expected a whole number >= 0, got 1.5"),
+    ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of "mocap_loss", "link_loss", "servo_loss", "force_loss", got "mocap_los" (did you mean mocap_loss?)'),
+    ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
+    ("world.wind_m_s={a: 1, a: 2}", "--set world.wind_m_s: a: duplicate key, already given; remove one of the two"),
+    ("vehicle.safety.mocap_timeout_ms=200", "--set vehicle.safety.mocap_timeout_ms: unknown key; write mocap_timeout_s, in s (not in ms)"),
+    ("vehicle.safty.mocap_timeout_s=0.2", "--set vehicle.safty.mocap_timeout_s: safty: unknown key; did you mean safety?"),
+    ("mission.phases[2].duration_s=-3", "--set mission.phases[2].duration_s: expected a number > 0 and <= 600, got -3"),
+    ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no [9]; indices there: 0 to 6"),
+    ("mission.phases.duration_s=3", "--set mission.phases.duration_s: mission.phases has no keys, it is a list"),
+    ("mission.name.x=3", "--set mission.name.x: mission.name has no keys, it is a single value"),
+    ("mission.name[0]=3", "--set mission.name[0]: mission.name is not a list"),
+    ("mission.phases=[]", "--set mission.phases: expected a list of at least 2, got []"),
+    ("mission.vehicle=none.yaml", "--set mission.vehicle: vehicle: none.yaml: no such file"),
+    ("controller.rho_max=0", "--set controller.rho_max: expected a number > 0, got 0"),
+    ("controller.stiffness_kp[2]=90", "--set controller.stiffness_kp[2]: gain_cond asks for (K_d - M_d Phi) Phi = 144, got 90"),
+    ("controller.damping_kd[0]=3", "--set controller.damping_kd[0]: gain_new asks for K_d / M_d > Phi, got 3 <= 4"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("option", "line"), BAD_OVERRIDES, ids=[option for option, _ in BAD_OVERRIDES])
+def test_bad_override(project: Path, option: str, line: str) -> None:
+    assert lines_of(lambda: load_flight(CATCH, preset="paper", overrides=[option])) == [line]
+
+
+def test_problems_of_all_files_are_told_together(project: Path) -> None:
+    overrides = ["mission.phases[2].duration_s=0", "vehicle.airframe.mass_kg=0", "controller.nu=1", "world.seed=-1"]
+    lines = lines_of(lambda: load_flight(CATCH, overrides=overrides))
+    assert [line.split(":")[0] for line in lines] == [
+        "--set mission.phases[2].duration_s",
+        "--set vehicle.airframe.mass_kg",
+        "--set controller.nu",
+        "--set world.seed",
+    ]
+
+
+def test_unknown_controller_and_preset(project: Path) -> None:
+    assert lines_of(lambda: load_flight(CATCH, controller_law="csc")) == [
+        "--controller csc: no such controller; available: adaptive"
+    ]
+    assert lines_of(lambda: load_flight(CATCH, preset="papr")) == [
+        "--preset papr: no such preset of 'adaptive'; available: paper, recommended"
+    ]
+
+
+def test_missing_mission() -> None:
+    assert lines_of(lambda: load_flight("none.yaml")) == ["none.yaml: no such file"]
+
+
+def test_overrides_reach_every_section(project: Path) -> None:
+    config = load_flight(
+        CATCH,
+        overrides=[
+            "world.payload_kg=0.3",
+            "vehicle.safety.mocap_timeout_s=0.2",
+            "controller.rho_max=4",
+            "mission.phases[2].duration_s=5",
+            "world.faults=[{kind: mocap_loss, t_s: 5}]",
+            "world.faults[0].t_s=6",
+            "mission.name=a=b",
+        ],
+    )
+    assert config.world.payload_kg == 0.3
+    assert config.vehicle.safety.mocap_timeout_s == 0.2
+    assert config.controller.rho_max == 4.0
+    assert isinstance(config.controller.rho_max, float)
+    assert config.mission.phases[2].model_dump()["duration_s"] == 5.0
+    assert config.world.faults[0].t_s == 6.0
+    assert config.mission.name == "a=b"
+
+
+def test_override_of_a_key_and_a_section_that_the_file_leaves_to_defaults(project: Path) -> None:
+    text = (project / VEHICLE).read_text()
+    (project / VEHICLE).write_text(text[: text.index("safety:")])
+    config = load_flight(CATCH, overrides=["vehicle.safety.battery_min=0.3", "vehicle.airframe.hover_thrust=0.5"])
+    assert config.vehicle.safety.battery_min == 0.3
+    assert config.vehicle.airframe.hover_thrust == 0.5
+
+
+@pytest.mark.parametrize("preset", PRESETS["adaptive"])
+@pytest.mark.parametrize("mission", ["catch", "hover"])
+def test_config_survives_a_json_round_trip(mission: str, preset: str) -> None:
+    config = load_flight(
+        ROOT / "configs" / "missions" / f"{mission}.yaml", preset=preset, overrides=["world.payload_kg=0.1"]
+    )
+    again = FlightConfig.model_validate_json(config.model_dump_json())
+    assert again == config
+    assert again.model_dump_json() == config.model_dump_json()
+    assert json.loads(config.model_dump_json())["controller"]["preset"] == preset
+
+
+def test_paper_preset_is_the_papers_table() -> None:
+    controller = load_flight(ROOT / CATCH, preset="paper").controller
+    assert controller.inertia_md == (1, 1, 1, 0.015, 0.015, 0.015, 0.1, 0.1)
+    assert controller.lambda_gain == (1.5, 1.5, 2.0, 3.5, 3.5, 2.5, 1.0, 1.0)
+    assert controller.phi == (4, 4, 4, 3, 3, 3, 3.5, 3.5)
+    assert controller.damping_kd == (40, 40, 40, 0.75, 0.75, 0.75, 0.7, 0.7)
+    assert controller.stiffness_kp == (144, 144, 144, 2.115, 2.115, 2.115, 1.225, 1.225)
+    assert controller.desired_force_time_s is None
+    assert (controller.epsilon, controller.boundary_layer, controller.zeta_initial) == (1e-4, 0.1, 0.1)
+
+
+def test_relative_names_are_relative_to_the_file_that_names_them(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    mission = project / CATCH
+    shutil.copy(ROOT / "configs/controllers/adaptive_paper.yaml", mission.parent / "mine.yaml")
+    mission.write_text(mission.read_text().replace("{law: adaptive, preset: recommended}", "{file: mine.yaml}"))
+    monkeypatch.chdir(elsewhere)
+    config = load_flight(mission)
+    assert config.controller.preset == "paper"
+    assert config.sources.controller == str(mission.parent / "mine.yaml")
+    assert config.sources.phases[1] == f"{mission}:32:5"
+
+
+def test_a_vehicle_on_the_command_line_is_relative_to_the_current_directory(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (project / VEHICLE).rename(project / "other.yaml")
+    config = load_flight(CATCH, vehicle_path="other.yaml", overrides=["vehicle.name=other"])
+    assert config.vehicle.name == "other"
+    assert config.sources.vehicle == "other.yaml"
+
+
+def test_vehicle_and_world_load_alone(project: Path) -> None:
+    overrides = ["vehicle.airframe.mass_kg=3.1", "world.seed=7", "mission.phases[99].x=1"]
+    assert load_vehicle(VEHICLE, overrides).airframe.mass_kg == 3.1
+    assert load_world(overrides).seed == 7
+    assert lines_of(lambda: load_vehicle(VEHICLE, ["vehicle.airframe.mass_kg=x"]))[0].startswith(
+        "--set vehicle.airframe"
+    )
+    assert lines_of(lambda: load_world(["world.sed=7"])) == ["--set world.sed: unknown key; did you mean seed?"]
+
+
+def test_a_loaded_config_is_frozen(project: Path) -> None:
+    config = load_flight(CATCH)
+    with pytest.raises(ValueError, match="frozen"):
+        config.world.payload_kg = 1.0

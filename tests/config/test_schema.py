@@ -1,0 +1,63 @@
+"""The committed JSON schemas are those of the models, and every committed YAML file fits."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from companion.config.loader import PRESET_DIRECTORY, PRESETS
+from companion.config.schema import KINDS, schema_json
+from companion.config.yaml_strict import read_document
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "controller"}
+FILES = [(path, kind) for folder, kind in FOLDERS.items() for path in sorted((CONFIGS / folder).glob("*.yaml"))]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_committed_schema_is_up_to_date(kind: str) -> None:
+    committed = (CONFIGS / "schema" / f"{kind}.schema.json").read_text(encoding="utf-8")
+    assert committed == schema_json(kind) + "\n", (
+        f"write the output of `companion schema {kind}` to configs/schema/{kind}.schema.json"
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_schema_is_a_schema(kind: str) -> None:
+    jsonschema.Draft202012Validator.check_schema(json.loads(schema_json(kind)))
+
+
+def test_there_are_files_of_every_kind() -> None:
+    assert {kind for _, kind in FILES} == set(FOLDERS.values())
+
+
+@pytest.mark.parametrize(("path", "kind"), FILES, ids=[path.name for path, _ in FILES])
+def test_committed_file_fits_its_schema_and_names_it(path: Path, kind: str) -> None:
+    jsonschema.Draft202012Validator(json.loads(schema_json(kind))).validate(read_document(path).data)
+    header = re.match(r"# yaml-language-server: \$schema=(\S+)\n", path.read_text(encoding="utf-8"))
+    assert header is not None
+    assert (path.parent / header[1]).resolve() == (CONFIGS / "schema" / f"{kind}.schema.json").resolve()
+
+
+def test_schema_refuses_what_the_model_refuses() -> None:
+    schema = jsonschema.Draft202012Validator(json.loads(schema_json("mission")))
+    document = read_document(CONFIGS / "missions" / "hover.yaml").data
+    phases = document["phases"]
+    assert isinstance(phases, list)
+    phases[1] = {"type": "hold", "duration_s": -1}
+    with pytest.raises(jsonschema.ValidationError):
+        schema.validate(document)
+    phases[1] = {"type": "hold", "duration_ms": 1}
+    with pytest.raises(jsonschema.ValidationError):
+        schema.validate(document)
+
+
+def test_every_preset_is_there_once_and_shown_beside_the_other_configurations() -> None:
+    names = {f"{law}_{preset}.yaml" for law, presets in PRESETS.items() for preset in presets}
+    assert {path.name for path in PRESET_DIRECTORY.glob("*.yaml")} == names
+    for name in names:
+        assert (CONFIGS / "controllers" / name).resolve() == (PRESET_DIRECTORY / name).resolve()

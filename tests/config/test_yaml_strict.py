@@ -1,0 +1,142 @@
+"""YAML that is refused, and what scalars mean."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from companion.config.document import ConfigError, Origin
+from companion.config.yaml_strict import SIZE_MAX_BYTES, parse_value, read_document
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e3", 1000.0),
+        ("-.5", -0.5),
+        ("1.", 1.0),
+        ("0x1F", 31),
+        ("0o17", 15),
+        ("017", 17),
+        ("12:30", "12:30"),
+        ("1_000", "1_000"),
+        ("on", "on"),
+        ("yes", "yes"),
+        ("No", "No"),
+        ("True", True),
+        ("false", False),
+        ("~", None),
+        ("2024-01-01", "2024-01-01"),
+        ("'1'", "1"),
+        ("-.inf", -math.inf),
+        ("{a: [1, b]}", {"a": [1, "b"]}),
+    ],
+)
+def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
+    parsed = parse_value(text, Origin("test"))
+    assert parsed == value
+    assert type(parsed) is type(value)
+
+
+BAD = [
+    ("a: 1\nb: {c: 1}\na: 2\n", ["f.yaml:3:1: a: duplicate key, already given on line 1; remove one of the two"]),
+    ("a:\n\tb: 1\n", ["f.yaml:2:1: not YAML: a tab; indent with spaces"]),
+    ("a: [1, 2\n", ["f.yaml:2:1: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"]),
+    (
+        "a: b: c\n",
+        [
+            "f.yaml:1:5: not YAML: a ':' that does not belong here; is the line above complete, is the text quoted, "
+            "is the indentation right?"
+        ],
+    ),
+    ("a: 1\nb\n", ["f.yaml:3:1: not YAML: a key without ':'"]),
+    ("a: &x [1]\nb: *x\n", ["f.yaml:2:4: not YAML: aliases (*name) are not accepted; write the value out"]),
+    (
+        "a: !!float 1\n",
+        ["f.yaml:1:4: not YAML: tags (tag:yaml.org,2002:float) are not accepted; write the plain value"],
+    ),
+    ("a: !!python/object:os.system x\n", None),
+    ("<<: {a: 1}\n", ["f.yaml:1:1: merge keys (<<) are not accepted; write the keys out"]),
+    ("[a]: 1\n", ["f.yaml:1:1: a key must be plain text"]),
+    ("a: 1\n---\nb: 1\n", ["f.yaml:2:1: not YAML: a second document (---); one per file"]),
+    ("a: " + "[" * 5000 + "]" * 5000, ["f.yaml:1:35: not YAML: nested more than 32 levels deep"]),
+    ("a: " + "9" * 5000, ["f.yaml:1:4: a: a number of 5000 digits"]),
+    ("a: \x07\n", ["f.yaml:1:4: not YAML: control character U+0007 is not allowed"]),
+    ("- 1\n", ["f.yaml:1:1: expected a mapping (key: value) at the top level, got a list"]),
+    ("just text\n", ["f.yaml:1:1: expected a mapping (key: value) at the top level, got a single value"]),
+    ("", ["f.yaml: is empty"]),
+    ("# nothing\n", ["f.yaml: is empty"]),
+]
+
+
+@pytest.mark.parametrize(("text", "lines"), BAD, ids=range(len(BAD)))
+def test_refused_text_is_told_in_one_line_per_problem(tmp_path: Path, text: str, lines: list[str] | None) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_text(text, encoding="utf-8")
+    try:
+        document = read_document(path, "f.yaml")
+    except ConfigError as error:
+        found = list(error.lines)
+    else:
+        found = [str(problem) for problem in document.problems]
+    assert len(found) == 1
+    assert "\n" not in found[0]
+    assert lines is None or found == lines
+
+
+def test_every_duplicate_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_text("a: 1\na: 2\nb:\n  c: 1\n  c: 2\n")
+    assert [str(problem.origin) for problem in read_document(path, "f.yaml").problems] == ["f.yaml:2:1", "f.yaml:5:3"]
+
+
+def test_missing_file() -> None:
+    with pytest.raises(ConfigError, match=r"^no/such\.yaml: no such file$"):
+        read_document("no/such.yaml")
+
+
+def test_directory(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"is a directory, expected a YAML file$"):
+        read_document(tmp_path)
+
+
+def test_path_with_a_nul_byte() -> None:
+    with pytest.raises(ConfigError, match="not readable"):
+        read_document("a\0b")
+
+
+def test_path_through_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a: 1")
+    with pytest.raises(ConfigError, match=r"not readable: Not a directory$"):
+        read_document(tmp_path / "file" / "x.yaml")
+
+
+def test_not_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_bytes(b"a: 1\nname: caf\xe9\n")
+    with pytest.raises(ConfigError, match=r"^f.yaml:2: not UTF-8 \(byte 0xe9\); save the file as UTF-8$"):
+        read_document(path, "f.yaml")
+
+
+def test_byte_order_mark_is_accepted(tmp_path: Path) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_bytes(b"\xef\xbb\xbfa: 1\n")
+    assert read_document(path).data == {"a": 1}
+
+
+def test_too_large_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_bytes(b"#" * (SIZE_MAX_BYTES + 1))
+    with pytest.raises(ConfigError, match=r"^f\.yaml: larger than 256 KiB; is this a configuration file"):
+        read_document(path, "f.yaml")
+
+
+def test_places_of_values_and_keys(tmp_path: Path) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_text("a:\n  - b: 1\n    c: [2, 3]\n")
+    document = read_document(path, "f.yaml")
+    assert str(document.origin(("a", 0, "c", 1))) == "f.yaml:3:12"
+    assert str(document.key_origin(("a", 0, "c"))) == "f.yaml:3:5"
+    assert str(document.origin(("a", 0, "missing"))) == "f.yaml:2:5"
