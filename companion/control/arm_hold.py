@@ -1,0 +1,28 @@
+"""A plain PD on the joints: holds or folds the arm when the impedance law is not flying (on the ground, after an abort)."""
+
+from __future__ import annotations
+
+from companion.control.manipulator import Manipulator
+from companion.types import Quat, Vec2
+
+STIFFNESS_NM_RAD = 5.0
+DAMPING_NMS_RAD = 0.45
+
+
+def hold_torque_nm(
+    manipulator: Manipulator,
+    angle_rad: Vec2,
+    rate_rad_s: Vec2,
+    target_rad: Vec2,
+    target_rate_rad_s: Vec2,
+    attitude: Quat,
+) -> Vec2:
+    """Joint torques towards the target, nominal gravity carried."""
+    gravity = manipulator.gravity_torque_nm(angle_rad, attitude)
+    torque = [
+        g + STIFFNESS_NM_RAD * (target - angle) + DAMPING_NMS_RAD * (target_rate - rate)
+        for g, angle, rate, target, target_rate in zip(
+            gravity, angle_rad, rate_rad_s, target_rad, target_rate_rad_s, strict=True
+        )
+    ]
+    return (torque[0], torque[1])

@@ -1,0 +1,81 @@
+"""Kinematics and nominal gravity of the 2R arm.
+
+Angles are the paper's: alpha_1 is the angle of link 1 from body +x, positive turning down (about body +y); alpha_2 turns link 2 the
+other way, so that link 2 points along alpha_1 - alpha_2. Everything lives in the body's x-z plane. Floats and tuples only: these run in
+the control tick.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Arm, Tool
+from companion.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.types import Quat, Vec2, Vec3
+
+GRAVITY_M_S2 = 9.81
+
+
+class Manipulator:
+    """Geometry and nominal masses of arm and tool, payload excluded."""
+
+    def __init__(self, arm: Arm, tool: Tool) -> None:
+        self._shoulder = arm.shoulder_body_m
+        self._l1, self._l2 = arm.link_lengths_m
+        m1, m2 = arm.link_masses_kg
+        c1, c2 = arm.link_com_m
+        tool_mass = tool.sensor_mass_kg + tool.net_mass_kg
+        # First moments about each joint's axis, kg m.
+        self._moment_1 = m1 * c1 + (m2 + tool_mass) * self._l1
+        self._moment_2 = m2 * c2 + tool_mass * self._l2
+        roll, pitch, yaw = (math.radians(angle) for angle in tool.sensor_rpy_deg)
+        self._sensor_in_link2: Quat = quat_from_euler_zyx(roll, pitch, yaw)
+
+    def net_body_m(self, angle_rad: Vec2) -> Vec3:
+        """Centre of the net in the body frame."""
+        a1 = angle_rad[0]
+        b = a1 - angle_rad[1]
+        sx, sy, sz = self._shoulder
+        return (
+            sx + self._l1 * math.cos(a1) + self._l2 * math.cos(b),
+            sy,
+            sz - self._l1 * math.sin(a1) - self._l2 * math.sin(b),
+        )
+
+    def elbow_body_m(self, angle_rad: Vec2) -> Vec3:
+        """Elbow joint in the body frame."""
+        sx, sy, sz = self._shoulder
+        return (sx + self._l1 * math.cos(angle_rad[0]), sy, sz - self._l1 * math.sin(angle_rad[0]))
+
+    def jacobian_body_m(self, angle_rad: Vec2) -> tuple[Vec2, Vec2]:
+        """Rows x and z of d net_body / d alpha (the y row is zero), m/rad: the paper's J_alpha."""
+        a1 = angle_rad[0]
+        b = a1 - angle_rad[1]
+        s1, c1 = self._l1 * math.sin(a1), self._l1 * math.cos(a1)
+        s2, c2 = self._l2 * math.sin(b), self._l2 * math.cos(b)
+        return ((-s1 - s2, s2), (-c1 - c2, c2))
+
+    def joint_torque_from_force(self, angle_rad: Vec2, force_body_n: Vec3) -> Vec2:
+        """J' F: joint torques that a force on the net exerts, N m."""
+        (jx1, jx2), (jz1, jz2) = self.jacobian_body_m(angle_rad)
+        fx, _, fz = force_body_n
+        return (jx1 * fx + jz1 * fz, jx2 * fx + jz2 * fz)
+
+    def gravity_torque_nm(
+        self, angle_rad: Vec2, attitude_wxyz: Quat, specific_force_m_s2: float = GRAVITY_M_S2
+    ) -> Vec2:
+        """Motor torques that hold the arm against gravity in the attitude given, payload excluded."""
+        # "Up" seen from the body: the arm must push that way.
+        up_x, _, up_z = quat_rotate(
+            (attitude_wxyz[0], -attitude_wxyz[1], -attitude_wxyz[2], -attitude_wxyz[3]), (0.0, 0.0, specific_force_m_s2)
+        )
+        a1 = angle_rad[0]
+        b = a1 - angle_rad[1]
+        about_1 = self._moment_1 * (-math.sin(a1) * up_x - math.cos(a1) * up_z)
+        about_2 = self._moment_2 * (-math.sin(b) * up_x - math.cos(b) * up_z)
+        return (about_1 + about_2, -about_2)
+
+    def sensor_attitude_body(self, angle_rad: Vec2) -> Quat:
+        """Rotation from the force-torque sensor's frame to the body frame."""
+        half = 0.5 * (angle_rad[0] - angle_rad[1])
+        return quat_multiply((math.cos(half), 0.0, math.sin(half), 0.0), self._sensor_in_link2)

@@ -1,0 +1,91 @@
+"""From raw inputs to what the law needs: acceleration from the IMU, the tared external force, the catch."""
+
+from __future__ import annotations
+
+from companion.config.vehicle import Tool
+from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.frames import quat_conjugate, quat_multiply, quat_rotate
+from companion.types import ForceSample, Quat, Vec2, Vec3, VehicleState
+
+
+def acceleration_world_m_s2(vehicle: VehicleState) -> Vec3:
+    """Coordinate acceleration of the body: specific force turned into the world, gravity taken off."""
+    x, y, z = quat_rotate(vehicle.attitude_wxyz, vehicle.specific_force_body_m_s2)
+    return (x, y, z - GRAVITY_M_S2)
+
+
+class ForceSensing:
+    """Tare and gravity compensation of the force-torque sensor."""
+
+    def __init__(self, tool: Tool, manipulator: Manipulator) -> None:
+        self._net_weight_n = tool.net_mass_kg * GRAVITY_M_S2
+        self._manipulator = manipulator
+        self._sum = [0.0, 0.0, 0.0]
+        self._count = 0
+        self._last_stamp_s: float | None = None
+        self.bias_sensor_n: Vec3 | None = None
+
+    def collect(self, sample: ForceSample, attitude_wxyz: Quat, arm_rad: Vec2) -> None:
+        """Add one sample at rest to the tare; a sample seen before is not counted twice."""
+        if sample.stamp_s == self._last_stamp_s:
+            return
+        self._last_stamp_s = sample.stamp_s
+        to_sensor = quat_conjugate(self._to_world(attitude_wxyz, arm_rad))
+        weight = quat_rotate(to_sensor, (0.0, 0.0, -self._net_weight_n))
+        for i in range(3):
+            self._sum[i] += sample.force_sensor_n[i] - weight[i]
+        self._count += 1
+
+    def finish_tare(self) -> int:
+        """Fix the bias from what was collected; returns the number of samples."""
+        if self._count:
+            self.bias_sensor_n = (
+                self._sum[0] / self._count,
+                self._sum[1] / self._count,
+                self._sum[2] / self._count,
+            )
+        return self._count
+
+    def external_world_n(self, sample: ForceSample | None, attitude_wxyz: Quat, arm_rad: Vec2) -> Vec3 | None:
+        """External force on the net; None without sample or tare."""
+        if sample is None or self.bias_sensor_n is None:
+            return None
+        b, f = self.bias_sensor_n, sample.force_sensor_n
+        x, y, z = quat_rotate(self._to_world(attitude_wxyz, arm_rad), (f[0] - b[0], f[1] - b[1], f[2] - b[2]))
+        return (x, y, z + self._net_weight_n)
+
+    def _to_world(self, attitude_wxyz: Quat, arm_rad: Vec2) -> Quat:
+        return quat_multiply(attitude_wxyz, self._manipulator.sensor_attitude_body(arm_rad))
+
+
+class CatchDetector:
+    """A caught payload: a blow on the sensor, followed by a lasting pull downwards."""
+
+    BLOW_N = 3.0
+    PULL_N = 0.5
+    PULL_TIME_S = 0.25
+
+    def __init__(self) -> None:
+        self._blow_s: float | None = None
+        self._pull = 0.0
+        self._samples = 0
+        self.caught_s: float | None = None
+
+    def update(self, t_s: float, force_world_n: Vec3 | None) -> bool:
+        """True in the one tick in which a catch becomes certain; `caught_s` is then the time of the blow."""
+        if self.caught_s is not None or force_world_n is None:
+            return False
+        x, y, z = force_world_n
+        if self._blow_s is None:
+            if x * x + y * y + z * z > self.BLOW_N**2:
+                self._blow_s, self._pull, self._samples = t_s, 0.0, 0
+            return False
+        self._pull += z
+        self._samples += 1
+        if t_s - self._blow_s < self.PULL_TIME_S:
+            return False
+        if self._pull / self._samples < -self.PULL_N:
+            self.caught_s = self._blow_s
+            return True
+        self._blow_s = None
+        return False

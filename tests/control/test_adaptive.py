@@ -1,0 +1,141 @@
+"""The corrected discrete law: signs, invariants, and what the paper's proof leans on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.control.adaptive import Adaptation, AdaptiveController
+from companion.control.impedance import Impedance
+from companion.control.types import PlantState, Wrench
+from companion.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+
+FOLD: Vec2 = (math.radians(165), math.radians(140))
+HOVER = 0.49
+
+
+@pytest.fixture(scope="module", params=["paper", "recommended"])
+def config(request: pytest.FixtureRequest) -> FlightConfig:
+    return load_flight("configs/missions/catch.yaml", preset=request.param)
+
+
+def reference(position: Vec3 = (0.0, 0.0, 1.0), arm: Vec2 = FOLD) -> Reference:
+    zero: Vec3 = (0.0, 0.0, 0.0)
+    return Reference(position, zero, zero, 0.0, 0.0, arm, (0.0, 0.0), (0.0, 0.0))
+
+
+def state(
+    position: Vec3 = (0.0, 0.0, 1.0),
+    velocity: Vec3 = (0.0, 0.0, 0.0),
+    arm: Vec2 = FOLD,
+    arm_rate: Vec2 = (0.0, 0.0),
+    force: Vec3 | None = (0.0, 0.0, 0.0),
+) -> PlantState:
+    zero: Vec3 = (0.0, 0.0, 0.0)
+    return PlantState(position, velocity, zero, IDENTITY_QUAT, zero, arm, arm_rate, force)
+
+
+def settled(config: FlightConfig, plant: PlantState, ticks: int = 400) -> Wrench:
+    controller = AdaptiveController(config.controller, config.vehicle, HOVER)
+    for _ in range(ticks):
+        wrench = controller.step(0.005, plant, reference(), 1.0)
+    return wrench
+
+
+def test_at_rest_on_the_reference_it_asks_for_hover_and_arm_gravity(config: FlightConfig) -> None:
+    wrench = settled(config, state(), 1)
+    assert wrench.collective_n == pytest.approx(config.vehicle.airframe.mass_kg * 9.81, abs=1e-9)
+    assert wrench.attitude_wxyz == pytest.approx(IDENTITY_QUAT, abs=1e-12)
+    assert wrench.log.saturated == (False, False, False)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_it_pushes_against_the_position_error(config: FlightConfig, axis: int) -> None:
+    off = [0.0, 0.0, 1.0]
+    off[axis] += 0.1
+    tau = settled(config, state(position=(off[0], off[1], off[2])), 1).log.tau
+    rest = (0.0, 0.0, config.vehicle.airframe.mass_kg * 9.81)
+    # At least the free-motion stiffness Lambda Phi.
+    stiffness = config.controller.lambda_gain[axis] * config.controller.phi[axis]
+    assert tau[axis] - rest[axis] <= -0.1 * stiffness * 0.999
+
+
+def test_leaning_follows_the_lateral_force(config: FlightConfig) -> None:
+    """Too far forward and left: it leans back (pitch < 0) and right (roll > 0)."""
+    roll, pitch, _ = settled(config, state(position=(0.2, 0.2, 1.0)), 100).log.attitude_desired_rad
+    assert pitch < -0.01
+    assert roll > 0.01
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_it_pushes_joints_back_and_respects_their_limit(config: FlightConfig, joint: int) -> None:
+    rest = settled(config, state(), 1).arm_torque_nm
+    off = list(FOLD)
+    off[joint] += 0.2
+    pushed = settled(config, state(arm=(off[0], off[1])), 1).arm_torque_nm
+    assert pushed[joint] < rest[joint]
+    far = [FOLD[0], FOLD[1]]
+    far[joint] -= 3.0
+    limit = config.vehicle.arm.joints[joint].torque_max_nm
+    wrench = settled(config, state(arm=(far[0], far[1])), 50)
+    assert abs(wrench.arm_torque_nm[joint]) <= limit
+
+
+def test_a_payload_is_carried_after_a_while() -> None:
+    """recommended: the measured pull of 2 N goes into the vertical force; the arm's desired force follows it."""
+    config = load_flight("configs/missions/catch.yaml", preset="recommended")
+    wrench = settled(config, state(force=(0.0, 0.0, -2.0)), 1200)
+    weight = config.vehicle.airframe.mass_kg * 9.81
+    assert wrench.collective_n == pytest.approx(weight + 2.0, abs=0.05)
+    assert max(abs(e) for e in wrench.log.e_tau) < 0.01
+
+
+def test_without_force_sensor_it_flies_on() -> None:
+    config = load_flight("configs/missions/catch.yaml", preset="recommended")
+    wrench = settled(config, state(force=None))
+    assert wrench.log.force_ext_world_n == (0.0, 0.0, 0.0)
+
+
+def test_lateral_force_is_limited_by_tilt(config: FlightConfig) -> None:
+    wrench = settled(config, state(position=(3.0, -3.0, 1.0)), 400)
+    roll, pitch, _ = wrench.log.attitude_desired_rad
+    tilt = math.acos(math.cos(roll) * math.cos(pitch))
+    assert tilt <= math.radians(config.vehicle.airframe.tilt_max_deg) + 1e-6
+    assert wrench.log.saturated[1]
+
+
+norms = st.floats(0, 1e4)
+
+
+@settings(max_examples=300)
+@given(st.lists(st.tuples(norms, norms, st.floats(0, 3), st.booleans()), max_size=40), st.floats(1e-4, 1.0))
+def test_adaptive_gains_stay_nonnegative_for_any_input(
+    inputs: list[tuple[float, float, float, bool]], dt_s: float
+) -> None:
+    """Property: H and zeta stay >= 0 and rho stays within its cap, whatever ||s||, ||xi|| and ||chi_dd|| do."""
+    controller = load_flight("configs/missions/catch.yaml").controller
+    adaptation = Adaptation(controller)
+    for norm_s, x, acceleration, frozen in inputs:
+        regressor = (1.0, x, x * x, acceleration)
+        assert 0.0 <= adaptation.rho(regressor) <= controller.rho_max
+        adaptation.advance(dt_s, norm_s, regressor, frozen)
+        assert min(adaptation.h) >= 0.0
+        assert adaptation.zeta >= 0.0
+
+
+def test_gamma_is_the_exact_solution(config: FlightConfig) -> None:
+    """M_d gamma' = e_tau - D gamma for a held e_tau, against a fine Euler integration."""
+    impedance = Impedance(config.controller)
+    e_tau = [0.3, -0.2, 1.0, 0.0, 0.0, 0.0, 0.5, -0.4]
+    for _ in range(20):
+        impedance.advance(0.005, e_tau)
+    gamma = np.zeros(8)
+    m_d, d = np.array(impedance.inertia), np.array(impedance.d)
+    for _ in range(100_000):
+        gamma += 1e-6 * (e_tau - d * gamma) / m_d
+    np.testing.assert_allclose(impedance.gamma, gamma, rtol=1e-3, atol=1e-9)
