@@ -1,0 +1,245 @@
+"""A mission as motion: when each phase begins and ends, and where the machine should be at every instant.
+
+Pure and deterministic: a replay builds the same plan from the same mission and the same measured start.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+
+from companion.config.mission import ArmMove, Land, Line, Mission, Phase, Takeoff
+from companion.config.vehicle import Vehicle
+from companion.frames import wrap_rad
+from companion.mission.reference import (
+    REST_TO_REST_PEAK_SPEED,
+    Move,
+    Track,
+    reference_at,
+    rest_to_rest,
+    slow_down,
+    speed_up,
+    steady,
+)
+from companion.types import PhaseKind, Reference, Vec2, Vec3
+
+BELOW_GROUND_M = 0.25
+"""A landing's reference goes on below the floor, so that the vehicle is pressed down until touchdown is detected."""
+LAND_SPEED_UP_S = 1.0
+LAND_SLOW_DOWN_S = 0.5
+STOP_SPEED_MAX_M_S = 1.0
+"""A landing from flight starts with the measured velocity, but not faster: the faster, the farther away it would come to rest."""
+STOP_ACCELERATION_M_S2 = 2.0
+STOP_MIN_S = 0.5
+FOLD_SPEED_RAD_S = math.radians(75.0)
+FOLD_MIN_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """One phase on the plan's clock."""
+
+    name: str
+    kind: PhaseKind
+    start_s: float
+    end_s: float
+    index: int
+    """Number of the phase in the mission, from 0; -1 in a plan without a mission."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Segments without gaps from 0 to `duration_s`, and the motion in them. Built by `Plan.build` or `landing_from`."""
+
+    name: str
+    segments: tuple[Segment, ...]
+    duration_s: float
+    _starts_s: tuple[float, ...]
+    _position: Track
+    _yaw: Track
+    _arm: Track
+
+    @classmethod
+    def build(
+        cls,
+        mission: Mission,
+        vehicle: Vehicle,
+        start_position_world_m: Vec3,
+        start_yaw_rad: float,
+        start_arm_rad: Vec2 | None = None,
+    ) -> Plan:
+        """Plan a mission from where the machine really stands.
+
+        The take-off ends over the mission's start point, at the mission's yaw and with the mission's arm angles: what is measured
+        differs from them by the start's tolerances at most (`check_mission`), and that difference is taken out on the way up.
+
+        Args:
+            mission: phases; positions in the world frame.
+            vehicle: for the height of the body's origin on the ground.
+            start_position_world_m: measured, body origin.
+            start_yaw_rad: measured.
+            start_arm_rad: measured, the paper's angles; None: as the mission says.
+        """
+        arm_start = _radians(mission.start.arm_deg)
+        builder = _Builder(start_position_world_m, start_yaw_rad, start_arm_rad or arm_start)
+        for index, phase in enumerate(mission.phases):
+            start_s = builder.t_s
+            kind = PhaseKind.FLIGHT
+            if isinstance(phase, Takeoff):
+                kind = PhaseKind.TAKEOFF
+                x_m, y_m = mission.start.position_m
+                builder.move_vehicle((x_m, y_m, phase.height_m), phase.duration_s)
+                builder.turn(math.radians(mission.start.yaw_deg), phase.duration_s)
+                builder.move_arm(arm_start, 0.0, phase.duration_s)
+            elif isinstance(phase, Line):
+                builder.move_vehicle(phase.to_m, phase.duration_s)
+                if phase.arm_deg is not None:
+                    delay_s = phase.arm_delay_s or 0.0
+                    builder.move_arm(
+                        _radians(phase.arm_deg), delay_s, phase.arm_duration_s or phase.duration_s - delay_s
+                    )
+            elif isinstance(phase, ArmMove):
+                builder.move_arm(_radians(phase.arm_deg), 0.0, phase.duration_s)
+            if isinstance(phase, Land):
+                kind = PhaseKind.LANDING
+                builder.t_s = builder.descend(phase.speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
+            else:
+                builder.t_s = start_s + phase.duration_s
+            builder.segments.append(Segment(phase.name or _default_name(phase), kind, start_s, builder.t_s, index))
+        return builder.plan(mission.name)
+
+    def reference(self, t_s: float) -> Reference:
+        """Where the machine should be; at rest before 0 and after `duration_s`. Position, yaw and arm are C2 in time."""
+        return reference_at(self._position, self._yaw, self._arm, t_s)
+
+    def segment(self, t_s: float) -> Segment:
+        """The segment at a time: the first before 0, the last after the end."""
+        return self.segments[max(0, bisect_right(self._starts_s, t_s) - 1)]
+
+    def progress(self, t_s: float) -> float:
+        """Share of the whole duration, 0 to 1."""
+        return min(1.0, max(0.0, t_s / self.duration_s))
+
+
+def landing_from(
+    position_world_m: Vec3,
+    velocity_world_m_s: Vec3,
+    yaw_rad: float,
+    arm_rad: Vec2,
+    arm_fold_rad: Vec2,
+    speed_m_s: float,
+    vehicle: Vehicle,
+) -> Plan:
+    """Come to rest, then descend in place while the arm folds; from anywhere, at once.
+
+    The descent waits so long that the arm is folded before the net could touch the floor. Two segments, both PhaseKind.LANDING.
+
+    Args:
+        position_world_m: where the reference starts: the measured position, or the last reference.
+        velocity_world_m_s: what it starts with; cut to `STOP_SPEED_MAX_M_S`.
+        yaw_rad: kept.
+        arm_rad: where the arm starts, from rest.
+        arm_fold_rad: where it goes.
+        speed_m_s: of the descent.
+        vehicle: for the height of the floor and the reach of the arm.
+    """
+    builder = _Builder(position_world_m, yaw_rad, arm_rad)
+    fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
+    fold_s = max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * fold_rad / FOLD_SPEED_RAD_S)
+    builder.move_arm(arm_fold_rad, 0.0, fold_s)
+    stop_s = builder.stop(velocity_world_m_s)
+    arm = vehicle.arm
+    reach_m = sum(arm.link_lengths_m) - arm.shoulder_body_m[2] + vehicle.tool.net_radius_m
+    free_s = max(0.0, builder.height_m - reach_m) / speed_m_s
+    builder.t_s = max(stop_s, fold_s - free_s)
+    builder.segments.append(Segment("stop", PhaseKind.LANDING, 0.0, builder.t_s, -1))
+    start_s = builder.t_s
+    end_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
+    builder.t_s = max(end_s, fold_s)
+    builder.segments.append(Segment("land", PhaseKind.LANDING, start_s, builder.t_s, -1))
+    return builder.plan("landing")
+
+
+class _Builder:
+    """Appends moves to the three tracks; `t_s` is where the next phase begins."""
+
+    def __init__(self, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2) -> None:
+        self.t_s = 0.0
+        self.segments: list[Segment] = []
+        self._initial = (position_world_m, (yaw_rad,), arm_rad)
+        self._at: list[tuple[float, ...]] = list(self._initial)
+        self._moves: list[list[Move]] = [[], [], []]
+
+    @property
+    def height_m(self) -> float:
+        return self._at[0][2]
+
+    def move_vehicle(self, to_world_m: Vec3, duration_s: float) -> None:
+        self._go(0, to_world_m, self.t_s, duration_s)
+
+    def turn(self, to_yaw_rad: float, duration_s: float) -> None:
+        """By the shorter way round."""
+        yaw_rad = self._at[1][0]
+        self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s)
+
+    def move_arm(self, to_rad: Vec2, delay_s: float, duration_s: float) -> None:
+        self._go(2, to_rad, self.t_s + delay_s, duration_s)
+
+    def stop(self, velocity_world_m_s: Vec3) -> float:
+        """Come to rest from a velocity; returns the end, s."""
+        speed_m_s = math.hypot(*velocity_world_m_s)
+        share = min(1.0, STOP_SPEED_MAX_M_S / speed_m_s) if speed_m_s > 0.0 else 0.0
+        duration_s = max(STOP_MIN_S, REST_TO_REST_PEAK_SPEED * share * speed_m_s / STOP_ACCELERATION_M_S2)
+        vx, vy, vz = velocity_world_m_s
+        reach = share * duration_s
+        self._append(0, Move(self.t_s, duration_s, self._at[0], (vx * reach, vy * reach, vz * reach), slow_down))
+        return self.t_s + duration_s
+
+    def descend(self, speed_m_s: float, to_height_m: float) -> float:
+        """Straight down from rest to rest; returns the end, s."""
+        x_m, y_m, z_m = self._at[0]
+        depth_m = z_m - to_height_m
+        ramps_m = 0.5 * speed_m_s * (LAND_SPEED_UP_S + LAND_SLOW_DOWN_S)
+        if depth_m <= ramps_m:
+            duration_s = max(STOP_MIN_S, REST_TO_REST_PEAK_SPEED * depth_m / speed_m_s)
+            self._go(0, (x_m, y_m, min(z_m, to_height_m)), self.t_s, duration_s)
+            return self.t_s + duration_s
+        t_s = self.t_s
+        steady_s = (depth_m - ramps_m) / speed_m_s
+        for duration_s, profile in ((LAND_SPEED_UP_S, speed_up), (steady_s, steady), (LAND_SLOW_DOWN_S, slow_down)):
+            if duration_s > 0.0:
+                self._append(0, Move(t_s, duration_s, self._at[0], (0.0, 0.0, -speed_m_s * duration_s), profile))
+                t_s += duration_s
+        return t_s
+
+    def plan(self, name: str) -> Plan:
+        position, yaw, arm = (
+            Track(initial, tuple(moves)) for initial, moves in zip(self._initial, self._moves, strict=True)
+        )
+        starts_s = tuple(segment.start_s for segment in self.segments)
+        return Plan(name, tuple(self.segments), self.t_s, starts_s, position, yaw, arm)
+
+    def _go(self, track: int, to: tuple[float, ...], start_s: float, duration_s: float) -> None:
+        delta = tuple(b - a for a, b in zip(self._at[track], to, strict=True))
+        if any(delta):
+            self._append(track, Move(start_s, duration_s, self._at[track], delta, rest_to_rest))
+
+    def _append(self, track: int, move: Move) -> None:
+        self._moves[track].append(move)
+        self._at[track] = move.end
+
+
+def _radians(angle_deg: Vec2) -> Vec2:
+    return (math.radians(angle_deg[0]), math.radians(angle_deg[1]))
+
+
+_PLAIN_NAMES = {"takeoff": "take-off", "hold": "hold", "land": "land"}
+
+
+def _default_name(phase: Phase) -> str:
+    if isinstance(phase, Line):
+        return f"line to ({', '.join(f'{value:g}' for value in phase.to_m)}) m"
+    if isinstance(phase, ArmMove):
+        return f"arm to ({', '.join(f'{value:g}' for value in phase.arm_deg)}) deg"
+    return _PLAIN_NAMES[phase.type]

@@ -1,0 +1,85 @@
+"""The flight's sequence on top of the plan: wait, offboard, arm, spool up, fly the plan, touch down, disarm. Pure; time is an argument.
+
+WAIT -> OFFBOARD -> ARM -> SPOOL -> PLAN -> TOUCHDOWN -> DISARM -> DONE
+in the air, at any time:  -> PLAN (a landing from here)  or  -> AUTOPILOT_LAND, both ending in DONE
+before SPOOL, at any time: -> STAND_DOWN -> DONE
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from companion.types import AutopilotStatus, FlightMode, LandedState
+
+WAIT_TIMEOUT_S = 8.0
+TARE_S = 1.0
+STREAM_BEFORE_OFFBOARD_S = 0.8
+OFFBOARD_TIMEOUT_S = 8.0
+ARM_TIMEOUT_S = 10.0
+SPOOL_S = 1.2
+SPOOL_SHARE = 0.7
+"""Share of hover thrust at the end of spooling up; the plan's first tick takes it from there."""
+SPOOL_TO_FULL_S = 0.4
+TOUCHDOWN_RAMP_S = 0.4
+DISARM_TIMEOUT_S = 8.0
+
+
+class Stage(Enum):
+    """Stages of a flight."""
+
+    WAIT = "wait"
+    OFFBOARD = "offboard"
+    ARM = "arm"
+    SPOOL = "spool up"
+    PLAN = "plan"
+    TOUCHDOWN = "touchdown"
+    DISARM = "disarm"
+    AUTOPILOT_LAND = "autopilot land"
+    STAND_DOWN = "stand down"
+    DONE = "done"
+
+
+BEFORE_LIFT = frozenset({Stage.WAIT, Stage.OFFBOARD, Stage.ARM})
+LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
+COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
+"""Stages in which PX4 must be in OFFBOARD, by the companion's belief."""
+
+
+class TouchdownDetector:
+    """The vehicle stands: low, not sinking though the reference sinks, held so for a while."""
+
+    HOLD_S = 0.35
+    HEIGHT_MARGIN_M = 0.12
+    SINK_M_S = 0.08
+    REFERENCE_BELOW_M = 0.05
+
+    def __init__(self, clearance_m: float) -> None:
+        self._clearance_m = clearance_m
+        self._since_s: float | None = None
+
+    def update(self, t_s: float, height_m: float, vertical_m_s: float, reference_height_m: float) -> bool:
+        """True once touch-down is certain."""
+        low = height_m < self._clearance_m + self.HEIGHT_MARGIN_M
+        pressed = reference_height_m < height_m - self.REFERENCE_BELOW_M
+        still = abs(vertical_m_s) < self.SINK_M_S
+        if not (low and still and pressed):
+            self._since_s = None
+            return False
+        if self._since_s is None:
+            self._since_s = t_s
+        return t_s - self._since_s >= self.HOLD_S
+
+
+def in_offboard(status: AutopilotStatus | None) -> bool:
+    """PX4 says that it is in OFFBOARD."""
+    return status is not None and status.mode is FlightMode.OFFBOARD
+
+
+def is_armed(status: AutopilotStatus | None) -> bool:
+    """PX4 says that it is armed."""
+    return status is not None and status.armed
+
+
+def on_ground(status: AutopilotStatus | None) -> bool:
+    """PX4's land detector says that the vehicle stands."""
+    return status is not None and status.landed is LandedState.ON_GROUND

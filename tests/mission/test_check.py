@@ -1,0 +1,128 @@
+"""Missions that must not be flown, and the line that says so."""
+
+# ruff: noqa: E501  (the lines are as long as users see them)
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.mission.check import check_mission
+from companion.safety.tether import allowed_m, attachment_world_m, distance_m, slack_m
+
+ROOT = Path(__file__).parents[2]
+
+
+def load(*overrides: str, mission: str = "catch") -> FlightConfig:
+    return load_flight(ROOT / f"configs/missions/{mission}.yaml", overrides=overrides)
+
+
+def problems(*overrides: str, **measured: Any) -> list[str]:
+    config = load(*overrides)
+    return check_mission(config.mission, config.vehicle, **measured)
+
+
+@pytest.mark.parametrize("mission", ["catch", "hover"])
+def test_committed_missions_are_flyable(mission: str) -> None:
+    config = load(mission=mission)
+    assert check_mission(config.mission, config.vehicle) == []
+    assert check_mission(
+        config.mission,
+        config.vehicle,
+        start_position_world_m=(-1.1, 0.08, config.vehicle.airframe.ground_clearance_m + 0.02),
+        start_yaw_rad=0.1,
+        start_arm_rad=(2.85, 2.42),
+    ) == []  # fmt: skip
+
+
+REFUSED = [
+    (["mission.phases[2].to_m=[1, 0, 1.9]", "vehicle.tether.length_m=2.5"], "phase 'catch' leaves the tether sphere at t = 9.5 s, (1.00, 0.00, 1.90) m: 2.46 m from the anchor, 2.25 m allowed; shorten the line or move the anchor (also in 'stabilise', 'return')"),
+    (["mission.phases[2].to_m=[1.9, 0, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.90, 0.00, 1.00) m: rotors, arm and net reach x = 2.35 m, the room is -2.2 to 2.2 m; move the waypoint inwards (also in 'stabilise', 'return')"),
+    (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: rotors, arm and net reach y = -1.95 m, the room is -1.8 to 1.8 m; move the waypoint inwards"),
+    (["mission.phases[2].to_m=[1, 0, 2.1]"], "rotors, arm and net reach z = 2.25 m, the room is 0 to 2.2 m"),
+    (["mission.phases[2].to_m=[1, 0, 0.2]"], "phase 'catch' flies into the floor at t = 9.5 s, (1.00, 0.00, 0.20) m: the body's origin at 0.20 m, 0.30 m is the lowest; raise the waypoint"),
+    (["mission.phases[2].to_m=[1, 0, 0.4]"], "phase 'catch' drags the net over the floor at t = 9.5 s, (1.00, 0.00, 0.40) m: its lowest point is -0.07 m high, 0.01 m is the least; fly higher or fold the arm first"),
+    (["mission.phases[4].arm_deg=[100, 60]"], "phase 'land' drags the net over the floor"),
+    (["mission.phases[4].arm_deg=[50, 140]"], "phase 'return' drives joint 1 through its wall at t = 17.0 s, (-1.00, 0.00, 1.00) m: 50.0 deg, 60 to 175 deg allowed; change arm_deg (also in 'above the start', 'land')"),
+    (["mission.phases[2].arm_deg=[100, -20]"], "phase 'catch' drives joint 2 through its wall"),
+    (["mission.phases[2].duration_s=4"], "phase 'catch' flies too fast at t = 5.5 s, (0.00, 0.00, 1.00) m: 0.938 m/s, limits.speed_max_m_s is 0.8; take longer or go less far"),
+    (["mission.phases[2].duration_s=3"], "phase 'catch' accelerates too hard at t = 4.1 s, (-0.86, 0.00, 1.00) m: 1.28 m/s^2, limits.acceleration_max_m_s2 is 1; take longer or go less far"),
+    (["mission.phases[2].arm_duration_s=1"], "phase 'catch' turns a joint too fast at t = 4.0 s, (-0.99, 0.00, 1.00) m: 150 deg/s, limits.arm_speed_max_deg_s is 90"),
+    (["mission.phases[2].arm_duration_s=1"], "phase 'catch' accelerates a joint too hard"),
+    (["vehicle.arm.joints[1].velocity_max_deg_s=50"], "phase 'catch' turns joint 2 faster than it can"),
+    (["mission.catch.payload_max_kg=2"], "phase 'take-off' needs too much thrust at t = 0.6 s"),
+    (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2", "vehicle.airframe.tilt_max_deg=10"], "phase 'catch' leans too far"),
+    (["mission.phases[0].height_m=0.4"], "phase 'take-off' ends at 0.4 m, but the body's origin is 0.3 m above the floor when the vehicle stands; set height_m to 0.5 or more"),
+    (["mission.catch.expected_at_m=[0, 0.5]"], "mission 'catch': expects the payload at (0, 0.5) m, but never comes nearer than 0.50 m; change catch.expected_at_m or the lines"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("overrides", "line"), REFUSED, ids=[line[:60] for _, line in REFUSED])
+def test_unflyable_mission_is_refused(overrides: list[str], line: str) -> None:
+    found = problems(*overrides)
+    assert any(line in problem for problem in found), found
+    assert all("\n" not in problem for problem in found)
+
+
+@pytest.mark.parametrize(
+    ("measured", "line"),
+    [
+        (
+            {"start_position_world_m": (-1.0, 0.3, 0.3)},
+            "mission 'catch': starts at (-1, 0) m, but the vehicle stands at (-1.00, 0.30) m, 0.30 m away, 0.15 m allowed; "
+            "carry it there or change start.position_m",
+        ),
+        (
+            {"start_position_world_m": (-1.0, 0.0, 0.5)},
+            "mission 'catch': starts on the floor, with the body's origin at z = 0.30 m (airframe.ground_clearance_m), "
+            "but z = 0.50 m was measured; check the floor of the motion-capture volume and the pivot of the rigid body",
+        ),
+        (
+            {"start_yaw_rad": -1.0},
+            "mission 'catch': starts at a yaw of 0 deg, but the vehicle stands at -57 deg, 15 deg of difference allowed; "
+            "turn it or change start.yaw_deg",
+        ),
+        (
+            {"start_arm_rad": (2.0, 2.44)},
+            "mission 'catch': starts with the arm at (165, 140) deg, but it is at (115, 140) deg, 10 deg of difference "
+            "allowed; move it there by hand",
+        ),
+    ],
+)
+def test_a_start_elsewhere_is_refused(measured: dict[str, Any], line: str) -> None:
+    assert line in problems(**measured)
+
+
+def test_a_problem_points_at_its_phase_in_the_file() -> None:
+    config = load("mission.phases[2].to_m=[1.9, 0, 1]")
+    found = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
+    assert found[0].startswith(f"{config.sources.phases[2]}: mission 'catch', phase 'catch' ")
+
+
+def test_limits_may_be_used_to_the_full() -> None:
+    assert problems("mission.limits.speed_max_m_s=0.625", "mission.limits.arm_speed_max_deg_s=60") == []
+    assert problems("mission.limits.speed_max_m_s=0.6249") != []
+
+
+def test_a_yawed_vehicle_reaches_elsewhere_with_its_net() -> None:
+    wide = "vehicle.arm.link_lengths_m=[0.4, 0.4]"
+    overrides = [wide, "mission.phases[2].arm_deg=[60, 60]", "mission.limits.arm_speed_max_deg_s=200"]
+    assert any("x = " in problem for problem in problems(*overrides, "vehicle.room.x_m=[-1.6, 1.6]"))
+    assert not any("x = 1.6" in problem for problem in problems(*overrides, "vehicle.room.x_m=[-1.8, 1.8]"))
+    turned = problems(*overrides, "mission.start.yaw_deg=90", "vehicle.room.y_m=[-1.8, 0.6]")
+    assert any("y = 0." in problem for problem in turned)
+
+
+def test_tether_geometry() -> None:
+    tether = load(
+        "vehicle.tether.attachment_body_m=[0.1, 0, 0.2]", "vehicle.tether.anchor_world_m=[0, 0, 0]"
+    ).vehicle.tether
+    half = 0.5**0.5
+    left: tuple[float, float, float, float] = (half, 0.0, 0.0, half)  # yaw +90 deg
+    assert attachment_world_m(tether, (1.0, 0.0, 0.8), left) == pytest.approx((1.0, 0.1, 1.0))
+    assert distance_m(tether, (1.0, 0.0, 0.8), left) == pytest.approx((1.0 + 0.01 + 1.0) ** 0.5)
+    assert slack_m(tether, (1.0, 0.0, 0.8), left) == pytest.approx(tether.length_m - 2.01**0.5)
+    assert allowed_m(tether) == pytest.approx(tether.length_m - tether.margin_m)
