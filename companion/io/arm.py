@@ -1,0 +1,258 @@
+"""The arm edge: one thread owns the servo bus, the event loop only hands over and takes back."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from types import TracebackType
+from typing import Self, TypeVar
+
+from companion.clock import Clock
+from companion.config.vehicle import Arm, ArmDevice
+from companion.io.dynamixel import WATCHDOG_ERROR, WATCHDOG_TRIPPED, Block, JointScale
+from companion.io.dynamixel_bus import ArmBus, Pair
+from companion.io.edges import DeviceError
+from companion.types import ArmState, Vec2
+
+_OPEN_TIMEOUT_S = 8.0
+_CLOSE_TIMEOUT_S = 2.0
+_KEEPALIVES_PER_WATCHDOG = 3.0
+
+_T = TypeVar("_T")
+
+_WRITE = object()
+_STOP = object()
+
+
+class DynamixelArm:
+    """Two XM430-W210-T in current mode behind the `Arm` protocol.
+
+    While nobody asks for a read the thread reads on its own, often enough that the servos' bus watchdogs stay quiet; a torque that
+    is not renewed within `device.watchdog_ms` is taken back to 0. The watchdogs themselves are for the case that the whole
+    process stops. One that tripped is restarted, and shown once as `WATCHDOG_ERROR` in `ArmState.hardware_error`; a servo with a
+    hardware error of its own is left alone.
+
+    Args:
+        device: port, baud rate, watchdog.
+        arm: joints and torque constant.
+        clock: the flight clock; stamps come from it.
+    """
+
+    def __init__(self, device: ArmDevice, arm: Arm, clock: Clock) -> None:
+        self._device = device
+        self._arm = arm
+        self._clock = clock
+        self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
+        self._goals: deque[Pair] = deque(maxlen=1)
+        self._goal_handed_s = 0.0
+        self._state: ArmState | None = None
+        self._failures = 0
+        self._problem = ""
+        self._scales: tuple[JointScale, JointScale] | None = None
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._finished: asyncio.Future[None] | None = None
+        self._reading: asyncio.Future[None] | None = None
+        self._stop = threading.Event()
+
+    # --- event loop --------------------------------------------------------------------------------------------------
+
+    async def __aenter__(self) -> Self:
+        if self._thread is not None:
+            raise RuntimeError("an arm edge is entered once")
+        self._loop = asyncio.get_running_loop()
+        opened: asyncio.Future[DeviceError | None] = self._loop.create_future()
+        self._finished = self._loop.create_future()
+        self._thread = threading.Thread(target=self._run, args=(opened,), name="arm-bus", daemon=True)
+        self._thread.start()
+        try:
+            await asyncio.wait((opened,), timeout=_OPEN_TIMEOUT_S + 1.0)
+        except BaseException:
+            await self._shut_down()
+            raise
+        failure = (
+            opened.result()
+            if opened.done()
+            else DeviceError(f"arm bus {self._device.port}: the port did not open within {_OPEN_TIMEOUT_S:g} s")
+        )
+        if failure is not None:
+            await self._shut_down()
+            raise failure
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._shut_down()
+
+    def latest(self) -> ArmState | None:
+        """Newest joint state."""
+        return self._state
+
+    @property
+    def problem(self) -> str:
+        """What the port itself said when it last failed; empty while it has not."""
+        return self._problem
+
+    async def read(self, timeout_s: float) -> ArmState | None:
+        """One sync read; the newest state, whose `read_failures` counts the misses up to now.
+
+        A read that takes longer than `timeout_s` goes on in the bus thread and the next call waits for that one.
+        """
+        reading = self._reading
+        if reading is None or reading.done():
+            assert self._loop is not None, "the arm edge is not entered"
+            reading = self._reading = self._loop.create_future()
+            self._jobs.put(reading)
+        await asyncio.wait((reading,), timeout=timeout_s)
+        return self._state
+
+    def write_torque(self, torque_nm: Vec2) -> Vec2:
+        """Hand one command to the bus thread.
+
+        Args:
+            torque_nm: joint torques, paper's signs.
+
+        Returns:
+            What will be sent, after rounding to current counts and clipping, N m.
+
+        Raises:
+            ValueError: a torque is not finite.
+        """
+        assert self._scales is not None, "the arm edge is not entered"
+        first, second = self._scales
+        counts = (first.current_counts(torque_nm[0]), second.current_counts(torque_nm[1]))
+        self._goal_handed_s = time.monotonic()
+        self._goals.append(counts)
+        self._jobs.put(_WRITE)
+        return (first.torque_nm(counts[0]), second.torque_nm(counts[1]))
+
+    async def _shut_down(self) -> None:
+        self._stop.set()
+        self._jobs.put(_STOP)
+        if self._thread is None or self._finished is None:
+            return
+        await asyncio.wait((self._finished,), timeout=_CLOSE_TIMEOUT_S)
+        if self._finished.done():
+            self._thread.join(_CLOSE_TIMEOUT_S)  # has nothing left to do but end
+
+    # --- bus thread --------------------------------------------------------------------------------------------------
+
+    def _run(self, opened: asyncio.Future[DeviceError | None]) -> None:
+        bus = ArmBus(self._device, self._arm, self._stop.is_set)
+        try:
+            failure = self._open(bus)
+            self._post(functools.partial(_resolve, opened, failure))
+            if failure is None:
+                self._serve(bus)
+        finally:
+            bus.close()
+            finished = self._finished
+            assert finished is not None
+            self._post(functools.partial(_resolve, finished, None))
+
+    def _open(self, bus: ArmBus) -> DeviceError | None:
+        try:
+            self._scales = bus.open(_OPEN_TIMEOUT_S)
+            self._read_once(bus)
+        except DeviceError as error:
+            return error
+        except Exception as error:  # an unplugged port raises whatever its driver likes; preflight wants one line of it
+            return DeviceError(f"arm bus {self._device.port}: failed while being set up: {_describe(error)}")
+        if self._state is None:
+            return DeviceError(
+                f"arm bus {self._device.port}: the servos fell silent right after set-up; check the cables"
+            )
+        return None
+
+    def _serve(self, bus: ArmBus) -> None:
+        watchdog_s = self._device.watchdog_ms * 1e-3
+        sent: Pair = (0, 0)
+        while True:
+            try:
+                job = self._jobs.get(timeout=watchdog_s / _KEEPALIVES_PER_WATCHDOG)
+            except queue.Empty:
+                job = None
+            if job is _STOP:
+                return
+            if job is _WRITE:
+                sent = self._write_newest(bus, sent)
+                continue
+            tripped = self._read_once(bus)
+            if isinstance(job, asyncio.Future):
+                self._post(functools.partial(_resolve, job, None))
+            if tripped:
+                sent = (0, 0)
+                self._try(bus.restart_watchdogs)
+            elif sent != (0, 0) and time.monotonic() - self._goal_handed_s > watchdog_s:
+                sent = (0, 0)
+                self._try(lambda: bus.write_currents((0, 0)))
+
+    def _write_newest(self, bus: ArmBus, sent: Pair) -> Pair:
+        try:
+            goal = self._goals.pop()
+        except IndexError:
+            return sent  # an earlier turn took the newest already
+        self._try(lambda: bus.write_currents(goal))
+        return goal
+
+    def _read_once(self, bus: ArmBus) -> bool:
+        """Read, publish the state; True if a bus watchdog had tripped."""
+        try:
+            pair = bus.read()
+        except Exception as error:  # as in `_try`
+            self._problem = _describe(error)
+            pair = None
+        if pair is None:
+            self._failures += 1
+            if self._state is not None:
+                self._state = replace(self._state, read_failures=self._failures)
+            return False
+        self._failures = 0
+        self._state = self._to_state(pair)
+        return WATCHDOG_TRIPPED in (pair[0].bus_watchdog, pair[1].bus_watchdog)
+
+    def _to_state(self, blocks: tuple[Block, Block]) -> ArmState:
+        assert self._scales is not None
+        (a, b), (first, second) = blocks, self._scales
+        return ArmState(
+            stamp_s=self._clock(),
+            angle_rad=(first.angle_rad(a.position_count), second.angle_rad(b.position_count)),
+            velocity_rad_s=(first.velocity_rad_s(a.velocity_count), second.velocity_rad_s(b.velocity_count)),
+            torque_nm=(first.torque_nm(a.current_count), second.torque_nm(b.current_count)),
+            hardware_error=(_errors(a), _errors(b)),
+            temperature_c=(float(a.temperature_c), float(b.temperature_c)),
+            read_failures=0,
+        )
+
+    def _try(self, transaction: Callable[[], None]) -> None:
+        # A port that dies raises whatever its driver likes; the thread must outlive it to let go of the arm in the end.
+        try:
+            transaction()
+        except Exception as error:
+            self._problem = _describe(error)
+
+    def _post(self, callback: Callable[[], None]) -> None:
+        assert self._loop is not None
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            self._loop.call_soon_threadsafe(callback)
+
+
+def _errors(block: Block) -> int:
+    return block.hardware_error | (WATCHDOG_ERROR if block.bus_watchdog == WATCHDOG_TRIPPED else 0)
+
+
+def _describe(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _resolve(future: asyncio.Future[_T], result: _T) -> None:
+    if not future.done():
+        future.set_result(result)

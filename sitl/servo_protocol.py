@@ -1,0 +1,178 @@
+"""DYNAMIXEL Protocol 2.0 on the servo's side: CRC, byte stuffing, a parser that survives garbage. No I/O, no state but the buffer.
+
+Source: ROBOTIS e-manual, "DYNAMIXEL Protocol 2.0".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+HEADER = b"\xff\xff\xfd\x00"
+BROADCAST_ID = 0xFE
+MAX_ID = 252
+MAX_LENGTH = 1024
+"""Largest length field that a servo takes for a packet; anything longer is noise that looks like a header."""
+_PREFIX = 7  # header, id, length
+
+
+class Instruction(IntEnum):
+    """Instruction field."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    STATUS = 0x55
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
+
+
+class StatusError(IntEnum):
+    """Error number of a status packet (its bits 0 to 6)."""
+
+    NONE = 0
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    CRC = 3
+    DATA_RANGE = 4
+    DATA_LENGTH = 5
+    DATA_LIMIT = 6
+    ACCESS = 7
+
+
+ALERT = 0x80
+"""Bit 7 of the error byte: register 70 is not zero."""
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = ((crc << 1) ^ 0x8005 if crc & 0x8000 else crc << 1) & 0xFFFF
+        table.append(crc)
+    return tuple(table)
+
+
+_CRC_TABLE = _crc_table()
+
+
+def crc16(data: bytes | bytearray, crc: int = 0) -> int:
+    """CRC-16 of `data` (polynomial 0x8005, most significant bit first), continued from `crc`."""
+    for byte in data:
+        crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
+    return crc
+
+
+def stuff(body: bytes) -> bytes:
+    """Instruction or status body with FD added after every FF FF FD."""
+    return body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
+
+
+def unstuff(body: bytes) -> bytes:
+    """Inverse of `stuff`."""
+    return body.replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+
+
+def packet(packet_id: int, body: bytes) -> bytes:
+    """A whole packet around an unstuffed body (instruction byte and parameters)."""
+    body = stuff(body)
+    head = HEADER + bytes((packet_id,)) + (len(body) + 2).to_bytes(2, "little") + body
+    return head + crc16(head).to_bytes(2, "little")
+
+
+def status(servo_id: int, error: int, data: bytes = b"") -> bytes:
+    """A status packet; `error` is the whole error byte, alert bit included."""
+    return packet(servo_id, bytes((Instruction.STATUS, error)) + data)
+
+
+def fast_status(blocks: list[tuple[int, int, bytes]], total_blocks_size: int) -> bytes:
+    """The one status packet of a fast sync or bulk read.
+
+    Args:
+        blocks: (servo id, error byte, data) of the servos that answered, in the order asked for.
+        total_blocks_size: data bytes of all servos asked plus 4 per servo; the first servo announces it whether or not the
+            others follow. The packet is not stuffed and each block ends with the CRC of everything before it.
+    """
+    out = bytearray(HEADER)
+    out.append(BROADCAST_ID)
+    out += (1 + total_blocks_size).to_bytes(2, "little")
+    out.append(Instruction.STATUS)
+    for servo_id, error, data in blocks:
+        out += bytes((error, servo_id)) + data
+        out += crc16(out).to_bytes(2, "little")
+    return bytes(out)
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet that was found on the line."""
+
+    packet_id: int
+    instruction: int
+    parameters: bytes
+    """Stuffing removed; empty when the CRC is wrong."""
+    crc_ok: bool
+
+
+class PacketParser:
+    """Finds packets in a byte stream. Never raises; noise is skipped and the next good header is found again."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    @property
+    def pending(self) -> bool:
+        """A packet has begun and is not complete."""
+        return bool(self._buffer)
+
+    def drop_partial(self) -> None:
+        """Forget a packet that has begun (the servo's byte-to-byte timeout)."""
+        self._buffer.clear()
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """Take bytes from the line; returns the packets that became complete."""
+        buffer = self._buffer
+        buffer += data
+        packets: list[Packet] = []
+        while True:
+            start = buffer.find(HEADER)
+            if start < 0:
+                keep = _header_prefix_size(buffer)
+                del buffer[: len(buffer) - keep]
+                return packets
+            del buffer[:start]
+            if len(buffer) < _PREFIX:
+                return packets
+            length = buffer[5] | buffer[6] << 8
+            if not 3 <= length <= MAX_LENGTH or not (buffer[4] <= MAX_ID or buffer[4] == BROADCAST_ID):
+                del buffer[0]
+                continue
+            end = _PREFIX + length
+            if len(buffer) < end:
+                return packets
+            if crc16(buffer[: end - 2]) == buffer[end - 2] | buffer[end - 1] << 8:
+                body = unstuff(bytes(buffer[_PREFIX : end - 2]))
+                packets.append(Packet(buffer[4], body[0], body[1:], True))
+                del buffer[:end]
+            else:
+                # A wrong length may have swallowed the packet behind this one: look for a header inside as well.
+                packets.append(Packet(buffer[4], buffer[_PREFIX], b"", False))
+                del buffer[0]
+
+
+def _header_prefix_size(buffer: bytearray) -> int:
+    """How many bytes at the end of the buffer may be the beginning of a header."""
+    for size in (3, 2, 1):
+        if buffer.endswith(HEADER[:size]):
+            return size
+    return 0

@@ -1,0 +1,491 @@
+"""The arm edge over a real pty against the emulated servos; the real dynamixel-sdk speaks in between."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import threading
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from companion.clock import flight_clock
+from companion.config.vehicle import Arm as ArmConfig
+from companion.config.vehicle import ArmDevice, Joint
+from companion.io import dynamixel as dxl
+from companion.io.arm import DynamixelArm
+from companion.io.dynamixel import (
+    WATCHDOG_ERROR,
+)
+from companion.io.edges import Arm as ArmEdge
+from companion.io.edges import DeviceError
+from companion.types import ArmState
+from sitl.servo_bus import ServoBus
+from sitl.servo_model import ServoModel
+
+KT = 1.3
+NM_PER_COUNT = KT * 2.69e-3
+JOINTS = (
+    Joint(servo_id=11, sign=-1, zero_count=3072, angle_deg=(-20, 180), torque_max_nm=2.5),
+    Joint(servo_id=12, sign=1, zero_count=1024, angle_deg=(-150, 150), torque_max_nm=1.5),
+)
+START_DEG = (165.0, 140.0)
+LONG_S = 30.0
+"""No test measures time: this only ends a run that hangs."""
+
+
+def arm_config(*joints: Joint) -> ArmConfig:
+    return ArmConfig(
+        shoulder_body_m=(0.0, 0.0, -0.05),
+        link_lengths_m=(0.2, 0.2),
+        link_masses_kg=(0.15, 0.05),
+        link_com_m=(0.1, 0.1),
+        torque_per_amp_nm_a=KT,
+        joints=(joints[0], joints[1]) if joints else JOINTS,
+    )
+
+
+def shaft_rad(joint: Joint, angle_rad: float) -> float:
+    return joint.zero_count * dxl.RAD_PER_COUNT + joint.sign * angle_rad
+
+
+def new_servos(baud: int = 3_000_000, start_deg: tuple[float, float] = START_DEG) -> list[ServoModel]:
+    return [
+        ServoModel(joint.servo_id, baud_bps=baud, shaft_angle_rad=shaft_rad(joint, math.radians(angle)))
+        for joint, angle in zip(JOINTS, start_deg, strict=True)
+    ]
+
+
+def register(servo: ServoModel, address: int, size: int = 1) -> int:
+    return int.from_bytes(servo.read(address, size), "little", signed=size > 1)
+
+
+def device_on(path: str, **changes: Any) -> ArmDevice:
+    return ArmDevice(port=path, **changes)
+
+
+@dataclass
+class Setup:
+    servos: list[ServoModel]
+    bus: ServoBus
+    arm: DynamixelArm
+    clock: Callable[[], float]
+
+
+@asynccontextmanager
+async def flying_arm(**device: Any) -> AsyncIterator[Setup]:
+    servos = new_servos()
+    clock = flight_clock()
+    async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path, **device), arm_config(), clock) as arm:
+        yield Setup(servos, bus, arm, clock)
+
+
+def fly(scenario: Callable[[Setup], Awaitable[None]], **device: Any) -> None:
+    async def main() -> None:
+        async with flying_arm(**device) as setup:
+            await asyncio.wait_for(scenario(setup), LONG_S)
+
+    asyncio.run(main())
+    assert_nothing_left()
+
+
+def assert_nothing_left() -> None:
+    assert [thread.name for thread in threading.enumerate() if thread.name == "arm-bus"] == []
+
+
+async def state_when(arm: ArmEdge, condition: Callable[[ArmState], bool]) -> ArmState:
+    while True:
+        state = await arm.read(1.0)
+        assert state is not None
+        if condition(state):
+            return state
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    while not condition():  # noqa: ASYNC110 - registers have no event to wait for; `asyncio.wait_for` around ends it
+        await asyncio.sleep(0.001)
+
+
+def refused(servos: list[ServoModel], config: ArmConfig | None = None, **device: Any) -> str:
+    """Text with which the edge refuses these servos; the servos are left without torque."""
+
+    async def main() -> str:
+        async with ServoBus(servos) as bus:
+            arm = DynamixelArm(device_on(bus.path, **device), config or arm_config(), flight_clock())
+            with pytest.raises(DeviceError) as caught:
+                await arm.__aenter__()
+            assert "\n" not in str(caught.value)
+            assert str(caught.value).startswith(f"arm bus {bus.path}: ")
+            with serial.Serial(bus.path, exclusive=True):
+                pass  # the port is free again
+            return str(caught.value)
+
+    text = asyncio.run(main())
+    assert_nothing_left()
+    assert [register(servo, 64) for servo in servos] == [0] * len(servos)
+    return text
+
+
+# --- flight ---------------------------------------------------------------------------------------------------------------
+
+
+def test_joint_state_arrives_in_the_papers_angles() -> None:
+    async def scenario(setup: Setup) -> None:
+        edge: ArmEdge = setup.arm
+        state = edge.latest()
+        assert state is not None
+        assert [math.degrees(a) for a in state.angle_rad] == pytest.approx(START_DEG, abs=0.05)
+        for joint, servo, angle in zip(JOINTS, setup.servos, (1.0, -0.7), strict=True):
+            servo.update(0.001, shaft_rad(joint, angle), joint.sign * 0.5)
+        asked_s = setup.clock()
+        fresh = await state_when(edge, lambda s: s.stamp_s > asked_s)
+        state = await state_when(edge, lambda s: s.stamp_s > fresh.stamp_s)
+        assert state.angle_rad == pytest.approx((1.0, -0.7), abs=0.001)
+        assert state.velocity_rad_s == pytest.approx((0.5, 0.5), abs=0.012)
+        assert state.temperature_c == (30.0, 30.0)
+        assert (state.hardware_error, state.read_failures) == ((0, 0), 0)
+        assert state.stamp_s <= setup.clock()
+
+    fly(scenario)
+
+
+def test_servos_are_set_up_for_current_control() -> None:
+    async def scenario(setup: Setup) -> None:
+        for servo in setup.servos:
+            assert [register(servo, a) for a in (9, 11, 64, 98)] == [0, 0, 1, 6]
+            assert register(servo, 102, 2) == 0
+
+    fly(scenario, watchdog_ms=120)
+
+
+def test_torque_returned_is_the_torque_that_flows() -> None:
+    async def scenario(setup: Setup) -> None:
+        sent = setup.arm.write_torque((0.5, -99.0))
+        assert sent == pytest.approx((0.5, -1.5), abs=NM_PER_COUNT)
+        await until(lambda: register(setup.servos[1], 102, 2) != 0)
+        flowing = [
+            joint.sign * KT * servo.update(0.001, shaft_rad(joint, 1.0), 0.0)
+            for joint, servo in zip(JOINTS, setup.servos, strict=True)
+        ]
+        assert flowing == pytest.approx(sent, abs=1e-9)
+        state = await state_when(setup.arm, lambda s: s.torque_nm[1] != 0.0)
+        assert state.torque_nm == pytest.approx(sent, abs=1e-9)
+
+    fly(scenario, watchdog_ms=2540)
+
+
+def test_newest_torque_wins() -> None:
+    async def scenario(setup: Setup) -> None:
+        for step in range(200):
+            setup.arm.write_torque((step * 0.01, 0.0))
+        last = setup.arm.write_torque((0.7, 0.3))
+        counts = [round(JOINTS[i].sign * last[i] / NM_PER_COUNT) for i in (0, 1)]
+        await until(lambda: [register(s, 102, 2) for s in setup.servos] == counts)
+
+    fly(scenario, watchdog_ms=2540)
+
+
+def test_torque_that_is_not_renewed_goes_to_zero_while_reads_go_on() -> None:
+    async def scenario(setup: Setup) -> None:
+        setup.arm.write_torque((0.5, 0.5))
+        await until(lambda: register(setup.servos[0], 102, 2) != 0)
+        for _ in range(10):
+            await setup.arm.read(1.0)
+        await until(lambda: [register(s, 102, 2) for s in setup.servos] == [0, 0])
+        assert [register(s, 64) for s in setup.servos] == [1, 1]
+
+    fly(scenario)
+
+
+def test_servos_hear_from_the_bus_though_nobody_reads() -> None:
+    async def scenario(setup: Setup) -> None:
+        first = setup.arm.latest()
+        assert first is not None
+        await until(lambda: setup.arm.latest() is not first)
+
+    fly(scenario)
+
+
+def test_servo_falling_silent_counts_and_comes_back() -> None:
+    async def scenario(setup: Setup) -> None:
+        before = setup.arm.latest()
+        assert before is not None
+        setup.servos[1].fail_silent(True)
+        lost = await state_when(setup.arm, lambda s: s.read_failures >= 5)
+        setup.arm.write_torque((0.4, 0.4))
+        await until(lambda: register(setup.servos[0], 102, 2) != 0)
+        assert register(setup.servos[1], 102, 2) == 0
+        later = await setup.arm.read(1.0)
+        assert later is not None
+        assert later.read_failures > lost.read_failures
+        assert later.stamp_s == lost.stamp_s, "the stamp is of the last complete read"
+        setup.servos[1].fail_silent(False)
+        back = await state_when(setup.arm, lambda s: s.read_failures == 0)
+        assert back.stamp_s > lost.stamp_s
+
+    fly(scenario, watchdog_ms=2540)
+
+
+def test_hardware_error_is_reported_and_never_rebooted() -> None:
+    async def scenario(setup: Setup) -> None:
+        setup.servos[0].trip_overload()
+        state = await state_when(setup.arm, lambda s: s.hardware_error != (0, 0))
+        assert state.hardware_error == (0x20, 0)
+        for _ in range(50):
+            setup.arm.write_torque((0.3, 0.3))
+            state = await state_when(setup.arm, lambda s: s.read_failures == 0)
+            assert state.hardware_error == (0x20, 0)
+        assert [register(s, 64) for s in setup.servos] == [0, 1]
+
+    fly(scenario)
+
+
+def test_servo_that_restarts_by_itself_is_a_lost_servo_not_an_angle_of_zero() -> None:
+    async def scenario(setup: Setup) -> None:
+        before = setup.arm.latest()
+        assert before is not None
+        setup.servos[1].reboot()
+        state = await state_when(setup.arm, lambda s: s.read_failures >= 5)
+        assert state.angle_rad == pytest.approx(before.angle_rad)
+
+    fly(scenario)
+
+
+def test_overheating_is_reported_with_its_temperature() -> None:
+    async def scenario(setup: Setup) -> None:
+        setup.servos[1].set_temperature_c(85.0)
+        state = await state_when(setup.arm, lambda s: s.temperature_c[1] > 80.0)
+        assert state.hardware_error == (0, 0x04)
+
+    fly(scenario)
+
+
+def test_tripped_watchdog_is_shown_and_started_again() -> None:
+    async def scenario(setup: Setup) -> None:
+        servo, joint = setup.servos[0], JOINTS[0]
+        servo.update(1.0, shaft_rad(joint, 1.0), 0.0)
+        servo.update(9.0, shaft_rad(joint, 1.0), 0.0)  # no packet came in between, by the servo's time
+        assert register(servo, 98) == 0xFF
+        state = await state_when(setup.arm, lambda s: s.hardware_error != (0, 0))
+        assert state.hardware_error == (WATCHDOG_ERROR, 0)
+        await state_when(setup.arm, lambda s: s.hardware_error == (0, 0))
+        assert [register(s, 98) for s in setup.servos] == [5, 5]
+        setup.arm.write_torque((0.3, 0.0))
+        await until(lambda: register(servo, 102, 2) != 0)
+
+    fly(scenario)
+
+
+def test_leaving_lets_go_of_the_arm() -> None:
+    async def main() -> list[ServoModel]:
+        async with flying_arm() as setup:
+            setup.arm.write_torque((0.5, 0.5))
+            await until(lambda: register(setup.servos[0], 102, 2) != 0)
+            await setup.arm.__aexit__(None, None, None)
+            with serial.Serial(setup.bus.path, exclusive=True):
+                pass  # closed and unlocked
+            return setup.servos
+
+    servos = asyncio.run(asyncio.wait_for(main(), LONG_S))
+    for servo in servos:
+        assert (register(servo, 102, 2), register(servo, 64), register(servo, 98)) == (0, 0, 0)
+    assert_nothing_left()
+
+
+def test_leaving_a_dead_bus_is_quiet_and_ends() -> None:
+    async def main() -> None:
+        servos = new_servos()
+        async with ServoBus(servos) as bus:
+            arm = DynamixelArm(device_on(bus.path), arm_config(), flight_clock())
+            await arm.__aenter__()
+            for servo in servos:
+                servo.fail_silent(True)
+            await state_when(arm, lambda s: s.read_failures >= 3)
+            await arm.__aexit__(None, None, None)
+            assert_nothing_left()
+
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+
+
+def test_unplugged_port_counts_as_failures_and_leaving_ends() -> None:
+    async def main() -> None:
+        async with ServoBus(new_servos()) as bus:
+            arm = DynamixelArm(device_on(bus.path), arm_config(), flight_clock())
+            await arm.__aenter__()
+        await state_when(arm, lambda s: s.read_failures >= 3)
+        arm.write_torque((0.1, 0.1))
+        assert arm.problem
+        await arm.__aexit__(None, None, None)
+        assert_nothing_left()
+
+    before = set(os.listdir("/proc/self/fd"))
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    assert set(os.listdir("/proc/self/fd")) == before
+
+
+def test_cancelled_opening_leaves_nothing_behind() -> None:
+    async def main() -> list[ServoModel]:
+        servos = new_servos()
+        async with ServoBus(servos) as bus:
+            opening = asyncio.create_task(DynamixelArm(device_on(bus.path), arm_config(), flight_clock()).__aenter__())
+            await until(lambda: register(servos[0], 11) == 0)
+            opening.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await opening
+            assert_nothing_left()
+            with serial.Serial(bus.path, exclusive=True):
+                pass
+        return servos
+
+    servos = asyncio.run(asyncio.wait_for(main(), LONG_S))
+    assert [register(servo, 64) for servo in servos] == [0, 0]
+
+
+@pytest.mark.parametrize("baud", [57600, 1_000_000, 4_000_000])
+def test_other_baud_rates_work(baud: int) -> None:
+    async def main() -> None:
+        servos = new_servos(baud)
+        async with (
+            ServoBus(servos) as bus,
+            DynamixelArm(device_on(bus.path, baud=baud), arm_config(), flight_clock()) as arm,
+        ):
+            await state_when(arm, lambda s: s.read_failures == 0)
+
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+
+
+# --- refusals -------------------------------------------------------------------------------------------------------------
+
+
+def enter(device: ArmDevice) -> str:
+    async def main() -> str:
+        with pytest.raises(DeviceError) as caught:
+            await DynamixelArm(device, arm_config(), flight_clock()).__aenter__()
+        return str(caught.value)
+
+    text = asyncio.run(main())
+    assert "\n" not in text
+    assert_nothing_left()
+    return text
+
+
+def test_missing_port_is_named_with_the_ports_there_are() -> None:
+    text = enter(device_on("/dev/ttyUSB_not_here"))
+    assert text.startswith("arm bus /dev/ttyUSB_not_here: no such port; ")
+    assert "serial port" in text
+    assert "devices.arm.port" in text
+
+
+def test_file_that_is_no_port_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("")
+    assert "not a usable serial port" in enter(device_on(str(path)))
+
+
+def test_busy_port_is_refused() -> None:
+    async def main() -> str:
+        async with ServoBus(new_servos()) as bus:
+            with serial.Serial(bus.path, exclusive=True), pytest.raises(DeviceError) as caught:
+                await DynamixelArm(device_on(bus.path), arm_config(), flight_clock()).__aenter__()
+            return str(caught.value)
+
+    assert "port is busy; another program" in asyncio.run(main())
+    assert_nothing_left()
+
+
+def test_second_companion_is_refused_and_the_first_flies_on() -> None:
+    async def scenario(setup: Setup) -> None:
+        with pytest.raises(DeviceError, match="port is busy"):
+            await DynamixelArm(device_on(setup.bus.path), arm_config(), flight_clock()).__aenter__()
+        await state_when(setup.arm, lambda s: s.read_failures == 0)
+
+    fly(scenario)
+
+
+def test_absent_servo_is_named_with_the_ids_that_answer() -> None:
+    text = refused([new_servos()[0]])
+    assert "servo 12 (joint 2): does not answer at 3000000 baud; ids that answer: 11;" in text
+
+
+def test_wrong_baud_rate_says_that_nobody_answers() -> None:
+    text = refused(new_servos(57600))
+    assert "servo 11 (joint 1): does not answer at 3000000 baud; no servo answers at all;" in text
+
+
+def test_wrong_model_is_refused() -> None:
+    servos = [ServoModel(11, model=1020), ServoModel(12)]
+    text = refused(servos)
+    assert "servo 11 (joint 1): has model number 1020, expected 1030 (XM430-W210)" in text
+
+
+def test_hardware_error_at_start_is_named_and_not_rebooted() -> None:
+    servos = new_servos()
+    servos[1].trip_overload()
+    text = refused(servos)
+    assert "servo 12 (joint 2): reports a hardware error: overload (hardware error status (register 70) = 32)" in text
+    assert register(servos[1], 70) == 0x20
+
+
+def test_joint_outside_its_walls_is_refused() -> None:
+    text = refused(new_servos(start_deg=(165.0, 170.0)))
+    assert "servo 12 (joint 2): stands at 170.0 deg" in text
+    assert "outside its walls -150 to 150 deg" in text
+
+
+def test_current_limit_below_the_joints_torque_is_refused() -> None:
+    servos = new_servos()
+    servos[0].write(38, (400).to_bytes(2, "little"))
+    text = refused(servos)
+    assert "current limit (register 38) is 400, which is 1.40 N m; torque_max_nm 2.5 needs 714" in text
+
+
+def test_servos_left_in_odd_states_are_taken_over() -> None:
+    async def main() -> None:
+        servos = new_servos()
+        for servo in servos:
+            servo.write(11, b"\x00")
+            servo.write(64, b"\x01")
+            servo.write(98, b"\x01")
+            servo.write(102, (300).to_bytes(2, "little"))
+            servo.write(68, b"\x00")
+        first = servos[0]
+        for t_s in (0.0, 1.0):
+            first.update(t_s, shaft_rad(JOINTS[0], 1.0), 0.0)
+        assert register(first, 98) == 0xFF
+        async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path), arm_config(), flight_clock()):
+            for servo in servos:
+                assert [register(servo, a) for a in (9, 11, 64, 68, 98)] == [0, 0, 1, 2, 5]
+                assert register(servo, 102, 2) == 0
+
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+
+
+def test_noise_on_the_line_costs_reads_not_the_thread() -> None:
+    async def scenario(setup: Setup) -> None:
+        noise = bytes(range(256)) + b"\xff\xff\xfd\x00\x0b\x0d\x00\x55\x00" * 5
+        for _ in range(30):
+            os.write(setup.bus._master_fd, noise)
+            await setup.arm.read(1.0)
+        assert (await state_when(setup.arm, lambda s: s.read_failures == 0)).hardware_error == (0, 0)
+        assert not setup.arm.problem
+
+    fly(scenario)
+
+
+def test_reads_end_though_the_caller_waits_for_less() -> None:
+    async def scenario(setup: Setup) -> None:
+        for servo in setup.servos:
+            servo.fail_silent(True)
+        state = await setup.arm.read(0.0)
+        assert state is not None
+        failed = await state_when(setup.arm, lambda s: s.read_failures > state.read_failures)
+        assert failed.stamp_s <= time.monotonic()
+
+    fly(scenario)

@@ -1,0 +1,153 @@
+"""The unmodified dynamixel-sdk, as anybody would use it, against the emulated bus on its pty."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from dynamixel_sdk import (
+    COMM_RX_TIMEOUT,
+    COMM_SUCCESS,
+    GroupBulkRead,
+    GroupBulkWrite,
+    GroupSyncRead,
+    GroupSyncWrite,
+    PacketHandler,
+    PortHandler,
+    port_handler,
+)
+
+from sitl.servo_bus import ServoBus
+from sitl.servo_model import RAD_PER_COUNT, ServoModel
+
+BAUD = 1_000_000
+IDS = (11, 12)
+
+
+def on_bus(talk: Callable[[Any, Any], None], servos: list[ServoModel], *, wire_time: bool = True) -> None:
+    """Run `talk(port, protocol)` in a thread, with the SDK's own port, while this loop serves the bus."""
+
+    patience = port_handler.LATENCY_TIMER
+
+    def session(path: str) -> None:
+        # Only patience, for a loaded machine: the SDK gives a servo 34 ms of wall time, in one process with this bus.
+        port_handler.LATENCY_TIMER = 500
+        port = PortHandler(path)
+        port.baudrate = BAUD
+        assert port.openPort()
+        try:
+            talk(port, PacketHandler(2.0))
+        finally:
+            port.closePort()
+            port_handler.LATENCY_TIMER = patience
+
+    async def scenario() -> None:
+        async with ServoBus(servos, wire_time=wire_time) as bus:
+            await asyncio.to_thread(session, bus.path)
+
+    asyncio.run(scenario())
+
+
+def servos(*counts: int) -> list[ServoModel]:
+    return [
+        ServoModel(i, baud_bps=BAUD, shaft_angle_rad=count * RAD_PER_COUNT)
+        for i, count in zip(IDS, counts, strict=True)
+    ]
+
+
+def test_ping_and_broadcast_ping_find_both_servos() -> None:
+    def talk(port: Any, protocol: Any) -> None:
+        assert protocol.ping(port, 11) == (1030, COMM_SUCCESS, 0)
+        assert protocol.ping(port, 13)[1] == COMM_RX_TIMEOUT
+        found, result = protocol.broadcastPing(port)
+        assert result == COMM_SUCCESS
+        assert found == {11: [1030, 48], 12: [1030, 48]}
+
+    on_bus(talk, servos(100, 200))
+
+
+@pytest.mark.parametrize("wire_time", [False, True])
+def test_sync_bulk_and_fast_reads_agree(wire_time: bool) -> None:
+    def talk(port: Any, protocol: Any) -> None:
+        sync = GroupSyncRead(port, protocol, 126, 10)
+        bulk = GroupBulkRead(port, protocol)
+        for i in IDS:
+            assert sync.addParam(i)
+        assert bulk.addParam(11, 132, 4)
+        assert bulk.addParam(12, 146, 1)
+        for read in (sync.txRxPacket, sync.fastSyncRead):
+            assert read() == COMM_SUCCESS
+            assert [sync.getData(i, 132, 4) for i in IDS] == [0x0AFD, 2079]
+            assert [sync.getData(i, 128, 4) for i in IDS] == [0xFFFFFFFF, 0], "-1, unsigned as the SDK has it"
+        for read in (bulk.txRxPacket, bulk.fastBulkRead):
+            assert read() == COMM_SUCCESS
+            assert (bulk.getData(11, 132, 4), bulk.getData(12, 146, 1)) == (0x0AFD, 30)
+
+    pair = servos(0x0AFD, 2079)
+    pair[0].update(0.0, 0x0AFD * RAD_PER_COUNT, -0.024)  # velocity FFFFFFFF before position FD0A: has to be stuffed
+    on_bus(talk, pair, wire_time=wire_time)
+
+
+def test_writes_single_synchronous_bulk_and_registered() -> None:
+    def talk(port: Any, protocol: Any) -> None:
+        for i in IDS:
+            assert protocol.write1ByteTxRx(port, i, 11, 0) == (COMM_SUCCESS, 0)
+            assert protocol.write1ByteTxRx(port, i, 64, 1) == (COMM_SUCCESS, 0)
+        sync = GroupSyncWrite(port, protocol, 102, 2)
+        assert sync.addParam(11, [0x9C, 0xFF])
+        assert sync.addParam(12, [200, 0])
+        assert sync.txPacket() == COMM_SUCCESS
+        assert protocol.read2ByteTxRx(port, 11, 102) == (0xFF9C, COMM_SUCCESS, 0)
+        assert protocol.read2ByteTxRx(port, 12, 102) == (200, COMM_SUCCESS, 0)
+        bulk = GroupBulkWrite(port, protocol)
+        assert bulk.addParam(11, 65, 1, [1])
+        assert bulk.addParam(12, 102, 2, [7, 0])
+        assert bulk.txPacket() == COMM_SUCCESS
+        assert protocol.read1ByteTxRx(port, 11, 65) == (1, COMM_SUCCESS, 0)
+        assert protocol.read2ByteTxRx(port, 12, 102) == (7, COMM_SUCCESS, 0)
+        assert protocol.regWriteTxRx(port, 12, 102, 2, [9, 0]) == (COMM_SUCCESS, 0)
+        assert protocol.read1ByteTxRx(port, 12, 69) == (1, COMM_SUCCESS, 0)
+        assert protocol.action(port, 0xFE) == COMM_SUCCESS
+        assert protocol.read2ByteTxRx(port, 12, 102) == (9, COMM_SUCCESS, 0)
+
+    on_bus(talk, servos(0, 0))
+
+
+def test_refusals_arrive_as_the_sdk_names_them() -> None:
+    def talk(port: Any, protocol: Any) -> None:
+        result, error = protocol.write2ByteTxRx(port, 11, 38, 1194)
+        assert (result, error) == (COMM_SUCCESS, 4)
+        assert protocol.write1ByteTxRx(port, 11, 64, 1) == (COMM_SUCCESS, 0)
+        result, error = protocol.write1ByteTxRx(port, 11, 9, 0)
+        assert (
+            protocol.getRxPacketError(error) == "[RxPacketError] Writing or Reading is not available to target address!"
+        )
+        assert protocol.factoryReset(port, 11, 0xFF) == (COMM_SUCCESS, 1)
+        assert protocol.clearMultiTurn(port, 11) == (COMM_SUCCESS, 0)
+
+    on_bus(talk, servos(0, 0))
+
+
+def test_hardware_error_alerts_in_every_packet_until_reboot() -> None:
+    pair = servos(0, 0)
+    pair[0].trip_overload()
+
+    def talk(port: Any, protocol: Any) -> None:
+        assert protocol.read1ByteTxRx(port, 11, 70) == (0x20, COMM_SUCCESS, 0x80)
+        assert protocol.write1ByteTxRx(port, 11, 64, 1) == (COMM_SUCCESS, 0x81)
+        assert protocol.reboot(port, 11) == (COMM_SUCCESS, 0)
+        assert protocol.write1ByteTxRx(port, 11, 64, 1) == (COMM_SUCCESS, 0)
+
+    on_bus(talk, pair)
+
+
+def test_wrong_baud_rate_hears_nothing() -> None:
+    def talk(port: Any, protocol: Any) -> None:
+        assert port.setBaudRate(57600)
+        assert protocol.ping(port, 11)[1] == COMM_RX_TIMEOUT
+        assert port.setBaudRate(BAUD)
+        assert protocol.ping(port, 11)[1] == COMM_SUCCESS
+
+    on_bus(talk, servos(0, 0))

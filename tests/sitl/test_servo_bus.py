@@ -1,0 +1,352 @@
+"""The emulated servos against the e-manual: known packets, register rules, watchdog, hardware errors, noise on the line."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import termios
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sitl.servo_bus import ServoBus, ServoLine
+from sitl.servo_model import RAD_PER_COUNT, ServoModel, ServoRefusal
+from sitl.servo_protocol import (
+    HEADER,
+    Instruction,
+    PacketParser,
+    StatusError,
+    crc16,
+    packet,
+    status,
+    stuff,
+    unstuff,
+)
+
+AMP = 2.69e-3
+
+
+def servo_at(count: int, servo_id: int = 1) -> ServoModel:
+    return ServoModel(servo_id, shaft_angle_rad=count * RAD_PER_COUNT)
+
+
+def line_of(*servos: ServoModel) -> ServoLine:
+    for servo in servos:
+        servo.write(9, b"\x00")
+    return ServoLine(servos)
+
+
+def word(value: int, size: int = 2) -> bytes:
+    return value.to_bytes(size, "little", signed=value < 0)
+
+
+def get(servo: ServoModel, address: int, size: int, *, signed: bool = False) -> int:
+    return int.from_bytes(servo.read(address, size), "little", signed=signed)
+
+
+def refusal(servo: ServoModel, address: int, data: bytes) -> StatusError:
+    with pytest.raises(ServoRefusal) as caught:
+        servo.write(address, data)
+    return caught.value.error
+
+
+def in_current_mode(servo_id: int = 1) -> ServoModel:
+    servo = ServoModel(servo_id)
+    servo.write(11, b"\x00")
+    servo.write(64, b"\x01")
+    return servo
+
+
+# --- packets, byte for byte as in the e-manual ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sent", "answered"),
+    [
+        ("fffffd000103000119 4e", "fffffd0001070055000604266 55d"),
+        ("fffffd00fe03000131 42", "fffffd0001070055000604266 55d fffffd0002070055000604266f6d"),
+        ("fffffd000107000284000400 1d15", "fffffd00010800550 0a6000000 8cc0"),
+        ("fffffd0001090003740000020000 ca89", "fffffd00010400550 0a10c"),
+        ("fffffd0001030008 2f4e", "fffffd00010400550 0a10c"),
+        (
+            "fffffd00fe090082840004000102 cefa",
+            "fffffd00010800550 0a6000000 8cc0 fffffd00020800550 01f080000 babe",
+        ),
+        (
+            "fffffd00fe0d0092 0190000200 0292000100 1a05",
+            "fffffd00010600550 07700 c369 fffffd00020500550 024 8ba9",
+        ),
+        ("fffffd00fe110083 74000400 0196000000 02aa000000 8287", ""),
+        ("fffffd00fe100093 0120000200a000 021f00010050 b768", ""),
+    ],
+)
+def test_manual_example_is_answered_byte_for_byte(sent: str, answered: str) -> None:
+    servos = [ServoModel(i, firmware=38, shaft_angle_rad=c * RAD_PER_COUNT) for i, c in ((1, 166), (2, 2079))]
+    servos[0].set_voltage_v(11.9)
+    servos[1].set_temperature_c(36)
+    assert line_of(*servos).feed(bytes.fromhex(sent)) == bytes.fromhex(answered.replace(" ", ""))
+
+
+def test_manual_examples_of_group_writes_take_effect() -> None:
+    servos = [ServoModel(1), ServoModel(2)]
+    line = line_of(*servos)
+    line.feed(bytes.fromhex("fffffd00fe110083740004000196000000 02aa000000 8287"))
+    assert [get(s, 116, 4) for s in servos] == [150, 170]
+    line.feed(packet(0xFE, bytes((0x93, 1, 32, 0, 2, 0, 150, 0, 2, 31, 0, 1, 0, 70))))
+    assert (get(servos[0], 32, 2), get(servos[1], 31, 1)) == (150, 70)
+
+
+def test_manual_example_of_fast_sync_read_is_answered_byte_for_byte() -> None:
+    line = line_of(servo_at(166, 3), servo_at(2079, 7), servo_at(1023, 4))
+    assert line.feed(bytes.fromhex("fffffd00fe0a008a8400040003070420f2")) == bytes.fromhex(
+        "fffffd00fe1900550003a60000008408 00071f08000016ca 0004ff030000d19e".replace(" ", "")
+    )
+
+
+def test_fast_sync_read_stops_where_a_servo_is_missing() -> None:
+    servos = (servo_at(166, 3), servo_at(2079, 7), servo_at(1023, 4))
+    servos[1].fail_silent(True)
+    answer = line_of(*servos).feed(bytes.fromhex("fffffd00fe0a008a8400040003070420f2"))
+    assert answer == bytes.fromhex("fffffd00fe1900550003a60000008408")
+
+
+def test_sync_read_stops_where_a_servo_is_missing() -> None:
+    line = line_of(servo_at(166, 1), servo_at(2079, 2))
+    line.servos[0].fail_silent(True)
+    assert line.feed(bytes.fromhex("fffffd00fe090082840004000102cefa")) == b""
+
+
+def test_reg_write_waits_for_action() -> None:
+    servo = ServoModel(1)
+    line = line_of(servo)
+    ok = status(1, 0)
+    assert line.feed(bytes.fromhex("fffffd0001030005 02ce")) == status(1, StatusError.INSTRUCTION)
+    assert line.feed(bytes.fromhex("fffffd000109000468 00c8000000 ae8e")) == ok
+    assert (get(servo, 104, 4), get(servo, 69, 1)) == (0, 1)
+    assert line.feed(bytes.fromhex("fffffd0001030005 02ce")) == ok
+    assert (get(servo, 104, 4), get(servo, 69, 1)) == (200, 0)
+
+
+def test_stuffing_hides_every_header_and_comes_off_again() -> None:
+    body = b"\xff\xff\xfd\xff\xff\xfd\xfd\xff\xff\xff\xfd\x00"
+    assert HEADER not in stuff(body)
+    assert unstuff(stuff(body)) == body
+    (found,) = PacketParser().feed(packet(1, b"\x03" + body))
+    assert (found.crc_ok, found.instruction, found.parameters) == (True, 3, body)
+
+
+@given(st.binary(max_size=200))
+def test_any_body_survives_packing_and_parsing(body: bytes) -> None:
+    (found,) = PacketParser().feed(packet(9, b"\x03" + body))
+    assert found.parameters == body
+
+
+def test_crc_is_zero_over_a_packet_with_its_crc_swapped() -> None:
+    data = bytes.fromhex("fffffd0001030001")
+    crc = crc16(data)
+    assert crc == 0x4E19
+    assert crc16(data + crc.to_bytes(2, "big")) == 0
+
+
+@pytest.mark.parametrize(
+    ("body", "error"),
+    [
+        (bytes((0x7E,)), StatusError.INSTRUCTION),
+        (bytes((2, 132, 0, 4)), StatusError.DATA_LENGTH),
+        (bytes((2, 0x00, 0x10, 4, 0)), StatusError.ACCESS),
+        (bytes((2, 14, 0, 1, 0)), StatusError.ACCESS),
+        (bytes((3, 132, 0, 1, 0, 0, 0)), StatusError.ACCESS),
+        (bytes((3, 65, 0, 2)), StatusError.DATA_RANGE),
+        (bytes((3, 116, 0, 1, 0)), StatusError.DATA_LENGTH),
+        (bytes((6, 0xFF)), StatusError.RESULT_FAIL),
+        (bytes((0x10, 2)), StatusError.DATA_RANGE),
+    ],
+)
+def test_wrong_instruction_is_answered_with_its_error(body: bytes, error: StatusError) -> None:
+    assert line_of(ServoModel(1)).feed(packet(1, body)) == status(1, error)
+
+
+def test_wrong_crc_is_answered_with_its_error_and_not_obeyed() -> None:
+    servo = ServoModel(1)
+    damaged = bytearray(packet(1, bytes((3, 65, 0, 1))))
+    damaged[-1] ^= 1
+    assert line_of(servo).feed(bytes(damaged)) == status(1, StatusError.CRC)
+    assert get(servo, 65, 1) == 0
+
+
+def test_servo_does_not_hear_another_baud_rate() -> None:
+    line = line_of(ServoModel(1, baud_bps=1_000_000))
+    ping = packet(1, b"\x01")
+    assert line.feed(ping, 57600) == b""
+    assert line.feed(ping, 1_000_000) != b""
+
+
+def test_status_return_level_silences_writes_then_reads() -> None:
+    line = line_of(ServoModel(1))
+    read = packet(1, bytes((2, 132, 0, 4, 0)))
+    assert line.feed(packet(1, bytes((3, 68, 0, 1)))) == status(1, 0)
+    assert line.feed(packet(1, bytes((3, 65, 0, 1)))) == b""
+    assert line.feed(read) != b""
+    line.feed(packet(1, bytes((3, 68, 0, 0))))
+    assert line.feed(read) == b""
+    assert line.feed(packet(1, b"\x01")) != b""
+
+
+# --- noise ----------------------------------------------------------------------------------------------------------------
+
+_PING = packet(1, b"\x01")
+_TRAFFIC = (
+    _PING
+    + packet(0xFE, bytes((0x82, 132, 0, 4, 0, 1, 2)))
+    + packet(0xFE, bytes((0x83, 102, 0, 2, 0, 1, 5, 0, 2, 6, 0)))
+    + packet(1, bytes((3, 224, 0)) + b"\xff\xff\xfd\x00")
+    + packet(0xFE, bytes((0x8A, 132, 0, 4, 0, 1, 2)))
+    + packet(0xFE, bytes((0x92, 1, 132, 0, 4, 0, 2, 146, 0, 1, 0)))
+)
+
+
+def recovers(line: ServoLine) -> bool:
+    """After an idle line (the servo's byte timeout) a ping is answered."""
+    line.drop_partial()
+    return line.feed(_PING).endswith(status(1, line.servos[0].alert, bytes((6, 4, line.servos[0].firmware))))
+
+
+@settings(max_examples=1500, deadline=None)
+@given(st.binary(max_size=120))
+def test_random_bytes_never_raise(noise: bytes) -> None:
+    line = line_of(ServoModel(1), ServoModel(2))
+    line.feed(noise)
+    assert recovers(line)
+
+
+@settings(max_examples=1500, deadline=None)
+@given(
+    st.sampled_from(list(Instruction)).filter(lambda i: i != Instruction.STATUS) | st.integers(0, 255),
+    st.sampled_from([0, 1, 2, 254]),
+    st.binary(max_size=60),
+)
+def test_random_instructions_never_raise(instruction: int, packet_id: int, parameters: bytes) -> None:
+    line = line_of(ServoModel(1), ServoModel(2))
+    line.feed(packet(packet_id, bytes((instruction,)) + parameters))
+    for servo in line.servos:
+        current = servo.update(0.1, 1.0, 0.5)
+        assert abs(current) <= 1193 * AMP + 1e-9
+
+
+@settings(max_examples=1500, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, len(_TRAFFIC) * 8 - 1)), max_size=4), st.integers(0, len(_TRAFFIC)), st.data())
+def test_damaged_traffic_never_raises(flips: list[tuple[int]], cut: int, data: st.DataObject) -> None:
+    damaged = bytearray(_TRAFFIC)
+    for (bit,) in flips:
+        damaged[bit // 8] ^= 1 << bit % 8
+    del damaged[cut : cut + data.draw(st.integers(0, 20))]
+    line = line_of(ServoModel(1), ServoModel(2))
+    i = 0
+    while i < len(damaged):
+        step = data.draw(st.integers(1, 40))
+        line.feed(bytes(damaged[i : i + step]))
+        i += step
+    assert recovers(line)
+
+
+def test_packet_behind_a_damaged_length_is_found() -> None:
+    damaged = bytearray(_PING)
+    damaged[5] = 30
+    line = line_of(ServoModel(1))
+    assert line.feed(bytes(damaged) + _PING * 3).count(status(1, 0, bytes((6, 4, 48)))) == 3
+
+
+def test_packet_arrives_byte_by_byte() -> None:
+    line = line_of(ServoModel(1))
+    answers = [line.feed(bytes((byte,))) for byte in b"\xff\xff" + _PING]
+    assert [bool(answer) for answer in answers] == [False] * (len(_PING) + 1) + [True]
+
+
+# --- pty ------------------------------------------------------------------------------------------------------------------
+
+
+async def _wait_for_bytes(fd: int, size: int) -> bytes:
+    loop = asyncio.get_running_loop()
+    data = b""
+    while len(data) < size:
+        ready = loop.create_future()
+        loop.add_reader(fd, ready.set_result, None)
+        try:
+            await asyncio.wait_for(ready, 20.0)
+        finally:
+            loop.remove_reader(fd)
+        data += os.read(fd, size - len(data))
+    return data
+
+
+def _open_at(path: str, speed: int) -> int:
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    settings_ = termios.tcgetattr(fd)
+    settings_[4] = settings_[5] = speed
+    termios.tcsetattr(fd, termios.TCSANOW, settings_)
+    return fd
+
+
+def test_answer_is_not_earlier_than_the_wire_allows() -> None:
+    async def scenario() -> tuple[float, float]:
+        servo = ServoModel(1, baud_bps=57600)
+        servo.write(9, bytes((250,)))
+        async with ServoBus([servo], wire_time=True) as bus:
+            fd = _open_at(bus.path, termios.B57600)
+            try:
+                loop = asyncio.get_running_loop()
+                start_s = loop.time()
+                os.write(fd, packet(1, bytes((2, 0, 0, 6, 0))) * 10)
+                answer = await _wait_for_bytes(fd, 17 * 10)
+                assert answer == status(1, 0, servo.read(0, 6)) * 10
+                return loop.time() - start_s, 10 * ((14 + 17) * 10 / 57600 + 250 * 2e-6)
+            finally:
+                os.close(fd)
+
+    took_s, wire_s = asyncio.run(scenario())
+    assert took_s >= wire_s
+
+
+def test_bus_leaves_no_descriptor_and_no_device_behind() -> None:
+    async def scenario() -> str:
+        async with ServoBus([ServoModel(1)]) as bus:
+            path = bus.path
+            fd = _open_at(path, termios.B3000000)
+            os.write(fd, _PING)  # its answer falls due after the bus is gone
+            os.close(fd)
+        return path
+
+    before = set(os.listdir("/proc/self/fd"))
+    path = asyncio.run(scenario())
+    assert set(os.listdir("/proc/self/fd")) == before
+    assert not os.path.exists(path)
+
+
+def test_bus_survives_a_master_that_never_reads() -> None:
+    async def scenario() -> int:
+        servo = ServoModel(1)
+        async with ServoBus([servo], wire_time=False) as bus:
+            fd = _open_at(bus.path, termios.B3000000)
+            try:
+                read = packet(1, bytes((2, 168, 0, 56, 0)))
+                loop = asyncio.get_running_loop()
+                give_up_s = loop.time() + 60.0
+                while not bus.dropped_bytes and loop.time() < give_up_s:
+                    os.write(fd, read * 20)
+                    await asyncio.sleep(0)
+                dropped = bus.dropped_bytes
+                termios.tcflush(fd, termios.TCIOFLUSH)
+                bus.line.drop_partial()
+                os.write(fd, _PING)
+                await _wait_for_bytes(fd, len(status(1, 0, b"abc")))
+                return dropped
+            finally:
+                os.close(fd)
+
+    assert asyncio.run(scenario()) > 0
+
+
+def test_two_servos_with_one_id_are_refused() -> None:
+    with pytest.raises(ValueError, match="must differ"):
+        ServoLine([ServoModel(1), ServoModel(1)])

@@ -1,0 +1,232 @@
+"""One emulated servo: register rules, units, motor, watchdog, hardware errors."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from sitl.servo_bus import ServoLine
+from sitl.servo_model import AMP_PER_COUNT as AMP
+from sitl.servo_model import RAD_PER_COUNT, RAD_S_PER_COUNT, ServoModel, ServoRefusal
+from sitl.servo_protocol import ALERT, StatusError, packet, status
+
+_PING = packet(1, b"\x01")
+
+
+def word(value: int, size: int = 2) -> bytes:
+    return value.to_bytes(size, "little", signed=value < 0)
+
+
+def get(servo: ServoModel, address: int, size: int, *, signed: bool = False) -> int:
+    return int.from_bytes(servo.read(address, size), "little", signed=signed)
+
+
+def refusal(servo: ServoModel, address: int, data: bytes) -> StatusError:
+    with pytest.raises(ServoRefusal) as caught:
+        servo.write(address, data)
+    return caught.value.error
+
+
+def in_current_mode(servo_id: int = 1) -> ServoModel:
+    servo = ServoModel(servo_id)
+    servo.write(11, b"\x00")
+    servo.write(64, b"\x01")
+    return servo
+
+
+# --- registers ------------------------------------------------------------------------------------------------------------
+
+
+def test_eeprom_is_locked_while_torque_is_on() -> None:
+    servo = in_current_mode()
+    assert refusal(servo, 9, b"\x00") is StatusError.ACCESS
+    assert refusal(servo, 11, b"\x03") is StatusError.ACCESS
+    servo.write(64, b"\x00")
+    servo.write(11, b"\x05")
+    assert get(servo, 11, 1) == 5
+
+
+def test_only_the_modes_that_are_modelled_can_be_set() -> None:
+    assert refusal(ServoModel(1), 11, b"\x04") is StatusError.DATA_RANGE
+
+
+def test_goal_current_beyond_the_current_limit_is_refused() -> None:
+    servo = ServoModel(1)
+    servo.write(11, b"\x00")
+    servo.write(38, word(500))
+    assert refusal(servo, 102, word(501)) is StatusError.DATA_LIMIT
+    assert refusal(servo, 102, word(-1194)) is StatusError.DATA_RANGE
+    servo.write(102, word(-500))
+    assert get(servo, 102, 2, signed=True) == -500
+
+
+def test_a_write_of_several_registers_is_all_or_nothing() -> None:
+    servo = ServoModel(1)
+    assert refusal(servo, 64, b"\x01\x07") is StatusError.DATA_RANGE
+    assert get(servo, 64, 1) == 0
+
+
+def test_present_values_are_in_register_units() -> None:
+    servo = in_current_mode()
+    servo.write(102, word(-300))
+    assert servo.update(0.001, -2.0, -1.0) == pytest.approx(-300 * AMP)
+    assert get(servo, 126, 2, signed=True) == -300
+    assert get(servo, 128, 4, signed=True) == round(-1.0 / RAD_S_PER_COUNT)
+
+
+def test_position_starts_within_one_turn_and_then_counts_turns() -> None:
+    servo = ServoModel(1)
+    servo.update(0.0, -1.0, 0.0)
+    start = get(servo, 132, 4, signed=True)
+    assert start == 4096 - round(1.0 / RAD_PER_COUNT)
+    servo.update(0.001, -1.0 - 4.0 * math.pi, 0.0)
+    assert get(servo, 132, 4, signed=True) == start - 2 * 4096
+    servo.reboot()
+    assert get(servo, 132, 4, signed=True) == start
+
+
+def test_reverse_mode_turns_every_sign() -> None:
+    servo = ServoModel(1)
+    servo.write(10, b"\x01")
+    servo.write(11, b"\x00")
+    servo.write(64, b"\x01")
+    servo.write(102, word(100))
+    servo.update(0.0, 0.0, 0.0)
+    assert servo.update(0.001, -0.5, -1.0) == pytest.approx(-100 * AMP)
+    assert get(servo, 132, 4, signed=True) == round(0.5 / RAD_PER_COUNT)
+    assert get(servo, 128, 4, signed=True) == round(1.0 / RAD_S_PER_COUNT)
+
+
+def test_indirect_data_is_a_window_on_other_registers() -> None:
+    servo = in_current_mode()
+    addresses = [132, 133, 134, 135, 70, 102, 103]
+    servo.write(168, b"".join(word(a) for a in addresses))
+    servo.update(0.0, 1.0, 0.0)
+    assert servo.read(224, 4) == servo.read(132, 4)
+    servo.write(229, word(77))
+    assert get(servo, 102, 2) == 77
+    assert refusal(servo, 224, word(0, 4)) is StatusError.ACCESS
+    assert refusal(servo, 229, b"\x01") is StatusError.DATA_LENGTH
+    servo.write(231, b"\xaa\xbb")
+    assert servo.read(231, 2) == b"\xaa\xbb"
+    assert refusal(servo, 168, word(63)) is StatusError.DATA_RANGE
+
+
+def test_second_indirect_block_works_too() -> None:
+    servo = ServoModel(1)
+    servo.write(578, word(65))
+    servo.write(634, b"\x01")
+    assert get(servo, 65, 1) == 1
+
+
+# --- motor ----------------------------------------------------------------------------------------------------------------
+
+
+def test_motor_gives_current_only_with_torque_on() -> None:
+    servo = in_current_mode()
+    servo.write(102, word(200))
+    assert servo.update(0.001, 0.0, 0.0) == pytest.approx(200 * AMP)
+    servo.write(64, b"\x00")
+    assert servo.update(0.002, 0.0, 0.0) == 0.0
+
+
+def test_goal_current_starts_at_zero_in_current_mode() -> None:
+    assert in_current_mode().update(0.001, 0.0, 0.0) == 0.0
+
+
+@pytest.mark.parametrize("mode", [3, 5])
+def test_position_modes_hold_against_a_load(mode: int) -> None:
+    servo = ServoModel(1, shaft_angle_rad=1.0)
+    servo.write(11, bytes((mode,)))
+    servo.write(64, b"\x01")
+    servo.write(116, word(1024, 4))
+    angle, velocity, dt, inertia, load_nm = 1.0, 0.0, 1e-3, 0.02, 0.3
+    for step in range(3000):
+        torque = 1.3 * servo.update(step * dt, angle, velocity) - load_nm
+        velocity += torque / inertia * dt
+        angle += velocity * dt
+    assert angle == pytest.approx(math.pi / 2, abs=0.03)
+    assert abs(velocity) < 0.01
+
+
+def test_watchdog_trips_and_stays_until_cleared() -> None:
+    servo = in_current_mode()
+    line = ServoLine([servo])
+    servo.write(98, b"\x05")
+    servo.write(102, word(200))
+    servo.update(1.0, 0.0, 0.0)
+    line.feed(packet(7, b"\x01"))  # a packet for somebody else counts
+    assert servo.update(1.099, 0.0, 0.0) != 0.0
+    assert servo.update(1.101, 0.0, 0.0) == 0.0
+    assert get(servo, 98, 1) == 0xFF
+    assert get(servo, 102, 2) == 0
+    for address, data in ((102, word(10)), (100, word(10)), (104, word(10, 4)), (116, word(10, 4)), (98, b"\x05")):
+        assert refusal(servo, address, data) is StatusError.DATA_RANGE
+    servo.write(98, b"\x00")
+    servo.write(102, word(10))
+    assert servo.update(1.2, 0.0, 0.0) == pytest.approx(10 * AMP)
+
+
+def test_watchdog_sleeps_while_torque_is_off() -> None:
+    servo = ServoModel(1)
+    servo.write(98, b"\x01")
+    servo.update(0.0, 0.0, 0.0)
+    servo.update(5.0, 0.0, 0.0)
+    assert get(servo, 98, 1) == 1
+
+
+def test_silent_servo_is_let_go_by_its_watchdog() -> None:
+    servo = in_current_mode()
+    servo.write(98, b"\x05")
+    servo.write(102, word(200))
+    line = ServoLine([servo])
+    servo.update(0.0, 0.0, 0.0)
+    servo.fail_silent(True)
+    assert line.feed(_PING) == b""
+    assert servo.update(0.09, 0.0, 0.0) != 0.0
+    assert servo.update(0.11, 0.0, 0.0) == 0.0
+
+
+def test_overload_lets_go_until_reboot() -> None:
+    servo = in_current_mode()
+    line = ServoLine([servo])
+    servo.write(102, word(200))
+    servo.trip_overload()
+    assert servo.update(0.001, 0.0, 0.0) == 0.0
+    assert get(servo, 64, 1) == 0
+    assert get(servo, 70, 1) == 0x20
+    assert line.feed(packet(1, bytes((3, 64, 0, 1)))) == status(1, ALERT | StatusError.RESULT_FAIL)
+    assert line.feed(packet(1, b"\x08"))[8] == 0
+    assert get(servo, 70, 1) == 0
+    servo.write(64, b"\x01")
+    assert get(servo, 11, 1) == 0, "EEPROM outlives a reboot"
+    assert get(servo, 102, 2) == 0, "RAM does not"
+
+
+def test_overheating_comes_back_after_reboot_while_it_is_hot() -> None:
+    servo = in_current_mode()
+    servo.set_temperature_c(81)
+    servo.reboot()
+    assert get(servo, 70, 1) == 0x04
+    servo.set_temperature_c(60)
+    servo.reboot()
+    assert get(servo, 70, 1) == 0
+
+
+def test_voltage_error_is_reported_but_does_not_shut_down_by_default() -> None:
+    servo = in_current_mode()
+    servo.set_voltage_v(9.0)
+    assert (get(servo, 70, 1), get(servo, 64, 1), get(servo, 144, 2)) == (1, 1, 90)
+
+
+def test_clear_is_refused_while_the_shaft_moves() -> None:
+    servo = ServoModel(1)
+    clear = packet(1, bytes((0x10, 0x01, 0x44, 0x58, 0x4C, 0x22)))
+    line = ServoLine([servo])
+    servo.update(0.0, 0.0, 0.0)
+    servo.update(0.1, 7.0, 3.0)
+    assert line.feed(clear) == status(1, StatusError.RESULT_FAIL)
+    servo.update(0.2, 7.0, 0.0)
+    assert line.feed(clear) == status(1, 0)
+    assert 0 <= get(servo, 132, 4, signed=True) < 4096
