@@ -1,0 +1,183 @@
+"""A Robotous RFT60-HA01 on a pty: the sensor's end of the serial line.
+
+Answers as the sensor does (see `companion.io.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17; while it streams only STOP and
+SET_BIAS are executed, and those two have no answer. Readings are quantised to 1/50 N and 1/2000 N m. Noise and latency are made by the
+caller.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import tty
+from types import TracebackType
+from typing import Final, Self
+
+from companion.io import rft
+from companion.io.rft import Command, Overload, PacketScanner, SetError, Wrench
+from companion.types import Vec3
+
+FORCE_CAPACITY_N: Final = 200.0
+TORQUE_CAPACITY_NM: Final = 4.0
+_ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
+_FORCE_BITS = (Overload.FX, Overload.FY, Overload.FZ)
+_TORQUE_BITS = (Overload.TX, Overload.TY, Overload.TZ)
+_MAX_CATCH_UP = 8  # frames; a world that jumped further is not paid back in a burst
+
+
+class ForceTorqueServer:
+    """The emulated sensor; an async context manager on the running event loop.
+
+    Attributes:
+        silent: the sensor neither answers nor streams (cable cut).
+        stuck: it streams its last reading for ever.
+        dropped: packets that the pty would not take whole, because nobody reads it.
+    """
+
+    def __init__(
+        self, product_name: str = "RFT60-HA01", serial_number: str = "RFT60HA-0001", firmware: str = "V1.2.0"
+    ) -> None:
+        self.silent = False
+        self.stuck = False
+        self.dropped = 0
+        self._texts = {
+            Command.PRODUCT_NAME: product_name,
+            Command.SERIAL_NUMBER: serial_number,
+            Command.FIRMWARE_VERSION: firmware,
+        }
+        self._scanner = PacketScanner(rft.COMMAND_BYTES)
+        self._master: int | None = None
+        self._slave: int | None = None
+        self._port = ""
+        self._force_n: Vec3 = _ZERO
+        self._torque_nm: Vec3 = _ZERO
+        self._bias_force_n: Vec3 = _ZERO
+        self._bias_torque_nm: Vec3 = _ZERO
+        self._rate_code = 0
+        self._streaming = False
+        self._due_s: float | None = None
+        self._reading = Wrench(_ZERO, _ZERO, 0)
+
+    @property
+    def port(self) -> str:
+        """Path of the tty that the companion opens."""
+        return self._port
+
+    @property
+    def rate_hz(self) -> int:
+        """Output rate in force."""
+        return rft.RATE_CODES[self._rate_code]
+
+    @property
+    def streaming(self) -> bool:
+        """Whether continuous output was started."""
+        return self._streaming
+
+    async def __aenter__(self) -> Self:
+        """Open the pty."""
+        self._master, self._slave = os.openpty()
+        # The slave is kept open here, so that a companion that closes the port does not hang the line up.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._port = os.ttyname(self._slave)
+        asyncio.get_running_loop().add_reader(self._master, self._on_commands)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the pty; a companion that still holds the port sees it hang up."""
+        if self._master is not None:
+            asyncio.get_running_loop().remove_reader(self._master)
+        for descriptor in (self._master, self._slave):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._master = self._slave = None
+
+    def set_wrench(self, force_n: Vec3, torque_nm: Vec3) -> None:
+        """What the sensor feels from now on, in its own frame, N and N m; any rate."""
+        self._force_n = force_n
+        self._torque_nm = torque_nm
+
+    def tick(self, t_s: float) -> None:
+        """Send every packet that is due by the world's time `t_s`; call it every millisecond or two of world time."""
+        if not self._streaming:
+            return
+        period_s = 1.0 / self.rate_hz
+        if self._due_s is None or t_s - self._due_s > _MAX_CATCH_UP * period_s:
+            self._due_s = t_s
+        while self._due_s <= t_s:
+            self._due_s += period_s
+            self._send_reading(Command.START)
+
+    def inject(self, noise: bytes) -> None:
+        """Put bytes on the line as they are (line noise, half a packet)."""
+        self._write(noise)
+
+    def _measure(self) -> Wrench:
+        if self.stuck:
+            return self._reading
+        bits = 0
+        for value, bit in zip(self._force_n, _FORCE_BITS, strict=True):
+            bits |= bit if abs(value) > FORCE_CAPACITY_N else 0
+        for value, bit in zip(self._torque_nm, _TORQUE_BITS, strict=True):
+            bits |= bit if abs(value) > TORQUE_CAPACITY_NM else 0
+        self._reading = Wrench(
+            _subtract(self._force_n, self._bias_force_n), _subtract(self._torque_nm, self._bias_torque_nm), bits
+        )
+        return self._reading
+
+    def _send_reading(self, command: Command) -> None:
+        self._write(rft.encode_wrench(command, self._measure()))
+
+    def _write(self, packet: bytes) -> None:
+        if self._master is None or self.silent:
+            return
+        try:
+            written = os.write(self._master, packet)
+        except BlockingIOError:
+            written = 0
+        if written < len(packet):
+            self.dropped += 1
+
+    def _on_commands(self) -> None:
+        if self._master is None:
+            return
+        try:
+            received = os.read(self._master, 4096)
+        except (BlockingIOError, InterruptedError):
+            return
+        for field in self._scanner.feed(received):
+            if not self.silent:
+                self._execute(Command(field[0]), field[1])
+
+    def _execute(self, command: Command, parameter: int) -> None:
+        if command == Command.STOP:
+            self._streaming = False
+            return
+        if command == Command.SET_BIAS:
+            self._bias_force_n = self._force_n if parameter else _ZERO
+            self._bias_torque_nm = self._torque_nm if parameter else _ZERO
+            return
+        if self._streaming:
+            return
+        if command == Command.START:
+            self._streaming = True
+            self._due_s = None
+        elif command == Command.READ_ONCE:
+            self._send_reading(Command.READ_ONCE)
+        elif command == Command.SET_RATE:
+            known = parameter in rft.RATE_CODES
+            if known:
+                self._rate_code = parameter
+            error = SetError.NONE if known else SetError.VALUE_RANGE
+            self._write(rft.pack(bytes((command, int(known), error)), rft.RESPONSE_BYTES))
+        elif command == Command.GET_RATE:
+            self._write(rft.pack(bytes((command, self._rate_code)), rft.RESPONSE_BYTES))
+        else:
+            text = self._texts[command].encode("ascii")[:15]
+            self._write(rft.pack(bytes((command,)) + text, rft.RESPONSE_BYTES))
+
+
+def _subtract(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])

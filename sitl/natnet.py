@@ -1,0 +1,368 @@
+"""A NatNet server: the Motive end of the wire, multicast and unicast, bitstream 3.0 and 4.1.
+
+Layouts as in the NatNet SDK (`NatNetTypes.h`, packet client). Written apart from the companion's parser on purpose: only message
+ids are shared. Latency and noise are made by the caller.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Self
+
+from companion.frames import quat_rotate
+from companion.io.natnet import Descriptor, Message, NatNetVersion
+from companion.types import Quat, Vec3
+
+CLOCK_FREQUENCY_HZ: Final = 10_000_000
+"""Windows' performance counter, as Motive reports it."""
+_CLOCK_ORIGIN_S: Final = 1000.0  # the server machine was on for a while; tick 0 means "no stamp"
+_VERSION_BYTES: Final[dict[str, bytes]] = {"3.0": bytes((3, 0, 0, 0)), "4.1": bytes((4, 1, 0, 0))}
+_APPLICATION = b"Motive"
+_APPLICATION_VERSION: Final[dict[str, bytes]] = {"3.0": bytes((2, 0, 0, 0)), "4.1": bytes((3, 0, 0, 0))}
+_CLIENT_TIMEOUT_S: Final = 5.0
+_MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
+    (0.16, 0.0, 0.05),
+    (-0.12, 0.10, 0.05),
+    (-0.12, -0.12, 0.05),
+    (0.0, 0.05, 0.11),
+)
+_STRAY_MARKER_M: Final[Vec3] = (2.5, -2.0, 0.03)  # a reflection on the floor, as every lab has one
+_MARKER_SIZE_M: Final = 0.014
+_MARKER_OCCLUDED = 0x01
+_MARKER_POINT_CLOUD_SOLVED = 0x02
+_MARKER_MODEL_SOLVED = 0x04
+_MARKER_HAS_MODEL = 0x08
+_MARKER_UNLABELLED = 0x10
+_END_OF_DATA = bytes(4)
+
+
+@dataclass(frozen=True, slots=True)
+class BodyPose:
+    """One rigid body of one frame, in the axes that the server is to stream."""
+
+    id: int
+    position_m: Vec3
+    quat_wxyz: Quat
+    valid: bool = True
+    error_m: float = 0.0002
+
+
+class NatNetServer:
+    """Streams frames of data and answers clients; an async context manager on the running event loop.
+
+    Unicast clients are those that asked to be connected; with a multicast group, those that sent a keep-alive. A unicast client of a
+    4.1 server may choose its bitstream ("Bitstream,3.0").
+
+    Args:
+        version: NatNet bitstream version.
+        interface: local address of both sockets, and the multicast interface.
+        command_port: 0 takes a free one, see the property.
+        data_port: source of all frames, destination of multicast ones; 0 takes a free one.
+        multicast_group: None streams to unicast clients only.
+        bodies: id and name of each rigid body.
+        rate_hz: answer to the FrameRate request.
+    """
+
+    def __init__(
+        self,
+        version: NatNetVersion = "4.1",
+        interface: str = "127.0.0.1",
+        command_port: int = 0,
+        data_port: int = 0,
+        multicast_group: str | None = None,
+        bodies: Sequence[tuple[int, str]] = ((1, "companion"),),
+        rate_hz: float = 200.0,
+    ) -> None:
+        self.version = version
+        self.interface = interface
+        self.multicast_group = multicast_group
+        self.bodies = tuple(bodies)
+        self.rate_hz = rate_hz
+        self.dropped = 0
+        """Datagrams that the network would not take."""
+        self.requests = 0
+        """Datagrams received from clients."""
+        self._ports = (command_port, data_port)
+        self._command: socket.socket | None = None
+        self._data: socket.socket | None = None
+        self._clients: dict[tuple[str, int], tuple[float, NatNetVersion]] = {}
+        self._number = 0
+        self._last: tuple[float, tuple[BodyPose, ...], float | None] = (0.0, (), None)
+
+    @property
+    def command_port(self) -> int:
+        """Port that clients send to."""
+        return _port(self._command, self._ports[0])
+
+    @property
+    def data_port(self) -> int:
+        """Port that multicast frames go to."""
+        return _port(self._data, self._ports[1])
+
+    @property
+    def frame_number(self) -> int:
+        """Number of the frame that was published last; 0 before the first."""
+        return self._number
+
+    @property
+    def unicast_clients(self) -> tuple[tuple[str, int], ...]:
+        """Addresses that frames are sent to."""
+        return tuple(self._clients)
+
+    async def __aenter__(self) -> Self:
+        """Open both sockets.
+
+        Raises:
+            OSError: a port is in use or the interface is not of this machine; the text says which.
+        """
+        try:
+            self._command = self._bind(self._ports[0])
+            self._data = self._bind(self._ports[1])
+            if self.multicast_group is not None:
+                self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self.interface))
+                self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+                self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+        except BaseException:
+            self._close()
+            raise
+        asyncio.get_running_loop().add_reader(self._command.fileno(), self._answer_all)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close both sockets."""
+        if self._command is not None:
+            asyncio.get_running_loop().remove_reader(self._command.fileno())
+        self._close()
+
+    def publish(self, t_s: float, poses: Sequence[BodyPose], exposure_t_s: float | None) -> None:
+        """Send one frame to everybody; never blocks.
+
+        Args:
+            t_s: time of transmission on the world's clock.
+            poses: bodies of this frame; one that is left out is not streamed.
+            exposure_t_s: middle of the cameras' exposure on the same clock; None: not known (as with some cameras).
+        """
+        self._number += 1
+        self._last = (t_s, tuple(poses), exposure_t_s)
+        encoded: dict[str, bytes] = {}
+        if self.multicast_group is not None:
+            encoded[self.version] = self._encode_last(self.version)
+            self._send(self._data, encoded[self.version], (self.multicast_group, self.data_port))
+        oldest_s = asyncio.get_running_loop().time() - _CLIENT_TIMEOUT_S
+        for address, (seen_s, version) in list(self._clients.items()):
+            if seen_s < oldest_s:
+                del self._clients[address]
+                continue
+            if version not in encoded:
+                encoded[version] = self._encode_last(version)
+            self._send(self._data, encoded[version], address)
+
+    def _encode_last(self, version: NatNetVersion) -> bytes:
+        t_s, poses, exposure_t_s = self._last
+        return encode_frame(version, self._number, t_s, poses, exposure_t_s, dict(self.bodies))
+
+    def _bind(self, port: int) -> socket.socket:
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            opened.setblocking(False)
+            opened.bind((self.interface, port))
+        except OSError as error:
+            opened.close()
+            raise OSError(
+                error.errno, f"NatNet server: cannot bind UDP {self.interface}:{port} ({error.strerror})"
+            ) from None
+        return opened
+
+    def _close(self) -> None:
+        for opened in (self._command, self._data):
+            if opened is not None:
+                opened.close()
+        self._command = self._data = None
+        self._clients.clear()
+
+    def _send(self, sender: socket.socket | None, datagram: bytes, address: tuple[str, int]) -> None:
+        if sender is None:
+            return
+        try:
+            sender.sendto(datagram, address)
+        except OSError:
+            self.dropped += 1
+
+    def _answer_all(self) -> None:
+        while self._command is not None:
+            try:
+                datagram, address = self._command.recvfrom(65535)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:  # an ICMP error of an earlier answer
+                continue
+            self.requests += 1
+            self._answer(datagram, (address[0], address[1]))
+
+    def _answer(self, datagram: bytes, address: tuple[str, int]) -> None:
+        if len(datagram) < 4:
+            return
+        message: int = struct.unpack_from("<H", datagram)[0]
+        now_s = asyncio.get_running_loop().time()
+        _, version = self._clients.get(address, (now_s, self.version))
+        if message == Message.CONNECT:
+            if self.multicast_group is None:
+                self._clients[address] = (now_s, version)
+            self._reply(Message.SERVER_INFO, self._server_info(), address)
+        elif message == Message.KEEP_ALIVE:
+            self._clients[address] = (now_s, version)
+        elif message == Message.REQUEST_MODELDEF:
+            self._reply(Message.MODELDEF, encode_model_definitions(version, self.bodies), address)
+        elif message == Message.REQUEST_FRAME:
+            self._send(self._command, self._encode_last(version), address)
+        elif message == Message.REQUEST:
+            request = datagram[4:].partition(b"\0")[0].decode("utf-8", "replace")
+            self._answer_request(request, address)
+        elif message == Message.DISCONNECT:
+            self._clients.pop(address, None)
+        else:
+            self._reply(Message.UNRECOGNIZED_REQUEST, b"", address)
+
+    def _answer_request(self, request: str, address: tuple[str, int]) -> None:
+        """NAT_REQUEST: a value for a question, an int32 return code (0 success) for an order."""
+        name, _, argument = request.partition(",")
+        known = self._clients.get(address)
+        if name == "FrameRate":
+            self._reply(Message.RESPONSE, struct.pack("<f", self.rate_hz), address)
+        elif name == "UnitsToMillimeters":
+            self._reply(Message.RESPONSE, struct.pack("<f", 1000.0), address)
+        elif name == "CurrentMode":
+            self._reply(Message.RESPONSE, struct.pack("<i", 0), address)  # live
+        elif name == "Bitstream" and not argument:
+            self._reply(Message.RESPONSE, f"Bitstream,{known[1] if known else self.version}\0".encode(), address)
+        elif name == "Bitstream":
+            accepted = self.version == "4.1" and known is not None and argument in _VERSION_BYTES
+            if accepted and known is not None:
+                self._clients[address] = (known[0], "3.0" if argument == "3.0" else "4.1")
+            self._reply(Message.RESPONSE, struct.pack("<i", 0 if accepted else 1), address)
+        else:
+            self._reply(Message.UNRECOGNIZED_REQUEST, b"", address)
+
+    def _reply(self, message: Message, payload: bytes, address: tuple[str, int]) -> None:
+        self._send(self._command, struct.pack("<HH", message, len(payload)) + payload, address)
+
+    def _server_info(self) -> bytes:
+        group = socket.inet_aton(self.multicast_group or "0.0.0.0")
+        sender = struct.pack(
+            "<256s4s4s", _APPLICATION, _APPLICATION_VERSION[self.version], _VERSION_BYTES[self.version]
+        )
+        return (
+            sender + struct.pack("<QH?", CLOCK_FREQUENCY_HZ, self.data_port, self.multicast_group is not None) + group
+        )
+
+
+def encode_frame(
+    version: NatNetVersion,
+    number: int,
+    t_s: float,
+    poses: Sequence[BodyPose],
+    exposure_t_s: float | None,
+    names: dict[int, str],
+) -> bytes:
+    """One NAT_FRAMEOFDATA datagram with every section of the version; arguments as of `NatNetServer.publish`."""
+    markers = {
+        pose.id: [_add(pose.position_m, quat_rotate(pose.quat_wxyz, offset)) for offset in _MARKERS_BODY_M]
+        for pose in poses
+    }
+    sets = [(names.get(body_id, f"body {body_id}"), points) for body_id, points in markers.items()]
+    sets.append(("all", [point for points in markers.values() for point in points]))
+    marker_sets = b"".join(
+        name.encode()
+        + b"\0"
+        + struct.pack("<I", len(points))
+        + b"".join(struct.pack("<3f", *point) for point in points)
+        for name, points in sets
+    )
+    bodies = b"".join(_rigid_body(pose) for pose in poses)
+    labelled = b"".join(
+        struct.pack("<I3ffHf", pose.id << 16 | k, *point, _MARKER_SIZE_M, _marker_params(pose), pose.error_m)
+        for pose in poses
+        for k, point in enumerate(markers[pose.id], start=1)
+    )
+    stray_params = _MARKER_UNLABELLED | _MARKER_POINT_CLOUD_SOLVED
+    labelled += struct.pack("<I3ffHf", 900001, *_STRAY_MARKER_M, _MARKER_SIZE_M, stray_params, 0.0004)
+
+    def section(count: int, content: bytes) -> bytes:
+        sized = struct.pack("<I", len(content)) if version == "4.1" else b""
+        return struct.pack("<I", count) + sized + content
+
+    exposure = 0 if exposure_t_s is None else _ticks(exposure_t_s)
+    suffix = struct.pack("<IIdQQQ", 0, 0, t_s, exposure, exposure, _ticks(t_s))
+    if version == "4.1":
+        whole_s = int(t_s)
+        suffix += struct.pack("<II", whole_s, int((t_s - whole_s) * 0xFFFFFFFF))
+    payload = b"".join(
+        (
+            struct.pack("<I", number & 0xFFFFFFFF),
+            section(len(sets), marker_sets),
+            section(1, struct.pack("<3f", *_STRAY_MARKER_M)),
+            section(len(poses), bodies),
+            section(0, b""),  # skeletons
+            section(0, b"") if version == "4.1" else b"",  # assets
+            section(len(_MARKERS_BODY_M) * len(poses) + 1, labelled),
+            section(0, b""),  # force plates
+            section(0, b""),  # devices
+            suffix,
+            struct.pack("<H", 0),
+            _END_OF_DATA,
+        )
+    )
+    return struct.pack("<HH", Message.FRAME, len(payload)) + payload
+
+
+def encode_model_definitions(version: NatNetVersion, bodies: Sequence[tuple[int, str]]) -> bytes:
+    """Payload of NAT_MODELDEF: the marker sets, the rigid bodies and one camera."""
+    descriptions: list[tuple[Descriptor, bytes]] = []
+    count = len(_MARKERS_BODY_M)
+    labels = [f"Marker{k}".encode() + b"\0" for k in range(1, count + 1)]
+    for number, name in bodies:
+        text = name.encode() + b"\0"
+        descriptions.append((Descriptor.MARKER_SET, text + struct.pack("<I", count) + b"".join(labels)))
+        body = text + struct.pack("<Ii3fI", number, -1, 0.0, 0.0, 0.0, count)
+        body += b"".join(struct.pack("<3f", *offset) for offset in _MARKERS_BODY_M) + struct.pack("<I", 0) * count
+        if version == "4.1":
+            body += b"".join(labels)
+        descriptions.append((Descriptor.RIGID_BODY, body))
+    camera = b"Prime 13 #1\0" + struct.pack("<7f", 3.0, 3.0, 2.8, 0.0, 0.0, 0.0, 1.0)
+    descriptions.append((Descriptor.CAMERA, camera))
+    parts = [struct.pack("<I", len(descriptions))]
+    for kind, content in descriptions:
+        parts.append(struct.pack("<I", kind))
+        if version == "4.1":
+            parts.append(struct.pack("<I", len(content)))
+        parts.append(content)
+    return b"".join(parts)
+
+
+def _rigid_body(pose: BodyPose) -> bytes:
+    w, x, y, z = pose.quat_wxyz
+    return struct.pack("<I3f4ffH", pose.id, *pose.position_m, x, y, z, w, pose.error_m, 1 if pose.valid else 0)
+
+
+def _marker_params(pose: BodyPose) -> int:
+    solved = _MARKER_POINT_CLOUD_SOLVED if pose.valid else _MARKER_OCCLUDED
+    return _MARKER_HAS_MODEL | _MARKER_MODEL_SOLVED | solved
+
+
+def _add(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def _ticks(t_s: float) -> int:
+    return round((t_s + _CLOCK_ORIGIN_S) * CLOCK_FREQUENCY_HZ)
+
+
+def _port(opened: socket.socket | None, configured: int) -> int:
+    return configured if opened is None else int(opened.getsockname()[1])

@@ -1,0 +1,456 @@
+"""The force-torque edge against the emulated sensor on a pty, and its packet codec."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import tty
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from companion.clock import flight_clock
+from companion.config.vehicle import ForceDevice
+from companion.io import rft
+from companion.io.edges import DeviceError, ForceTorque
+from companion.io.force_torque import RobotousForceTorque
+from companion.io.rft import Command, PacketScanner, Wrench
+from companion.types import ForceSample
+from sitl.force_torque import ForceTorqueServer
+
+WAIT_S = 20.0
+# 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
+AWKWARD = Wrench((0x55AA / 50, -0x55AB / 50, 0x5555 / 50), (-0x5556 / 2000, 0x55AA / 2000, 0x55AA / 2000), 0)
+
+counts = st.integers(-32768, 32767) | st.sampled_from([0x55AA, -0x55AB, 0x5555, -0x5556, 0x0055, 0x00AA])
+wrenches = st.tuples(*[counts] * 6, st.integers(0, 255)).map(
+    lambda c: Wrench((c[0] / 50, c[1] / 50, c[2] / 50), (c[3] / 2000, c[4] / 2000, c[5] / 2000), c[6])
+)
+
+
+# -- codec ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_golden_packets() -> None:
+    assert rft.encode_command(Command.START).hex() == "550b000000000000000baa"
+    assert rft.encode_command(Command.SET_RATE, 6).hex() == "550f0600000000000015aa"
+    assert rft.encode_command(Command.SET_BIAS, 1).hex() == "5511010000000000" + "0012aa"
+    wrench = Wrench((1.0, -1.0, 200.0), (0.5, -0.0005, 4.0), 0x20)
+    packet = rft.encode_wrench(Command.START, wrench)
+    assert packet.hex() == "55" + "0b" + "0032" + "ffce" + "2710" + "03e8" + "ffff" + "1f40" + "20" + "0000" + "a9aa"
+    assert rft.decode_wrench(packet[1:-2]) == wrench
+
+
+def test_counts_saturate() -> None:
+    packet = rft.encode_wrench(Command.START, Wrench((1e6, -1e6, 0.0), (1e6, -1e6, 0.0), 0))
+    assert rft.decode_wrench(packet[1:-2]).force_n == (655.34, -655.36, 0.0)
+
+
+def test_text() -> None:
+    assert rft.decode_text(b"\x01RFT60-HA01\0\0\0\0\0") == "RFT60-HA01"
+    assert "\n" not in rft.decode_text(b"\x01RFT\n\x9960-HA01\0\0\0")
+
+
+def test_data_field_that_does_not_fit() -> None:
+    with pytest.raises(ValueError, match="9 bytes, 8 fit"):
+        rft.pack(bytes(9), rft.COMMAND_BYTES)
+
+
+@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    sent=st.lists(wrenches, min_size=1, max_size=6),
+    gaps=st.lists(st.binary(max_size=25).map(lambda noise: noise.replace(b"\x55", b"\xaa")), min_size=6, max_size=6),
+    cuts=st.lists(st.integers(1, 40), min_size=1, max_size=5),
+)
+def test_no_packet_is_missed_however_the_stream_is_cut(sent: list[Wrench], gaps: list[bytes], cuts: list[int]) -> None:
+    stream = b"".join(gap + rft.encode_wrench(Command.START, wrench) for gap, wrench in zip(gaps, sent, strict=False))
+    scanner = PacketScanner(rft.RESPONSE_BYTES)
+    found: list[bytes] = []
+    position, step = 0, 0
+    while position < len(stream):
+        size = cuts[step % len(cuts)]
+        found += scanner.feed(stream[position : position + size])
+        position, step = position + size, step + 1
+    assert [rft.decode_wrench(field) for field in found] == sent
+    assert scanner.packets == len(sent)
+    assert scanner.skipped_bytes == sum(map(len, gaps[: len(sent)]))
+
+
+@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(noise=st.binary(max_size=200), sent=st.tuples(wrenches, wrenches, wrenches))
+def test_any_noise_is_overcome(noise: bytes, sent: tuple[Wrench, Wrench, Wrench]) -> None:
+    scanner = PacketScanner(rft.RESPONSE_BYTES)
+    found = scanner.feed(noise)
+    # Noise may look like the start of a packet and take the next one along; two later the scanner is in step again.
+    found += scanner.feed(b"".join(rft.encode_wrench(Command.START, wrench) for wrench in sent))
+    assert rft.decode_wrench(found[-1]) == sent[-1]
+    for field in found:
+        rft.decode_wrench(field)
+        rft.decode_text(field)
+
+
+@settings(max_examples=500, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(wrench=wrenches, position=st.integers(0, 18), change=st.integers(1, 255))
+def test_one_wrong_byte_is_always_noticed(wrench: Wrench, position: int, change: int) -> None:
+    packet = bytearray(rft.encode_wrench(Command.START, wrench))
+    packet[position] ^= change
+    assert PacketScanner(rft.RESPONSE_BYTES).feed(bytes(packet)) == []
+
+
+# -- driver and sensor -----------------------------------------------------------------------------------------------------------
+
+
+def device_on(port: str, **changes: object) -> ForceDevice:
+    return ForceDevice.model_validate({"port": port} | changes)
+
+
+def driver(port: str, answer_timeout_s: float = WAIT_S, **changes: object) -> RobotousForceTorque:
+    return RobotousForceTorque(device_on(port, **changes), flight_clock(), answer_timeout_s=answer_timeout_s)
+
+
+@asynccontextmanager
+async def world(server: ForceTorqueServer) -> AsyncIterator[None]:
+    """Tick the sensor in real time."""
+
+    async def tick() -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            server.tick(loop.time())
+            await asyncio.sleep(0.002)
+
+    ticking = asyncio.create_task(tick())
+    try:
+        yield
+    finally:
+        ticking.cancel()
+        await asyncio.gather(ticking, return_exceptions=True)
+
+
+async def sample_with(edge: RobotousForceTorque, force_x_n: float) -> ForceSample:
+    """The first sample that shows a force."""
+    async with asyncio.timeout(WAIT_S):
+        while True:
+            for sample in await edge.tare_samples(0.005):
+                if sample.force_sensor_n[0] == force_x_n:
+                    return sample
+
+
+def test_samples_arrive_quantised() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server):
+            server.set_wrench((1.013, -2.0, 30.0), (0.12345, -0.0002, 1.0))
+            async with driver(server.port) as edge:
+                source: ForceTorque = edge
+                sample = source.latest()
+                assert sample is not None
+                assert sample.force_sensor_n == (1.02, -2.0, 30.0)
+                assert sample.torque_sensor_nm == (0.1235, 0.0, 1.0)
+                assert not sample.overload
+                assert edge.product_name == "RFT60-HA01"
+                assert edge.firmware == "V1.2.0"
+                assert server.streaming
+                assert server.rate_hz == 200
+                server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+                later = await sample_with(edge, 5.0)
+                assert later.stamp_s >= sample.stamp_s
+            async with asyncio.timeout(WAIT_S):
+                while server.streaming:  # noqa: ASYNC110 - the STOP is read by another task, no event to wait for
+                    await asyncio.sleep(0.001)
+
+    asyncio.run(run())
+
+
+def test_reopening_a_sensor_that_still_streams() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server):
+            crashed = driver(server.port)
+            await crashed.__aenter__()
+            crashed._send = lambda *_: None  # type: ignore[method-assign]  # killed before it could say STOP
+            await crashed.__aexit__(None, None, None)
+            assert server.streaming
+            async with driver(server.port) as edge:
+                assert edge.latest() is not None
+
+    asyncio.run(run())
+
+
+def test_rate_is_set_and_read_back() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server):
+            async with driver(server.port, rate_hz=333):
+                assert server.rate_hz == 333
+            async with driver(server.port, rate_hz=200):
+                assert server.rate_hz == 200
+
+    asyncio.run(run())
+
+
+def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server):
+            server.set_wrench(AWKWARD.force_n, AWKWARD.torque_nm)
+            async with driver(server.port) as edge:
+                for noise in (
+                    b"\x55\xaa\x55",
+                    b"\x00" * 7,
+                    rft.encode_wrench(Command.START, AWKWARD)[:9],
+                    b"\x55" * 30,
+                ):
+                    server.inject(noise)
+                    for sample in await edge.tare_samples(0.05):
+                        assert sample.force_sensor_n == AWKWARD.force_n
+                        assert sample.torque_sensor_nm == AWKWARD.torque_nm
+                        assert sample.overload
+                assert edge.health().skipped_bytes >= 49
+
+    asyncio.run(run())
+
+
+def test_overload_by_the_sensor_and_by_the_device_file() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server), driver(server.port, force_max_n=50.0) as edge:
+            server.set_wrench((60.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            assert (await sample_with(edge, 60.0)).overload
+            server.set_wrench((40.0, 0.0, 0.0), (0.0, 0.0, 4.1))
+            assert (await sample_with(edge, 40.0)).overload
+            server.set_wrench((30.0, 0.0, 0.0), (0.0, 0.0, 3.9))
+            assert not (await sample_with(edge, 30.0)).overload
+
+    asyncio.run(run())
+
+
+def test_tare_takes_the_samples_that_it_was_asked_for() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server):
+            server.set_wrench((1.2, -0.8, 2.5), (0.0, 0.0, 0.0))
+            async with driver(server.port) as edge:
+                samples = await edge.tare_samples(0.25)
+                assert len(samples) == 50
+                assert {sample.force_sensor_n for sample in samples} == {(1.2, -0.8, 2.5)}
+
+    asyncio.run(run())
+
+
+def test_sensor_falls_silent_in_flight() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server), driver(server.port) as edge:
+            server.silent = True
+            with pytest.raises(
+                DeviceError, match="of 100 samples came within 2 s while taring; the sensor fell silent"
+            ):
+                await edge.tare_samples(0.5)
+            assert edge.latest() is not None
+
+    asyncio.run(run())
+
+
+def test_port_vanishes_in_flight() -> None:
+    async def run() -> None:
+        server = ForceTorqueServer()
+        async with server, world(server):
+            edge = await driver(server.port).__aenter__()
+        last = edge.latest()
+        with pytest.raises(DeviceError, match="the port was lost"):
+            await edge.tare_samples(10.0)
+        assert edge.latest() == last
+        assert edge.health().lost is not None
+        await edge.__aexit__(None, None, None)
+
+    asyncio.run(run())
+
+
+# -- what can be wrong ---------------------------------------------------------------------------------------------------------
+
+
+async def refusal(edge: RobotousForceTorque) -> str:
+    with pytest.raises(DeviceError) as caught:
+        async with edge:
+            pass
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_no_such_port() -> None:
+    text = asyncio.run(refusal(driver("/dev/no-such-port")))
+    assert text.startswith("force sensor /dev/no-such-port: no such port; serial ports of this machine: ")
+
+
+def test_port_in_use() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server, world(server), driver(server.port):
+            assert "in use by another program" in await refusal(driver(server.port))
+
+    asyncio.run(run())
+
+
+def test_port_that_is_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("not a port")
+    assert "not usable as a serial port" in asyncio.run(refusal(driver(str(path))))
+    assert path.read_text() == "not a port"
+
+
+def test_silent_sensor() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server:
+            server.silent = True
+            text = await refusal(driver(server.port, answer_timeout_s=0.2))
+            assert "no answer to command 1 (PRODUCT_NAME) within 0.2 s, nothing was received" in text
+
+    asyncio.run(run())
+
+
+def test_sensor_that_answers_but_never_streams() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server:  # no world, so it never ticks
+            text = await refusal(driver(server.port, answer_timeout_s=1.0))
+            assert "0 of 5 samples after START within 1 s" in text
+
+    asyncio.run(run())
+
+
+def test_other_model() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer(product_name="RFT40-SA01") as server:
+            assert 'a "RFT40-SA01" answers, expected a RFT60-HA01' in await refusal(driver(server.port))
+
+    asyncio.run(run())
+
+
+@contextmanager
+def babbler(garbage: bytes) -> Iterator[str]:
+    """A tty whose other end answers every question with garbage."""
+    loop = asyncio.get_running_loop()
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        loop.add_reader(master, lambda: os.write(master, garbage) if os.read(master, 100) else None)
+        yield os.ttyname(slave)
+    finally:
+        loop.remove_reader(master)
+        os.close(master)
+        os.close(slave)
+
+
+def test_wrong_checksums() -> None:
+    async def run() -> None:
+        packet = bytearray(rft.pack(b"\x01RFT60-HA01", rft.RESPONSE_BYTES))
+        packet[-2] ^= 0xFF
+        with babbler(bytes(packet)) as port:
+            text = await refusal(driver(port, answer_timeout_s=1.0))
+            assert "bytes came but no valid packet" in text
+            assert "(0 wrong checksums)" not in text
+            assert "baud rate (115200)" in text
+
+    asyncio.run(run())
+
+
+# -- the emulated sensor alone -------------------------------------------------------------------------------------------------
+
+
+class Line:
+    """The companion's end of the tty, raw."""
+
+    def __init__(self, server: ForceTorqueServer) -> None:
+        self._descriptor = os.open(server.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        self._scanner = PacketScanner(rft.RESPONSE_BYTES)
+
+    def __enter__(self) -> Line:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._descriptor)
+
+    async def send(self, command: Command, parameter: int = 0) -> None:
+        os.write(self._descriptor, rft.encode_command(command, parameter))
+
+    async def receive(self, count: int) -> list[bytes]:
+        found: list[bytes] = []
+        async with asyncio.timeout(WAIT_S):
+            while len(found) < count:
+                await asyncio.sleep(0.001)
+                found += self.read()
+        assert len(found) == count
+        return found
+
+    def read(self) -> list[bytes]:
+        try:
+            return self._scanner.feed(os.read(self._descriptor, 65536))
+        except BlockingIOError:
+            return []
+
+
+def test_sensor_once_bias_and_refused_rate() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server:
+            with Line(server) as line:
+                server.set_wrench((2.0, 0.0, 0.0), (0.0, 0.5, 0.0))
+                await line.send(Command.SERIAL_NUMBER)
+                assert rft.decode_text((await line.receive(1))[0]) == "RFT60HA-0001"
+                await line.send(Command.SET_BIAS, 1)
+                await line.send(Command.READ_ONCE)
+                assert rft.decode_wrench((await line.receive(1))[0]) == Wrench((0.0,) * 3, (0.0,) * 3, 0)
+                await line.send(Command.SET_BIAS, 0)
+                await line.send(Command.READ_ONCE)
+                assert rft.decode_wrench((await line.receive(1))[0]).force_n == (2.0, 0.0, 0.0)
+                await line.send(Command.SET_RATE, 99)
+                assert (await line.receive(1))[0][:3] == bytes((15, 0, 2))
+                await line.send(Command.SET_RATE, 4)
+                assert (await line.receive(1))[0][:3] == bytes((15, 1, 0))
+                await line.send(Command.GET_RATE)
+                assert (await line.receive(1))[0][:2] == bytes((16, 4))
+
+    asyncio.run(run())
+
+
+def test_frames_follow_the_world_clock() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server:
+            with Line(server) as line:
+                server.tick(0.0)
+                await line.send(Command.START)
+                async with asyncio.timeout(WAIT_S):
+                    while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
+                        await asyncio.sleep(0.001)
+                for k in range(201):  # 0.2 s of world time, however long it takes
+                    server.tick(1.0 + k * 0.001)
+                assert len(await line.receive(41)) == 41
+                server.tick(100.0)  # a jump is not paid back in a burst
+                assert len(await line.receive(1)) == 1
+                server.stuck = True
+                server.set_wrench((9.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+                server.tick(100.005)
+                assert rft.decode_wrench((await line.receive(1))[0]).force_n == (0.0, 0.0, 0.0)
+                server.silent = True
+                server.tick(100.010)
+                assert line.read() == []
+                await line.send(Command.PRODUCT_NAME)  # not executed while streaming
+                server.silent = False
+                server.tick(100.015)
+                assert (await line.receive(1))[0][0] == Command.START
+
+    asyncio.run(run())
+
+
+def test_nobody_reads() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server:
+            with Line(server) as line:
+                await line.send(Command.START)
+                async with asyncio.timeout(WAIT_S):
+                    while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
+                        await asyncio.sleep(0.001)
+                for k in range(20_000):
+                    server.tick(k * 0.005)
+                    if server.dropped:
+                        break
+                assert server.dropped > 0
+            async with world(server), driver(server.port) as edge:
+                assert edge.latest() is not None
+
+    asyncio.run(run())

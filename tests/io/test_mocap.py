@@ -1,0 +1,487 @@
+"""The mocap edge against the SITL's NatNet server: real sockets, both transports, both versions, and everything that can be wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any, Literal
+
+import pytest
+
+from companion.clock import flight_clock
+from companion.config.vehicle import MocapDevice
+from companion.frames import quat_from_euler_zyx, quat_rotate
+from companion.io import natnet
+from companion.io.edges import DeviceError, Mocap
+from companion.io.mocap import NatNetMocap
+from companion.io.natnet import Message, NatNetVersion
+from companion.types import MocapPose, Quat, Vec3
+from sitl.natnet import BodyPose, NatNetServer, encode_frame
+
+GROUP = "239.255.42.99"
+POSE = BodyPose(1, (-1.25, 0.5, 1.0), (0.5, -0.5, 0.5, 0.5), error_m=0.00025)
+STRANGER = BodyPose(4, (3.0, 3.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+WAIT_S = 20.0
+Transport = Literal["multicast", "unicast"]
+
+
+def device_for(server: NatNetServer, transport: Transport = "unicast", **changes: Any) -> MocapDevice:
+    fields: dict[str, object] = {
+        "server": "127.0.0.1",
+        "interface": "127.0.0.1",
+        "transport": transport,
+        "multicast_group": GROUP,
+        "command_port": server.command_port,
+        "data_port": server.data_port,
+        "rigid_body_id": 1,
+    }
+    return MocapDevice.model_validate(fields | changes)
+
+
+@asynccontextmanager
+async def streaming(server: NatNetServer, *poses: BodyPose) -> AsyncIterator[None]:
+    """Publish the poses at about 200 Hz, transmitted 4 ms after exposure."""
+
+    async def publish() -> None:
+        t_s = 0.0
+        while True:
+            t_s += 0.005
+            server.publish(t_s, poses, t_s - 0.004)
+            await asyncio.sleep(0.005)
+
+    publisher = asyncio.create_task(publish())
+    try:
+        yield
+    finally:
+        publisher.cancel()
+        await asyncio.gather(publisher, return_exceptions=True)
+
+
+class Inbox:
+    """An `on_pose` that keeps what it got."""
+
+    def __init__(self) -> None:
+        self.queue: asyncio.Queue[MocapPose] = asyncio.Queue()
+
+    def __call__(self, pose: MocapPose) -> None:
+        self.queue.put_nowait(pose)
+
+    async def next(self) -> MocapPose:
+        return await asyncio.wait_for(self.queue.get(), WAIT_S)
+
+    def clear(self) -> None:
+        while not self.queue.empty():
+            self.queue.get_nowait()
+
+
+def mocap(
+    device: MocapDevice, on_pose: Callable[[MocapPose], None] | None = None, body_timeout_s: float = WAIT_S
+) -> NatNetMocap:
+    return NatNetMocap(
+        device, flight_clock(), on_pose or Inbox(), connect_timeout_s=WAIT_S, body_timeout_s=body_timeout_s
+    )
+
+
+@pytest.mark.parametrize("version", ["3.0", "4.1"])
+@pytest.mark.parametrize("transport", ["unicast", "multicast"])
+def test_pose_arrives(version: NatNetVersion, transport: Transport) -> None:
+    async def run() -> None:
+        group = GROUP if transport == "multicast" else None
+        inbox = Inbox()
+        async with NatNetServer(version, multicast_group=group) as server, streaming(server, STRANGER, POSE):
+            edge = mocap(device_for(server, transport, natnet_version=version), inbox)
+            assert edge.latest() is None
+            async with edge:
+                latest: Mocap = edge
+                pose = latest.latest()
+                assert pose is not None
+                assert pose.position_world_m == (-1.25, 0.5, 1.0)
+                assert pose.attitude_wxyz == (0.5, -0.5, 0.5, 0.5)
+                assert pose.tracking_valid
+                assert pose.marker_error_m == pytest.approx(0.00025)
+                assert pose.latency_s == pytest.approx(0.004, abs=1e-6)
+                first, second = await inbox.next(), await inbox.next()
+                assert second.frame_number > first.frame_number
+                assert second.stamp_s >= first.stamp_s
+                assert edge.server_info is not None
+                assert edge.server_info.version == version
+
+    asyncio.run(run())
+
+
+def test_unicast_client_of_a_multicast_server() -> None:
+    async def run() -> None:
+        async with (
+            NatNetServer(multicast_group=GROUP) as server,
+            streaming(server, POSE),
+            mocap(device_for(server)) as edge,
+        ):
+            assert edge.latest() is not None
+
+    asyncio.run(run())
+
+
+def test_two_listeners_share_the_multicast_port() -> None:
+    async def run() -> None:
+        async with NatNetServer(multicast_group=GROUP) as server, streaming(server, POSE):
+            device = device_for(server, "multicast")
+            async with mocap(device) as flight, mocap(device) as guardian:
+                assert flight.latest() is not None
+                assert guardian.latest() is not None
+
+    asyncio.run(run())
+
+
+def test_leaving_unsubscribes_and_frees_the_sockets() -> None:
+    async def run() -> None:
+        async with NatNetServer() as server, streaming(server, POSE):
+            for _ in range(3):
+                async with mocap(device_for(server)):
+                    assert len(server.unicast_clients) == 1
+                await until(lambda: not server.unicast_clients)
+
+    asyncio.run(run())
+
+
+@asynccontextmanager
+async def quiet_after_opening(
+    on_pose: Callable[[MocapPose], None], **changes: Any
+) -> AsyncIterator[tuple[NatNetServer, NatNetMocap]]:
+    """A server that has stopped publishing and an edge that has read everything: what comes next is the test's own."""
+    async with NatNetServer() as server:
+        async with streaming(server, POSE):
+            edge = await mocap(device_for(server, **changes), on_pose).__aenter__()
+        try:
+            # The last frame is answered for before the test begins.
+            await until(lambda: (pose := edge.latest()) is not None and pose.frame_number == server.frame_number)
+            yield server, edge
+        finally:
+            await edge.__aexit__(None, None, None)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait for something that a socket callback does."""
+    async with asyncio.timeout(WAIT_S):
+        while not condition():  # noqa: ASYNC110 - datagrams set no event
+            await asyncio.sleep(0.001)
+
+
+def handled(edge: NatNetMocap) -> int:
+    """Frames of every fate, so far."""
+    health = edge.health()
+    return health.frames + health.superseded + health.out_of_order + health.malformed
+
+
+async def send_and_wait(server: NatNetServer, edge: NatNetMocap, *datagrams: bytes) -> None:
+    """Datagrams of the test's own making, from the server's address, one at a time."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        for datagram in datagrams:
+            before = handled(edge)
+            for client in server.unicast_clients:
+                sender.sendto(datagram, client)
+            await until(lambda before=before: handled(edge) > before)  # type: ignore[misc]
+
+
+def test_newest_of_the_waiting_frames_wins() -> None:
+    async def run() -> None:
+        inbox = Inbox()
+        async with quiet_after_opening(inbox) as (server, edge):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as witness:
+                witness.bind(("127.0.0.1", 0))
+                witness.settimeout(WAIT_S)
+                witness.sendto(natnet.encode_connect(), ("127.0.0.1", server.command_port))
+                await until(lambda: len(server.unicast_clients) == 2)
+                inbox.clear()
+                before = edge.health()
+                for k in range(5):
+                    server.publish(10.0 + k, [BodyPose(1, (float(k), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))], None)
+                # The loop stands still here. Frames go to the edge first: when the witness has five, so has the edge's socket.
+                while natnet.message_id(witness.recv(65535)) != Message.FRAME:
+                    pass
+                for _ in range(4):
+                    witness.recv(65535)
+            assert (await inbox.next()).position_world_m == (4.0, 0.0, 0.0)
+            assert inbox.queue.empty()
+            assert edge.health().superseded - before.superseded == 4
+            assert edge.health().frames - before.frames == 1
+
+    asyncio.run(run())
+
+
+def test_untracked_frame_is_delivered_and_marked() -> None:
+    async def run() -> None:
+        inbox = Inbox()
+        async with quiet_after_opening(inbox) as (server, _):
+            inbox.clear()
+            server.publish(10.0, [BodyPose(1, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), valid=False)], 9.99)
+            assert not (await inbox.next()).tracking_valid
+
+    asyncio.run(run())
+
+
+def numbered(number: int) -> bytes:
+    return encode_frame("4.1", number, 1.0, [POSE], None, {})
+
+
+def test_old_and_repeated_frames_are_dropped() -> None:
+    async def run() -> None:
+        inbox = Inbox()
+        async with quiet_after_opening(inbox) as (server, edge):
+            inbox.clear()
+            await send_and_wait(server, edge, *map(numbered, (100_000, 100_000, 99_998, 100_002)))
+            assert [(await inbox.next()).frame_number for _ in range(2)] == [100_000, 100_002]
+            assert inbox.queue.empty()
+            assert edge.health().out_of_order == 2
+
+    asyncio.run(run())
+
+
+def test_restarted_server_is_believed_again() -> None:
+    async def run() -> None:
+        inbox = Inbox()
+        async with quiet_after_opening(inbox) as (server, edge):
+            inbox.clear()
+            await send_and_wait(server, edge, *map(numbered, (100_000, 1, 2)))
+            assert [(await inbox.next()).frame_number for _ in range(3)] == [100_000, 1, 2]
+
+    asyncio.run(run())
+
+
+def test_unicast_server_that_was_restarted_is_connected_again() -> None:
+    async def run() -> None:
+        inbox = Inbox()
+        async with quiet_after_opening(inbox) as (server, _):
+            port = server.command_port
+            await server.__aexit__(None, None, None)
+            inbox.clear()
+            moved = BodyPose(1, (9.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+            async with NatNetServer(command_port=port) as successor, streaming(successor, moved):
+                assert (await inbox.next()).position_world_m == (9.0, 0.0, 1.0)
+
+    asyncio.run(run())
+
+
+def test_malformed_datagrams_do_not_stop_reception() -> None:
+    async def run() -> None:
+        inbox = Inbox()
+        async with quiet_after_opening(inbox) as (server, edge):
+            inbox.clear()
+            whole = numbered(100_000)
+            frame, info = struct.pack("<HH", Message.FRAME, 4), struct.pack("<HH", Message.SERVER_INFO, 4)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.bind(("127.0.0.1", 0))
+                for junk in (b"", b"\x07", bytes(2000), b"\xff" * 2000):  # no message of a server: not even counted
+                    sender.sendto(junk, server.unicast_clients[0])
+            await send_and_wait(server, edge, whole[:60], frame + b"\xff" * 4, info + b"\0" * 4)
+            assert inbox.queue.empty()
+            assert edge.health().malformed == 3
+            await send_and_wait(server, edge, whole)
+            assert (await inbox.next()).frame_number == 100_000
+
+    asyncio.run(run())
+
+
+def test_callback_that_fails_does_not_stop_reception(caplog: pytest.LogCaptureFixture) -> None:
+    async def run() -> None:
+        seen: list[int] = []
+
+        def fails(pose: MocapPose) -> None:
+            seen.append(pose.frame_number)
+            raise RuntimeError("link refused")
+
+        async with quiet_after_opening(fails) as (server, edge):
+            known = len(seen)
+            for k in range(3):
+                server.publish(10.0 + k, [POSE], None)
+                await until(lambda k=k: len(seen) == known + k + 1)  # type: ignore[misc]
+            latest = edge.latest()
+            assert latest is not None
+            assert latest.frame_number == seen[-1]
+            assert edge.health().callback_error == "RuntimeError: link refused"
+
+    with caplog.at_level(logging.ERROR):
+        asyncio.run(run())
+    assert len([record for record in caplog.records if "on_pose failed" in record.message]) == 1
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 45, 90, 180, -90])
+def test_y_up_stream_at_compass_points(yaw_deg: int) -> None:
+    yaw_rad = math.radians(yaw_deg)
+    # Motive's own axes: y up, so z is to the right of x and a turn to the left is one about +y.
+    y_up = BodyPose(1, (2.0, 1.5, -0.75), (math.cos(yaw_rad / 2), 0.0, math.sin(yaw_rad / 2), 0.0))
+
+    async def run() -> None:
+        inbox = Inbox()
+        async with quiet_after_opening(inbox, up_axis="y") as (server, _):
+            inbox.clear()
+            server.publish(10.0, [y_up], None)
+            pose = await inbox.next()
+            assert pose.position_world_m == (2.0, 0.75, 1.5)
+            nose = quat_rotate(pose.attitude_wxyz, (1.0, 0.0, 0.0))
+            left = quat_rotate(pose.attitude_wxyz, (0.0, 1.0, 0.0))
+            assert nose == pytest.approx((math.cos(yaw_rad), math.sin(yaw_rad), 0.0), abs=1e-6)
+            assert left == pytest.approx((-math.sin(yaw_rad), math.cos(yaw_rad), 0.0), abs=1e-6)
+
+    asyncio.run(run())
+
+
+def test_y_up_turns_world_and_body_alike() -> None:
+    quat: Quat = quat_from_euler_zyx(0.3, -0.5, 1.1)
+    vector: Vec3 = (0.2, -0.7, 0.4)
+    turned_vector, turned_quat = natnet.z_up_from_y_up(vector, quat)
+    expected, _ = natnet.z_up_from_y_up(quat_rotate(quat, vector), quat)
+    assert quat_rotate(turned_quat, turned_vector) == pytest.approx(expected)
+
+
+# -- what can be wrong ---------------------------------------------------------------------------------------------------------
+
+
+async def refusal(edge: NatNetMocap) -> str:
+    with pytest.raises(DeviceError) as caught:
+        async with edge:
+            pass
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_no_answer() -> None:
+    async def run() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+            deaf.bind(("127.0.0.1", 0))
+            port = deaf.getsockname()[1]
+            device = MocapDevice(
+                server="127.0.0.1", interface="127.0.0.1", transport="unicast", command_port=port, rigid_body_id=1
+            )
+            text = await refusal(NatNetMocap(device, flight_clock(), Inbox(), connect_timeout_s=0.3))
+            assert f"127.0.0.1:{port}: no answer to the NatNet connect request within 0.3 s" in text
+
+    asyncio.run(run())
+
+
+def test_other_version_than_wanted() -> None:
+    async def run() -> None:
+        async with NatNetServer("4.1") as server:
+            text = await refusal(mocap(device_for(server, natnet_version="3.0")))
+            assert "Motive speaks NatNet 4.1, expected 3.0" in text
+            await until(lambda: server.requests > 1 and server.unicast_clients == ())
+
+    asyncio.run(run())
+
+
+def test_version_that_is_not_supported() -> None:
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ancient:
+            ancient.bind(("127.0.0.1", 0))
+            ancient.setblocking(False)
+
+            async def answer() -> None:
+                _, client = await loop.sock_recvfrom(ancient, 2000)
+                sender = struct.pack("<256s4s4s", b"Arena", bytes((1, 0, 0, 0)), bytes((2, 9, 0, 0)))
+                await loop.sock_sendto(ancient, natnet.encode_message(Message.SERVER_INFO, sender), client)
+
+            answering = asyncio.create_task(answer())
+            device = MocapDevice(
+                server="127.0.0.1",
+                interface="127.0.0.1",
+                transport="unicast",
+                command_port=ancient.getsockname()[1],
+                rigid_body_id=1,
+            )
+            text = await refusal(mocap(device))
+            await answering
+            assert "Arena speaks NatNet 2.9, expected 3.0 or 4.1" in text
+
+    asyncio.run(run())
+
+
+def test_body_never_seen_lists_the_others() -> None:
+    async def run() -> None:
+        async with NatNetServer(bodies=[(1, "quad"), (4, "wand")]) as server, streaming(server, POSE, STRANGER):
+            text = await refusal(mocap(device_for(server, rigid_body_id=7), body_timeout_s=2.0))
+            assert "rigid body id 7 was never seen within 2 s" in text
+            assert '1 "quad", 4 "wand"' in text
+
+    asyncio.run(run())
+
+
+def test_body_never_tracked() -> None:
+    async def run() -> None:
+        lost = BodyPose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), valid=False)
+        async with NatNetServer(bodies=[(1, "quad")]) as server, streaming(server, lost):
+            text = await refusal(mocap(device_for(server), body_timeout_s=2.0))
+            assert 'rigid body 1 "quad" is streamed but was not tracked' in text
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("transport", ["unicast", "multicast"])
+def test_server_that_does_not_stream(transport: Transport) -> None:
+    async def run() -> None:
+        group = GROUP if transport == "multicast" else None
+        async with NatNetServer(multicast_group=group) as server:
+            text = await refusal(mocap(device_for(server, transport), body_timeout_s=0.2))
+            assert "no frame of data came within 0.2 s" in text
+            assert transport in text
+
+    asyncio.run(run())
+
+
+def test_transport_or_group_that_the_server_does_not_use() -> None:
+    async def run() -> None:
+        async with NatNetServer() as server:
+            assert "the server streams unicast, expected multicast" in await refusal(
+                mocap(device_for(server, "multicast"))
+            )
+        async with NatNetServer(multicast_group=GROUP) as server:
+            device = device_for(server, "multicast", multicast_group="239.255.42.98")
+            text = await refusal(mocap(device))
+            assert f"streams to {GROUP}:{server.data_port}, expected 239.255.42.98:{server.data_port}" in text
+
+    asyncio.run(run())
+
+
+def test_port_in_use() -> None:
+    async def run() -> None:
+        async with NatNetServer(multicast_group=GROUP) as server:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as selfish:
+                selfish.bind((GROUP, server.data_port))
+                text = await refusal(mocap(device_for(server, "multicast")))
+                assert f"cannot open UDP {GROUP}:{server.data_port}: another program holds the port" in text
+
+    asyncio.run(run())
+
+
+def test_interface_of_another_machine() -> None:
+    async def run() -> None:
+        async with NatNetServer() as server:
+            text = await refusal(mocap(device_for(server, interface="192.0.2.1")))
+            assert "set devices.mocap.interface to an address of this machine" in text
+
+    asyncio.run(run())
+
+
+def test_group_or_interface_that_cannot_be_joined() -> None:
+    async def run() -> None:
+        async with NatNetServer(multicast_group=GROUP) as server:
+            text = await refusal(mocap(device_for(server, "multicast", multicast_group="192.0.2.7")))
+            assert "set devices.mocap.multicast_group to the group that Motive streams to" in text
+            text = await refusal(mocap(device_for(server, "multicast", interface="localhost")))
+            assert f"cannot join {GROUP} on localhost" in text
+
+    asyncio.run(run())
+
+
+def test_server_name_that_is_no_address() -> None:
+    async def run() -> None:
+        device = MocapDevice(server="256.256.256.256", interface="127.0.0.1", rigid_body_id=1)
+        assert "the name cannot be resolved" in await refusal(mocap(device))
+
+    asyncio.run(run())

@@ -1,0 +1,327 @@
+"""The NatNet server's datagrams, read by the companion's parser, and the parser against everything else."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+import struct
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from companion.io import natnet
+from companion.io.natnet import Frame, Malformed, Message, NatNetVersion
+from companion.types import Quat
+from sitl.natnet import CLOCK_FREQUENCY_HZ, BodyPose, NatNetServer, encode_frame, encode_model_definitions
+
+VERSIONS: tuple[NatNetVersion, ...] = ("3.0", "4.1")
+NAMES = {1: "quad", 5: "ball"}
+TURNED: Quat = (0.5, -0.5, 0.5, 0.5)
+POSES = (
+    BodyPose(5, (4.0, 5.0, 6.0), (1.0, 0.0, 0.0, 0.0), valid=False, error_m=0.003),
+    BodyPose(1, (-1.25, 0.5, 1.0), TURNED, error_m=0.00025),
+)
+versions = pytest.mark.parametrize("version", VERSIONS)
+
+
+def frame_of(version: NatNetVersion, poses: Sequence[BodyPose] = POSES, exposure_t_s: float | None = 2.0) -> bytes:
+    return encode_frame(version, 77, 2.005, poses, exposure_t_s, NAMES)
+
+
+def parse(datagram: bytes, version: NatNetVersion, body_id: int = 1) -> Frame | Malformed:
+    return natnet.parse_frame(datagram, version, body_id, CLOCK_FREQUENCY_HZ)
+
+
+def good(result: Frame | Malformed) -> Frame:
+    assert isinstance(result, Frame), result
+    return result
+
+
+@versions
+def test_frame_round_trip(version: NatNetVersion) -> None:
+    frame = good(parse(frame_of(version), version))
+    assert frame.number == 77
+    assert frame.timestamp_s == 2.005
+    assert frame.latency_s == pytest.approx(0.005, abs=1e-6)
+    assert frame.body_ids == (5, 1)
+    assert frame.body is not None
+    assert frame.body.id == 1
+    assert frame.body.position_m == (-1.25, 0.5, 1.0)
+    assert frame.body.quat_wxyz == TURNED
+    assert frame.body.error_m == pytest.approx(0.00025)
+    assert frame.body.tracking_valid
+
+
+@versions
+def test_other_body_untracked_and_missing_body(version: NatNetVersion) -> None:
+    other = good(parse(frame_of(version), version, 5)).body
+    assert other is not None
+    assert other.position_m == (4.0, 5.0, 6.0)
+    assert not other.tracking_valid
+    missing = good(parse(frame_of(version), version, 9))
+    assert missing.body is None
+    assert missing.body_ids == (5, 1)
+    assert good(parse(frame_of(version, ()), version)).body_ids == ()
+
+
+@versions
+def test_no_exposure_stamp_or_clock_means_no_latency(version: NatNetVersion) -> None:
+    assert good(parse(frame_of(version, exposure_t_s=None), version)).latency_s is None
+    assert good(natnet.parse_frame(frame_of(version), version, 1, None)).latency_s is None
+
+
+def rich_frame(version: NatNetVersion) -> bytes:
+    """A frame with two entries in every section, written here so that neither encoder nor parser can agree by mistake."""
+
+    def section(parts: list[bytes]) -> bytes:
+        content = b"".join(parts)
+        return struct.pack("<I", len(parts)) + (struct.pack("<I", len(content)) if version == "4.1" else b"") + content
+
+    def body(number: int, x: float) -> bytes:
+        return struct.pack("<IffffffffH", number, x, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 0.001, 1)
+
+    def channels(number: int) -> bytes:
+        return struct.pack("<II", number, 2) + struct.pack("<I2f", 2, 1.0, 2.0) + struct.pack("<I1f", 1, 3.0)
+
+    skeletons = [struct.pack("<II", k, 2) + body(1, 99.0) + body(2, 99.0) for k in (1, 2)]
+    assets = [
+        struct.pack("<II", k, 1) + body(1, 98.0) + struct.pack("<IIffffHf", 1, 7, 1, 2, 3, 0.01, 0, 0.1) for k in (1, 2)
+    ]
+    payload = struct.pack("<I", 4242)
+    payload += section([name + struct.pack("<I3f", 1, 7.0, 7.0, 7.0) for name in (b"a longer name\0", b"\0")])
+    payload += section([struct.pack("<3f", 1.0, 1.0, 1.0)] * 2)
+    payload += section([body(3, 30.0), body(1, 10.0)])
+    payload += section(skeletons)
+    payload += section(assets) if version == "4.1" else b""
+    payload += section([struct.pack("<IffffHf", 65537, 1.0, 2.0, 3.0, 0.014, 2, 0.0)] * 2)
+    payload += section([channels(1), channels(2)]) * 2
+    payload += struct.pack("<IIdQQQ", 1, 2, 12.5, 1000, 1500, 3000)
+    payload += struct.pack("<II", 12, 0) if version == "4.1" else b""
+    payload += struct.pack("<H", 2) + bytes(4)
+    return struct.pack("<HH", Message.FRAME, len(payload)) + payload
+
+
+@versions
+def test_every_section_is_skipped(version: NatNetVersion) -> None:
+    frame = good(natnet.parse_frame(rich_frame(version), version, 1, 1000))
+    assert (frame.number, frame.timestamp_s, frame.latency_s) == (4242, 12.5, 2.0)
+    assert frame.body_ids == (3, 1)
+    assert frame.body is not None
+    assert frame.body.position_m == (10.0, 2.0, 3.0)
+
+
+def test_frame_of_the_other_version_is_not_believed() -> None:
+    for actual, assumed in (("3.0", "4.1"), ("4.1", "3.0")):
+        result = parse(frame_of(actual), assumed)  # type: ignore[arg-type]
+        assert isinstance(result, Malformed) or result.body is None
+
+
+@versions
+@pytest.mark.parametrize("bad", [(0.0, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0)])
+def test_bad_quaternion(version: NatNetVersion, bad: Quat) -> None:
+    assert isinstance(parse(frame_of(version, [BodyPose(1, (0.0, 0.0, 0.0), bad)]), version), Malformed)
+    lost = good(parse(frame_of(version, [BodyPose(1, (0.0, 0.0, 0.0), bad, valid=False)]), version)).body
+    assert lost is not None
+    assert not lost.tracking_valid
+    assert lost.quat_wxyz == (1.0, 0.0, 0.0, 0.0)
+
+
+def test_position_that_is_not_finite() -> None:
+    assert isinstance(parse(frame_of("4.1", [BodyPose(1, (math.inf, 0.0, 0.0), TURNED)]), "4.1"), Malformed)
+
+
+@versions
+def test_model_definitions(version: NatNetVersion) -> None:
+    payload = encode_model_definitions(version, [(1, "quad"), (12, "Bälle")])
+    found = natnet.parse_model_definitions(natnet.encode_message(Message.MODELDEF, payload), version)
+    assert found == (natnet.BodyDefinition(1, "quad"), natnet.BodyDefinition(12, "Bälle"))
+
+
+def test_model_definitions_with_every_description_3_0() -> None:
+    body = b"quad\0" + struct.pack("<Ii3fI", 1, -1, 0, 0, 0, 1) + struct.pack("<3fI", 0, 0, 0, 0)
+    names = struct.pack("<I", 2) + b"Fx\0Fy\0"
+    descriptions = [
+        (0, b"set\0" + struct.pack("<I", 1) + b"m1\0"),
+        (2, b"skeleton\0" + struct.pack("<II", 1, 2) + body * 2),
+        (3, struct.pack("<I", 1) + b"serial\0" + struct.pack("<161f", *range(161)) + struct.pack("<II", 1, 0) + names),
+        (4, struct.pack("<I", 1) + b"daq\0serial\0" + struct.pack("<II", 1, 0) + names),
+        (5, b"camera\0" + struct.pack("<7f", *range(7))),
+        (1, body),
+    ]
+    payload = struct.pack("<I", len(descriptions))
+    payload += b"".join(struct.pack("<I", kind) + content for kind, content in descriptions)
+    datagram = natnet.encode_message(Message.MODELDEF, payload)
+    assert natnet.parse_model_definitions(datagram, "3.0") == (natnet.BodyDefinition(1, "quad"),)
+    unknown = natnet.encode_message(Message.MODELDEF, struct.pack("<II", 1, 66) + b"whatever")
+    assert isinstance(natnet.parse_model_definitions(unknown, "3.0"), Malformed)
+
+
+def test_numbers_follow_wrap_and_restart() -> None:
+    assert natnet.is_newer(5, None, 0.0)
+    assert natnet.is_newer(6, 5, 0.0)
+    assert not natnet.is_newer(5, 5, 0.0)
+    assert not natnet.is_newer(5, 5, 10.0)
+    assert not natnet.is_newer(4, 5, 0.0)
+    assert natnet.is_newer(0, 0xFFFFFFFF, 0.0)
+    assert not natnet.is_newer(0xFFFFFFFF, 0, 0.0)
+    assert natnet.is_newer(1, 50_000, 0.0)
+    assert natnet.is_newer(1, 50, 0.6)
+
+
+# -- fuzz ----------------------------------------------------------------------------------------------------------------------
+
+
+def believable(result: Frame | Malformed) -> None:
+    if isinstance(result, Frame) and result.body is not None:
+        assert math.isclose(math.hypot(*result.body.quat_wxyz), 1.0, rel_tol=1e-9)
+        assert all(map(math.isfinite, result.body.position_m))
+
+
+@versions
+def test_every_truncation_is_refused(version: NatNetVersion) -> None:
+    for whole in (frame_of(version), rich_frame(version)):
+        for size in range(len(whole)):
+            assert isinstance(parse(whole[:size], version), Malformed)
+        tail = 2 + 4 + (8 if version == "4.1" else 0)  # behind the last field that is read
+        for size in range(4, len(whole) - tail):
+            honest = struct.pack("<HH", Message.FRAME, size - 4) + whole[4:size]
+            assert isinstance(parse(honest, version), Malformed)
+
+
+@settings(max_examples=2000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    version=st.sampled_from(VERSIONS),
+    rich=st.booleans(),
+    flips=st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 7)), min_size=1, max_size=12),
+)
+def test_flipped_bits(version: NatNetVersion, rich: bool, flips: list[tuple[int, int]]) -> None:
+    datagram = bytearray(rich_frame(version) if rich else frame_of(version))
+    for position, bit in flips:
+        datagram[position % len(datagram)] ^= 1 << bit
+    believable(parse(bytes(datagram), version))
+
+
+@settings(max_examples=2000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(version=st.sampled_from(VERSIONS), payload=st.binary(max_size=400), lead=st.integers(0, 200))
+def test_random_payloads(version: NatNetVersion, payload: bytes, lead: int) -> None:
+    believable(parse(payload, version))
+    believable(parse(natnet.encode_message(Message.FRAME, frame_of(version)[4 : 4 + lead] + payload), version))
+    for message, parser in (
+        (Message.MODELDEF, lambda datagram: natnet.parse_model_definitions(datagram, version)),
+        (Message.SERVER_INFO, natnet.parse_server_info),
+    ):
+        parser(payload)
+        parser(natnet.encode_message(message, payload))
+        parser(natnet.encode_message(message, encode_model_definitions(version, NAMES.items())[:lead] + payload))  # type: ignore[arg-type]
+
+
+# -- the server on a socket ----------------------------------------------------------------------------------------------------
+
+
+class Client:
+    """A plain UDP client."""
+
+    def __init__(self, server: NatNetServer) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.setblocking(False)
+        self._server = ("127.0.0.1", server.command_port)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    @property
+    def address(self) -> tuple[str, int]:
+        host, port = self._socket.getsockname()
+        return host, port
+
+    def send(self, datagram: bytes) -> None:
+        self._socket.sendto(datagram, self._server)
+
+    async def receive(self, expected: Message) -> bytes:
+        datagram = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(self._socket, 65535), 10.0)
+        assert natnet.message_id(datagram) == expected
+        return datagram
+
+    async def request(self, text: str) -> bytes:
+        self.send(natnet.encode_request(Message.REQUEST, text))
+        return (await self.receive(Message.RESPONSE))[4:]
+
+
+@versions
+def test_server_answers(version: NatNetVersion) -> None:
+    async def run() -> None:
+        async with NatNetServer(version, bodies=[(1, "quad")], rate_hz=180.0) as server:
+            with Client(server) as client:
+                client.send(natnet.encode_connect())
+                info = natnet.parse_server_info(await client.receive(Message.SERVER_INFO))
+                assert isinstance(info, natnet.ServerInfo)
+                assert (info.application, info.version) == ("Motive", version)
+                assert info.clock_frequency_hz == CLOCK_FREQUENCY_HZ
+                assert (info.data_port, info.multicast) == (server.data_port, False)
+
+                client.send(natnet.encode_request(Message.REQUEST_MODELDEF))
+                definitions = natnet.parse_model_definitions(await client.receive(Message.MODELDEF), version)
+                assert definitions == (natnet.BodyDefinition(1, "quad"),)
+
+                assert struct.unpack("<f", await client.request("FrameRate")) == (180.0,)
+                assert await client.request("Bitstream") == f"Bitstream,{version}\0".encode()
+                client.send(natnet.encode_request(Message.REQUEST, "NoSuchThing"))
+                await client.receive(Message.UNRECOGNIZED_REQUEST)
+
+                server.publish(1.0, POSES, 0.99)
+                pushed = await client.receive(Message.FRAME)
+                client.send(natnet.encode_request(Message.REQUEST_FRAME))
+                assert await client.receive(Message.FRAME) == pushed
+
+                client.send(natnet.encode_message(Message.DISCONNECT))
+                await client.request("FrameRate")  # answered after the datagram before it
+                assert server.unicast_clients == ()
+
+    asyncio.run(run())
+
+
+def test_unicast_client_chooses_its_bitstream() -> None:
+    async def run() -> None:
+        async with NatNetServer("4.1") as server:
+            with Client(server) as old, Client(server) as new:
+                for client in (old, new):
+                    client.send(natnet.encode_connect())
+                    await client.receive(Message.SERVER_INFO)
+                assert await old.request("Bitstream,3.0") == struct.pack("<i", 0)
+                assert await new.request("Bitstream,2.7") == struct.pack("<i", 1)
+                server.publish(1.0, POSES, 0.99)
+                assert good(parse(await old.receive(Message.FRAME), "3.0")).body is not None
+                assert good(parse(await new.receive(Message.FRAME), "4.1")).body is not None
+
+    asyncio.run(run())
+
+
+def test_multicast_server_sends_unicast_to_keep_alive_only() -> None:
+    async def run() -> None:
+        async with NatNetServer("4.1", multicast_group="239.255.42.99") as server:
+            with Client(server) as client:
+                client.send(natnet.encode_connect())
+                await client.receive(Message.SERVER_INFO)
+                assert server.unicast_clients == ()
+                client.send(natnet.encode_request(Message.KEEP_ALIVE))
+                await client.request("FrameRate")
+                assert list(server.unicast_clients) == [client.address]
+
+    asyncio.run(run())
+
+
+def test_port_in_use_is_named() -> None:
+    async def run() -> None:
+        async with NatNetServer() as first:
+            with pytest.raises(OSError, match=f"cannot bind UDP 127.0.0.1:{first.command_port}"):
+                async with NatNetServer(command_port=first.command_port):
+                    pass
+
+    asyncio.run(run())
