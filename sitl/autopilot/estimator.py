@@ -1,22 +1,148 @@
-"""EKF-like estimator of the PX4 stub: IMU prediction, delayed vision fusion."""
+"""EKF-like estimator of the PX4 stub: IMU prediction, delayed vision fusion.
+
+A fixed-gain observer with the couplings that matter in EKF2: position innovations correct velocity and, through gravity, tilt; vision
+corrects yaw; without vision the state dead-reckons on the IMU and drifts. Vision is fused at the time it was taken, against the state
+the filter had then, as EKF2 does on its delayed horizon; the output is predicted to now.
+"""
 
 from __future__ import annotations
 
-from companion.types import Quat, Vec3
+import math
+from collections import deque
+
+from companion.frames import euler_zyx_from_quat, quat_multiply, quat_normalize, quat_rotate, wrap_rad
+from companion.types import IDENTITY_QUAT, Quat, Vec3
 from sitl.autopilot.types import Estimate, ImuSample
+
+GRAVITY_M_S2 = 9.81
+VISION_FUSED_TIMEOUT_S = 0.55
+POSITION_VALID_TIMEOUT_S = 4.5
+_HISTORY_S = 0.3
+_GATE_M = 0.5
+_GATE_RESET_S = 1.0
+
+# Observer poles 10, 6 and 1.5 rad/s on position, velocity and tilt (vertical: accelerometer bias).
+_L_POSITION = 17.5
+_L_VELOCITY = 84.0
+_L_ACCELERATION = 90.0
+_L_YAW = 3.0
 
 
 class Estimator:
     """Fixed-gain observer that behaves as EKF2 with external vision does."""
 
+    def __init__(self) -> None:
+        self._t_s: float | None = None
+        self._p = (0.0, 0.0, 0.0)
+        self._v = (0.0, 0.0, 0.0)
+        self._q: Quat = IDENTITY_QUAT
+        self._bias_z = 0.0
+        self._rates = (0.0, 0.0, 0.0)
+        self._accel = (0.0, 0.0, -GRAVITY_M_S2)
+        self._history: deque[tuple[float, Vec3, Quat]] = deque()
+        self._fused_t_s: float | None = None
+        self._arrived_t_s: float | None = None
+        self._tilt_aligned = False
+
     def predict(self, imu: ImuSample) -> None:
         """Advance to the sample's time."""
-        raise NotImplementedError
+        if self._t_s is None or not self._tilt_aligned:
+            self._align_tilt(imu)
+            return
+        dt = imu.t_s - self._t_s
+        self._t_s = imu.t_s
+        if dt <= 0.0:
+            return
+        gx, gy, gz = imu.gyro_frd_rad_s
+        angle = math.sqrt(gx * gx + gy * gy + gz * gz) * dt
+        if angle > 1e-9:
+            k = math.sin(0.5 * angle) / angle * dt
+            self._q = quat_normalize(quat_multiply(self._q, (math.cos(0.5 * angle), gx * k, gy * k, gz * k)))
+        fx, fy, fz = imu.accel_frd_m_s2
+        ax, ay, az = quat_rotate(self._q, (fx, fy, fz - self._bias_z))
+        az += GRAVITY_M_S2
+        px, py, pz = self._p
+        vx, vy, vz = self._v
+        half = 0.5 * dt * dt
+        self._p = (px + vx * dt + ax * half, py + vy * dt + ay * half, pz + vz * dt + az * half)
+        self._v = (vx + ax * dt, vy + ay * dt, vz + az * dt)
+        self._rates = imu.gyro_frd_rad_s
+        self._accel = imu.accel_frd_m_s2
+        self._history.append((imu.t_s, self._p, self._q))
+        while self._history[0][0] < imu.t_s - _HISTORY_S:
+            self._history.popleft()
+
+    def _align_tilt(self, imu: ImuSample) -> None:
+        """Roll and pitch from the accelerometer at rest, yaw 0 until vision says more."""
+        fx, fy, fz = imu.accel_frd_m_s2
+        if fx * fx + fy * fy + fz * fz < 1.0:
+            return
+        roll = math.atan2(-fy, -fz)
+        pitch = math.atan2(fx, math.sqrt(fy * fy + fz * fz))
+        cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
+        self._q = (cr * cp, sr * cp, cr * sp, -sr * sp)
+        self._t_s = imu.t_s
+        self._tilt_aligned = True
 
     def fuse_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> None:
         """Fuse a vision pose that was taken at world time `t_s` (arrival minus EKF2_EV_DELAY)."""
-        raise NotImplementedError
+        if self._t_s is None or not all(math.isfinite(value) for value in (*position_ned_m, *attitude_ned_frd)):
+            return
+        gap = self._t_s - self._arrived_t_s if self._arrived_t_s is not None else 1.0
+        self._arrived_t_s = self._t_s
+        then_p, then_q = self._at(t_s)
+        rx, ry, rz = (z - p for z, p in zip(position_ned_m, then_p, strict=True))
+        yaw_error = wrap_rad(euler_zyx_from_quat(attitude_ned_frd)[2] - euler_zyx_from_quat(then_q)[2])
+        starved = self._fused_t_s is None or self._t_s - self._fused_t_s > _GATE_RESET_S
+        if starved:
+            self._reset_to((rx, ry, rz), yaw_error)
+            return
+        if rx * rx + ry * ry + rz * rz > _GATE_M * _GATE_M:
+            return
+        self._fused_t_s = self._t_s
+        dt = min(gap, 0.05)
+        kp, kv, ka = _L_POSITION * dt, _L_VELOCITY * dt, _L_ACCELERATION * dt
+        kp, kv, ka = min(kp, 0.6), min(kv, 2.0), min(ka, 1.0)
+        px, py, pz = self._p
+        vx, vy, vz = self._v
+        self._p = (px + kp * rx, py + kp * ry, pz + kp * rz)
+        self._v = (vx + kv * rx, vy + kv * ry, vz + kv * rz)
+        # A tilt error shows as a horizontal acceleration error of g x theta.
+        self._rotate_world((ka / GRAVITY_M_S2 * ry, -ka / GRAVITY_M_S2 * rx, _L_YAW * dt * yaw_error))
+        self._bias_z -= ka * rz * 0.3
+        self._bias_z = max(-1.0, min(1.0, self._bias_z))
+
+    def _at(self, t_s: float) -> tuple[Vec3, Quat]:
+        for stamp, position, attitude in reversed(self._history):
+            if stamp <= t_s + 1e-9:
+                return position, attitude
+        return (self._history[0][1], self._history[0][2]) if self._history else (self._p, self._q)
+
+    def _reset_to(self, innovation: Vec3, yaw_error: float) -> None:
+        self._p = (self._p[0] + innovation[0], self._p[1] + innovation[1], self._p[2] + innovation[2])
+        self._v = (0.0, 0.0, 0.0)
+        self._rotate_world((0.0, 0.0, yaw_error))
+        self._history.clear()
+        self._fused_t_s = self._t_s
+
+    def _rotate_world(self, theta: Vec3) -> None:
+        half = (0.5 * theta[0], 0.5 * theta[1], 0.5 * theta[2])
+        norm = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
+        k = math.sin(norm) / norm if norm > 1e-12 else 1.0
+        self._q = quat_normalize(quat_multiply((math.cos(norm), k * half[0], k * half[1], k * half[2]), self._q))
 
     def estimate(self) -> Estimate:
         """Newest output."""
-        raise NotImplementedError
+        t_s = self._t_s or 0.0
+        since = t_s - self._fused_t_s if self._fused_t_s is not None else math.inf
+        return Estimate(
+            t_s=t_s,
+            position_ned_m=self._p,
+            velocity_ned_m_s=self._v,
+            attitude_ned_frd=self._q,
+            rates_frd_rad_s=self._rates,
+            accel_frd_m_s2=self._accel,
+            vision_fused=since <= VISION_FUSED_TIMEOUT_S,
+            position_valid=since <= POSITION_VALID_TIMEOUT_S,
+            attitude_valid=self._tilt_aligned,
+        )

@@ -1,0 +1,157 @@
+"""Opening MAVSDK's connection to PX4: every way in which it can fail becomes one clear line."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import os
+import re
+import socket
+import stat
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from mavsdk import Autopilot as AutopilotKind
+from mavsdk import ConnectionResult, Mavsdk, log_subscribe, log_unsubscribe
+from mavsdk.exceptions import ConnectionError as MavsdkConnectionError
+
+from companion.io.edges import DeviceError
+
+_ADDRESS = re.compile(
+    r"(?P<net>udpin|udpout|tcpin|tcpout)://(?P<host>[^:/?]+):(?P<port>\d+)"
+    r"|(?P<serial>serial|serial_flowcontrol)://(?P<path>/[^:]+):(?P<baud>\d+)"
+)
+_FORMS = "udpin://0.0.0.0:14540, udpout://HOST:PORT, tcpout://HOST:PORT or serial:///dev/ttyAMA0:921600"
+
+_native_log = logging.getLogger("companion.mavsdk")
+_log_lock = threading.Lock()
+_log_users = 0
+
+
+def device_error(address: str, expected: str, found: str, fix: str) -> DeviceError:
+    """The one line that a person gets."""
+    return DeviceError(f"autopilot {address}: expected {expected}, found {found}; {fix}")
+
+
+def check_address(address: str) -> None:
+    """Look at the address before MAVSDK does: it shares a busy UDP port silently and reports bad ones without a reason.
+
+    Raises:
+        DeviceError: syntax, port range, busy or foreign local address, serial port missing or not accessible.
+    """
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
+        raise device_error(address, f"an address like {_FORMS}", "something else", "correct devices.autopilot.address")
+    if match["serial"]:
+        _check_serial(address, match["path"])
+        return
+    port = int(match["port"])
+    if not 0 < port <= 65535:
+        raise device_error(address, "a port from 1 to 65535", str(port), "correct devices.autopilot.address")
+    if match["net"] in ("udpin", "tcpin"):
+        kind = socket.SOCK_DGRAM if match["net"] == "udpin" else socket.SOCK_STREAM
+        _check_bindable(address, match["host"], port, kind)
+
+
+def _check_serial(address: str, path: str) -> None:
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as error:
+        fix = "plug the autopilot in, or correct devices.autopilot.address (ls /dev/serial/by-id)"
+        raise device_error(address, f"the serial port {path}", error.strerror or str(error), fix) from None
+    if not stat.S_ISCHR(mode):
+        raise device_error(address, f"a serial port at {path}", "no device file", "correct devices.autopilot.address")
+    if not os.access(path, os.R_OK | os.W_OK):
+        fix = "add the user to the group that owns it (usually dialout) and log in again"
+        raise device_error(address, f"permission to read and write {path}", "none", fix)
+
+
+def _check_bindable(address: str, host: str, port: int, kind: socket.SocketKind) -> None:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                fix = "stop that program (another companion, QGroundControl, a MAVLink router?) or use another port"
+                raise device_error(address, f"port {port} to be free", "another program on it", fix) from None
+            fix = "use an address of this machine, 0.0.0.0 for all"
+            raise device_error(address, f"a local address in {host}", error.strerror or str(error), fix) from None
+
+
+def add_connection(mavsdk: Mavsdk, address: str) -> Any:
+    """Open the connection; the handle that `Mavsdk.remove_connection` takes. Blocks while a TCP connection is made.
+
+    Raises:
+        DeviceError: MAVSDK could not open it.
+    """
+    try:
+        return mavsdk.add_any_connection_with_handle(address)
+    except MavsdkConnectionError as error:
+        found = str(error).removeprefix("Connection failed: ").lower().replace("_", " ")
+        if ConnectionResult.BAUDRATE_UNKNOWN.name in str(error):
+            fix = "use a baud rate that the port knows, 921600 for PX4's TELEM2"
+        else:
+            fix = "check cable, address and that no other program holds it"
+        raise device_error(address, "to open the connection", found, fix) from None
+
+
+async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any:
+    """The MAVSDK system whose heartbeat comes first, if it is PX4.
+
+    Raises:
+        DeviceError: no heartbeat within `timeout_s`, or another autopilot's.
+    """
+    loop = asyncio.get_running_loop()
+    found: asyncio.Future[Any] = loop.create_future()
+
+    def resolve(system: Any) -> None:
+        if not found.done():
+            found.set_result(system)
+
+    handle = mavsdk.first_autopilot_async(timeout_s, lambda system: loop.call_soon_threadsafe(resolve, system))
+    try:
+        # MAVSDK keeps the deadline; this one only guards against MAVSDK.
+        system = await asyncio.wait_for(found, timeout_s + 2.0)
+    except TimeoutError:
+        system = None
+    finally:
+        mavsdk.cancel_first_autopilot(handle)
+    if system is None:
+        fix = "power the autopilot, check cable, baud or PX4's MAVLink target address and port"
+        raise device_error(address, f"a PX4 heartbeat within {timeout_s:g} s", "none", fix)
+    kind = system.autopilot_type()
+    if kind != AutopilotKind.PX4:
+        raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion speaks no other's modes")
+    return system
+
+
+def _log_native(level: Any, message: str, file: str | None, line: int) -> bool:
+    del level, file, line
+    _native_log.debug("%s", message)
+    return True  # keeps MAVSDK from printing it
+
+
+def quiet_native_log() -> Callable[[], None]:
+    """Send MAVSDK's own log to the logger `companion.mavsdk` at DEBUG instead of the terminal. Returns the undo."""
+    global _log_users
+    with _log_lock:
+        _log_users += 1
+        if _log_users == 1:
+            log_subscribe(_log_native)
+    undone = False
+
+    def undo() -> None:
+        nonlocal undone
+        global _log_users
+        with _log_lock:
+            if undone:
+                return
+            undone = True
+            _log_users -= 1
+            # After the last instance is gone no thread of MAVSDK is left to call into Python while the interpreter ends.
+            if _log_users == 0:
+                log_unsubscribe()
+
+    return undo

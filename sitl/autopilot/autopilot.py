@@ -1,0 +1,322 @@
+"""The PX4 stub without its wire: commander, navigator, estimator and cascade stepped on world time. No I/O, no clock.
+
+Frames are PX4's: local NED, body FRD. Everything that arrives carries the world time of its arrival; nothing in here knows sockets,
+so the same object flies behind MAVLink in real time and inside a faster-than-real-time loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from companion.frames import quat_multiply
+from companion.types import Quat, Vec3
+from sitl.autopilot.cascade import Cascade, CascadeGains
+from sitl.autopilot.commander import Command, Commander, Notice, Result
+from sitl.autopilot.estimator import Estimator
+from sitl.autopilot.land_detector import LandDetector
+from sitl.autopilot.modes import Health, NavState, OffboardKind
+from sitl.autopilot.navigator import Navigator
+from sitl.autopilot.params import Params
+from sitl.autopilot.position_control import heading_rad
+from sitl.autopilot.setpoints import OffboardTarget, PositionTarget, RateTarget
+from sitl.autopilot.types import AttitudeTarget, Estimate, ImuSample, RotorCommands
+
+Command7 = tuple[float, float, float, float, float, float, float]
+
+_STOPPED: RotorCommands = (0.0, 0.0, 0.0, 0.0)
+_COMMANDER_PERIOD_S = 0.01
+_POSITION_PERIOD_S = 0.004
+_EARTH_RADIUS_M = 6371000.0
+_EV_POSITION_AND_YAW = 1 | 2 | 8
+"""EKF2_EV_CTRL: horizontal position, vertical position, yaw. Without magnetometer, barometer and GPS PX4 needs all of them."""
+_TIME_EPSILON_S = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Battery:
+    """What the power module measures."""
+
+    voltage_v: float = 16.2
+    current_a: float = 0.5
+    remaining: float = 1.0
+    """0 to 1."""
+    consumed_mah: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where local (0, 0, 0) lies on earth (SET_GPS_GLOBAL_ORIGIN)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+    def local_ned_m(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
+        """Local position of a point nearby (equirectangular)."""
+        north = math.radians(latitude_deg - self.latitude_deg) * _EARTH_RADIUS_M
+        east = math.radians(longitude_deg - self.longitude_deg) * _EARTH_RADIUS_M * self._shrink()
+        return (north, east, self.altitude_m - altitude_m)
+
+    def global_deg_m(self, position_ned_m: Vec3) -> Vec3:
+        """Latitude and longitude in degrees, altitude in m."""
+        north, east, down = position_ned_m
+        latitude = self.latitude_deg + math.degrees(north / _EARTH_RADIUS_M)
+        longitude = self.longitude_deg + math.degrees(east / (_EARTH_RADIUS_M * self._shrink()))
+        return (latitude, longitude, self.altitude_m - down)
+
+    def _shrink(self) -> float:
+        return max(math.cos(math.radians(self.latitude_deg)), 1e-6)
+
+
+def gains_from_params(params: Params) -> CascadeGains:
+    """Gains of the attitude and rate loops as MC_* say."""
+    real = params.real
+
+    def axes(pattern: str) -> Vec3:
+        return (real(pattern.format("ROLL")), real(pattern.format("PITCH")), real(pattern.format("YAW")))
+
+    roll_max, pitch_max, yaw_max = axes("MC_{}RATE_MAX")
+    return CascadeGains(
+        attitude_p=axes("MC_{}_P"),
+        rate_p=axes("MC_{}RATE_P"),
+        rate_i=axes("MC_{}RATE_I"),
+        rate_d=axes("MC_{}RATE_D"),
+        rate_max_rad_s=(math.radians(roll_max), math.radians(pitch_max), math.radians(yaw_max)),
+        integrator_max=real("MC_RR_INT_LIM"),
+        d_cutoff_hz=real("IMU_GYRO_CUTOFF"),
+    )
+
+
+class Px4Stub:
+    """A PX4-like autopilot.
+
+    Args:
+        params: the parameter store; read live.
+        estimator: stands for EKF2.
+        cascade: attitude and rate loops and mixer.
+        setpoint_delay_s: world time from the arrival of a setpoint to its effect in the attitude loop.
+    """
+
+    def __init__(
+        self, params: Params, estimator: Estimator, cascade: Cascade, *, setpoint_delay_s: float = 0.0
+    ) -> None:
+        self.params = params
+        self.commander = Commander(params)
+        self.navigator = Navigator(params)
+        self.land = LandDetector(params)
+        self.battery = Battery()
+        self.origin: Origin | None = None
+        self.home_ned_m: Vec3 | None = None
+        self.notices: deque[Notice] = deque(maxlen=64)
+        """STATUSTEXTs not yet sent; oldest are dropped when nobody sends them."""
+        self.t_s = 0.0
+        self.imu: ImuSample | None = None
+        self.estimate: Estimate | None = None
+        self.target = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0)
+        """What the attitude loop follows: ATTITUDE_TARGET."""
+        self.rotors: RotorCommands = _STOPPED
+        self.vision_received = 0
+        self.vision_passed_on = 0
+        """Vision poses that arrived, and those among them that EKF2_EV_CTRL let through to the estimator."""
+        self._estimator = estimator
+        self._cascade = cascade
+        self._setpoint_delay_s = setpoint_delay_s
+        self._queue: deque[tuple[float, OffboardTarget]] = deque()
+        self._offboard: OffboardTarget | None = None
+        self._setpoint_at_s: float | None = None
+        self._setpoint_kind = OffboardKind.ATTITUDE
+        self._next_commander_s = -math.inf
+        self._position_at_s = -math.inf
+        self._flying: NavState | None = None
+        self._climb_rate_controlled = False
+
+    @property
+    def armed(self) -> bool:
+        """Rotors may turn."""
+        return self.commander.armed
+
+    @property
+    def nav_state(self) -> NavState:
+        """The mode that flies."""
+        return self.commander.nav_state
+
+    @property
+    def landed(self) -> bool:
+        """Land detector."""
+        return self.land.landed
+
+    @property
+    def position_controlled(self) -> bool:
+        """The position controller makes the attitude target."""
+        return self._climb_rate_controlled
+
+    @property
+    def home_set(self) -> bool:
+        """Home is known, locally and globally."""
+        return self.home_ned_m is not None and self.origin is not None
+
+    def step(self, imu: ImuSample) -> RotorCommands:
+        """Advance to the sample's world time; returns normalised rotor commands, all zero while disarmed."""
+        dt_s = imu.t_s - self.imu.t_s if self.imu is not None else 0.0
+        self.imu = imu
+        self.t_s = t_s = imu.t_s
+        self._estimator.predict(imu)
+        self.estimate = estimate = self._estimator.estimate()
+        while self._queue and self._queue[0][0] <= t_s + _TIME_EPSILON_S:
+            self._offboard = self._queue.popleft()[1]
+        if t_s >= self._next_commander_s:
+            self._next_commander_s = t_s + _COMMANDER_PERIOD_S - _TIME_EPSILON_S
+            self._command_cycle(t_s, estimate)
+        if not self.commander.armed or self.commander.nav_state is NavState.TERMINATION:
+            self.target = AttitudeTarget(estimate.attitude_ned_frd, 0.0)
+            self.rotors = _STOPPED
+            return _STOPPED
+        self._choose_target(t_s, estimate)
+        if dt_s > 0.0:
+            self.rotors = self._cascade.step(dt_s, estimate, self.target)
+        return self.rotors
+
+    def on_setpoint(self, t_s: float, target: OffboardTarget) -> None:
+        """An offboard setpoint arrived at world time `t_s`."""
+        self._setpoint_at_s = t_s
+        self._setpoint_kind = target.kind if isinstance(target, PositionTarget) else OffboardKind.ATTITUDE
+        self._queue.append((t_s + self._setpoint_delay_s, target))
+
+    def on_attitude_target(self, t_s: float, target: AttitudeTarget) -> None:
+        """SET_ATTITUDE_TARGET arrived at world time `t_s`."""
+        self.on_setpoint(t_s, target)
+
+    def on_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> bool:
+        """A vision pose of a kind that EKF2 fuses arrived at world time `t_s`. False: EKF2_EV_CTRL keeps it out."""
+        self.vision_received += 1
+        if self.params.integer("EKF2_EV_CTRL") & _EV_POSITION_AND_YAW != _EV_POSITION_AND_YAW:
+            return False
+        self.vision_passed_on += 1
+        self._estimator.fuse_vision(t_s - self.params.real("EKF2_EV_DELAY") / 1000.0, position_ned_m, attitude_ned_frd)
+        return True
+
+    def on_command(self, t_s: float, command: int, params: Command7) -> Result:
+        """A MAV_CMD with param1 to param7 arrived at world time `t_s`; positions in degrees and m."""
+        was_armed = self.commander.armed
+        result = self.commander.command(t_s, command, params, self._health(t_s))
+        if self.commander.armed and not was_armed:
+            self._on_arming()
+        if result is Result.ACCEPTED and command == Command.DO_REPOSITION and self.estimate is not None:
+            self._follow_mode(self.estimate)
+            self._reposition(params)
+        self._collect_notices()
+        return result
+
+    def set_origin(self, origin: Origin) -> None:
+        """SET_GPS_GLOBAL_ORIGIN: from now on the local position is a global one too."""
+        self.origin = origin
+
+    def arming_problem(self) -> str | None:
+        """Why arming would be refused now; None: it would not."""
+        return self.commander.arming_problem(self._health(self.t_s))
+
+    def _command_cycle(self, t_s: float, estimate: Estimate) -> None:
+        commander = self.commander
+        self.land.update(
+            t_s,
+            commander.armed,
+            estimate,
+            self.target.thrust,
+            self._climb_rate_controlled,
+            self.navigator.descend_m_s,
+        )
+        if self.home_ned_m is None and self.origin is not None and estimate.position_valid:
+            self.home_ned_m = estimate.position_ned_m
+        health = self._health(t_s)
+        if commander.armed and commander.nav_state is NavState.TAKEOFF and self.navigator.takeoff_done:
+            commander.change_mode(NavState.LOITER, health)  # COM_TAKEOFF_ACT 0
+        commander.update(t_s, health)
+        self._follow_mode(estimate)
+        self._collect_notices()
+
+    def _follow_mode(self, estimate: Estimate) -> None:
+        state = self.commander.nav_state if self.commander.armed else None
+        if state is self._flying:
+            return
+        self._flying = state
+        self._position_at_s = -math.inf
+        if state is None:
+            self.navigator.leave()
+        else:
+            self.navigator.enter(state, estimate, self.home_ned_m, self.land.landed)
+
+    def _choose_target(self, t_s: float, estimate: Estimate) -> None:
+        offboard = self._offboard if self.commander.nav_state is NavState.OFFBOARD else None
+        if isinstance(offboard, AttitudeTarget | RateTarget):
+            self._climb_rate_controlled = False
+            self.navigator.settle(self.land.landed)
+            if isinstance(offboard, RateTarget):
+                self.target = self._attitude_for_rates(estimate, offboard)
+            else:
+                self.target = offboard
+            return
+        self._climb_rate_controlled = True
+        since_s = t_s - self._position_at_s
+        if since_s < _POSITION_PERIOD_S - _TIME_EPSILON_S:
+            return
+        self._position_at_s = t_s
+        self.target = self.navigator.step(
+            t_s,
+            since_s if math.isfinite(since_s) else 0.0,
+            estimate,
+            self.home_ned_m,
+            offboard,
+            armed_s=t_s - (self.commander.armed_at_s or 0.0),
+            landed=self.land.landed,
+            touching=self.land.ground_contact or self.land.maybe_landed,
+        )
+
+    def _attitude_for_rates(self, estimate: Estimate, rates: RateTarget) -> AttitudeTarget:
+        """The attitude whose P loop asks for exactly these rates: the cascade has one entrance only."""
+        gains = (self.params.real("MC_ROLL_P"), self.params.real("MC_PITCH_P"), self.params.real("MC_YAW_P"))
+        x, y, z = (rate / (2.0 * gain) for rate, gain in zip(rates.rates_frd_rad_s, gains, strict=True))
+        size = math.sqrt(x * x + y * y + z * z)
+        if size > 0.7:
+            x, y, z = x * 0.7 / size, y * 0.7 / size, z * 0.7 / size
+        turn = (math.sqrt(1.0 - (x * x + y * y + z * z)), x, y, z)
+        return AttitudeTarget(quat_multiply(estimate.attitude_ned_frd, turn), rates.thrust)
+
+    def _on_arming(self) -> None:
+        self._cascade.reset()
+        estimate = self.estimate
+        if estimate is not None and estimate.position_valid and self.params.integer("COM_HOME_EN"):
+            self.home_ned_m = estimate.position_ned_m
+
+    def _reposition(self, params: Command7) -> None:
+        if self.origin is None or self.estimate is None:
+            return
+        known = self.origin.global_deg_m(self.estimate.position_ned_m)
+        wanted = (params[4], params[5], params[6])
+        where = tuple(new if math.isfinite(new) else old for new, old in zip(wanted, known, strict=True))
+        yaw = params[3] if math.isfinite(params[3]) else None
+        self.navigator.reposition(self.origin.local_ned_m(where[0], where[1], where[2]), yaw)
+
+    def _health(self, t_s: float) -> Health:
+        estimate = self.estimate
+        return Health(
+            attitude_valid=estimate is not None and estimate.attitude_valid,
+            position_valid=estimate is not None and estimate.position_valid,
+            origin_set=self.origin is not None,
+            home_set=self.home_set,
+            landed=self.land.landed,
+            maybe_landed=self.land.maybe_landed,
+            setpoint_age_s=None if self._setpoint_at_s is None else t_s - self._setpoint_at_s,
+            setpoint_kind=self._setpoint_kind,
+        )
+
+    def _collect_notices(self) -> None:
+        if self.commander.notices:
+            self.notices.extend(self.commander.notices)
+            self.commander.notices.clear()
+
+    @property
+    def heading_rad(self) -> float:
+        """Yaw of the estimate, rad."""
+        return heading_rad(self.estimate.attitude_ned_frd) if self.estimate is not None else 0.0

@@ -1,0 +1,89 @@
+"""Landed detection, pure, after PX4's MulticopterLandDetector: ground contact, then maybe landed, then landed."""
+
+from __future__ import annotations
+
+import math
+
+from sitl.autopilot.params import Params
+from sitl.autopilot.types import Estimate
+
+_DESCENT_THRESHOLD_M_S = 0.3
+_BLIND_S = 8.0
+"""Without vertical velocity: this long at minimum thrust and without rotation counts as landed."""
+
+
+class LandDetector:
+    """Three conditions in a row, each held for a third of LNDMC_TRIG_TIME; each is lost at once."""
+
+    def __init__(self, params: Params) -> None:
+        self._params = params
+        self._contact_since_s: float | None = None
+        self._maybe_since_s: float | None = None
+        self._landed_since_s: float | None = None
+        self._low_since_s: float | None = None
+        self.ground_contact = True
+        self.maybe_landed = True
+        self.landed = True
+
+    def update(
+        self,
+        t_s: float,
+        armed: bool,
+        estimate: Estimate,
+        thrust: float,
+        climb_rate_controlled: bool,
+        descend_m_s: float,
+    ) -> None:
+        """One cycle. `thrust` is the collective that the attitude loop got, `descend_m_s` the commanded speed down."""
+        if not armed:
+            self.ground_contact = self.maybe_landed = self.landed = True
+            self._contact_since_s = self._maybe_since_s = self._landed_since_s = -math.inf
+            self._low_since_s = None
+            return
+        hold_s = self._params.real("LNDMC_TRIG_TIME") / 3.0
+        contact = self._contact_now(estimate, thrust, climb_rate_controlled, descend_m_s)
+        self._contact_since_s, self.ground_contact = _held(t_s, contact, self._contact_since_s, hold_s)
+        maybe = self._maybe_now(t_s, estimate, thrust, climb_rate_controlled)
+        self._maybe_since_s, self.maybe_landed = _held(t_s, maybe, self._maybe_since_s, hold_s)
+        self._landed_since_s, self.landed = _held(t_s, self.maybe_landed, self._landed_since_s, hold_s)
+
+    def _contact_now(self, estimate: Estimate, thrust: float, climb_rate_controlled: bool, descend_m_s: float) -> bool:
+        if not estimate.position_valid:
+            return False
+        params = self._params
+        thr_min, thr_hover = params.real("MPC_THR_MIN"), params.real("MPC_THR_HOVER")
+        # The hover thrust estimator runs in climb-rate-controlled modes only; where it does, PX4 trusts the hover thrust more.
+        share = 0.6 if climb_rate_controlled and params.integer("MPC_USE_HTE") else 0.3
+        if thrust > thr_min + share * (thr_hover - thr_min):
+            return False
+        if climb_rate_controlled and not self.maybe_landed and not self.landed and descend_m_s < _DESCENT_THRESHOLD_M_S:
+            return False
+        vx, vy, vz = estimate.velocity_ned_m_s
+        still_m_s = params.real("LNDMC_Z_VEL_MAX") * (2.5 if self.maybe_landed else 1.0)
+        return abs(vz) <= still_m_s and math.hypot(vx, vy) <= params.real("LNDMC_XY_VEL_MAX")
+
+    def _maybe_now(self, t_s: float, estimate: Estimate, thrust: float, climb_rate_controlled: bool) -> bool:
+        params = self._params
+        thr_min, thr_hover = params.real("MPC_THR_MIN"), params.real("MPC_THR_HOVER")
+        least = thr_min + 0.1 * (thr_hover - thr_min) if climb_rate_controlled else params.real("MPC_MANTHR_MIN") + 0.01
+        if thrust > least:
+            self._low_since_s = None
+            return False
+        if self._low_since_s is None:
+            self._low_since_s = t_s
+        turning_rad_s = math.radians(params.real("LNDMC_ROT_MAX")) * (2.5 if self.maybe_landed else 1.0)
+        p, q, _ = estimate.rates_frd_rad_s
+        if math.hypot(p, q) > turning_rad_s:
+            return False
+        if estimate.position_valid:
+            return self.ground_contact
+        return t_s - self._low_since_s > _BLIND_S
+
+
+def _held(t_s: float, now: bool, since_s: float | None, hold_s: float) -> tuple[float | None, bool]:
+    """Start of a condition and whether it has lasted `hold_s`."""
+    if not now:
+        return None, False
+    if since_s is None:
+        since_s = t_s
+    return since_s, t_s - since_s >= hold_s

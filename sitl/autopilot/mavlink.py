@@ -1,0 +1,232 @@
+"""The PX4 stub's wire: MAVLink 2 over UDP on 127.0.0.1, an onboard link and optionally one to a ground station.
+
+As PX4 SITL does, a link sends to its remote port from the start and from then on to whoever spoke last. Streams run on world time,
+driven by `pump`; what arrives is handled when it arrives.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+from collections import deque
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self, cast
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.receive import Receiver, hash_check_message, param_value_message
+from sitl.autopilot.streams import STREAMS, Schedule
+
+Message = Any
+
+_PARAMS_PER_PUMP = 4
+_GROUND_STATION_TIMEOUT_S = 5.0
+_STATUS_TEXT_BYTES = 50
+_CLOSE_DEADLINE_S = 1.0
+
+
+class LinkError(Exception):
+    """A UDP port cannot be had: one line for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """UDP ports of one link."""
+
+    local: int
+    """0: any free one."""
+    remote: int
+    """0: silent until somebody speaks to `local`."""
+
+
+ONBOARD_PORTS = Ports(14580, 14540)
+GROUND_PORTS = Ports(18570, 14550)
+
+
+class Link(asyncio.DatagramProtocol):
+    """One MAVLink channel: own sequence numbers, own streams, own partner."""
+
+    def __init__(self, stub: Px4Stub, receiver: Receiver, partner: tuple[str, int] | None, ground: bool) -> None:
+        self.schedule = Schedule(ground)
+        self.down = False
+        self.port = 0
+        self.messages_in = 0
+        self.messages_out = 0
+        self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._stub = stub
+        self._receiver = receiver
+        self._partner = partner
+        self._transport: asyncio.DatagramTransport | None = None
+        system, component = stub.params.integer("MAV_SYS_ID"), stub.params.integer("MAV_COMP_ID")
+        self._encoder = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._decoder = _new_decoder()
+        self._params_to_send: deque[str | None] = deque()
+        self._ground_station_at_s: float | None = None
+        self._text_id = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The socket is bound."""
+        # Python 3.11's selector transport is a datagram transport in all but its base classes.
+        self._transport = cast(asyncio.DatagramTransport, transport)
+        self.port = int(transport.get_extra_info("sockname")[1])
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The socket is closed."""
+        self._transport = None
+        if not self.closed.done():
+            self.closed.set_result(None)
+
+    def error_received(self, exc: Exception) -> None:
+        """Nobody listens at the partner's port: UDP does not care, and neither does PX4."""
+
+    def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
+        """Decode and handle at once."""
+        if self.down:
+            return
+        messages = self._decoder.parse_buffer(data)
+        if self._decoder.buf_len():
+            self._decoder = _new_decoder()  # a cut message must not swallow the datagrams after it
+        for message in messages or ():
+            if message.get_type() == "BAD_DATA":
+                continue
+            self.messages_in += 1
+            self._partner = (addr[0], addr[1])
+            self._receiver.handle(self, message)
+
+    def close(self) -> None:
+        """Start closing the socket; `closed` tells when it is."""
+        if self._transport is not None:
+            self._transport.close()
+
+    def send(self, message: Message) -> None:
+        """Send one message to the partner, if there is one."""
+        if self.down or self._transport is None or self._partner is None:
+            return
+        data = message.pack(self._encoder)
+        self._encoder.seq = (self._encoder.seq + 1) % 256
+        self.messages_out += 1
+        self._transport.sendto(data, self._partner)
+
+    def send_all_params(self) -> None:
+        """Queue _HASH_CHECK and every parameter; `pump` sends them in portions."""
+        self._params_to_send = deque([None, *self._stub.params])
+
+    def saw_ground_station(self) -> None:
+        """PX4 sends STATUSTEXT only on links where a ground station is alive."""
+        self._ground_station_at_s = self._stub.t_s
+
+    def status_text(self, severity: int, text: str) -> None:
+        """STATUSTEXT, in chunks when it is long."""
+        if self._ground_station_at_s is None:
+            return
+        if self._stub.t_s - self._ground_station_at_s > _GROUND_STATION_TIMEOUT_S:
+            return
+        data = text.encode()
+        chunks = [data[i : i + _STATUS_TEXT_BYTES] for i in range(0, len(data), _STATUS_TEXT_BYTES)]
+        if len(chunks) > 1:
+            self._text_id = self._text_id % 65535 + 1
+        for i, chunk in enumerate(chunks):
+            self.send(mavlink.MAVLink_statustext_message(severity, chunk, self._text_id if len(chunks) > 1 else 0, i))
+
+    def pump(self, t_s: float) -> None:
+        """Send the streams that are due at world time `t_s` and a portion of the parameter list."""
+        if self.down or self._partner is None:
+            return
+        for message_id in self.schedule.due(t_s):
+            message = STREAMS[message_id].build(self._stub)
+            if message is not None:
+                self.send(message)
+        for _ in range(min(_PARAMS_PER_PUMP, len(self._params_to_send))):
+            name = self._params_to_send.popleft()
+            self.send(hash_check_message(self._stub) if name is None else param_value_message(self._stub, name))
+
+
+def _new_decoder() -> Any:
+    decoder = mavlink.MAVLink(None)
+    decoder.robust_parsing = True
+    return decoder
+
+
+class MavlinkServer:
+    """Owns the links of one stub. `async with` opens and closes the sockets.
+
+    Raises (on entering):
+        LinkError: a port is in use or may not be had.
+    """
+
+    def __init__(
+        self, stub: Px4Stub, onboard: Ports = ONBOARD_PORTS, ground: Ports | None = None, host: str = "127.0.0.1"
+    ) -> None:
+        self._stub = stub
+        self._host = host
+        self._wanted = [(onboard, False)] + ([(ground, True)] if ground is not None else [])
+        self._links: list[Link] = []
+        self._down = False
+
+    @property
+    def onboard_port(self) -> int:
+        """Local port of the onboard link (while open)."""
+        return self._links[0].port
+
+    @property
+    def ground_port(self) -> int | None:
+        """Local port of the link to the ground station; None: there is none."""
+        return self._links[1].port if len(self._links) > 1 else None
+
+    @property
+    def link_down(self) -> bool:
+        """Fault: nothing goes in or out on any link."""
+        return self._down
+
+    @link_down.setter
+    def link_down(self, down: bool) -> None:
+        self._down = down
+        for link in self._links:
+            link.down = down
+
+    @property
+    def messages_in(self) -> int:
+        """Messages decoded on all links."""
+        return sum(link.messages_in for link in self._links)
+
+    async def __aenter__(self) -> Self:
+        receiver = Receiver(self._stub)
+        loop = asyncio.get_running_loop()
+        for ports, ground in self._wanted:
+            partner = (self._host, ports.remote) if ports.remote else None
+            link = Link(self._stub, receiver, partner, ground)
+            link.down = self._down
+            try:
+                await loop.create_datagram_endpoint(lambda link=link: link, local_addr=(self._host, ports.local))  # type: ignore[misc]
+            except OSError as error:
+                await self._close()
+                found = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be opened ({error.strerror})"
+                raise LinkError(
+                    f"PX4 stub: UDP port {self._host}:{ports.local} {found}; end the program that holds it or choose another port"
+                ) from error
+            self._links.append(link)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._close()
+
+    def pump(self, t_s: float) -> None:
+        """Send what is due at world time `t_s`; call it every 2 to 4 ms."""
+        notices = self._stub.notices
+        while notices:
+            notice = notices.popleft()
+            for link in self._links:
+                link.status_text(int(notice.severity), notice.text)
+        for link in self._links:
+            link.pump(t_s)
+
+    async def _close(self) -> None:
+        links, self._links = self._links, []
+        for link in links:
+            link.close()
+        if links:
+            await asyncio.wait([link.closed for link in links], timeout=_CLOSE_DEADLINE_S)

@@ -1,0 +1,136 @@
+"""PX4's navigation states: their place in HEARTBEAT.custom_mode and what each of them needs to run (ModeUtil/mode_requirements)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+
+class NavState(Enum):
+    """vehicle_status.nav_state; the value is (main mode, sub mode) of HEARTBEAT.custom_mode."""
+
+    MANUAL = (1, 0)
+    ALTCTL = (2, 0)
+    POSCTL = (3, 0)
+    TAKEOFF = (4, 2)
+    LOITER = (4, 3)
+    MISSION = (4, 4)
+    RTL = (4, 5)
+    LAND = (4, 6)
+    ACRO = (5, 0)
+    OFFBOARD = (6, 0)
+    STABILIZED = (7, 0)
+    # PX4 shows both of these as AUTO LAND / MANUAL; a third number keeps them apart in here.
+    DESCEND = (4, 6, 1)
+    TERMINATION = (1, 0, 1)
+
+    @property
+    def custom_mode(self) -> int:
+        """HEARTBEAT.custom_mode."""
+        numbers: tuple[int, ...] = self.value
+        return numbers[0] << 16 | numbers[1] << 24
+
+    @property
+    def auto(self) -> bool:
+        """PX4 flies by itself (MAV_MODE_FLAG_AUTO_ENABLED)."""
+        numbers: tuple[int, ...] = self.value
+        return numbers[0] == 4
+
+
+_BY_CUSTOM = {state.value: state for state in NavState if len(state.value) == 2}
+
+
+def nav_state_from_custom(main_mode: int, sub_mode: int) -> NavState | None:
+    """Navigation state asked for by DO_SET_MODE param2 and param3; AUTO without a sub mode is MISSION. None: there is none."""
+    if main_mode == 4 and sub_mode == 0:
+        return NavState.MISSION
+    return _BY_CUSTOM.get((main_mode, sub_mode if main_mode == 4 else 0))
+
+
+class Need(Enum):
+    """What a mode may require; the value is PX4's text when it is missing."""
+
+    ATTITUDE = "No valid attitude estimate"
+    LOCAL_ALTITUDE = "No valid altitude estimate"
+    LOCAL_POSITION = "No valid position estimate"
+    GLOBAL_POSITION = "No valid global position estimate"
+    HOME = "Home position not set"
+    OFFBOARD_SIGNAL = "No offboard signal"
+    MANUAL_CONTROL = "No manual control input"
+    MISSION = "No valid mission available"
+
+
+_POSITION = (Need.ATTITUDE, Need.LOCAL_ALTITUDE, Need.LOCAL_POSITION)
+
+REQUIREMENTS: dict[NavState, tuple[Need, ...]] = {
+    NavState.MANUAL: (Need.MANUAL_CONTROL,),
+    NavState.ACRO: (Need.MANUAL_CONTROL,),
+    NavState.STABILIZED: (Need.ATTITUDE, Need.MANUAL_CONTROL),
+    NavState.ALTCTL: (Need.ATTITUDE, Need.LOCAL_ALTITUDE, Need.MANUAL_CONTROL),
+    NavState.POSCTL: (*_POSITION, Need.MANUAL_CONTROL),
+    NavState.TAKEOFF: _POSITION,
+    NavState.LOITER: (*_POSITION, Need.GLOBAL_POSITION),
+    NavState.MISSION: (*_POSITION, Need.GLOBAL_POSITION, Need.MISSION),
+    NavState.RTL: (*_POSITION, Need.GLOBAL_POSITION, Need.HOME),
+    NavState.LAND: _POSITION,
+    NavState.DESCEND: (Need.ATTITUDE,),
+    NavState.OFFBOARD: (Need.ATTITUDE, Need.OFFBOARD_SIGNAL),
+    NavState.TERMINATION: (),
+}
+
+PREVENT_ARMING = frozenset({NavState.RTL, NavState.LAND, NavState.DESCEND, NavState.TERMINATION})
+"""Modes in which PX4 does not arm (mode_req_prevent_arming); it is not in them after a disarm either."""
+
+
+class OffboardKind(Enum):
+    """Which fields of offboard_control_mode the setpoint stream sets."""
+
+    ATTITUDE = auto()  # attitude or body rates: no position needed
+    POSITION = auto()
+    VELOCITY = auto()
+    ACCELERATION = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What the commander looks at, sampled from the rest of the autopilot at one instant."""
+
+    attitude_valid: bool
+    position_valid: bool
+    origin_set: bool
+    """SET_GPS_GLOBAL_ORIGIN was received, so the local position is a global one too."""
+    home_set: bool
+    landed: bool
+    maybe_landed: bool
+    """The land detector's last stage before `landed`; enough for a disarm command."""
+    setpoint_age_s: float | None
+    """World time since the last offboard setpoint arrived; None: never."""
+    setpoint_kind: OffboardKind = OffboardKind.ATTITUDE
+
+    def offboard_available(self, timeout_s: float) -> bool:
+        """offboardCheck: fresh, and what the setpoint needs is valid. `timeout_s` is COM_OF_LOSS_T."""
+        if self.setpoint_age_s is None or self.setpoint_age_s > timeout_s:
+            return False
+        return self.setpoint_kind is OffboardKind.ATTITUDE or self.position_valid
+
+    def missing(self, state: NavState, offboard_timeout_s: float) -> Need | None:
+        """First requirement of a mode that is not met; None: the mode can run."""
+        for need in REQUIREMENTS[state]:
+            if not self._met(need, offboard_timeout_s):
+                return need
+        return None
+
+    def _met(self, need: Need, offboard_timeout_s: float) -> bool:
+        match need:
+            case Need.ATTITUDE:
+                return self.attitude_valid
+            case Need.LOCAL_ALTITUDE | Need.LOCAL_POSITION:
+                return self.position_valid
+            case Need.GLOBAL_POSITION:
+                return self.position_valid and self.origin_set
+            case Need.HOME:
+                return self.home_set
+            case Need.OFFBOARD_SIGNAL:
+                return self.offboard_available(offboard_timeout_s)
+            case Need.MANUAL_CONTROL | Need.MISSION:
+                return False  # the stub has neither a radio nor a mission store

@@ -1,0 +1,354 @@
+"""Telemetry of the PX4 stub: one builder per MAVLink message. No I/O, no clock.
+
+A builder returns None while PX4 would not send the message: LOCAL_POSITION_NED without a valid position, HOME_POSITION without home.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.frames import euler_zyx_from_quat
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.modes import NavState
+from sitl.autopilot.types import Estimate
+
+Message = Any
+
+_NAN = math.nan
+_NO_COVARIANCE = [_NAN] * 21
+_PRESSURE_HPA, _TEMPERATURE_C = 1013.25, 25.0
+_VERSION = 1 << 24 | 16 << 16 | 1 << 8 | 255
+"""1.16.1, release."""
+
+
+def _ms(stub: Px4Stub) -> int:
+    return int(stub.t_s * 1e3) & 0xFFFFFFFF
+
+
+def _us(stub: Px4Stub) -> int:
+    return int(stub.t_s * 1e6)
+
+
+def heartbeat(stub: Px4Stub) -> Message:
+    """HEARTBEAT."""
+    state, commander = stub.nav_state, stub.commander
+    base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    if state not in (NavState.TERMINATION, NavState.MANUAL, NavState.ACRO):
+        base |= mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
+    if state.auto:
+        base |= mavlink.MAV_MODE_FLAG_AUTO_ENABLED
+    if stub.armed:
+        base |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+    if state is NavState.TERMINATION:
+        status = mavlink.MAV_STATE_FLIGHT_TERMINATION
+    elif stub.armed:
+        status = mavlink.MAV_STATE_CRITICAL if commander.failsafe else mavlink.MAV_STATE_ACTIVE
+    else:
+        status = mavlink.MAV_STATE_STANDBY
+    return mavlink.MAVLink_heartbeat_message(
+        stub.params.integer("MAV_TYPE"), mavlink.MAV_AUTOPILOT_PX4, base, state.custom_mode, status, 3
+    )
+
+
+def sys_status(stub: Px4Stub) -> Message:
+    """SYS_STATUS. As measured, PREARM_CHECK is never healthy with SYS_HAS_MAG = 0; position sources are not reported at all."""
+    present = (
+        mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+        | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+        | mavlink.MAV_SYS_STATUS_AHRS
+        | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+        | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    )
+    healthy = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    healthy |= mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+    if stub.estimate is not None and stub.estimate.attitude_valid:
+        healthy |= mavlink.MAV_SYS_STATUS_AHRS
+    if stub.params.integer("SYS_HAS_MAG"):
+        present |= mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+        healthy |= mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+        if stub.arming_problem() is None:
+            healthy |= mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    battery = stub.battery
+    return mavlink.MAVLink_sys_status_message(
+        present, present, healthy, 300, _u16(battery.voltage_v * 1e3), _i16(battery.current_a * 1e2),
+        _percent(battery.remaining), 0, 0, 0, 0, 0, 0,
+    )  # fmt: skip
+
+
+def extended_sys_state(stub: Px4Stub) -> Message:
+    """EXTENDED_SYS_STATE."""
+    if stub.landed:
+        landed = mavlink.MAV_LANDED_STATE_ON_GROUND
+    elif stub.nav_state is NavState.TAKEOFF:
+        landed = mavlink.MAV_LANDED_STATE_TAKEOFF
+    elif stub.nav_state in (NavState.LAND, NavState.DESCEND):
+        landed = mavlink.MAV_LANDED_STATE_LANDING
+    else:
+        landed = mavlink.MAV_LANDED_STATE_IN_AIR
+    return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, landed)
+
+
+def battery_status(stub: Px4Stub) -> Message:
+    """BATTERY_STATUS of battery 1."""
+    battery, cells = stub.battery, max(1, min(10, stub.params.integer("BAT1_N_CELLS")))
+    each = _u16(battery.voltage_v / cells * 1e3)
+    voltages = [each if i < cells else 65535 for i in range(10)]
+    low = battery.remaining < stub.params.real("BAT_LOW_THR")
+    charge = mavlink.MAV_BATTERY_CHARGE_STATE_LOW if low else mavlink.MAV_BATTERY_CHARGE_STATE_OK
+    return mavlink.MAVLink_battery_status_message(
+        0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 32767, voltages, _i16(battery.current_a * 1e2),
+        int(battery.consumed_mah), -1, _percent(battery.remaining), 0, charge,
+    )  # fmt: skip
+
+
+def attitude(stub: Px4Stub) -> Message | None:
+    """ATTITUDE."""
+    estimate = _attitude(stub)
+    if estimate is None:
+        return None
+    return mavlink.MAVLink_attitude_message(
+        _ms(stub), *euler_zyx_from_quat(estimate.attitude_ned_frd), *estimate.rates_frd_rad_s
+    )
+
+
+def attitude_quaternion(stub: Px4Stub) -> Message | None:
+    """ATTITUDE_QUATERNION."""
+    estimate = _attitude(stub)
+    if estimate is None:
+        return None
+    return mavlink.MAVLink_attitude_quaternion_message(_ms(stub), *estimate.attitude_ned_frd, *estimate.rates_frd_rad_s)
+
+
+def local_position_ned(stub: Px4Stub) -> Message | None:
+    """LOCAL_POSITION_NED; only while the position is valid."""
+    estimate = _position(stub)
+    if estimate is None:
+        return None
+    return mavlink.MAVLink_local_position_ned_message(_ms(stub), *estimate.position_ned_m, *estimate.velocity_ned_m_s)
+
+
+def odometry(stub: Px4Stub) -> Message | None:
+    """ODOMETRY; on 1.16 the velocity is NED, and child_frame_id says so."""
+    estimate = _attitude(stub)
+    if estimate is None:
+        return None
+    x, y, z = estimate.position_ned_m
+    frame = mavlink.MAV_FRAME_LOCAL_NED
+    return mavlink.MAVLink_odometry_message(
+        _us(stub), frame, frame, x, y, z, estimate.attitude_ned_frd, *estimate.velocity_ned_m_s, *estimate.rates_frd_rad_s,
+        _NO_COVARIANCE, _NO_COVARIANCE, 0, mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT, 100 if estimate.vision_fused else 0,
+    )  # fmt: skip
+
+
+def highres_imu(stub: Px4Stub) -> Message | None:
+    """HIGHRES_IMU: accelerometer and gyroscope only; specific force and rates in FRD."""
+    imu = stub.imu
+    if imu is None:
+        return None
+    return mavlink.MAVLink_highres_imu_message(
+        _us(stub),
+        *imu.accel_frd_m_s2,
+        *imu.gyro_frd_rad_s,
+        0.0,
+        0.0,
+        0.0,
+        _PRESSURE_HPA,
+        0.0,
+        0.0,
+        _TEMPERATURE_C,
+        0x3F,
+    )
+
+
+def scaled_imu(stub: Px4Stub) -> Message | None:
+    """SCALED_IMU: mG and mrad/s."""
+    imu = stub.imu
+    if imu is None:
+        return None
+    accel = (_i16(value / 9.80665 * 1e3) for value in imu.accel_frd_m_s2)
+    gyro = (_i16(value * 1e3) for value in imu.gyro_frd_rad_s)
+    return mavlink.MAVLink_scaled_imu_message(_ms(stub), *accel, *gyro, 0, 0, 0, int(_TEMPERATURE_C * 100))
+
+
+def estimator_status(stub: Px4Stub) -> Message | None:
+    """ESTIMATOR_STATUS. The absolute position flags follow the fusion of vision (they drop 0.55 s after its end)."""
+    estimate = stub.estimate
+    if estimate is None:
+        return None
+    flags = mavlink.ESTIMATOR_ATTITUDE if estimate.attitude_valid else 0
+    if estimate.position_valid:
+        flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_HORIZ_REL
+    else:
+        flags |= mavlink.ESTIMATOR_CONST_POS_MODE
+    if estimate.vision_fused:
+        flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_VERT_ABS
+        flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+    accuracy_m = 0.01 if estimate.vision_fused else 1.0
+    return mavlink.MAVLink_estimator_status_message(
+        _us(stub), flags, 0.01, 0.01, 0.01, 0.0, 0.0, 0.0, accuracy_m, accuracy_m
+    )
+
+
+def vfr_hud(stub: Px4Stub) -> Message | None:
+    """VFR_HUD."""
+    estimate = _attitude(stub)
+    if estimate is None:
+        return None
+    north, east, down = estimate.velocity_ned_m_s
+    return mavlink.MAVLink_vfr_hud_message(
+        0.0,
+        math.hypot(north, east),
+        _heading_deg(stub),
+        _percent(stub.target.thrust),
+        _altitude_m(stub, estimate),
+        -down,
+    )
+
+
+def altitude(stub: Px4Stub) -> Message | None:
+    """ALTITUDE."""
+    estimate = _position(stub)
+    if estimate is None:
+        return None
+    local = -estimate.position_ned_m[2]
+    relative = local + stub.home_ned_m[2] if stub.home_ned_m is not None else _NAN
+    absolute = _altitude_m(stub, estimate)
+    return mavlink.MAVLink_altitude_message(_us(stub), local, absolute, local, relative, _NAN, _NAN)
+
+
+def attitude_target(stub: Px4Stub) -> Message | None:
+    """ATTITUDE_TARGET: what the attitude loop follows."""
+    if not stub.armed:
+        return None
+    target = stub.target
+    return mavlink.MAVLink_attitude_target_message(
+        _ms(stub), 0, target.attitude_ned_frd, 0.0, 0.0, target.yaw_rate_rad_s, target.thrust
+    )
+
+
+def position_target_local_ned(stub: Px4Stub) -> Message | None:
+    """POSITION_TARGET_LOCAL_NED: what the position controller follows."""
+    if not stub.armed or not stub.position_controlled:
+        return None
+    target = stub.navigator.target
+    axes = (*target.position_ned_m, *target.velocity_ned_m_s, *target.acceleration_ned_m_s2)
+    mask = sum(1 << i for i, value in enumerate(axes) if value is None)
+    mask |= 1024 if target.yaw_rad is None else 0
+    mask |= 2048 if target.yaw_rate_rad_s is None else 0
+    values = [_NAN if value is None else value for value in (*axes, target.yaw_rad, target.yaw_rate_rad_s)]
+    return mavlink.MAVLink_position_target_local_ned_message(_ms(stub), mavlink.MAV_FRAME_LOCAL_NED, mask, *values)
+
+
+def global_position_int(stub: Px4Stub) -> Message | None:
+    """GLOBAL_POSITION_INT; only with an origin and a valid position."""
+    estimate, origin = _position(stub), stub.origin
+    if estimate is None or origin is None:
+        return None
+    latitude, longitude, absolute = origin.global_deg_m(estimate.position_ned_m)
+    home_down = stub.home_ned_m[2] if stub.home_ned_m is not None else 0.0
+    relative = home_down - estimate.position_ned_m[2]
+    vx, vy, vz = (_i16(value * 1e2) for value in estimate.velocity_ned_m_s)
+    return mavlink.MAVLink_global_position_int_message(
+        _ms(stub), round(latitude * 1e7), round(longitude * 1e7), round(absolute * 1e3), round(relative * 1e3), vx, vy, vz,
+        _heading_deg(stub) * 100,
+    )  # fmt: skip
+
+
+def gps_global_origin(stub: Px4Stub) -> Message | None:
+    """GPS_GLOBAL_ORIGIN."""
+    origin = stub.origin
+    if origin is None:
+        return None
+    return mavlink.MAVLink_gps_global_origin_message(
+        round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7), round(origin.altitude_m * 1e3), _us(stub)
+    )
+
+
+def home_position(stub: Px4Stub) -> Message | None:
+    """HOME_POSITION; only with an origin."""
+    home, origin = stub.home_ned_m, stub.origin
+    if home is None or origin is None:
+        return None
+    latitude, longitude, absolute = origin.global_deg_m(home)
+    return mavlink.MAVLink_home_position_message(
+        round(latitude * 1e7), round(longitude * 1e7), round(absolute * 1e3), *home, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0,
+        _us(stub),
+    )  # fmt: skip
+
+
+def servo_output_raw(stub: Px4Stub) -> Message:
+    """SERVO_OUTPUT_RAW: 1000 to 2000 us per rotor, 900 when disarmed."""
+    pulses = [round(1000 + 1000 * command) for command in stub.rotors] if stub.armed else [900] * 4
+    return mavlink.MAVLink_servo_output_raw_message(_us(stub) & 0xFFFFFFFF, 0, *pulses, 0, 0, 0, 0)
+
+
+def actuator_output_status(stub: Px4Stub) -> Message:
+    """ACTUATOR_OUTPUT_STATUS: rotor commands, 0 to 1."""
+    return mavlink.MAVLink_actuator_output_status_message(_us(stub), 0xF, [*stub.rotors, *[0.0] * 28])
+
+
+def system_time(stub: Px4Stub) -> Message:
+    """SYSTEM_TIME; no wall clock without GPS."""
+    return mavlink.MAVLink_system_time_message(0, _ms(stub))
+
+
+def timesync_request(stub: Px4Stub) -> Message:
+    """TIMESYNC as PX4 asks for it."""
+    return mavlink.MAVLink_timesync_message(0, _us(stub) * 1000)
+
+
+def ping(stub: Px4Stub) -> Message:
+    """PING request to everybody."""
+    return mavlink.MAVLink_ping_message(_us(stub), int(stub.t_s) & 0xFFFFFFFF, 0, 0)
+
+
+def vibration(stub: Px4Stub) -> Message:
+    """VIBRATION."""
+    return mavlink.MAVLink_vibration_message(_us(stub), 0.0, 0.0, 0.0, 0, 0, 0)
+
+
+def autopilot_version(stub: Px4Stub) -> Message:
+    """AUTOPILOT_VERSION: PX4 1.16.1."""
+    capabilities = (
+        mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+        | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+        | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+        | mavlink.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
+        | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+        | mavlink.MAV_PROTOCOL_CAPABILITY_FLIGHT_TERMINATION
+        | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    )
+    return mavlink.MAVLink_autopilot_version_message(
+        capabilities, _VERSION, _VERSION, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, stub.params.integer("MAV_SYS_ID")
+    )
+
+
+def _attitude(stub: Px4Stub) -> Estimate | None:
+    return stub.estimate if stub.estimate is not None and stub.estimate.attitude_valid else None
+
+
+def _position(stub: Px4Stub) -> Estimate | None:
+    return stub.estimate if stub.estimate is not None and stub.estimate.position_valid else None
+
+
+def _altitude_m(stub: Px4Stub, estimate: Estimate) -> float:
+    return (stub.origin.altitude_m if stub.origin is not None else 0.0) - estimate.position_ned_m[2]
+
+
+def _heading_deg(stub: Px4Stub) -> int:
+    return int(math.degrees(stub.heading_rad)) % 360
+
+
+def _percent(share: float) -> int:
+    return round(100 * min(1.0, max(0.0, share)))
+
+
+def _u16(value: float) -> int:
+    return max(0, min(65535, round(value)))
+
+
+def _i16(value: float) -> int:
+    return max(-32768, min(32767, round(value)))

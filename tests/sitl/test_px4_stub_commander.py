@@ -1,0 +1,267 @@
+"""Commander rules of the PX4 stub, as tables: what is refused, with which MAV_RESULT, and what flies when something is lost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from sitl.autopilot.commander import FORCE_MAGIC, OFFBOARD_LOSS_EXTRA_S, Command, Commander, Result
+from sitl.autopilot.modes import Health, NavState, OffboardKind, nav_state_from_custom
+from sitl.autopilot.params import Params
+
+GOOD = Health(
+    attitude_valid=True,
+    position_valid=True,
+    origin_set=True,
+    home_set=True,
+    landed=True,
+    maybe_landed=True,
+    setpoint_age_s=0.02,
+)
+BLIND = replace(GOOD, position_valid=False)
+FLYING = replace(GOOD, landed=False, maybe_landed=False)
+LOSS_S = 0.5
+
+
+def commander(**overrides: int) -> Commander:
+    return Commander(Params({"COM_OF_LOSS_T": LOSS_S, **overrides}))
+
+
+def ask(it: Commander, command: int, *params: float, health: Health = GOOD, t_s: float = 0.0) -> Result:
+    p = (*params, *(0.0,) * (7 - len(params)))
+    return it.command(t_s, command, (p[0], p[1], p[2], p[3], p[4], p[5], p[6]), health)
+
+
+def set_mode(it: Commander, state: NavState, health: Health = GOOD) -> Result:
+    return ask(it, Command.DO_SET_MODE, 1.0, float(state.value[0]), float(state.value[1]), health=health)
+
+
+def flying(state: NavState, **overrides: int) -> Commander:
+    it = commander(**overrides)
+    assert set_mode(it, state) is Result.ACCEPTED
+    assert ask(it, Command.COMPONENT_ARM_DISARM, 1.0) is Result.ACCEPTED
+    it.update(0.1, FLYING)
+    it.notices.clear()
+    return it
+
+
+@pytest.mark.parametrize(
+    ("state", "health", "reason"),
+    [
+        (NavState.LOITER, GOOD, None),
+        (NavState.LOITER, replace(GOOD, origin_set=False), "No valid global position estimate"),
+        (NavState.LOITER, replace(GOOD, attitude_valid=False), "No valid attitude estimate"),
+        (NavState.TAKEOFF, replace(GOOD, origin_set=False), None),
+        (NavState.TAKEOFF, BLIND, "No valid altitude estimate"),
+        (NavState.LAND, GOOD, "Mode not suitable for arming"),
+        (NavState.RTL, GOOD, "Mode not suitable for arming"),
+        (NavState.MISSION, GOOD, "No valid mission available"),
+        (NavState.POSCTL, GOOD, "No manual control input"),
+        (NavState.STABILIZED, GOOD, "No manual control input"),
+        (NavState.OFFBOARD, GOOD, None),
+        (NavState.OFFBOARD, BLIND, None),
+        (NavState.OFFBOARD, replace(BLIND, attitude_valid=False), "No valid attitude estimate"),
+        (NavState.OFFBOARD, replace(GOOD, setpoint_age_s=None), "No offboard signal"),
+        (NavState.OFFBOARD, replace(GOOD, setpoint_age_s=0.51), "No offboard signal"),
+        (NavState.OFFBOARD, replace(GOOD, setpoint_kind=OffboardKind.POSITION), None),
+        (NavState.OFFBOARD, replace(BLIND, setpoint_kind=OffboardKind.POSITION), "No offboard signal"),
+        (NavState.OFFBOARD, replace(BLIND, setpoint_kind=OffboardKind.VELOCITY), "No offboard signal"),
+    ],
+)
+def test_arming_rules(state: NavState, health: Health, reason: str | None) -> None:
+    it = commander()
+    assert set_mode(it, state, health) is Result.ACCEPTED, "disarmed, every mode may be wished for"
+    result = ask(it, Command.COMPONENT_ARM_DISARM, 1.0, health=health)
+    assert it.armed is (reason is None)
+    if reason is None:
+        assert result is Result.ACCEPTED
+        assert [notice.text for notice in it.notices] == ["Armed by external command"]
+    else:
+        assert result is Result.TEMPORARILY_REJECTED
+        assert it.notices[0].text == f"Preflight Fail: {reason}"
+        assert it.notices[1].text.startswith("Arming denied")
+
+
+def test_a_forced_arm_from_outside_still_runs_the_checks() -> None:
+    it = commander()
+    bad = replace(GOOD, attitude_valid=False)
+    assert ask(it, Command.COMPONENT_ARM_DISARM, 1.0, FORCE_MAGIC, health=bad) is Result.TEMPORARILY_REJECTED
+    assert not it.armed
+
+
+@pytest.mark.parametrize(
+    ("health", "magic", "result", "armed"),
+    [
+        (FLYING, 0.0, Result.TEMPORARILY_REJECTED, True),
+        (FLYING, 21195.0, Result.TEMPORARILY_REJECTED, True),
+        (FLYING, float(FORCE_MAGIC), Result.ACCEPTED, False),
+        (replace(FLYING, maybe_landed=True), 0.0, Result.ACCEPTED, False),
+        (GOOD, 0.0, Result.ACCEPTED, False),
+        (GOOD, math.nan, Result.ACCEPTED, False),
+    ],
+)
+def test_disarming_in_the_air_needs_force(health: Health, magic: float, result: Result, armed: bool) -> None:
+    it = flying(NavState.OFFBOARD)
+    assert ask(it, Command.COMPONENT_ARM_DISARM, 0.0, magic, health=health) is result
+    assert it.armed is armed
+
+
+@pytest.mark.parametrize("action", [2.0, -1.0, math.nan])
+def test_arm_commands_that_mean_nothing_are_unsupported(action: float) -> None:
+    it = commander()
+    assert ask(it, Command.COMPONENT_ARM_DISARM, action) is Result.UNSUPPORTED
+    assert not it.armed
+
+
+@pytest.mark.parametrize(
+    ("state", "health", "result"),
+    [
+        (NavState.LAND, FLYING, Result.ACCEPTED),
+        (NavState.LAND, replace(FLYING, position_valid=False), Result.TEMPORARILY_REJECTED),
+        (NavState.LOITER, FLYING, Result.ACCEPTED),
+        (NavState.LOITER, replace(FLYING, origin_set=False), Result.TEMPORARILY_REJECTED),
+        (NavState.OFFBOARD, FLYING, Result.ACCEPTED),
+        (NavState.OFFBOARD, replace(FLYING, setpoint_age_s=0.6), Result.TEMPORARILY_REJECTED),
+        (NavState.OFFBOARD, replace(FLYING, position_valid=False), Result.ACCEPTED),
+        (NavState.POSCTL, FLYING, Result.TEMPORARILY_REJECTED),
+        (NavState.RTL, replace(FLYING, home_set=False), Result.TEMPORARILY_REJECTED),
+    ],
+)
+def test_in_flight_a_mode_that_cannot_run_is_refused(state: NavState, health: Health, result: Result) -> None:
+    it = flying(NavState.TAKEOFF)
+    assert set_mode(it, state, health) is result
+    it.update(0.2, health)
+    if result is Result.ACCEPTED:
+        assert it.nav_state is state
+    else:
+        assert it.wish is NavState.TAKEOFF
+
+
+@pytest.mark.parametrize(
+    ("command", "params", "state"),
+    [
+        (Command.NAV_TAKEOFF, (), NavState.TAKEOFF),
+        (Command.NAV_LAND, (), NavState.LAND),
+        (Command.NAV_RETURN_TO_LAUNCH, (), NavState.RTL),
+        (Command.DO_REPOSITION, (-1.0, 1.0), NavState.LOITER),
+        (Command.DO_FLIGHTTERMINATION, (1.0,), NavState.TERMINATION),
+    ],
+)
+def test_commands_that_change_the_mode(command: Command, params: tuple[float, ...], state: NavState) -> None:
+    it = flying(NavState.OFFBOARD)
+    assert ask(it, command, *params, health=FLYING) is Result.ACCEPTED
+    it.update(0.2, FLYING)
+    assert it.nav_state is state
+
+
+def test_nothing_leads_out_of_termination() -> None:
+    it = flying(NavState.OFFBOARD)
+    ask(it, Command.DO_FLIGHTTERMINATION, 1.0, health=FLYING)
+    it.update(0.2, FLYING)
+    assert set_mode(it, NavState.LAND, FLYING) is Result.TEMPORARILY_REJECTED
+    it.update(0.3, FLYING)
+    assert it.nav_state is NavState.TERMINATION
+
+
+@pytest.mark.parametrize(
+    ("action", "health", "state"),
+    [
+        (4, FLYING, NavState.LAND),
+        (4, replace(FLYING, position_valid=False), NavState.DESCEND),
+        (3, FLYING, NavState.RTL),
+        (3, replace(FLYING, origin_set=False), NavState.LAND),
+        (5, FLYING, NavState.LOITER),
+        (5, replace(FLYING, origin_set=False), NavState.LAND),
+        (0, FLYING, NavState.RTL),
+        (6, FLYING, NavState.TERMINATION),
+        (4, replace(FLYING, position_valid=False, attitude_valid=False), NavState.TERMINATION),
+    ],
+)
+def test_offboard_loss_leads_to_com_obl_rc_act(action: int, health: Health, state: NavState) -> None:
+    it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=action)
+    it.update(1.0, replace(health, attitude_valid=True, setpoint_age_s=LOSS_S + OFFBOARD_LOSS_EXTRA_S - 0.001))
+    assert it.nav_state is NavState.OFFBOARD, "not yet"
+    it.update(1.1, replace(health, setpoint_age_s=LOSS_S + OFFBOARD_LOSS_EXTRA_S + 0.001))
+    assert it.nav_state is state
+    assert it.failsafe is True
+    assert it.notices[-1].text.startswith("Failsafe activated")
+
+
+def test_offboard_loss_may_disarm_at_once() -> None:
+    it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=7)
+    it.update(1.0, replace(FLYING, setpoint_age_s=1.0))
+    assert not it.armed
+
+
+def test_offboard_returns_with_its_setpoints() -> None:
+    it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=4)
+    it.update(1.0, replace(FLYING, setpoint_age_s=1.0))
+    it.update(1.1, FLYING)
+    assert it.nav_state is NavState.OFFBOARD
+    assert it.failsafe is False
+
+
+def test_attitude_offboard_has_no_failsafe_when_position_is_lost() -> None:
+    it = flying(NavState.OFFBOARD)
+    it.update(10.0, replace(FLYING, position_valid=False))
+    assert it.nav_state is NavState.OFFBOARD
+    assert it.failsafe is False
+
+
+def test_position_offboard_lands_blind_when_position_is_lost() -> None:
+    it = flying(NavState.OFFBOARD)
+    it.update(10.0, replace(FLYING, position_valid=False, setpoint_kind=OffboardKind.POSITION))
+    assert it.nav_state is NavState.DESCEND
+
+
+def test_land_without_position_becomes_a_blind_descent() -> None:
+    it = flying(NavState.OFFBOARD)
+    set_mode(it, NavState.LAND, FLYING)
+    it.update(1.0, FLYING)
+    it.update(1.1, replace(FLYING, position_valid=False))
+    assert it.nav_state is NavState.DESCEND
+
+
+def test_after_landing_px4_disarms_and_is_back_in_offboard() -> None:
+    it = flying(NavState.OFFBOARD)
+    set_mode(it, NavState.LAND, FLYING)
+    it.update(1.0, FLYING)
+    it.update(2.0, GOOD)
+    it.update(3.9, GOOD)
+    assert it.armed, "COM_DISARM_LAND has not passed"
+    it.update(4.0, GOOD)
+    assert not it.armed
+    assert it.nav_state is NavState.OFFBOARD
+    assert it.notices[-1].text == "Disarmed by landing"
+
+
+def test_without_a_take_off_it_disarms_after_com_disarm_prflt() -> None:
+    it = commander()
+    ask(it, Command.COMPONENT_ARM_DISARM, 1.0)
+    it.update(0.0, GOOD)
+    it.update(9.9, GOOD)
+    assert it.armed
+    it.update(10.0, GOOD)
+    assert not it.armed
+
+
+@pytest.mark.parametrize("state", [s for s in NavState if s not in (NavState.DESCEND, NavState.TERMINATION)])
+def test_custom_modes_go_there_and_back(state: NavState) -> None:
+    assert nav_state_from_custom(state.custom_mode >> 16 & 0xFF, state.custom_mode >> 24) is state
+
+
+@pytest.mark.parametrize(("main", "sub"), [(4, 7), (9, 0), (0, 0)])
+def test_unknown_custom_modes_are_rejected(main: int, sub: int) -> None:
+    it = commander()
+    assert ask(it, Command.DO_SET_MODE, 1.0, float(main), float(sub)) is Result.TEMPORARILY_REJECTED
+    assert it.wish is NavState.LOITER
+
+
+def test_a_mode_command_made_of_nan_is_denied() -> None:
+    assert ask(commander(), Command.DO_SET_MODE, 1.0, math.nan, math.nan) is Result.DENIED
+
+
+def test_unknown_commands_are_unsupported() -> None:
+    assert ask(commander(), 31000) is Result.UNSUPPORTED

@@ -1,0 +1,271 @@
+"""The PX4 stub flies a small rigid body, faster than real time and without sockets: own modes, OFFBOARD, losses."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.frames import quat_from_euler_zyx, tilt_rad
+from sitl.autopilot.autopilot import Origin
+from sitl.autopilot.commander import FORCE_MAGIC, Command, Result
+from sitl.autopilot.modes import NavState
+from sitl.autopilot.setpoints import PositionTarget, RateTarget
+from sitl.autopilot.types import AttitudeTarget
+from tests.sitl.px4_rig import PERIOD_S, Rig
+
+HOVER = 0.5
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def ready(**overrides: float) -> Rig:
+    rig = Rig(overrides)
+    rig.run(0.5)
+    return rig
+
+
+def hovering(**overrides: float) -> Rig:
+    """In Hold at 1 m."""
+    rig = ready(**overrides)
+    rig.stub.set_origin(Origin(47.397742, 8.545594, 488.0))
+    rig.run(0.1)
+    assert rig.command(Command.NAV_TAKEOFF) is Result.ACCEPTED
+    assert rig.arm() is Result.ACCEPTED
+    run_until(rig, lambda: rig.stub.nav_state is NavState.LOITER, 20.0)
+    assert rig.height_m == pytest.approx(1.0, abs=0.15)
+    rig.texts()
+    return rig
+
+
+def run_until(rig: Rig, condition: object, limit_s: float) -> float:
+    """Run until the condition holds; returns how long that took."""
+    assert callable(condition)
+    start_s = rig.t_s
+    while not condition():
+        assert rig.t_s - start_s < limit_s, "did not happen in time (world time)"
+        rig.step()
+    return rig.t_s - start_s
+
+
+def stream(rig: Rig, duration_s: float, target: AttitudeTarget | RateTarget | PositionTarget) -> None:
+    """A setpoint every 20 ms of world time."""
+    until_s = rig.t_s + duration_s
+    due_s = rig.t_s
+    while rig.t_s < until_s:
+        if rig.t_s >= due_s:
+            rig.stub.on_setpoint(rig.t_s, target)
+            due_s += 0.02
+        rig.step()
+
+
+def test_take_off_hold_land_and_automatic_disarm() -> None:
+    rig = hovering()
+    rig.run(3.0)
+    assert rig.stub.nav_state is NavState.LOITER
+    x, y, z = rig.plant.position_ned_m
+    assert math.hypot(x, y) < 0.05
+    assert z == pytest.approx(-1.0, abs=0.1)
+    rig.command(Command.NAV_LAND)
+    fastest = 0.0
+    start_s = rig.t_s
+    while rig.stub.armed:
+        rig.step()
+        fastest = max(fastest, rig.plant.velocity_ned_m_s[2])
+        assert rig.t_s - start_s < 20.0
+    assert 0.6 < fastest < 0.85, "MPC_LAND_SPEED is 0.7"
+    assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
+    assert rig.height_m == pytest.approx(0.0, abs=1e-6)
+    assert rig.texts() == ["Landing detected", "Disarmed by landing"]
+
+
+def test_nothing_turns_while_disarmed_and_nothing_lifts_during_spool_up() -> None:
+    rig = ready()
+    rig.stub.on_attitude_target(rig.t_s, AttitudeTarget(LEVEL, 0.9))
+    rig.run(0.2)
+    assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
+    rig.command(Command.NAV_TAKEOFF)
+    rig.arm()
+    rig.run(0.9)  # COM_SPOOLUP_TIME is 1 s
+    assert rig.stub.target.thrust == 0.0
+    assert rig.stub.landed
+
+
+def test_hold_needs_a_global_origin_but_take_off_does_not() -> None:
+    rig = ready()
+    assert rig.arm() is Result.TEMPORARILY_REJECTED
+    assert "No valid global position estimate" in rig.texts()[0]
+    rig.stub.set_origin(Origin(47.0, 8.0, 0.0))
+    assert rig.arm() is Result.ACCEPTED
+
+
+def test_disarm_in_the_air_is_refused_unless_forced() -> None:
+    rig = hovering()
+    assert rig.disarm() is Result.TEMPORARILY_REJECTED
+    assert rig.texts() == ["Disarming denied: not landed"]
+    assert rig.disarm(FORCE_MAGIC) is Result.ACCEPTED
+    rig.step()
+    assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_offboard_needs_a_stream_then_follows_attitude_and_thrust() -> None:
+    rig = ready()
+    rig.mode(6)
+    assert rig.arm() is Result.TEMPORARILY_REJECTED
+    assert rig.texts()[0] == "Preflight Fail: No offboard signal"
+    stream(rig, 0.2, AttitudeTarget(LEVEL, 0.0))
+    assert rig.arm() is Result.ACCEPTED
+    stream(rig, 1.0, AttitudeTarget(LEVEL, HOVER * 1.1))
+    assert not rig.stub.landed
+    assert rig.height_m > 0.2
+    wanted = quat_from_euler_zyx(0.1, -0.05, 0.4)
+    stream(rig, 2.0, AttitudeTarget(wanted, HOVER * 1.02))
+    error = 2 * math.acos(min(1.0, abs(sum(a * b for a, b in zip(wanted, rig.plant.attitude, strict=True)))))
+    assert math.degrees(error) < 2.0
+
+
+def test_attitude_offboard_lands_when_thrust_goes_to_zero_on_the_ground() -> None:
+    rig = ready()
+    stream(rig, 0.2, AttitudeTarget(LEVEL, 0.0))
+    rig.mode(6)
+    rig.arm()
+    stream(rig, 1.0, AttitudeTarget(LEVEL, HOVER * 1.05))
+    stream(rig, 2.5, AttitudeTarget(LEVEL, HOVER * 0.93))
+    stream(rig, 2.0, AttitudeTarget(LEVEL, 0.3))
+    assert rig.height_m == pytest.approx(0.0, abs=1e-6)
+    assert not rig.stub.landed, "0.3 is more than PX4 takes for idle"
+    assert rig.disarm() is Result.TEMPORARILY_REJECTED
+    stream(rig, 1.2, AttitudeTarget(LEVEL, 0.0))
+    assert rig.stub.landed
+    assert rig.disarm() is Result.ACCEPTED
+    assert rig.stub.nav_state is NavState.OFFBOARD
+
+
+def test_setpoints_act_after_the_configured_delay() -> None:
+    rig = Rig(setpoint_delay_s=0.02)
+    rig.run(0.5)
+    stream(rig, 0.2, AttitudeTarget(LEVEL, 0.05))
+    rig.mode(6)
+    rig.arm()
+    stream(rig, 0.1, AttitudeTarget(LEVEL, 0.05))
+    rig.run(0.04)
+    rig.stub.on_attitude_target(rig.t_s, AttitudeTarget(LEVEL, 0.3))
+    took_s = run_until(rig, lambda: rig.stub.target.thrust == 0.3, 1.0)
+    assert took_s == pytest.approx(0.02, abs=PERIOD_S)
+
+
+def test_offboard_follows_position_and_velocity_setpoints() -> None:
+    rig = hovering()
+    stream(rig, 0.1, PositionTarget((0.8, -0.4, -1.3), yaw_rad=0.5))
+    assert rig.mode(6) is Result.ACCEPTED
+    stream(rig, 8.0, PositionTarget((0.8, -0.4, -1.3), yaw_rad=0.5))
+    assert rig.plant.position_ned_m == pytest.approx((0.8, -0.4, -1.3), abs=0.1)
+    assert rig.stub.heading_rad == pytest.approx(0.5, abs=0.05)
+    stream(rig, 3.0, PositionTarget(velocity_ned_m_s=(0.3, 0.0, 0.0), yaw_rad=0.5))
+    assert rig.plant.velocity_ned_m_s == pytest.approx((0.3, 0.0, 0.0), abs=0.08)
+
+
+def test_offboard_follows_body_rates() -> None:
+    rig = hovering()
+    stream(rig, 0.1, RateTarget((0.0, 0.0, 0.6), HOVER))
+    rig.mode(6)
+    stream(rig, 1.5, RateTarget((0.0, 0.0, 0.6), HOVER))
+    assert rig.plant.rates == pytest.approx((0.0, 0.0, 0.6), abs=0.08)
+
+
+def test_offboard_loss_lands_after_com_of_loss_t() -> None:
+    rig = hovering(COM_OF_LOSS_T=0.3)
+    stream(rig, 0.3, AttitudeTarget(LEVEL, HOVER))
+    rig.mode(6)
+    stream(rig, 0.5, AttitudeTarget(LEVEL, HOVER))
+    last_s = rig.t_s
+    run_until(rig, lambda: rig.stub.nav_state is NavState.LAND, 2.0)
+    assert rig.t_s - last_s == pytest.approx(0.35, abs=0.04)
+    run_until(rig, lambda: not rig.stub.armed, 20.0)
+    assert rig.stub.nav_state is NavState.OFFBOARD, "as PX4: back in the mode of before"
+
+
+def test_mocap_loss_has_no_failsafe_in_attitude_offboard() -> None:
+    rig = hovering()
+    stream(rig, 0.1, AttitudeTarget(LEVEL, HOVER))
+    rig.mode(6)
+    rig.vision = False
+    stream(rig, 1.0, AttitudeTarget(LEVEL, HOVER))
+    assert rig.stub.estimate is not None
+    assert rig.stub.estimate.vision_fused is False
+    assert rig.stub.estimate.position_valid is True
+    stream(rig, 4.0, AttitudeTarget(LEVEL, HOVER))
+    assert rig.stub.estimate.position_valid is False
+    assert rig.stub.nav_state is NavState.OFFBOARD
+
+
+def test_land_without_mocap_descends_blindly_to_the_ground() -> None:
+    rig = hovering(MPC_LAND_SPEED=0.3)
+    rig.vision = False
+    rig.run(3.0)
+    rig.command(Command.NAV_LAND)
+    run_until(rig, lambda: rig.stub.nav_state is NavState.DESCEND, 5.0)
+    run_until(rig, lambda: rig.height_m <= 0.0, 20.0)
+    assert tilt_rad(rig.plant.attitude) < math.radians(5.0)
+
+
+def test_a_landing_that_ends_before_the_estimate_expires_disarms() -> None:
+    """Without position PX4 wants 8 s of idle thrust to believe that it has landed; the rotors stay idle meanwhile."""
+    rig = hovering()
+    rig.vision = False
+    rig.run(0.15)
+    rig.command(Command.NAV_LAND)
+    assert run_until(rig, lambda: rig.stub.landed, 4.4) > 1.5
+    rig.run(3.0)
+    assert rig.stub.armed
+    assert rig.stub.nav_state is NavState.DESCEND
+    assert not rig.stub.landed, "the position is invalid by now"
+    assert rig.stub.target.thrust == 0.0
+    run_until(rig, lambda: not rig.stub.armed, 12.0)
+    assert rig.height_m == 0.0
+
+
+def test_a_position_setpoint_below_the_floor_is_not_a_landing() -> None:
+    """PX4's land detector wants a commanded descent, which only a velocity setpoint is."""
+    rig = hovering()
+    below = PositionTarget((0.0, 0.0, 0.3))
+    stream(rig, 0.1, below)
+    rig.mode(6)
+    stream(rig, 8.0, below)
+    assert rig.height_m == 0.0
+    assert not rig.stub.landed
+    stream(rig, 4.0, PositionTarget(velocity_ned_m_s=(0.0, 0.0, 0.5)))
+    assert rig.stub.landed
+
+
+def test_return_flies_home_and_lands() -> None:
+    rig = hovering()
+    stream(rig, 0.1, PositionTarget((1.5, 0.0, -1.0)))
+    rig.mode(6)
+    stream(rig, 6.0, PositionTarget((1.5, 0.0, -1.0)))
+    assert rig.command(Command.NAV_RETURN_TO_LAUNCH) is Result.ACCEPTED
+    run_until(rig, lambda: not rig.stub.armed, 40.0)
+    x, y, _ = rig.plant.position_ned_m
+    assert math.hypot(x, y) < 0.35
+
+
+def test_reposition_moves_the_hold_point() -> None:
+    rig = hovering()
+    assert rig.stub.origin is not None
+    latitude, longitude, altitude = rig.stub.origin.global_deg_m((0.6, 0.3, -1.4))
+    assert rig.command(Command.DO_REPOSITION, -1, 1, 0, math.nan, latitude, longitude, altitude) is Result.ACCEPTED
+    rig.run(8.0)
+    assert rig.plant.position_ned_m == pytest.approx((0.6, 0.3, -1.4), abs=0.1)
+
+
+def test_termination_stops_the_rotors() -> None:
+    rig = hovering()
+    assert rig.command(Command.DO_FLIGHTTERMINATION, 1.0) is Result.ACCEPTED
+    rig.run(0.02)
+    assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
+    assert rig.stub.nav_state is NavState.TERMINATION
+
+
+def test_two_runs_are_bit_identical() -> None:
+    first, second = hovering(), hovering()
+    assert first.plant.position_ned_m == second.plant.position_ned_m
+    assert first.stub.rotors == second.stub.rotors

@@ -1,0 +1,93 @@
+"""Parameters of the PX4 stub: types, byte-wise encoding, what is refused, and that the facts' names are there."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sitl.autopilot.autopilot import gains_from_params
+from sitl.autopilot.params import (
+    MAV_PARAM_TYPE_INT32,
+    MAV_PARAM_TYPE_REAL32,
+    Params,
+    decode_bytewise,
+    encode_bytewise,
+)
+
+
+@given(st.integers(-(2**31), 2**31 - 1))
+def test_integers_survive_the_float_field_of_the_wire(value: int) -> None:
+    on_the_wire = struct.unpack("<f", struct.pack("<f", encode_bytewise(value)))[0]
+    if math.isnan(encode_bytewise(value)):
+        return  # a signalling NaN may be quietened by the float conversion, on PX4's side of the wire too
+    assert decode_bytewise(on_the_wire, MAV_PARAM_TYPE_INT32) == value
+
+
+def test_every_parameter_reads_back_from_its_own_wire_value() -> None:
+    params = Params()
+    for name in params:
+        before = params[name]
+        assert params.set_from_wire(name, params.wire_value(name), params.mav_type(name)) == before
+        assert params.name_at(params.index(name)) == name
+        assert len(name) <= 16
+    assert len(params) >= 60
+    assert list(params) == sorted(params)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("EKF2_EV_CTRL", 11), ("EKF2_HGT_REF", 3), ("EKF2_GPS_CTRL", 0), ("SYS_HAS_GPS", 0), ("EKF2_EV_DELAY", 5.0),
+        ("EKF2_EV_NOISE_MD", 0), ("EKF2_MAG_TYPE", 5), ("SYS_HAS_MAG", 0), ("EKF2_BARO_CTRL", 0), ("COM_RC_IN_MODE", 4),
+        ("COM_OBL_RC_ACT", 4), ("COM_OF_LOSS_T", 0.5), ("MAV_SYS_ID", 1), ("MPC_THR_HOVER", 0.5), ("COM_DISARM_LAND", 2.0),
+    ],
+)  # fmt: skip
+def test_defaults_fit_a_vehicle_on_mocap(name: str, value: float) -> None:
+    assert Params()[name] == value
+
+
+def test_reals_are_single_precision_as_in_px4() -> None:
+    params = Params({"EKF2_EVP_NOISE": 0.01})
+    assert params["EKF2_EVP_NOISE"] == struct.unpack("<f", struct.pack("<f", 0.01))[0]
+    assert params.mav_type("EKF2_EVP_NOISE") == MAV_PARAM_TYPE_REAL32
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("NO_SUCH_PARAM", 1, KeyError),
+        ("EKF2_EV_CTRL", 1.5, ValueError),
+        ("EKF2_EV_CTRL", 2**31, ValueError),
+        ("MPC_THR_HOVER", math.nan, ValueError),
+        ("MPC_THR_HOVER", math.inf, ValueError),
+    ],
+)
+def test_bad_values_are_refused(name: str, value: float, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        Params({name: value})
+
+
+def test_a_type_that_disagrees_changes_nothing() -> None:
+    params = Params()
+    with pytest.raises(ValueError, match="MAV_PARAM_TYPE"):
+        params.set_from_wire("EKF2_EV_CTRL", 0.0, MAV_PARAM_TYPE_REAL32)
+    assert params["EKF2_EV_CTRL"] == 11
+
+
+def test_the_hash_and_the_revision_tell_of_every_change() -> None:
+    params = Params()
+    hash_before, revision = params.hash_check(), params.revision
+    params.set("MPC_THR_HOVER", 0.6)
+    assert struct.pack("<f", params.hash_check()) != struct.pack("<f", hash_before)
+    assert params.revision > revision
+
+
+def test_the_cascade_takes_its_gains_from_the_parameters() -> None:
+    gains = gains_from_params(Params({"MC_ROLL_P": 4.0, "MC_YAWRATE_I": 0.2, "MC_PITCHRATE_MAX": 180.0}))
+    assert gains.attitude_p[0] == 4.0
+    assert gains.rate_i[2] == pytest.approx(0.2)
+    assert gains.rate_max_rad_s[1] == pytest.approx(math.pi)
