@@ -1,0 +1,178 @@
+"""Reads a flight log (MCAP) back into the records of `companion.types`, also one that was never closed."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.records import Channel, Footer, Message, Metadata
+from mcap.stream_reader import StreamReader
+
+from companion.frames import euler_zyx_from_quat
+from companion.record import RecordError, fingerprint, from_jsonable
+from companion.types import Inputs, Outputs, Sent
+
+Array = npt.NDArray[np.float64]
+_RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
+
+
+class LogError(Exception):
+    """The file is not a flight log, or not one that can be used for this: one line for the user."""
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """A flight: three lists of the same length, one entry per recorded tick, in order."""
+
+    path: Path
+    inputs: tuple[Inputs, ...]
+    outputs: tuple[Outputs, ...]
+    sent: tuple[Sent, ...]
+    metadata: dict[str, dict[str, str]]
+    """All metadata records by name: companion, config, flight, recorder, ..."""
+    closed: bool
+    """The recorder closed the file itself."""
+
+    @staticmethod
+    def read(path: Path) -> FlightLog:
+        """Read a log.
+
+        Raises:
+            LogError: no such file, no MCAP file, not written by the recorder, damaged, or records of another shape.
+        """
+        rows: dict[str, list[Any]] = {topic: [] for topic in _RECORDS}
+        metadata: dict[str, dict[str, str]] = {}
+        channels: dict[int, str] = {}
+        closed = False
+        try:
+            for record in _mcap_records(path):
+                if isinstance(record, Channel):
+                    channels[record.id] = record.topic
+                elif isinstance(record, Message):
+                    topic = channels[record.channel_id]
+                    if topic in _RECORDS:
+                        rows[topic].append(from_jsonable(_RECORDS[topic], json.loads(record.data)))
+                elif isinstance(record, Metadata):
+                    metadata[record.name] = dict(record.metadata)
+                elif isinstance(record, Footer):
+                    closed = True
+        except RecordError as error:
+            raise LogError(
+                f"{path}: records of another shape ({error}); it was written by {_writer(metadata)}"
+            ) from None
+        except (McapError, ValueError, KeyError) as error:
+            raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
+        if "companion" not in metadata:
+            raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
+        if metadata["companion"].get("records") != fingerprint(*_RECORDS.values()):
+            raise LogError(f"{path}: records of another shape; it was written by {_writer(metadata)}")
+        # Chunks hold whole ticks, so a difference means that the file was not written by the recorder.
+        ticks = [[row.tick for row in rows[topic]] for topic in _RECORDS]
+        if not ticks[0] == ticks[1] == ticks[2]:
+            raise LogError(f"{path}: damaged: /inputs, /outputs and /sent hold different ticks")
+        return FlightLog(path, tuple(rows["/inputs"]), tuple(rows["/outputs"]), tuple(rows["/sent"]), metadata, closed)
+
+    @property
+    def config_json(self) -> str | None:
+        """Effective configuration as recorded, or None."""
+        return self.metadata.get("config", {}).get("json") or None
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """Effective configuration as plain nested data; empty if absent."""
+        try:
+            parsed = json.loads(self.config_json or "{}")
+        except ValueError:
+            return {}
+        return parsed if isinstance(parsed, dict) else {}
+
+    def missing_ticks(self) -> int:
+        """Ticks between the first and the last one that are not in the log."""
+        return self.inputs[-1].tick - self.inputs[0].tick + 1 - len(self.inputs) if self.inputs else 0
+
+    def rows(self) -> Iterator[tuple[Inputs, Outputs, Sent]]:
+        """Ticks in order."""
+        return zip(self.inputs, self.outputs, self.sent, strict=True)
+
+    def column(self, value: Callable[[Inputs, Outputs, Sent], Any], width: int = 0) -> Array:
+        """One row per tick: a float (`width` 0) or `width` floats; NaN where `value` returns None."""
+        blank: Any = (np.nan,) * width if width else np.nan
+        values = [blank if (v := value(*row)) is None else v for row in self.rows()]
+        return np.array(values, dtype=np.float64).reshape((len(values), width) if width else (len(values),))
+
+    @cached_property
+    def columns(self) -> Columns:
+        """What metrics and plots share, as arrays."""
+        return _columns(self)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Arrays with one row per tick; NaN where a value was not known. World ENU, body FLU."""
+
+    t_s: Array
+    mission_t_s: Array
+    mocap_position_world_m: Array
+    """From valid frames not older than `MOCAP_FRESH_S`."""
+    mocap_attitude_rad: Array
+    """Roll, pitch, yaw (ZYX)."""
+    reference_position_world_m: Array
+    attitude_desired_rad: Array
+    arm_rad: Array
+    arm_reference_rad: Array
+    lateness_s: Array
+
+
+MOCAP_FRESH_S = 0.1
+
+
+def _columns(log: FlightLog) -> Columns:
+    def fresh(i: Inputs) -> bool:
+        return i.mocap is not None and i.mocap.tracking_valid and i.t_s - i.mocap.stamp_s <= MOCAP_FRESH_S
+
+    return Columns(
+        t_s=log.column(lambda i, o, s: i.t_s),
+        mission_t_s=log.column(lambda i, o, s: o.mission_t_s),
+        mocap_position_world_m=log.column(
+            lambda i, o, s: i.mocap.position_world_m if i.mocap and fresh(i) else None, 3
+        ),
+        mocap_attitude_rad=log.column(
+            lambda i, o, s: euler_zyx_from_quat(i.mocap.attitude_wxyz) if i.mocap and fresh(i) else None, 3
+        ),
+        reference_position_world_m=log.column(lambda i, o, s: o.reference.position_world_m if o.reference else None, 3),
+        attitude_desired_rad=log.column(lambda i, o, s: o.control.attitude_desired_rad if o.control else None, 3),
+        arm_rad=log.column(lambda i, o, s: i.arm.angle_rad if i.arm else None, 2),
+        arm_reference_rad=log.column(lambda i, o, s: o.reference.arm_rad if o.reference else None, 2),
+        lateness_s=log.column(lambda i, o, s: s.lateness_s),
+    )
+
+
+def _writer(metadata: dict[str, dict[str, str]]) -> str:
+    about = metadata.get("companion", {})
+    return f"companion {about.get('version_companion', 'of unknown version')} ({about.get('version_git', 'no git revision')})"
+
+
+def _mcap_records(path: Path) -> Iterator[Any]:
+    """Records of the file in order; an unclosed file simply ends."""
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    with file:
+        if path.stat().st_size == 0:
+            raise LogError(f"{path}: is empty; expected a flight log (MCAP)")
+        try:
+            yield from StreamReader(file, validate_crcs=True).records
+        except InvalidMagic:
+            raise LogError(f"{path}: is no MCAP file; expected a flight log such as flight.mcap") from None
+        except (EndOfFile, struct.error):
+            if file.read(1):
+                raise LogError(f"{path}: damaged before its end") from None

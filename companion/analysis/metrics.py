@@ -1,0 +1,230 @@
+"""Numbers that grade a flight; pure functions of a `FlightLog`. Position and attitude are graded by mocap, never by the estimator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.analysis.log import Array, FlightLog
+from companion.frames import quat_rotate
+from companion.types import PhaseKind
+
+Mask = npt.NDArray[np.bool_]
+SLIDING_LOWPASS_HZ = 10.0
+FINAL_WINDOW_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Of durations, in ms."""
+
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingRms:
+    """RMS of the error norms; None where nothing was measured."""
+
+    e_p_m: float | None
+    e_q_deg: float | None
+    e_alpha_deg: float | None
+
+
+def catch_index(log: FlightLog) -> int | None:
+    """Tick (position in the log) of the catch: the one at the time of the first event "catch".
+
+    A detector needs some time to be sure; it may date its event back to the contact, so that the kick counts as after the catch.
+    """
+    for k, outputs in enumerate(log.outputs):
+        for event in outputs.events:
+            if event.id == "catch":
+                return min(k, int(np.searchsorted(log.columns.t_s[: k + 1], event.t_s)))
+    return None
+
+
+def flight_masks(log: FlightLog) -> tuple[Mask, Mask]:
+    """Ticks of kind FLIGHT before the catch, and from the catch on; without a catch the second is empty."""
+    flight = np.array([o.phase_kind is PhaseKind.FLIGHT for o in log.outputs], dtype=np.bool_)
+    caught = catch_index(log)
+    after = np.arange(len(flight)) >= (len(flight) if caught is None else caught)
+    return flight & ~after, flight & after
+
+
+def position_error_m(log: FlightLog) -> Array:
+    """Mocap minus reference, world, (ticks, 3)."""
+    return log.columns.mocap_position_world_m - log.columns.reference_position_world_m
+
+
+def attitude_error_rad(log: FlightLog) -> Array:
+    """Mocap roll, pitch, yaw minus the law's desired attitude, wrapped, (ticks, 3)."""
+    return _wrapped(log.columns.mocap_attitude_rad - log.columns.attitude_desired_rad)
+
+
+def arm_error_rad(log: FlightLog) -> Array:
+    """Joint angles minus reference, (ticks, 2)."""
+    return log.columns.arm_rad - log.columns.arm_reference_rad
+
+
+def tracking_rms(log: FlightLog, mask: Mask) -> TrackingRms:
+    """RMS of ||e_p||, ||e_q||, ||e_alpha|| over the ticks of the mask."""
+    e_q, e_alpha = rms_norm(attitude_error_rad(log)[mask]), rms_norm(arm_error_rad(log)[mask])
+    return TrackingRms(
+        rms_norm(position_error_m(log)[mask]),
+        None if e_q is None else math.degrees(e_q),
+        None if e_alpha is None else math.degrees(e_alpha),
+    )
+
+
+def rms_norm(rows: Array) -> float | None:
+    """sqrt(mean ||row||^2) over rows that are known throughout; None if there is none."""
+    known = rows[np.isfinite(rows).all(axis=1)]
+    return float(np.sqrt(np.mean(np.sum(known * known, axis=1)))) if len(known) else None
+
+
+def final_e_z_m(log: FlightLog) -> float | None:
+    """Mean height error over the last 0.5 s of FLIGHT."""
+    pre, post = flight_masks(log)
+    flight = pre | post
+    if not flight.any():
+        return None
+    t_s = log.columns.t_s
+    window = flight & (t_s > t_s[flight][-1] - FINAL_WINDOW_S)
+    e_z = position_error_m(log)[window, 2]
+    e_z = e_z[np.isfinite(e_z)]
+    return float(np.mean(e_z)) if len(e_z) else None
+
+
+def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
+    """RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m).
+
+    dI = M_d s' + (K_d - M_d Phi) s: what keeps the machine from its desired impedance. s' is the central difference of s,
+    low-passed at 10 Hz without phase shift.
+    """
+    gains = _diagonals(log.config.get("controller"), "inertia_md", "damping_kd", "phi")
+    pre, post = flight_masks(log)
+    used = np.array([o.control is not None for o in log.outputs], dtype=np.bool_) & (pre | post)
+    if gains is None or not (used & post).any() or int(used.sum()) < 10:
+        return None, None
+    inertia, damping, phi = gains
+    sliding = log.column(lambda i, o, s: o.control.sliding if o.control else None, 8)[used]
+    t_s = log.columns.t_s[used]
+    if not np.isfinite(sliding).all() or not (np.diff(t_s) > 0).all():
+        return None, None
+    smooth = lowpass_zero_phase(sliding, float(np.median(np.diff(t_s))), SLIDING_LOWPASS_HZ)
+    d_i = inertia * np.gradient(smooth, t_s, axis=0) + (damping - inertia * phi) * sliding
+    after = d_i[post[used]]
+    return rms_norm(after[:, 0:3]), rms_norm(after[:, 6:8])
+
+
+def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
+    """Second-order Butterworth forwards and backwards along axis 0 (gain 1/2 at the cutoff), odd reflection at the ends."""
+    k = math.tan(math.pi * min(cutoff_hz * period_s, 0.49))
+    norm = 1.0 / (1.0 + math.sqrt(2.0) * k + k * k)
+    b0 = k * k * norm
+    a1, a2 = 2.0 * (k * k - 1.0) * norm, (1.0 - math.sqrt(2.0) * k + k * k) * norm
+    pad = min(len(rows) - 1, math.ceil(1.0 / (cutoff_hz * period_s)))
+    head, tail = 2.0 * rows[0] - rows[pad:0:-1], 2.0 * rows[-1] - rows[-2 : -pad - 2 : -1]
+    signal = np.concatenate([head, rows, tail])
+
+    def once(x: Array) -> Array:
+        out = np.empty_like(x)
+        x1 = x2 = y1 = y2 = x[0]
+        for n in range(len(x)):
+            y = b0 * (x[n] + 2.0 * x1 + x2) - a1 * y1 - a2 * y2
+            x2, x1, y2, y1 = x1, x[n], y1, y
+            out[n] = y
+        return out
+
+    return once(once(signal)[::-1])[::-1][pad : pad + len(rows)]
+
+
+def loop_rate_hz(log: FlightLog) -> float | None:
+    """Mean rate of ticks as they really started."""
+    if len(log.sent) < 2:
+        return None
+    span_s = log.sent[-1].start_s - log.sent[0].start_s
+    return (log.inputs[-1].tick - log.inputs[0].tick) / span_s if span_s > 0 else None
+
+
+def missed_deadlines(log: FlightLog) -> int:
+    """Ticks that started later than one whole period."""
+    if len(log.inputs) < 2:
+        return 0
+    return int((log.columns.lateness_s > period_s(log)).sum())
+
+
+def period_s(log: FlightLog) -> float:
+    """The loop's nominal period: the median of the ticks' times."""
+    return float(np.median(np.diff(log.columns.t_s))) if len(log.inputs) > 1 else math.nan
+
+
+def lateness(log: FlightLog) -> Percentiles | None:
+    """Tick start after its deadline."""
+    return percentiles(log.columns.lateness_s)
+
+
+def joint_read_to_write_s(log: FlightLog) -> Array:
+    """Joint state complete -> currents written, of ticks that wrote currents."""
+    used = [s.current_sent_s - s.joint_read_s for s in log.sent if s.arm_torque_sent_nm is not None]
+    return np.array(used, dtype=np.float64)
+
+
+def mocap_to_setpoint_s(log: FlightLog) -> Array:
+    """Mocap datagram -> setpoint sent, of ticks that saw a new frame and sent a setpoint."""
+    latest: float | None = None
+    used: list[float] = []
+    for i, _, s in log.rows():
+        if i.mocap is not None and i.mocap.stamp_s != latest:
+            # The first frame seen may have waited for the loop to begin.
+            if latest is not None and s.attitude_sent:
+                used.append(s.setpoint_sent_s - i.mocap.stamp_s)
+            latest = i.mocap.stamp_s
+    return np.array(used, dtype=np.float64)
+
+
+def percentiles(durations_s: Array) -> Percentiles | None:
+    """p50, p99 and maximum in ms; None if there are none."""
+    known = durations_s[np.isfinite(durations_s)]
+    if not len(known):
+        return None
+    p50, p99 = np.percentile(known, [50, 99])
+    return Percentiles(float(p50) * 1e3, float(p99) * 1e3, float(known.max()) * 1e3)
+
+
+def min_slack_m(log: FlightLog) -> float | None:
+    """Least of tether length minus distance from the anchor to the attachment point, between take-off and touchdown, by mocap."""
+    tether = (log.config.get("vehicle") or {}).get("tether")
+    if not isinstance(tether, dict) or not {"anchor_world_m", "length_m"} <= tether.keys():
+        return None
+    anchor, offset = tether["anchor_world_m"], tuple(tether.get("attachment_body_m", (0.0, 0.0, 0.0)))
+    least: float | None = None
+    known = np.isfinite(log.columns.mocap_position_world_m[:, 0])
+    for k, (i, o, _) in enumerate(log.rows()):
+        if o.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE) or not known[k] or i.mocap is None:
+            continue
+        arm = quat_rotate(i.mocap.attitude_wxyz, offset)
+        point = [p + a for p, a in zip(i.mocap.position_world_m, arm, strict=True)]
+        slack = float(tether["length_m"]) - math.dist(point, anchor)
+        least = slack if least is None else min(least, slack)
+    return least
+
+
+def _diagonals(controller: Any, *names: str) -> tuple[Array, ...] | None:
+    """Diagonals of eight rows from the controller's configuration; None if the law has no such gains."""
+    if not isinstance(controller, dict):
+        return None
+    rows = [controller.get(name) for name in names]
+    if not all(isinstance(row, list) and len(row) == 8 for row in rows):
+        return None
+    return tuple(np.array(row, dtype=np.float64) for row in rows)
+
+
+def _wrapped(angles_rad: Array) -> Array:
+    out: Array = (angles_rad + np.pi) % (2.0 * np.pi) - np.pi
+    return out

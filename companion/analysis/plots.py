@@ -1,0 +1,300 @@
+"""The plots of a flight, as in the paper's figures: errors, arm, actuation, adaptation, force, path, timing.
+
+Needs matplotlib (extra `analysis`); nothing that flies imports this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from companion.analysis import metrics
+from companion.analysis.log import Array, FlightLog
+from companion.frames import tilt_rad
+from companion.types import PhaseKind
+
+DPI = 150
+_INK = "#22303c"
+_REFERENCE = "#55626e"
+_CATCH = "#c2255c"
+_SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
+_SERIES_DARK = ("#0b365c", "#7d3d05")  # a reference drawn over its own measurement
+_PHASES = {
+    PhaseKind.TAKEOFF: "#eaf3fb",
+    PhaseKind.FLIGHT: "#ffffff",
+    PhaseKind.LANDING: "#f6f0e3",
+}
+_WIDTH_IN = 9.0
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """One written picture."""
+
+    path: Path
+    title: str
+    caption: str
+
+
+def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
+    """Draw every plot that the log has data for, as PNG into `out_dir`."""
+    if not log.inputs:
+        return []
+    makers: tuple[tuple[str, str, str, Callable[[FlightLog], Figure | None]], ...] = (
+        ("tracking", "Tracking", "Position and attitude by motion capture against the reference.", _tracking),
+        ("actuation", "Actuation", "What the law asked for and what was sent.", _actuation),
+        ("adaptation", "Adaptation", "Switching gain and its adapted parameters.", _adaptation),
+        ("force", "Contact force", "Tared force on the net in the world frame, its weight removed.", _force),
+        ("path", "Path", "By motion capture, seen from above and from the side.", _path),
+        ("timing", "Timing", "Lateness of the control tick, and the two latencies that matter.", _timing),
+    )
+    written: list[Plot] = []
+    for name, title, caption, make in makers:
+        figure = make(log)
+        if figure is not None:
+            path = out_dir / f"{name}.png"
+            FigureCanvasAgg(figure).print_png(path)
+            written.append(Plot(path, title, caption))
+    return written
+
+
+def _tracking(log: FlightLog) -> Figure | None:
+    figure, axes, t = _stack(log, "Tracking errors and arm", (1.0, 1.0, 1.25))
+    _line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", _SERIES[0])
+    _line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", _SERIES[0])
+    axes[0].set_ylabel("position error [m]")
+    axes[1].set_ylabel("attitude error [deg]")
+    pre, post = metrics.flight_masks(log)
+    # The take-off's transient would hide the flight itself.
+    for ax, values in (
+        (axes[0], _norm(metrics.position_error_m(log))),
+        (axes[1], np.degrees(_norm(metrics.attitude_error_rad(log)))),
+    ):
+        seen = values[(pre | post) & np.isfinite(values)]
+        if len(seen):
+            ax.set_ylim(0.0, 1.15 * max(float(seen.max()), 1e-3))
+    angles, wanted = np.degrees(log.columns.arm_rad), np.degrees(log.columns.arm_reference_rad)
+    for j in range(2):
+        _line(axes[2], t, angles[:, j], rf"$\alpha_{j + 1}$", _SERIES[j])
+        _line(axes[2], t, wanted[:, j], rf"$\alpha_{j + 1}$ reference", _SERIES_DARK[j], reference=True)
+    axes[2].set_ylabel("arm angle [deg]")
+    _legend(axes[2], columns=4)
+    return figure
+
+
+def _actuation(log: FlightLog) -> Figure | None:
+    figure, axes, t = _stack(log, "Actuation", (1.0, 1.0, 1.25))
+    thrust = log.column(lambda i, o, s: o.attitude.thrust if o.attitude else None)
+    hover = log.column(lambda i, o, s: o.control.hover_thrust if o.control else None)
+    _line(axes[0], t, 100 * thrust, "collective", _SERIES[0])
+    _line(axes[0], t, 100 * hover, "hover", _REFERENCE, reference=True)
+    axes[0].set_ylabel("thrust [%]")
+    _legend(axes[0])
+    asked = log.column(lambda i, o, s: tilt_rad(o.attitude.attitude_wxyz) if o.attitude else None)
+    flown = log.column(lambda i, o, s: tilt_rad(i.mocap.attitude_wxyz) if i.mocap and i.mocap.tracking_valid else None)
+    _line(axes[1], t, np.degrees(flown), "flown", _SERIES[0])
+    _line(axes[1], t, np.degrees(asked), "commanded", _REFERENCE, reference=True)
+    axes[1].set_ylabel("tilt [deg]")
+    _legend(axes[1])
+    commanded = log.column(lambda i, o, s: o.arm_torque_nm, 2)
+    sent = log.column(lambda i, o, s: s.arm_torque_sent_nm, 2)
+    for j in range(2):
+        _line(axes[2], t, sent[:, j], f"joint {j + 1} sent", _SERIES[j])
+        _line(axes[2], t, commanded[:, j], f"joint {j + 1} commanded", _SERIES_DARK[j], reference=True)
+    axes[2].set_ylabel("joint torque [N m]")
+    _legend(axes[2], columns=4)
+    return figure
+
+
+def _adaptation(log: FlightLog) -> Figure | None:
+    rho = log.column(lambda i, o, s: o.control.rho if o.control else None)
+    if not np.isfinite(rho).any():
+        return None
+    figure, axes, t = _stack(log, "Adaptation", (1.0, 1.25, 0.8))
+    _line(axes[0], t, rho, r"$\rho$", _SERIES[0])
+    axes[0].set_ylabel(r"switching gain $\rho$")
+    h_hat = log.column(lambda i, o, s: o.control.h_hat if o.control else None, 4)
+    for j in range(4):
+        _line(axes[1], t, h_hat[:, j], rf"$\hat{{H}}_{j}$", _SERIES[j])
+    axes[1].set_ylabel(r"$\hat{H}_0 \ldots \hat{H}_3$")
+    _legend(axes[1], columns=4)
+    _line(axes[2], t, log.column(lambda i, o, s: o.control.zeta if o.control else None), r"$\zeta$", _SERIES[0])
+    axes[2].set_ylabel(r"$\zeta$")
+    for ax in axes:
+        ax.set_ylim(bottom=0.0)
+    return figure
+
+
+def _force(log: FlightLog) -> Figure | None:
+    force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)
+    if not np.isfinite(force).any():
+        return None
+    figure, axes, t = _stack(log, "Contact force, world frame", (1.0,), height_in=3.2)
+    for j, name in enumerate("xyz"):
+        _line(axes[0], t, force[:, j], f"$F_{name}$", _SERIES[j])
+    axes[0].set_ylabel("force [N]")
+    _legend(axes[0], columns=3)
+    return figure
+
+
+def _path(log: FlightLog) -> Figure | None:
+    flown, wanted = log.columns.mocap_position_world_m, log.columns.reference_position_world_m
+    if not np.isfinite(flown).any():
+        return None
+    figure = Figure(figsize=(_WIDTH_IN, 5.2), dpi=DPI, layout="constrained", facecolor="white")
+    axes = figure.subplots(2, 1, sharex=True)
+    caught = metrics.catch_index(log)
+    for ax, row, name in ((axes[0], 1, "y"), (axes[1], 2, "z")):
+        _dress(ax)
+        ax.plot(wanted[:, 0], wanted[:, row], color=_REFERENCE, lw=1.2, ls=(0, (4, 2)), label="reference", zorder=3.5)
+        ax.plot(flown[:, 0], flown[:, row], color=_SERIES[0], lw=1.5, label="flown", zorder=3)
+        if caught is not None:
+            ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=_CATCH, mew=1.8, label="catch", zorder=4)
+        ax.set_ylabel(f"{name} [m]")
+        # A straight path gets room: noise of millimetres is not to look like a slalom.
+        low, high = np.nanmin([flown[:, row], wanted[:, row]]), np.nanmax([flown[:, row], wanted[:, row]])
+        middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
+        ax.set_ylim(middle - half, middle + half)
+    axes[0].set_title("From above", loc="left", fontsize=10, color=_INK)
+    axes[1].set_title("From the side", loc="left", fontsize=10, color=_INK)
+    axes[1].set_xlabel("x [m]")
+    _legend(axes[0], columns=3)
+    figure.suptitle("Path", fontsize=13, fontweight="bold", color=_INK)
+    return figure
+
+
+def _timing(log: FlightLog) -> Figure | None:
+    figure = Figure(figsize=(_WIDTH_IN, 5.4), dpi=DPI, layout="constrained", facecolor="white")
+    panes: dict[str, Any] = figure.subplot_mosaic([["time", "time", "time"], ["late", "joint", "mocap"]])
+    late_ms = 1e3 * log.columns.lateness_s
+    _dress(panes["time"])
+    panes["time"].plot(log.columns.t_s, late_ms, color=_SERIES[0], lw=0.6)
+    panes["time"].margins(x=0.0)
+    panes["time"].set_ylim(bottom=0.0)
+    panes["time"].set_xlabel("flight clock [s]")
+    panes["time"].set_ylabel("tick lateness [ms]")
+    for name, title, values_s in (
+        ("late", "tick lateness", log.columns.lateness_s),
+        ("joint", "joint read to current write", metrics.joint_read_to_write_s(log)),
+        ("mocap", "mocap datagram to setpoint", metrics.mocap_to_setpoint_s(log)),
+    ):
+        ax = panes[name]
+        _dress(ax)
+        ax.set_title(title, fontsize=10, color=_INK)
+        ax.set_xlabel("ms")
+        spread = metrics.percentiles(values_s)
+        if spread is None:
+            ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=_REFERENCE, transform=ax.transAxes)
+            continue
+        end_ms = max(1.3 * spread.p99_ms, 0.1)
+        ax.hist(np.minimum(1e3 * values_s, end_ms), bins=40, range=(0.0, end_ms), color=_SERIES[0], alpha=0.85)
+        for value_ms, label, dash in ((spread.p50_ms, "p50", "-"), (spread.p99_ms, "p99", "--")):
+            ax.axvline(value_ms, color=_CATCH, lw=1.2, ls=dash, label=f"{label} {value_ms:.2f} ms")
+        ax.plot([], [], " ", label=f"max {spread.max_ms:.2f} ms")
+        ax.set_ylim(top=1.45 * ax.get_ylim()[1])  # room for the legend
+        _legend(ax)
+    panes["late"].set_ylabel("ticks")
+    figure.suptitle("Timing", fontsize=13, fontweight="bold", color=_INK)
+    return figure
+
+
+def _stack(
+    log: FlightLog, title: str, heights: tuple[float, ...], height_in: float = 6.8
+) -> tuple[Figure, list[Any], Array]:
+    """Axes above each other over the mission clock, phases shaded and named, the catch marked; and the clock itself."""
+    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
+    grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
+    axes = [row[0] for row in grid]
+    flying = np.array([o.phase_kind in _PHASES for o in log.outputs], dtype=np.bool_)
+    t_s = log.columns.mission_t_s
+    span = t_s[flying] if flying.any() else t_s
+    for ax in axes:
+        _dress(ax)
+        ax.set_xlim(float(span[0]), float(max(span[-1], span[0] + 0.1)))
+        ax.margins(y=0.12)
+    _mark_phases(log, axes)
+    axes[-1].set_xlabel("mission time [s]")
+    figure.suptitle(title, fontsize=13, fontweight="bold", color=_INK)
+    return figure, axes, np.where(flying, t_s, np.nan) if flying.any() else t_s
+
+
+def _mark_phases(log: FlightLog, axes: list[Any]) -> None:
+    start = 0
+    outputs = log.outputs
+    whole_s = max(outputs[-1].mission_t_s, 1e-3)
+    for k in range(1, len(outputs) + 1):
+        if (
+            k < len(outputs)
+            and outputs[k].phase == outputs[start].phase
+            and outputs[k].phase_kind == outputs[start].phase_kind
+        ):
+            continue
+        colour = _PHASES.get(outputs[start].phase_kind)
+        if colour is not None:
+            begin_s, end_s = outputs[start].mission_t_s, outputs[min(k, len(outputs) - 1)].mission_t_s
+            for ax in axes:
+                ax.axvspan(begin_s, end_s, facecolor=colour, zorder=0, lw=0)
+                if start:
+                    ax.axvline(begin_s, color="#d5dbe1", lw=0.8, zorder=1)
+            name = outputs[start].phase
+            # A name is written where it fits: about 90 characters fill the whole axis.
+            if (end_s - begin_s) / whole_s > 0.012 * len(name):
+                middle_s = (begin_s + end_s) / 2
+                transform = axes[0].get_xaxis_transform()
+                axes[0].text(
+                    middle_s, 1.02, name, transform=transform, ha="center", va="bottom", fontsize=8.5, color="#5b6b79"
+                )
+        start = k
+    caught = metrics.catch_index(log)
+    if caught is not None:
+        for n, ax in enumerate(axes):
+            ax.axvline(outputs[caught].mission_t_s, color=_CATCH, lw=1.3, ls=(0, (5, 3)), zorder=2)
+            if n == 0:
+                ax.annotate(
+                    "catch",
+                    (outputs[caught].mission_t_s, 0.97),
+                    xycoords=ax.get_xaxis_transform(),
+                    xytext=(-4, 0),
+                    textcoords="offset points",
+                    ha="right",
+                    va="top",
+                    fontsize=9,
+                    color=_CATCH,
+                )
+
+
+def _dress(ax: Any) -> None:
+    ax.grid(True, color="#e6eaee", lw=0.7)
+    ax.set_axisbelow(True)
+    ax.tick_params(colors=_INK, labelsize=9, length=3)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color("#aab4bd")
+    for label in (ax.xaxis.label, ax.yaxis.label):
+        label.set_color(_INK)
+        label.set_size(9.5)
+
+
+def _line(ax: Any, t: Array, values: Array, label: str, colour: str, *, reference: bool = False) -> None:
+    style: dict[str, Any] = (
+        {"lw": 1.2, "ls": (0, (4, 2)), "alpha": 0.9, "zorder": 4} if reference else {"lw": 1.2, "zorder": 3}
+    )
+    ax.plot(t, values, color=colour, label=label, **style)
+
+
+def _legend(ax: Any, columns: int = 1) -> None:
+    ax.legend(
+        fontsize=8.5, ncols=columns, framealpha=0.9, edgecolor="none", handlelength=1.8, columnspacing=1.2, loc="best"
+    )
+
+
+def _norm(rows: Array) -> Array:
+    out: Array = np.sqrt(np.sum(rows * rows, axis=1))
+    return out

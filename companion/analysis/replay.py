@@ -1,0 +1,119 @@
+"""Runs the core again on a log's inputs and compares every output bit for bit."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from companion import __version__
+from companion.analysis.log import FlightLog, LogError
+from companion.record import differences
+from companion.types import Inputs, Outputs
+
+
+class Core(Protocol):
+    """`companion.core.FlightCore`, as far as replay needs it."""
+
+    def step(self, inputs: Inputs) -> Outputs:
+        """One tick."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """First field of the first output that came out otherwise."""
+
+    tick: int
+    t_s: float
+    field: str
+    logged: object
+    recomputed: object
+
+    def __str__(self) -> str:
+        return f"tick {self.tick} (t = {self.t_s:.3f} s): {self.field}: logged {self.logged!r}, recomputed {self.recomputed!r}"
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """Ticks that were compared, and the first difference if there is one."""
+
+    ticks: int
+    first_difference: Difference | None
+
+
+def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
+    """Step a fresh core through the logged inputs; stops at the first difference.
+
+    Args:
+        log: a log without gaps from its first tick on.
+        make_core: makes the core from the recorded configuration (JSON).
+
+    Raises:
+        LogError: no configuration, another version, an empty log, or missing ticks.
+    """
+    config_json = check_replayable(log)
+    try:
+        core = make_core(config_json)
+    except ValueError as error:
+        reason = str(error).splitlines()[0]
+        raise LogError(f"{log.path}: the recorded configuration does not fit this version: {reason}") from None
+    for k, (inputs, logged) in enumerate(zip(log.inputs, log.outputs, strict=True)):
+        found = differences(logged, core.step(inputs))
+        if found is not None:
+            field, old, new = found
+            return ReplayResult(k + 1, Difference(inputs.tick, inputs.t_s, field or "outputs", old, new))
+    return ReplayResult(len(log.inputs), None)
+
+
+def check_replayable(log: FlightLog) -> str:
+    """The recorded configuration (JSON) of a log that can be replayed.
+
+    Raises:
+        LogError: it cannot; says why.
+    """
+    about = log.metadata.get("companion", {})
+    version = about.get("version_companion")
+    if version != __version__:
+        found = f"companion {version}" if version else "a companion of unknown version"
+        raise LogError(
+            f"{log.path}: was recorded by {found}, this is {__version__}; replay it with the version that flew"
+        )
+    config_json = log.config_json
+    if config_json is None:
+        raise LogError(f"{log.path}: holds no configuration (metadata record 'config'); it cannot be replayed")
+    if not log.inputs:
+        raise LogError(f"{log.path}: holds no ticks")
+    first, missing = log.inputs[0].tick, log.missing_ticks()
+    if first != 0 or missing:
+        what = (
+            f"{missing} of {log.inputs[-1].tick - first + 1} ticks are missing"
+            if missing
+            else f"begins at tick {first}"
+        )
+        raise LogError(f"{log.path}: {what} (dropped by the recorder); the core's state cannot be rebuilt")
+    return config_json
+
+
+def flight_core(config_json: str) -> Core:
+    """The real core, made from a recorded configuration."""
+    from companion.config.loader import FlightConfig
+    from companion.core import FlightCore
+
+    core: Core = FlightCore(FlightConfig.model_validate_json(config_json))
+    return core
+
+
+def run(path: Path) -> int:
+    """`companion replay FILE`: 0 if every output is bit-identical, 1 if not, 2 if the log cannot be replayed."""
+    try:
+        result = replay(FlightLog.read(path), flight_core)
+    except LogError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if result.first_difference is not None:
+        print(f"{path}: differs at {result.first_difference}")
+        return 1
+    print(f"{path}: {result.ticks} ticks replayed, every output bit-identical")
+    return 0

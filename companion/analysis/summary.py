@@ -1,0 +1,129 @@
+"""summary.json: the contract that outside scripts rely on. Every key is always there; None (null) where a value is not known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from companion.analysis import metrics
+from companion.analysis.log import FlightLog
+from companion.analysis.metrics import Percentiles, TrackingRms
+
+_NO_RMS = TrackingRms(None, None, None)
+
+
+def empty_summary(
+    *,
+    outcome: str,
+    controller: str,
+    preset: str,
+    payload_kg: float | None = None,
+    recorder: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The summary of a flight that left no log; arguments as for `summarise`."""
+    recorder = recorder or {}
+    return {
+        "outcome": outcome,
+        "controller": controller,
+        "preset": preset,
+        "payload_kg": payload_kg,
+        "catch_t_s": None,
+        "rms": {"pre": _rms(_NO_RMS), "post": _rms(_NO_RMS)},
+        "impedance_error": {"position_n": None, "arm_nm": None},
+        "final_e_z_m": None,
+        "loop": {"rate_hz": None, "ticks": 0, "missed": 0, "lateness_ms": _spread(None)},
+        "latency_ms": {"mocap_to_setpoint": _spread(None), "joint_read_to_write": _spread(None)},
+        "recorder": {
+            "samples": recorder.get("samples", 0),
+            "dropped": recorder.get("dropped", 0),
+            "error": recorder.get("error"),
+        },
+        "events": [],
+        "tether": {"min_slack_m": None},
+    }
+
+
+def summarise(
+    log: FlightLog,
+    *,
+    outcome: str,
+    controller: str,
+    preset: str,
+    payload_kg: float | None = None,
+    recorder: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The summary of one flight.
+
+    Args:
+        log: the flight.
+        outcome: completed, refused, aborted, crashed or lost: as the launcher judged it.
+        controller: adaptive, csc or psc.
+        preset: paper, recommended or a name of the user's.
+        payload_kg: truth from SITL; None in reality.
+        recorder: the recorder's own report (samples, dropped, error); None: counted from the log.
+
+    Returns:
+        Keys as in the contract. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command), an event's `t_s`
+        is on the flight clock (as recorded) and comes with `mission_t_s`.
+    """
+    counted = {"samples": len(log.inputs), "dropped": log.missing_ticks()}
+    summary = empty_summary(
+        outcome=outcome, controller=controller, preset=preset, payload_kg=payload_kg, recorder=recorder or counted
+    )
+    if not log.inputs:
+        return summary
+    caught = metrics.catch_index(log)
+    pre, post = metrics.flight_masks(log)
+    position_n, arm_nm = metrics.impedance_error(log)
+    summary.update(
+        catch_t_s=None if caught is None else log.outputs[caught].mission_t_s,
+        rms={"pre": _rms(metrics.tracking_rms(log, pre)), "post": _rms(metrics.tracking_rms(log, post))},
+        impedance_error={"position_n": position_n, "arm_nm": arm_nm},
+        final_e_z_m=metrics.final_e_z_m(log),
+        loop={
+            "rate_hz": metrics.loop_rate_hz(log),
+            "ticks": log.inputs[-1].tick - log.inputs[0].tick + 1,
+            "missed": metrics.missed_deadlines(log),
+            "lateness_ms": _spread(metrics.lateness(log)),
+        },
+        latency_ms={
+            "mocap_to_setpoint": _spread(metrics.percentiles(metrics.mocap_to_setpoint_s(log))),
+            "joint_read_to_write": _spread(metrics.percentiles(metrics.joint_read_to_write_s(log))),
+        },
+        events=_events(log),
+        tether={"min_slack_m": metrics.min_slack_m(log)},
+    )
+    return summary
+
+
+def write_summary(summary: dict[str, Any], path: Path) -> None:
+    """Write it as JSON (never NaN)."""
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _rms(rms: TrackingRms) -> dict[str, float | None]:
+    return {"e_p_m": rms.e_p_m, "e_q_deg": rms.e_q_deg, "e_alpha_deg": rms.e_alpha_deg}
+
+
+def _spread(spread: Percentiles | None) -> dict[str, float | None]:
+    if spread is None:
+        return {"p50": None, "p99": None, "max": None}
+    return {"p50": spread.p50_ms, "p99": spread.p99_ms, "max": spread.max_ms}
+
+
+def _events(log: FlightLog) -> list[dict[str, Any]]:
+    return [
+        {
+            "t_s": event.t_s,
+            # An event may be dated back to its cause.
+            "mission_t_s": max(0.0, outputs.mission_t_s + event.t_s - outputs.t_s) if outputs.mission_t_s else 0.0,
+            "id": event.id,
+            "severity": event.severity.value,
+            "action": event.action.value,
+            "text": event.text,
+        }
+        for outputs in log.outputs
+        for event in outputs.events
+    ]

@@ -1,0 +1,108 @@
+"""`python -m sitl`: the simulated world as a process.
+
+Started by `companion fly --sitl` (with --for-launcher: talks JSON lines on stdout, ends when stdin does) or by `companion sitl`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import gc
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from companion.config.loader import FlightConfig
+from sitl.autopilot.mavlink import LinkError
+from sitl.server import Ports, Sitl, start_of
+
+_STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
+
+
+def _say(message: dict[str, Any]) -> None:
+    with contextlib.suppress(OSError):  # the launcher is gone; standard input will say so
+        print(json.dumps(message), flush=True)
+
+
+async def _serve(config: FlightConfig, for_launcher: bool) -> None:
+    start = config.mission.start
+    ports = Ports() if for_launcher else _STANDARD
+    sitl = Sitl(
+        config.vehicle, config.world, start_of(start.position_m, start.yaw_deg, start.arm_deg), ports,
+        _say if for_launcher else _tell,
+    )  # fmt: skip
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, sitl.stop)
+    async with sitl.wires() as devices:
+        if for_launcher:
+            _say({"type": "ready", "devices": devices})
+            _leave_with_launcher(sitl)
+        else:
+            _introduce(devices)
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        await sitl.run()
+    if for_launcher:
+        _say({"type": "final", "world": sitl.final()})
+
+
+def _leave_with_launcher(sitl: Sitl) -> None:
+    """Standard input ends when the launcher does; a vehicle that still flies then may land first."""
+    loop = asyncio.get_running_loop()
+    descriptor = sys.stdin.fileno()
+
+    def on_input() -> None:
+        if not os.read(descriptor, 4096):
+            loop.remove_reader(descriptor)
+            sitl.leave()
+
+    loop.add_reader(descriptor, on_input)
+
+
+def _tell(message: dict[str, Any]) -> None:
+    if message["type"] == "event":
+        print(f"  t = {message['t_s']:7.2f} s  payload {message['kind']}", flush=True)
+    elif message["type"] == "at_rest":
+        print("  disarmed" if message["at_rest"] else "  armed", flush=True)
+
+
+def _introduce(devices: dict[str, dict[str, Any]]) -> None:
+    mocap = devices["mocap"]
+    print(
+        "companion sitl is running; Ctrl-C ends it\n"
+        f"  PX4 stub      MAVLink 2 on UDP 127.0.0.1:14540 (MAVSDK: udpin://0.0.0.0:14540), from port 14580\n"
+        f"  mocap         NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port "
+        f"{mocap.get('data_port')}\n"
+        f"  arm bus       {devices['arm']['port']}\n"
+        f"  force sensor  {devices['force']['port']}",
+        flush=True,
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the world."""
+    parser = argparse.ArgumentParser(prog="python -m sitl")
+    parser.add_argument("--config", type=Path, required=True, help="effective configuration, JSON")
+    parser.add_argument("--for-launcher", action="store_true")
+    arguments = parser.parse_args(argv)
+    config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
+    try:
+        asyncio.run(_serve(config, arguments.for_launcher))
+    except (OSError, LinkError) as error:
+        text = f"sitl: {error}"
+        if arguments.for_launcher:
+            _say({"type": "error", "text": text})
+        else:
+            print(text, file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""The MuJoCo model of the machine, its tether and the thrown payload, built from the vehicle file."""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Vehicle
+from companion.config.world import World
+
+ROTOR_ARM_M = 0.325
+"""Tarot 650: centre to rotor."""
+YAW_TORQUE_PER_THRUST_M = 0.025
+BASE_INERTIA_KG_M2 = (0.045, 0.045, 0.075)
+JOINT_ARMATURE_KG_M2 = 0.008
+PAYLOAD_RADIUS_M = 0.035
+# PX4's quad-x order with each rotor's place (body FLU, in units of arm/sqrt 2) and its yaw reaction about body z (up).
+ROTORS = ((1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1))
+
+
+def base_mass_kg(vehicle: Vehicle, world: World) -> float:
+    """True mass of the flying base without arm and tool."""
+    arm, tool = vehicle.arm, vehicle.tool
+    rest = sum(arm.link_masses_kg) + tool.sensor_mass_kg + tool.net_mass_kg
+    return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
+
+
+def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
+    """The model as MJCF."""
+    arm, tool = vehicle.arm, vehicle.tool
+    l1, l2 = arm.link_lengths_m
+    offset = ROTOR_ARM_M / math.sqrt(2.0)
+    clearance = vehicle.airframe.ground_clearance_m
+    rotors = "\n".join(
+        f'<site name="rotor{i}" pos="{x * offset} {y * offset} 0.03"/>' for i, (x, y, _) in enumerate(ROTORS)
+    )
+    motors = "\n".join(
+        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {s * YAW_TORQUE_PER_THRUST_M}"/>'
+        for i, (_, _, s) in enumerate(ROTORS)
+    )
+    feet = "\n".join(
+        f'<geom name="foot{i}" type="sphere" size="0.02" pos="{x * 0.18} {y * 0.18} {-clearance + 0.02}" contype="1" '
+        f'conaffinity="2" friction="0.8 0.02 0.001" solref="0.02 1"/>'
+        for i, (x, y, _) in enumerate(ROTORS)
+    )
+
+    def rod(mass: float, com: float, length: float) -> str:
+        inertia = mass * length * length / 12.0
+        return f'<inertial pos="{com} 0 0" mass="{mass}" diaginertia="{0.1 * inertia + 1e-5} {inertia} {inertia}"/>'
+
+    def xyz(values: tuple[float, float, float]) -> str:
+        return " ".join(str(value) for value in values)
+
+    roll, pitch, yaw = tool.sensor_rpy_deg
+    payload = ""
+    connect = ""
+    if world.payload_kg > 0:
+        payload = f"""
+    <body name="payload" pos="0 50 {PAYLOAD_RADIUS_M}">
+      <freejoint name="payload"/>
+      <geom name="payload" type="sphere" size="{PAYLOAD_RADIUS_M}" mass="{world.payload_kg}" contype="1" conaffinity="2"/>
+    </body>"""
+        connect = """
+    <connect name="catch" body1="net" body2="payload" anchor="0 0 0" active="false" solref="0.025 1"
+             solimp="0.95 0.99 0.01"/>"""
+    return f"""
+<mujoco model="{vehicle.name}">
+  <compiler angle="radian" eulerseq="ZYX" inertiafromgeom="auto"/>
+  <option timestep="{timestep_s}" gravity="0 0 -9.81" integrator="implicitfast" cone="pyramidal"/>
+  <size memory="2M"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="20 20 1" contype="2" conaffinity="1"/>
+    <site name="anchor" pos="{xyz(vehicle.tether.anchor_world_m)}"/>
+    <body name="base" pos="0 0 {clearance}">
+      <freejoint name="base"/>
+      <inertial pos="0 0 0" mass="{base_mass_kg(vehicle, world)}" diaginertia="{xyz(BASE_INERTIA_KG_M2)}"/>
+      <site name="imu"/>
+      <site name="tether" pos="{xyz(vehicle.tether.attachment_body_m)}"/>
+      {rotors}
+      {feet}
+      <body name="link1" pos="{xyz(arm.shoulder_body_m)}">
+        <joint name="alpha1" axis="0 1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
+               armature="{JOINT_ARMATURE_KG_M2}"/>
+        {rod(arm.link_masses_kg[0], arm.link_com_m[0], l1)}
+        <body name="link2" pos="{l1} 0 0">
+          <joint name="alpha2" axis="0 -1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
+                 armature="{JOINT_ARMATURE_KG_M2}"/>
+          {rod(arm.link_masses_kg[1], arm.link_com_m[1], l2)}
+          <body name="sensor" pos="{l2} 0 0">
+            <inertial pos="0 0 0" mass="{max(tool.sensor_mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
+            <body name="net" euler="{math.radians(yaw)} {math.radians(pitch)} {math.radians(roll)}">
+              <inertial pos="0 0 0" mass="{max(tool.net_mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
+              <site name="net"/>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>{payload}
+  </worldbody>
+  <equality>
+    <joint name="park1" joint1="alpha1" solref="0.01 1"/>
+    <joint name="park2" joint1="alpha2" solref="0.01 1"/>{connect}
+  </equality>
+  <tendon>
+    <spatial name="tether" limited="true" range="0 {vehicle.tether.length_m}" solreflimit="0.02 1">
+      <site site="anchor"/><site site="tether"/>
+    </spatial>
+  </tendon>
+  <actuator>
+    {motors}
+    <motor name="alpha1" joint="alpha1"/>
+    <motor name="alpha2" joint="alpha2"/>
+  </actuator>
+  <sensor>
+    <accelerometer name="accel" site="imu"/>
+    <gyro name="gyro" site="imu"/>
+    <force name="force" site="net"/>
+    <torque name="torque" site="net"/>
+  </sensor>
+</mujoco>"""

@@ -1,0 +1,204 @@
+"""The SITL process: the plant in real time, every device behind its real wire.
+
+The world's clock follows the wall clock. When this process is held up for longer than `_CATCH_UP_S` the world pauses instead of
+racing: the time lost is counted (`slipped_s`) and reported.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import Any
+
+from companion.config.vehicle import Vehicle
+from companion.config.world import World as WorldConfig
+from companion.types import Vec2
+from sitl.autopilot.autopilot import Px4Stub, gains_from_params
+from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.estimator import Estimator
+from sitl.autopilot.mavlink import GROUND_PORTS, MavlinkServer
+from sitl.autopilot.mavlink import Ports as LinkPorts
+from sitl.autopilot.params import Params
+from sitl.force_torque import ForceTorqueServer
+from sitl.natnet import BodyPose, NatNetServer
+from sitl.plant import MocapFrame, Plant
+from sitl.servo_bus import ServoBus
+from sitl.servo_model import ServoModel
+from sitl.world import PHYSICS_DT_S
+
+_CATCH_UP_S = 0.03
+_LEAVE_S = 30.0
+
+OnMessage = Callable[[dict[str, Any]], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """UDP ports of the standalone simulator; 0 takes a free one."""
+
+    autopilot_local: int = 0
+    autopilot_remote: int = 0
+    """Where PX4 sends first; 0: it waits for a partner to speak."""
+    mocap_command: int = 0
+    mocap_data: int = 0
+    multicast: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where the machine stands."""
+
+    position_m: Vec2
+    yaw_rad: float
+    arm_rad: Vec2
+
+
+class Sitl:
+    """The plant and its wires."""
+
+    def __init__(
+        self, vehicle: Vehicle, config: WorldConfig, start: Start, ports: Ports, on_message: OnMessage
+    ) -> None:
+        self._vehicle = vehicle
+        self._config = config
+        self._on_message = on_message
+        arm = vehicle.arm
+        device = vehicle.devices.arm
+        self.servos = [ServoModel(joint.servo_id, baud_bps=device.baud) for joint in arm.joints]
+        params = Params()
+        self.px4 = Px4Stub(
+            params, Estimator(), Cascade(gains_from_params(params)), setpoint_delay_s=config.setpoint_delay_s
+        )
+        self.plant = Plant(vehicle, config, self.px4, self.servos, (start.position_m, start.yaw_rad, start.arm_rad))
+        params.set("MPC_THR_HOVER", self.plant.world.hover_command * (1.0 + config.hover_thrust_error))
+        self._ports = ports
+        self.slipped_s = 0.0
+        self._at_rest = False
+        self._leaving = False
+        self._end_s = math.inf
+        self._lost_servo: ServoModel | None = None
+
+    @contextlib.asynccontextmanager
+    async def wires(self) -> AsyncIterator[dict[str, dict[str, Any]]]:
+        """Open every wire; yields the addresses as settings of the vehicle file's devices."""
+        device = self._vehicle.devices
+        async with contextlib.AsyncExitStack() as stack:
+            self.bus = await stack.enter_async_context(ServoBus(self.servos))
+            self.force = await stack.enter_async_context(ForceTorqueServer())
+            self.mocap = await stack.enter_async_context(
+                NatNetServer(
+                    version=self._config.natnet_version,
+                    command_port=self._ports.mocap_command,
+                    data_port=self._ports.mocap_data,
+                    multicast_group=device.mocap.multicast_group if self._ports.multicast else None,
+                    bodies=((device.mocap.rigid_body_id, self._vehicle.name),),
+                    rate_hz=self._config.mocap_rate_hz,
+                )
+            )
+            self.mavlink = await stack.enter_async_context(
+                MavlinkServer(
+                    self.px4,
+                    LinkPorts(self._ports.autopilot_local, self._ports.autopilot_remote),
+                    GROUND_PORTS if self._ports.autopilot_remote else None,
+                )
+            )
+            mocap = {
+                "server": "127.0.0.1",
+                "interface": "127.0.0.1",
+                "transport": "multicast" if self._ports.multicast else "unicast",
+                "command_port": self.mocap.command_port,
+                "up_axis": "z",
+                "rate_hz": self._config.mocap_rate_hz,
+            }
+            if self._ports.multicast:
+                mocap["data_port"] = self.mocap.data_port
+            yield {
+                "autopilot": {"address": f"udpout://127.0.0.1:{self.mavlink.onboard_port}"},
+                "mocap": mocap,
+                "arm": {"port": self.bus.path},
+                "force": {"port": self.force.port},
+            }
+
+    def stop(self) -> None:
+        """End now."""
+        self._end_s = -math.inf
+
+    def leave(self) -> None:
+        """End as soon as the rotors stand, `_LEAVE_S` from now at the latest."""
+        self._leaving = True
+        self._end_s = min(self._end_s, self.plant.t_s + _LEAVE_S)
+
+    async def run(self) -> None:
+        """Follow the wall clock until asked to stop."""
+        origin_s = time.monotonic() - self.plant.t_s
+        while self.plant.t_s < self._end_s and not (self._leaving and not self.px4.armed):
+            behind_s = time.monotonic() - origin_s - self.plant.t_s
+            if behind_s > _CATCH_UP_S:
+                origin_s += behind_s - _CATCH_UP_S
+                self.slipped_s += behind_s - _CATCH_UP_S
+                behind_s = _CATCH_UP_S
+            for _ in range(int(behind_s / PHYSICS_DT_S)):
+                self._step()
+            ahead_s = self.plant.t_s + PHYSICS_DT_S - (time.monotonic() - origin_s)
+            await asyncio.sleep(max(0.0, ahead_s))
+
+    def _step(self) -> None:
+        plant = self.plant
+        self._plant_faults()
+        plant.step(self.px4.armed)
+        for frame in plant.take_mocap():
+            self._publish(frame)
+        self.force.set_wrench(*plant.force_torque())
+        self.force.tick(plant.t_s)
+        self.px4.battery = plant.battery()
+        self.mavlink.pump(plant.t_s)
+        for event in plant.world.take_events():
+            self._on_message({"type": "event", "kind": event.kind, "t_s": event.t_s})
+        at_rest = not self.px4.armed
+        if at_rest != self._at_rest:
+            self._at_rest = at_rest
+            self._on_message({"type": "at_rest", "at_rest": at_rest})
+
+    def _publish(self, frame: MocapFrame) -> None:
+        body = self._vehicle.devices.mocap.rigid_body_id
+        pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
+        self.mocap.publish(self.plant.t_s, (pose,), frame.exposure_t_s)
+
+    def _plant_faults(self) -> None:
+        plant = self.plant
+        self.mavlink.link_down = plant.fault("link_loss") is not None
+        self.force.silent = plant.fault("force_loss") is not None
+        fault = plant.fault("servo_loss")
+        if fault is not None:
+            self._lost_servo = self.servos[fault.servo - 1]
+            self._lost_servo.fail_silent(True)
+        elif self._lost_servo is not None:
+            self._lost_servo.fail_silent(False)
+            self._lost_servo = None
+
+    def final(self) -> dict[str, Any]:
+        """What the world knows at its end."""
+        world, armed = self.plant.world, self.plant.armed_t_s
+        caught = world.caught_t_s
+
+        def since_arming(t_s: float | None) -> float | None:
+            return None if t_s is None or armed is None else t_s - armed
+
+        return {
+            "payload_kg": self._config.payload_kg,
+            "thrown": world.thrown_t_s is not None,
+            "caught": caught is not None,
+            "caught_after_arming_s": since_arming(caught),
+            "missed": world.missed,
+            "crashed": world.crashed,
+            "slipped_s": self.slipped_s,
+        }
+
+
+def start_of(position_m: Vec2, yaw_deg: float, arm_deg: Vec2) -> Start:
+    """A start pose from a mission's degrees."""
+    return Start(position_m, math.radians(yaw_deg), (math.radians(arm_deg[0]), math.radians(arm_deg[1])))

@@ -1,0 +1,189 @@
+"""A fabricated flight with the shape of the paper's scenario; trial data for the log, the metrics and the plots."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import select
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from companion.frames import quat_from_euler_zyx
+from companion.io.recorder import RecorderProcess, RecorderReport
+from companion.types import (
+    ArmState,
+    AttitudeSetpoint,
+    AutopilotRequest,
+    AutopilotStatus,
+    ControlLog,
+    Event,
+    FlightMode,
+    ForceSample,
+    Inputs,
+    LandedState,
+    MocapPose,
+    OperatorCommand,
+    Outcome,
+    Outputs,
+    PhaseKind,
+    Reference,
+    SafetyAction,
+    Sent,
+    Severity,
+    Vec2,
+    Vec3,
+    VehicleState,
+)
+
+RATE_HZ = 200.0
+GROUND_S = 1.0
+TAKEOFF_S = 3.0
+CATCH_S = 6.5
+FLIGHT_END_S = 18.0
+LANDED_S = 21.0
+FOLDED_RAD: Vec2 = (math.radians(165), math.radians(140))
+CATCH_RAD: Vec2 = (math.radians(100), math.radians(60))
+
+CONFIG: dict[str, Any] = {
+    "vehicle": {
+        "name": "test rig",
+        "tether": {"anchor_world_m": [-2.0, 0.0, 3.0], "length_m": 4.5, "attachment_body_m": [0.0, 0.0, 0.1]},
+        "airframe": {"mass_kg": 3.0},
+    },
+    "controller": {
+        "law": "adaptive",
+        "preset": "recommended",
+        "inertia_md": [3.0, 3.0, 3.0, 0.1, 0.1, 0.1, 0.1, 0.1],
+        "damping_kd": [40.0, 40.0, 40.0, 2.0, 2.0, 2.0, 1.0, 1.0],
+        "phi": [2.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0],
+    },
+    "mission": {"name": "catch"},
+    "world": {"payload_kg": 0.2},
+}
+
+
+def _blend(x: float) -> float:
+    x = min(1.0, max(0.0, x))
+    return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)
+
+
+def _mix(a: float, b: float, share: float) -> float:
+    return a + (b - a) * share
+
+
+def phase_at(mission_t_s: float) -> tuple[str, PhaseKind]:
+    if mission_t_s < TAKEOFF_S:
+        return "take-off", PhaseKind.TAKEOFF
+    if mission_t_s < 9.0:
+        return "catch", PhaseKind.FLIGHT
+    if mission_t_s < FLIGHT_END_S:
+        return "return", PhaseKind.FLIGHT
+    return ("land", PhaseKind.LANDING) if mission_t_s < LANDED_S else ("done", PhaseKind.DONE)
+
+
+def reference_at(t_s: float) -> tuple[Vec3, Vec2]:
+    up = _blend(t_s / TAKEOFF_S) - _blend((t_s - FLIGHT_END_S) / (LANDED_S - FLIGHT_END_S))
+    x = -1.0 + 2.0 * _blend((t_s - 3.5) / 6.0) - 2.0 * _blend((t_s - 10.5) / 6.0)
+    open_ = _blend((t_s - 3.5) / 2.0) - _blend((t_s - 15.0) / 2.0)
+    arm = (_mix(FOLDED_RAD[0], CATCH_RAD[0], open_), _mix(FOLDED_RAD[1], CATCH_RAD[1], open_))
+    return (x, 0.0, 0.15 + 0.85 * up), arm
+
+
+def synthetic_flight(seed: int = 1, end_s: float = LANDED_S) -> Iterator[tuple[Inputs, Outputs, Sent]]:
+    """Ticks up to `end_s` of the mission clock."""
+    noise = random.Random(seed)
+    period_s = 1.0 / RATE_HZ
+    caught = False
+    last_kind: PhaseKind | None = None
+    for tick in range(round((GROUND_S + end_s) * RATE_HZ) + 1):
+        t_s = tick * period_s
+        mission_t_s = max(0.0, t_s - GROUND_S)
+        name, kind = ("ground", PhaseKind.GROUND) if t_s < GROUND_S else phase_at(mission_t_s)
+        position, arm = reference_at(mission_t_s)
+        after_s = mission_t_s - CATCH_S
+        kick = math.exp(-after_s / 0.8) * math.sin(4.0 * after_s) if after_s > 0 else 0.0
+        error: Vec3 = (
+            -0.05 * kick + noise.gauss(0, 1e-3),
+            0.006 * math.sin(t_s) + noise.gauss(0, 1e-3),
+            -0.06 * kick + noise.gauss(0, 1e-3),
+        )
+        tilt = 0.05 * math.sin(0.9 * t_s) + 0.06 * kick
+        actual = (position[0] + error[0], position[1] + error[1], position[2] + error[2])
+        attitude = quat_from_euler_zyx(noise.gauss(0, 2e-3), tilt + noise.gauss(0, 2e-3), noise.gauss(0, 2e-3))
+        joints = (arm[0] + 0.08 * kick + noise.gauss(0, 1e-3), arm[1] - 0.05 * kick + noise.gauss(0, 1e-3))
+        events: tuple[Event, ...] = ()
+        if kind is not last_kind and kind is not PhaseKind.GROUND:
+            events += (Event(t_s, f"phase_{kind.value}", Severity.INFO, SafetyAction.NOMINAL, f"phase {name}"),)
+        last_kind = kind
+        if not caught and after_s >= 0:
+            caught = True
+            events += (Event(t_s, "catch", Severity.INFO, SafetyAction.NOMINAL, "payload in the net"),)
+        load_n = 2.0 * (1.0 - math.exp(-max(0.0, after_s) / 0.05)) + 14.0 * max(0.0, kick) ** 8
+        velocity: Vec3 = (0.0, 0.0, 0.0)
+        inputs = Inputs(
+            tick,
+            t_s,
+            VehicleState(t_s - 0.004, t_s - 0.002, t_s - 0.002, actual, velocity, attitude, velocity, (0.0, 0.0, 9.81)),
+            AutopilotStatus(
+                math.floor(t_s), kind is not PhaseKind.GROUND, FlightMode.OFFBOARD, LandedState.IN_AIR, 15.8, 0.9
+            ),
+            MocapPose(t_s - 0.003, 0.002, tick, actual, attitude, True, 2e-4),
+            ArmState(t_s + 4e-4, joints, (0.0, 0.0), (0.1, 0.05), (0, 0), (31.0, 30.0), 0),
+            ForceSample(t_s - 0.002, (noise.gauss(0, 0.05), 0.0, -load_n), (0.0, 0.0, 0.0), False),
+            OperatorCommand.NONE,
+            0,
+        )
+        rho = 1.0 + 3.0 * abs(kick)
+        control = ControlLog(
+            error=(*error, 0.0, 0.0, 0.0, joints[0] - arm[0], joints[1] - arm[1]),
+            error_rate=(0.0,) * 8,
+            sliding=(2 * error[0], 2 * error[1], 3 * error[2], 0.0, 0.0, 0.0, 0.24 * kick, -0.15 * kick),
+            gamma=(0.0,) * 8,
+            tau=(-8 * error[0], -8 * error[1], 29.43 - 20 * error[2], 0.0, 0.0, 0.0, 0.35 + kick, 0.1 - 0.5 * kick),
+            e_tau=(0.0,) * 8,
+            h_hat=(0.1 * rho, 0.2 * rho, 0.05 * rho, 0.02 * rho),
+            zeta=0.1 * math.exp(-t_s / 10),
+            rho=rho,
+            force_ext_world_n=(0.0, 0.0, -load_n),
+            attitude_desired_rad=(0.0, tilt, 0.0),
+            hover_thrust=0.5,
+            saturated=(False, abs(kick) > 0.6, False),
+        )
+        flying = kind not in (PhaseKind.GROUND, PhaseKind.DONE)
+        outputs = Outputs(
+            tick,
+            t_s,
+            mission_t_s,
+            name,
+            kind,
+            min(1.0, mission_t_s / LANDED_S),
+            Reference(position, velocity, velocity, 0.0, 0.0, arm, (0.0, 0.0), (0.0, 0.0)) if flying else None,
+            AttitudeSetpoint(quat_from_euler_zyx(0.0, tilt, 0.0), 0.5 + 0.02 * kick) if flying else None,
+            (0.35 + kick, 0.1 - 0.5 * kick) if flying else None,
+            AutopilotRequest.NONE,
+            SafetyAction.NOMINAL,
+            events,
+            control if flying else None,
+            Outcome.COMPLETED if kind is PhaseKind.DONE else None,
+        )
+        late_s = abs(noise.gauss(0, 6e-4))
+        start_s = t_s + late_s
+        written: Vec2 | None = (
+            None if outputs.arm_torque_nm is None else (round(0.35 + kick, 2), round(0.1 - 0.5 * kick, 2))
+        )
+        core_s = start_s + 9e-4 + abs(noise.gauss(0, 1e-4))
+        sent = Sent(tick, flying, written, start_s, late_s, start_s + 8e-4, core_s, core_s + 1e-4, core_s + 2e-4)
+        yield inputs, outputs, sent
+
+
+def record_flight(path: Path, *, config: dict[str, Any] | None = CONFIG, end_s: float = LANDED_S) -> RecorderReport:
+    """Write a synthetic flight through the real recorder process."""
+    config_json = "" if config is None else json.dumps(config)
+    recorder = RecorderProcess.start(path, config_json=config_json, epoch_offset_ns=1_700_000_000_000_000_000)
+    for inputs, outputs, sent in synthetic_flight(end_s=end_s):
+        # Faster than real time the channel would drop, as it must in flight; here every tick matters.
+        select.select([], [recorder.client], [], 60.0)
+        recorder.client.record(inputs, outputs, sent)
+    return recorder.finish(60.0)

@@ -1,0 +1,360 @@
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import foxglove
+import numpy as np
+import pytest
+
+from companion.analysis import metrics
+from companion.analysis.log import FlightLog, LogError
+from companion.analysis.replay import replay
+from companion.analysis.report import write_report
+from companion.analysis.summary import empty_summary, summarise, write_summary
+from companion.record import differences
+from companion.types import Inputs, Outputs, PhaseKind, Sent
+from tests.analysis.synthetic_flight import CATCH_S, CONFIG, record_flight, synthetic_flight
+
+Row = tuple[Inputs, Outputs, Sent]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
+    path = tmp_path_factory.mktemp("flight") / "flight.mcap"
+    report = record_flight(path)
+    assert (report.dropped, report.error) == (0, None)
+    return FlightLog.read(path)
+
+
+def made_of(rows: list[Row], config: dict[str, Any] | None = None) -> FlightLog:
+    metadata = {"companion": {"version_companion": "0.1.0"}, "config": {"json": json.dumps(config or CONFIG)}}
+    inputs, outputs, sent = zip(*rows, strict=True)
+    return FlightLog(Path("made.mcap"), inputs, outputs, sent, metadata, closed=True)
+
+
+def changed(change: Callable[[Inputs, Outputs, Sent], Row]) -> FlightLog:
+    return made_of([change(*row) for row in synthetic_flight()])
+
+
+def test_a_log_gives_back_every_record_bit_for_bit(flight: FlightLog) -> None:
+    rows = list(synthetic_flight())
+    assert len(flight.inputs) == len(rows)
+    for logged, flown in zip(flight.rows(), rows, strict=True):
+        assert differences(logged, flown) is None
+    assert flight.closed
+    assert flight.config == CONFIG
+    assert flight.missing_ticks() == 0
+
+
+def test_a_log_cut_anywhere_is_read_up_to_its_last_whole_chunk(flight: FlightLog, tmp_path: Path) -> None:
+    data = flight.path.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for share in (0.3, 0.501, 0.77, 0.9999):
+        cut.write_bytes(data[: int(share * len(data))])
+        log = FlightLog.read(cut)
+        assert not log.closed
+        assert len(log.inputs) > 0.25 * len(flight.inputs)
+        assert log.inputs == flight.inputs[: len(log.inputs)]
+        assert len(log.outputs) == len(log.sent) == len(log.inputs)
+
+
+def test_a_file_that_is_no_flight_log_is_refused_in_one_line(flight: FlightLog, tmp_path: Path) -> None:
+    text, empty, foreign, damaged = (tmp_path / name for name in ("a.txt", "empty", "foreign.mcap", "damaged.mcap"))
+    text.write_text("not a log, but long enough to look at")
+    empty.touch()
+    with foxglove.open_mcap(foreign, context=foxglove.Context()) as writer:
+        writer.write_metadata("someone", {"else": "1"})
+    data = bytearray(flight.path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 64] = bytes(64)
+    damaged.write_bytes(data)
+    for path, reason in (
+        (tmp_path / "absent", "No such file"),
+        (tmp_path, "directory"),
+        (text, "no MCAP file"),
+        (empty, "is empty"),
+        (foreign, "not a flight log"),
+        (damaged, "damaged"),
+    ):
+        with pytest.raises(LogError) as refusal:
+            FlightLog.read(path)
+        assert str(refusal.value).startswith(f"{path}: "), refusal.value
+        assert reason in str(refusal.value)
+        assert "\n" not in str(refusal.value)
+
+
+def test_position_rms_is_that_of_mocap_against_the_reference_around_the_catch() -> None:
+    def shift(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.mocap is not None
+        if o.reference is None:
+            return i, o, s
+        x, y, z = o.reference.position_world_m
+        off = 0.03 if o.mission_t_s < CATCH_S else 0.05
+        return replace(i, mocap=replace(i.mocap, position_world_m=(x + 0.6 * off, y, z - 0.8 * off))), o, s
+
+    summary = summarise(changed(shift), outcome="completed", controller="adaptive", preset="paper")
+    assert summary["catch_t_s"] == pytest.approx(CATCH_S)
+    assert summary["rms"]["pre"]["e_p_m"] == pytest.approx(0.03)
+    assert summary["rms"]["post"]["e_p_m"] == pytest.approx(0.05)
+    assert summary["final_e_z_m"] == pytest.approx(-0.04)
+
+
+def test_a_catch_that_was_noticed_late_counts_from_the_time_it_is_dated() -> None:
+    contact_s = next(i.t_s for i, o, _ in synthetic_flight() if o.mission_t_s >= CATCH_S - 0.25)
+
+    def date_back(i: Inputs, o: Outputs, s: Sent) -> Row:
+        events = tuple(replace(event, t_s=contact_s) if event.id == "catch" else event for event in o.events)
+        return i, replace(o, events=events), s
+
+    log = changed(date_back)
+    caught = metrics.catch_index(log)
+    assert caught is not None
+    assert log.inputs[caught].t_s == contact_s
+    summary = summarise(log, outcome="completed", controller="adaptive", preset="paper")
+    event = next(event for event in summary["events"] if event["id"] == "catch")
+    assert summary["catch_t_s"] == pytest.approx(CATCH_S - 0.25, abs=0.005)
+    assert event["mission_t_s"] == pytest.approx(summary["catch_t_s"])
+
+
+def test_attitude_and_arm_rms_are_in_degrees_and_wrapped() -> None:
+    def turn(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.mocap is not None
+        if o.control is None or i.arm is None or o.reference is None:
+            return i, o, s
+        half = math.radians(179.0) / 2
+        pose = replace(i.mocap, attitude_wxyz=(math.cos(half), 0.0, 0.0, math.sin(half)))
+        arm = tuple(a + math.radians(d) for a, d in zip(o.reference.arm_rad, (3.0, -4.0), strict=True))
+        control = replace(o.control, attitude_desired_rad=(0.0, 0.0, math.radians(-179.0)))
+        return replace(i, mocap=pose, arm=replace(i.arm, angle_rad=arm)), replace(o, control=control), s  # type: ignore[arg-type]
+
+    log = changed(turn)
+    pre, _ = metrics.flight_masks(log)
+    rms = metrics.tracking_rms(log, pre)
+    assert rms.e_q_deg == pytest.approx(2.0)
+    assert rms.e_alpha_deg == pytest.approx(5.0)
+
+
+def test_an_estimator_that_praises_itself_changes_no_grade(flight: FlightLog) -> None:
+    def flatter(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.vehicle is not None
+        where = o.reference.position_world_m if o.reference else (9.0, 9.0, 9.0)
+        return replace(i, vehicle=replace(i.vehicle, position_world_m=where)), o, s
+
+    _, post = metrics.flight_masks(flight)
+    assert metrics.tracking_rms(changed(flatter), post) == metrics.tracking_rms(flight, post)
+
+
+def test_stale_or_invalid_mocap_is_not_graded() -> None:
+    def lose(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.mocap is not None
+        wrong = replace(i.mocap, position_world_m=(50.0, 0.0, 0.0))
+        if 10.0 < o.mission_t_s < 11.0:
+            wrong = replace(wrong, tracking_valid=False)
+        elif 12.0 < o.mission_t_s < 13.0:
+            wrong = replace(wrong, stamp_s=i.t_s - 0.5)
+        else:
+            wrong = i.mocap
+        return replace(i, mocap=wrong), o, s
+
+    log = changed(lose)
+    rms = metrics.tracking_rms(log, metrics.flight_masks(log)[1])
+    assert rms.e_p_m is not None
+    assert rms.e_p_m < 0.05
+
+
+def test_the_impedance_error_of_a_known_motion_is_what_the_formula_gives() -> None:
+    omega, size = 2 * math.pi * 0.5, 0.02
+
+    def swing(i: Inputs, o: Outputs, s: Sent) -> Row:
+        if o.control is None:
+            return i, o, s
+        row = size * math.sin(omega * o.mission_t_s)
+        return i, replace(o, control=replace(o.control, sliding=(row, 0.0, 0.0, 9.0, 9.0, 9.0, 0.0, row))), s
+
+    position_n, arm_nm = metrics.impedance_error(changed(swing))
+    # |M_d s' + (K_d - M_d Phi) s| of a sine; an odd number of half periods would not average out, 11.5 s is 5.75 periods.
+    gains = CONFIG["controller"]
+
+    def rms(row: int) -> float:
+        inertia, damping, phi = (gains[name][row] for name in ("inertia_md", "damping_kd", "phi"))
+        return size * math.hypot(inertia * omega, damping - inertia * phi) / math.sqrt(2.0)
+
+    assert position_n == pytest.approx(rms(0), rel=0.03)
+    assert arm_nm == pytest.approx(rms(7), rel=0.03)
+
+
+def test_the_zero_phase_lowpass_halves_a_sine_at_its_cutoff_and_leaves_slow_ones_in_place() -> None:
+    t_s = np.arange(0, 6, 0.005)
+    for hz, gain in ((0.5, 1.0), (10.0, 0.5)):
+        rows = np.sin(2 * np.pi * hz * t_s)[:, None]
+        out = metrics.lowpass_zero_phase(rows, 0.005, 10.0)
+        inner = slice(200, -200)
+        assert np.allclose(out[inner], gain * rows[inner], atol=4e-3)
+
+
+def test_loop_and_latency_count_what_they_should() -> None:
+    def slow(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.mocap is not None
+        late_s = 0.006 if i.tick % 1000 == 999 else 0.001
+        # Mocap at half the rate of the loop: the second tick of a frame tells nothing about the wire.
+        stamp_s = (i.tick - i.tick % 2) * 0.005 - 0.002
+        s = replace(
+            s, lateness_s=late_s, joint_read_s=i.t_s, current_sent_s=i.t_s + 0.0015, setpoint_sent_s=i.t_s + 0.001
+        )
+        return replace(i, mocap=replace(i.mocap, stamp_s=stamp_s)), o, s
+
+    summary = summarise(changed(slow), outcome="completed", controller="adaptive", preset="paper")
+    assert summary["loop"]["ticks"] == 4401
+    assert summary["loop"]["missed"] == 4
+    assert summary["loop"]["lateness_ms"]["max"] == pytest.approx(6.0)
+    assert summary["loop"]["lateness_ms"]["p50"] == pytest.approx(1.0)
+    assert summary["latency_ms"]["joint_read_to_write"]["p99"] == pytest.approx(1.5)
+    assert summary["latency_ms"]["mocap_to_setpoint"]["max"] == pytest.approx(3.0)
+
+
+def test_the_least_tether_slack_is_that_of_the_attachment_point() -> None:
+    def park(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.mocap is not None
+        # Rolled by 90 degrees: the attachment, 0.1 m above the body's origin, lies at y - 0.1.
+        half = math.sqrt(0.5)
+        return (
+            replace(i, mocap=replace(i.mocap, position_world_m=(-2.0, 4.1, 3.0), attitude_wxyz=(half, half, 0.0, 0.0))),
+            o,
+            s,
+        )
+
+    assert metrics.min_slack_m(changed(park)) == pytest.approx(4.5 - 4.0)
+
+
+def keys(tree: object) -> object:
+    return {k: keys(v) for k, v in tree.items()} if isinstance(tree, dict) else None
+
+
+def test_every_key_is_there_whatever_is_missing(flight: FlightLog, tmp_path: Path) -> None:
+    full = summarise(flight, outcome="completed", controller="adaptive", preset="recommended", payload_kg=0.2)
+    bare = [
+        (replace(i, mocap=None, arm=None, force=None), replace(o, control=None, reference=None, events=()), s)
+        for i, o, s in synthetic_flight(end_s=5.0)
+    ]
+    options: dict[str, Any] = {"outcome": "lost", "controller": "csc", "preset": "paper"}
+    for summary in (
+        empty_summary(**options),
+        summarise(made_of(bare), **options),
+        summarise(made_of(bare[:1], {"vehicle": {}}), **options),
+        summarise(replace(flight, inputs=(), outputs=(), sent=()), **options),
+    ):
+        assert keys(summary) == keys(full)
+        write_summary(summary, tmp_path / "summary.json")
+        assert json.loads((tmp_path / "summary.json").read_text()) == summary
+    caught = [event for event in full["events"] if event["id"] == "catch"]
+    assert len(caught) == 1
+    assert caught[0].keys() >= {"t_s", "id", "severity", "action"}
+    assert full["recorder"] == {"samples": 4401, "dropped": 0, "error": None}
+
+
+def test_without_a_catch_the_whole_flight_is_before_it() -> None:
+    log = made_of([(i, replace(o, events=()), s) for i, o, s in synthetic_flight()])
+    pre, post = metrics.flight_masks(log)
+    assert pre.sum() == sum(o.phase_kind is PhaseKind.FLIGHT for o in log.outputs)
+    assert not post.any()
+    assert metrics.tracking_rms(log, post).e_p_m is None
+
+
+def test_the_report_is_one_file_with_plots_results_and_events(flight: FlightLog, tmp_path: Path) -> None:
+    summary = summarise(flight, outcome="completed", controller="adaptive", preset="recommended", payload_kg=0.2)
+    path = write_report(flight, summary, tmp_path)
+    page = path.read_text(encoding="utf-8")
+    pictures = {p.stem for p in tmp_path.glob("*.png")}
+    assert pictures == {"tracking", "actuation", "adaptation", "force", "path", "timing"}
+    assert all((tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG") for name in pictures)
+    assert page.count("data:image/png;base64,") == len(pictures)
+    assert not re.search(r"""(?:src|href)=['"](?!data:)""", page)
+    assert f"{summary['rms']['post']['e_p_m']:.4f}" in page
+    assert "payload in the net" in page
+    assert "version_" not in page
+    assert "numpy" in page
+
+
+def test_the_report_of_a_flight_that_hardly_began_is_written_all_the_same(tmp_path: Path) -> None:
+    rows = [
+        (replace(i, mocap=None, arm=None), replace(o, control=None), s)
+        for i, o, s in list(synthetic_flight(end_s=0.0))[:3]
+    ]
+    for part in (rows, rows[:1]):
+        log = made_of(part)
+        summary = summarise(log, outcome="aborted", controller="adaptive", preset="<b>mine</b>")
+        page = write_report(log, summary, tmp_path).read_text(encoding="utf-8")
+        assert "aborted" in page
+        assert "<b>mine</b>" not in page
+
+
+class Recited:
+    """A core that gives back what was flown, but for one field of one tick."""
+
+    def __init__(self, outputs: tuple[Outputs, ...], spoil: Callable[[Outputs], Outputs] = lambda o: o) -> None:
+        self._outputs = iter(outputs)
+        self._spoil = spoil
+
+    def step(self, inputs: Inputs) -> Outputs:
+        return self._spoil(next(self._outputs))
+
+
+def test_replay_compares_every_tick_and_names_the_first_bit_that_differs(flight: FlightLog) -> None:
+    configs: list[str] = []
+
+    def same(config_json: str) -> Recited:
+        configs.append(config_json)
+        return Recited(flight.outputs)
+
+    result = replay(flight, same)
+    assert (result.ticks, result.first_difference) == (len(flight.inputs), None)
+    assert json.loads(configs[0]) == CONFIG
+
+    def spoil(o: Outputs) -> Outputs:
+        if o.tick < 1500 or o.control is None:
+            return o
+        h = o.control.h_hat
+        return replace(o, control=replace(o.control, h_hat=(h[0], h[1], math.nextafter(h[2], 1.0), h[3])))
+
+    result = replay(flight, lambda _: Recited(flight.outputs, spoil))
+    difference = result.first_difference
+    assert difference is not None
+    assert (difference.tick, difference.field) == (1500, "control.h_hat[2]")
+    logged = flight.outputs[1500].control
+    assert logged is not None
+    assert difference.logged == logged.h_hat[2]
+    assert difference.recomputed == math.nextafter(logged.h_hat[2], 1.0)
+
+
+def test_a_log_that_cannot_be_replayed_says_why_in_one_line(flight: FlightLog) -> None:
+    gap = replace(
+        flight,
+        inputs=flight.inputs[:100] + flight.inputs[103:],
+        outputs=flight.outputs[:100] + flight.outputs[103:],
+        sent=flight.sent[:100] + flight.sent[103:],
+    )
+    late = replace(flight, inputs=flight.inputs[5:], outputs=flight.outputs[5:], sent=flight.sent[5:])
+    older = replace(flight, metadata={**flight.metadata, "companion": {"version_companion": "0.0.1"}})
+    bare = replace(flight, metadata={"companion": flight.metadata["companion"]})
+    empty = replace(flight, inputs=(), outputs=(), sent=())
+
+    def refuse(config_json: str) -> Recited:
+        raise ValueError("field x is unknown\nmore lines")
+
+    for log, make, reason in (
+        (gap, refuse, "3 of 4401 ticks are missing"),
+        (late, refuse, "begins at tick 5"),
+        (older, refuse, "recorded by companion 0.0.1"),
+        (bare, refuse, "holds no configuration"),
+        (empty, refuse, "holds no ticks"),
+        (flight, refuse, "field x is unknown"),
+    ):
+        with pytest.raises(LogError) as refusal:
+            replay(log, make)
+        assert reason in str(refusal.value)
+        assert "\n" not in str(refusal.value)
