@@ -1,0 +1,279 @@
+"""The flight process of `companion fly`: opens the edges, ticks the core, closes down in order.
+
+Started by the launcher as `python -m companion.app --config FILE --out DIR --channel FD`. Ends with the outcome's exit code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import math
+import os
+import signal
+import socket
+import sys
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion import status
+from companion.clock import Clock, flight_clock
+from companion.config.loader import FlightConfig
+from companion.core import NOMINAL_DT_S, FlightCore
+from companion.exit_codes import EXIT_CODES, EXIT_REFUSED
+from companion.io.arm import DynamixelArm
+from companion.io.autopilot import MavsdkAutopilot
+from companion.io.edges import DeviceError
+from companion.io.force_torque import RobotousForceTorque
+from companion.io.mocap import NatNetMocap
+from companion.io.recorder import RecorderProcess, epoch_offset_ns
+from companion.realtime import Ticker, claim_realtime
+from companion.types import (
+    AutopilotRequest,
+    Inputs,
+    MocapPose,
+    OperatorCommand,
+    Outcome,
+    Outputs,
+    Sent,
+    Severity,
+    Vec2,
+)
+
+STATUS_EVERY = 20
+JOINT_READ_TIMEOUT_S = 0.003
+_HOVER_PARAM = "MPC_THR_HOVER"
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Everything on a wire, open."""
+
+    autopilot: MavsdkAutopilot
+    mocap: NatNetMocap
+    arm: DynamixelArm
+    force: RobotousForceTorque
+
+
+@contextlib.asynccontextmanager
+async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]:
+    """Open every device; the arm, which gets torque, last. Motion capture flows to PX4 from the first frame on."""
+    devices = config.vehicle.devices
+    forward: list[MavsdkAutopilot] = []
+
+    def on_pose(pose: MocapPose) -> None:
+        if forward and pose.tracking_valid:
+            forward[0].send_vision(pose)
+
+    async with contextlib.AsyncExitStack() as stack:
+        force = await stack.enter_async_context(RobotousForceTorque(devices.force, clock))
+        mocap = await stack.enter_async_context(NatNetMocap(devices.mocap, clock, on_pose))
+        autopilot = await stack.enter_async_context(MavsdkAutopilot(devices.autopilot, clock))
+        forward.append(autopilot)
+        arm = await stack.enter_async_context(DynamixelArm(devices.arm, config.vehicle.arm, clock))
+        yield Edges(autopilot, mocap, arm, force)
+
+
+class Flight:
+    """One flight over open edges."""
+
+    def __init__(
+        self, config: FlightConfig, edges: Edges, recorder: RecorderProcess, channel: socket.socket, clock: Clock
+    ) -> None:
+        self._edges = edges
+        self._recorder = recorder
+        self._channel = channel
+        self._clock = clock
+        self._core = FlightCore(config)
+        self._land = False
+        self._missed = 0
+        self._period_s = NOMINAL_DT_S
+
+    def land(self) -> None:
+        """Ask for a landing; it stays asked for."""
+        self._land = True
+
+    def listen(self) -> None:
+        """Take the launcher's messages; called when its channel is readable."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                message = status.receive(self._channel)
+                if message is None:
+                    asyncio.get_running_loop().remove_reader(self._channel)
+                    self.land()
+                    return
+                if message.get("type") == "land":
+                    self.land()
+
+    async def run(self) -> Outcome:
+        """Tick until the core says that it is over."""
+        ticker = Ticker(self._period_s, self._clock)
+        tick = 0
+        while True:
+            time = await ticker.next()
+            outputs, sent = await self._tick(tick, time.start_s, time.lateness_s)
+            self._missed += time.lateness_s > self._period_s
+            self._report(tick, outputs, sent)
+            if outputs.outcome is not None:
+                return outputs.outcome
+            tick += 1
+
+    async def _tick(self, tick: int, start_s: float, lateness_s: float) -> tuple[Outputs, Sent]:
+        edges = self._edges
+        arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S)
+        joint_read_s = self._clock()
+        inputs = Inputs(
+            tick=tick,
+            t_s=joint_read_s,
+            vehicle=edges.autopilot.vehicle(),
+            status=edges.autopilot.status(),
+            mocap=edges.mocap.latest(),
+            arm=arm_state,
+            force=edges.force.latest(),
+            command=OperatorCommand.LAND if self._land else OperatorCommand.NONE,
+            recorder_dropped=self._recorder.client.dropped,
+        )
+        outputs = self._core.step(inputs)
+        core_s = self._clock()
+        torque_sent: Vec2 | None = None
+        if outputs.arm_torque_nm is not None:
+            torque_sent = edges.arm.write_torque(outputs.arm_torque_nm)
+        current_s = self._clock()
+        attitude_sent = outputs.attitude is not None and edges.autopilot.send_attitude(outputs.attitude)
+        setpoint_s = self._clock()
+        if outputs.request is not AutopilotRequest.NONE:
+            edges.autopilot.request(outputs.request)
+        sent = Sent(
+            tick=tick,
+            attitude_sent=attitude_sent,
+            arm_torque_sent_nm=torque_sent,
+            start_s=start_s,
+            lateness_s=lateness_s,
+            joint_read_s=joint_read_s,
+            core_s=core_s,
+            setpoint_sent_s=setpoint_s,
+            current_sent_s=current_s,
+        )
+        self._recorder.client.record(inputs, outputs, sent)
+        return outputs, sent
+
+    def _report(self, tick: int, outputs: Outputs, sent: Sent) -> None:
+        for event in outputs.events:
+            message = {
+                "type": "event",
+                "t_s": outputs.mission_t_s,
+                "id": event.id,
+                "severity": event.severity.value,
+                "action": event.action.value,
+                "text": event.text,
+            }
+            status.send(self._channel, message)
+        if tick % STATUS_EVERY and outputs.outcome is None:
+            return
+        for text in self._edges.autopilot.take_messages():
+            self._recorder.client.text(outputs.t_s, Severity.WARNING, "px4", text)
+            status.send(self._channel, {"type": "px4", "text": text})
+        status.send(self._channel, self._status(tick, outputs, sent))
+
+    def _status(self, tick: int, outputs: Outputs, sent: Sent) -> status.Message:
+        error = outputs.control.error if outputs.control else None
+        reference = outputs.reference
+        return {
+            "type": "status",
+            "tick": tick,
+            "t_s": outputs.t_s,
+            "mission_t_s": outputs.mission_t_s,
+            "phase": outputs.phase,
+            "kind": outputs.phase_kind.value,
+            "progress": outputs.progress,
+            "action": outputs.action.value,
+            "error_m": math.hypot(*error[0:3]) if error else None,
+            "position_m": [r + e for r, e in zip(reference.position_world_m, error[0:3], strict=True)]
+            if reference and error
+            else None,
+            "thrust": outputs.attitude.thrust if outputs.attitude else None,
+            "lateness_ms": sent.lateness_s * 1e3,
+            "missed": self._missed,
+            "dropped": self._recorder.client.dropped,
+        }
+
+
+async def fly(config: FlightConfig, out: Path, channel: socket.socket) -> Outcome:
+    """Open, fly, close.
+
+    Raises:
+        DeviceError: a device is not there or not as it must be; nothing was armed.
+    """
+    clock = flight_clock()
+    loop = asyncio.get_running_loop()
+    async with open_edges(config, clock) as edges:
+        config = await with_hover_thrust(config, edges.autopilot)
+        recorder = await asyncio.to_thread(
+            RecorderProcess.start,
+            out / "flight.mcap",
+            config_json=config.model_dump_json(),
+            epoch_offset_ns=epoch_offset_ns(clock()),
+            metadata={"mission": config.mission.name, "law": config.controller.law, "preset": config.controller.preset},
+        )
+        try:
+            recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
+            flight = Flight(config, edges, recorder, channel, clock)
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                loop.add_signal_handler(number, flight.land)
+            loop.add_reader(channel, flight.listen)
+            status.send(
+                channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": claim_realtime()}
+            )
+            outcome = await flight.run()
+        finally:
+            loop.remove_reader(channel)
+            report = await asyncio.to_thread(recorder.finish)
+        recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}
+        status.send(channel, {"type": "result", "outcome": outcome.value, "recorder": recorded})
+    return outcome
+
+
+async def with_hover_thrust(config: FlightConfig, autopilot: MavsdkAutopilot) -> FlightConfig:
+    """The effective configuration: hover thrust from PX4 unless the vehicle file gives it.
+
+    Raises:
+        DeviceError: the parameter cannot be read or makes no sense.
+    """
+    airframe = config.vehicle.airframe
+    if airframe.hover_thrust is not None:
+        return config
+    value = float(await autopilot.read_param(_HOVER_PARAM))
+    if not 0.1 <= value <= 0.8:
+        raise DeviceError(
+            f"autopilot: {_HOVER_PARAM} = {value:.3f} is no hover thrust of this machine, expected 0.1 to 0.8;"
+            f" set it in PX4 or give airframe.hover_thrust"
+        )
+    airframe = airframe.model_copy(update={"hover_thrust": value})
+    vehicle = config.vehicle.model_copy(update={"airframe": airframe})
+    return config.model_copy(update={"vehicle": vehicle})
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the flight process."""
+    parser = argparse.ArgumentParser(prog="companion.app")
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--channel", type=int, required=True)
+    arguments = parser.parse_args(argv)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the launcher's: it asks for a landing
+    config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
+    channel = socket.socket(fileno=arguments.channel)
+    channel.setblocking(False)
+    try:
+        outcome = asyncio.run(fly(config, arguments.out, channel))
+    except DeviceError as error:
+        status.send(channel, {"type": "refused", "lines": str(error).splitlines()})
+        return EXIT_REFUSED
+    return EXIT_CODES[outcome]
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    os._exit(code)  # MAVSDK's C++ threads may outlive the interpreter's teardown

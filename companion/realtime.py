@@ -1,0 +1,61 @@
+"""What the flight process asks of the operating system, and absolute-deadline ticks."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+from dataclasses import dataclass
+
+from companion.clock import Clock
+
+PRIORITY = 50
+
+
+def claim_realtime() -> str:
+    """Switch garbage collection off and ask for real-time scheduling.
+
+    Returns:
+        One line that says what was got. Without the permission (rtprio) the flight goes on at normal priority.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except (OSError, AttributeError) as error:
+        return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO); garbage collection off"
+    return f"SCHED_FIFO {PRIORITY}; garbage collection off"
+
+
+@dataclass(frozen=True, slots=True)
+class TickTime:
+    """When a tick began."""
+
+    start_s: float
+    lateness_s: float
+    """Behind its deadline."""
+
+
+class Ticker:
+    """Absolute deadlines: an error of one tick does not move the next. Deadlines that are past are skipped, not made up for."""
+
+    def __init__(self, period_s: float, clock: Clock) -> None:
+        self._period_s = period_s
+        self._clock = clock
+        self._deadline_s = clock() + period_s
+        self.skipped = 0
+
+    async def next(self) -> TickTime:
+        """Wait for the next deadline."""
+        now_s = self._clock()
+        late_periods = int((now_s - self._deadline_s) / self._period_s)
+        if late_periods > 0:
+            self.skipped += late_periods
+            self._deadline_s += late_periods * self._period_s
+        # Even when late: the loop must serve its sockets once a tick.
+        await asyncio.sleep(max(0.0, self._deadline_s - now_s))
+        start_s = self._clock()
+        tick = TickTime(start_s, max(0.0, start_s - self._deadline_s))
+        self._deadline_s += self._period_s
+        return tick
