@@ -20,7 +20,7 @@ from sitl.autopilot.streams import STREAMS, Schedule
 Message = Any
 
 _FTP_NAK, _FTP_FILE_NOT_FOUND = 129, 10
-_RESET_COUNTER_FUSED = (mavlink.MAV_ESTIMATOR_TYPE_VISION, mavlink.MAV_ESTIMATOR_TYPE_VIO)
+_FUSED_ESTIMATORS = (mavlink.MAV_ESTIMATOR_TYPE_VISION, mavlink.MAV_ESTIMATOR_TYPE_VIO)
 _FUSED_FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD)
 
 
@@ -208,7 +208,7 @@ class Receiver:
     def _odometry(self, _link: Reply, message: Message) -> None:
         """Only external vision is fused: MOCAP_NED, unset and naive estimators end in other topics or in an error, silently."""
         m = message
-        if m.estimator_type in _RESET_COUNTER_FUSED and m.frame_id in _FUSED_FRAMES:
+        if m.estimator_type in _FUSED_ESTIMATORS and m.frame_id in _FUSED_FRAMES:
             self._vision((m.x, m.y, m.z), (m.q[0], m.q[1], m.q[2], m.q[3]))
 
     def _vision(self, position_ned_m: Vec3, attitude: tuple[float, float, float, float]) -> None:

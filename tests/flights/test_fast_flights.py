@@ -1,0 +1,136 @@
+"""Whole missions in the fast closed loop: the real core, stub, servos and world on simulated time."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.frames import tilt_rad
+from companion.types import Outcome, PhaseKind
+from sitl.fast import FastFlight, FastResult
+
+
+def configured(*overrides: str, preset: str = "recommended") -> FlightConfig:
+    return load_flight("configs/missions/catch.yaml", preset=preset, overrides=overrides)
+
+
+@cache
+def flown(payload_kg: float, preset: str, seed: int = 1) -> FastResult:
+    overrides = (f"world.payload_kg={payload_kg}", f"world.seed={seed}")
+    return FastFlight(configured(*overrides, preset=preset)).run()
+
+
+def event_ids(result: FastResult) -> list[str]:
+    return [event.id for outputs in result.outputs for event in outputs.events]
+
+
+def error_after_catch_m(result: FastResult) -> float:
+    """RMS of the mocap position against the reference, from the catch to the landing."""
+    squares = []
+    caught = False
+    for inputs, outputs in zip(result.inputs, result.outputs, strict=True):
+        caught = caught or any(event.id == "catch" for event in outputs.events)
+        if caught and outputs.phase_kind is PhaseKind.FLIGHT and outputs.reference and inputs.mocap:
+            squares.append(math.dist(inputs.mocap.position_world_m, outputs.reference.position_world_m) ** 2)
+    return math.sqrt(sum(squares) / len(squares))
+
+
+@pytest.mark.parametrize("payload_kg", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize(("preset", "limit_m"), [("recommended", 0.03), ("paper", 0.42)])
+def test_the_payload_is_caught_and_carried_home(payload_kg: float, preset: str, limit_m: float) -> None:
+    result = flown(payload_kg, preset)
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert result.caught
+    assert event_ids(result) == ["takeoff", "catch", "touchdown"]
+    assert error_after_catch_m(result) <= limit_m
+    x, y, _ = result.truth[-1].position_world_m
+    assert math.hypot(x + 1.0, y) < 0.1, "it did not come home"
+    assert max(tilt_rad(truth.attitude_wxyz) for truth in result.truth) < math.radians(15)
+
+
+def test_the_catch_is_where_and_when_the_paper_has_it() -> None:
+    result = flown(0.2, "recommended")
+    begun = next(o.t_s - o.mission_t_s for o in result.outputs if o.mission_t_s > 0)
+    catch = next(e for o in result.outputs for e in o.events if e.id == "catch")
+    assert catch.t_s - begun == pytest.approx(6.5, abs=0.15)
+    at = min(result.truth, key=lambda truth: abs(truth.t_s - catch.t_s))
+    assert at.position_world_m[0] == pytest.approx(0.0, abs=0.1)
+
+
+def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
+    again = FastFlight(configured("world.payload_kg=0.2", "world.seed=1")).run()
+    assert again.outputs == flown(0.2, "recommended").outputs
+    other = flown(0.2, "recommended", seed=2)
+    assert other.outputs != again.outputs
+    assert other.outputs[-1].outcome is Outcome.COMPLETED
+
+
+def test_nothing_thrown_is_no_catch() -> None:
+    result = flown(0.0, "recommended")
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert event_ids(result) == ["takeoff", "touchdown"]
+
+
+FOLDED_DEG = (165.0, 140.0)
+
+
+@pytest.mark.parametrize("at_s", [2.5, 4.0, 6.0, 9.0, 16.0, 19.0])
+@pytest.mark.parametrize("kind", ["mocap_loss", "servo_loss", "link_loss"])
+def test_a_lost_device_lands_it(kind: str, at_s: float) -> None:
+    """At any time of the flight; the fault's clock starts at arming, 1.2 s before take-off."""
+    result = FastFlight(configured(f"world.faults=[{{kind: {kind}, t_s: {at_s}}}]")).run()
+    last, truth = result.outputs[-1], result.truth[-1]
+    assert last.outcome is Outcome.ABORTED
+    assert not result.crashed
+    assert truth.position_world_m[2] < 0.35
+    assert max(tilt_rad(t.attitude_wxyz) for t in result.truth) < math.radians(25)
+    if kind == "mocap_loss":
+        moved = [t.position_world_m for t in result.truth if t.t_s > at_s + 1.8]
+        assert max(math.dist(moved[0][:2], p[:2]) for p in moved) < 0.5, "drifted too far"
+    if kind != "servo_loss":
+        folded = [math.degrees(angle) for angle in truth.joint_angle_rad]
+        assert max(abs(a - b) for a, b in zip(folded, FOLDED_DEG, strict=True)) < 12
+
+
+def test_a_short_mocap_gap_is_flown_through() -> None:
+    result = FastFlight(configured("world.faults=[{kind: mocap_loss, t_s: 6.0, duration_s: 0.08}]")).run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+
+
+def test_without_force_sensor_the_mission_goes_on() -> None:
+    result = FastFlight(configured("world.faults=[{kind: force_loss, t_s: 5.0}]")).run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert "force_lost" in event_ids(result)
+
+
+@pytest.mark.parametrize("at_s", [0.5, 1.5, 2.2, 4.5, 9.0, 22.0])
+def test_asked_to_land_it_lands(at_s: float) -> None:
+    """Before arming, on the ground with rotors turning, in take-off, in flight, in the landing."""
+    result = FastFlight(configured(), land_at_s=at_s).run()
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert not result.crashed
+    assert result.truth[-1].position_world_m[2] < 0.35
+    assert result.outputs[-1].t_s < at_s + 9.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "why"),
+    [
+        (("mission.start.position_m=[-0.5, 0]",), "x"),
+        (("vehicle.safety.battery_min=0.9", "world.battery_start=0.5"), "battery_low"),
+    ],
+)
+def test_refused_on_the_ground(overrides: tuple[str, ...], why: str) -> None:
+    if why == "x":
+        # The world is built from the same mission, so the machine is moved after it was placed.
+        flight = FastFlight(configured(*overrides))
+        flight.plant.world.data.qpos[0] = -1.0
+    else:
+        flight = FastFlight(configured(*overrides))
+    result = flight.run()
+    assert result.outputs[-1].outcome is Outcome.REFUSED
+    assert max(t.position_world_m[2] for t in result.truth) < 0.32
+    assert result.outputs[-1].mission_t_s == 0.0
