@@ -5,15 +5,11 @@ One `step` is one control tick: monitors and ladder -> sequence -> reference -> 
 
 from __future__ import annotations
 
-import math
+import dataclasses
 
 from companion.config.loader import FlightConfig
-from companion.control.adaptive import AdaptiveController
-from companion.control.arm_hold import hold_torque_nm
-from companion.control.manipulator import Manipulator
-from companion.control.sensing import CatchDetector, ForceSensing, acceleration_world_m_s2
-from companion.control.types import Controller, PlantState, Wrench
-from companion.frames import euler_zyx_from_quat, quat_from_euler_zyx
+from companion.control.pilot import Command, Pilot
+from companion.frames import euler_zyx_from_quat
 from companion.mission import sequencer as seq
 from companion.mission.autopilot_landing import AutopilotLanding
 from companion.mission.check import check_start
@@ -23,7 +19,6 @@ from companion.safety.gate import Gate
 from companion.safety.monitors import Monitors, Situation
 from companion.safety.supervisor import SupervisorState, update
 from companion.types import (
-    AttitudeSetpoint,
     AutopilotRequest,
     ControlLog,
     Event,
@@ -34,11 +29,9 @@ from companion.types import (
     Reference,
     SafetyAction,
     Severity,
-    Vec2,
 )
 
 NOMINAL_DT_S = 0.005
-FOLD_RATE_RAD_S = 1.2
 _DT_MIN_S, _DT_MAX_S = 0.001, 0.05
 
 
@@ -51,16 +44,8 @@ class FlightCore:
 
     def __init__(self, config: FlightConfig) -> None:
         vehicle = config.vehicle
-        hover_thrust = vehicle.airframe.hover_thrust
-        if hover_thrust is None:
-            raise ValueError("hover_thrust must be in the effective configuration before the core starts")
         self._config = config
-        self._hover_thrust = hover_thrust
-        self._weight_n = vehicle.airframe.mass_kg * 9.81
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
-        self._sensing = ForceSensing(vehicle.tool, self._manipulator)
-        self._catch = CatchDetector()
-        self._controller: Controller = AdaptiveController(config.controller, vehicle, hover_thrust)
+        self._pilot = Pilot(config)
         self._monitors = Monitors(vehicle.safety)
         self._gate = Gate(vehicle)
         self._ladder = SupervisorState()
@@ -74,15 +59,11 @@ class FlightCore:
         self._aborting = False
         self._outcome: Outcome | None = None
         self._last_t_s: float | None = None
-        self._arm_target: Vec2 | None = None
-        self._tracking_error_m: float | None = None
         self._landing: AutopilotLanding | None = None
         self._zero_thrust = False
         self._events: list[Event] = []
         self._refused: set[str] = set()
         """What the gate held back in the last tick; told once when it begins."""
-        fold = vehicle.safety.fold_arm_deg
-        self._fold_rad: Vec2 = (math.radians(fold[0]), math.radians(fold[1]))
 
     def step(self, inputs: Inputs) -> Outputs:
         """One control tick."""
@@ -95,9 +76,11 @@ class FlightCore:
         self._events = []
         self._judge(inputs)
         request = self._advance(inputs)
-        reference, setpoint, torque, log = self._command(dt_s, inputs)
+        reference, command = self._command(dt_s, inputs)
         arm_fresh = inputs.arm is not None and inputs.t_s - inputs.arm.stamp_s <= 0.05
-        verdict = self._gate.check(setpoint, torque, inputs.arm.angle_rad if inputs.arm else None, arm_fresh)
+        verdict = self._gate.check(
+            command.attitude, command.arm_torque_nm, inputs.arm.angle_rad if inputs.arm else None, arm_fresh
+        )
         for reason in sorted(set(verdict.refused) - self._refused):
             self._event(inputs, "gate", Severity.WARNING, SafetyAction.WARN, reason)
         self._refused = set(verdict.refused)
@@ -114,7 +97,7 @@ class FlightCore:
             request=request,
             action=self._ladder.action,
             events=tuple(self._events),
-            control=log,
+            control=command.log,
             outcome=self._outcome if self._stage is Stage.DONE else None,
         )
 
@@ -127,7 +110,7 @@ class FlightCore:
         situation = Situation(
             airborne=self._stage in seq.LIFTING,
             offboard_expected=self._stage in seq.COMMANDING,
-            tracking_error_m=self._tracking_error_m if self._stage is Stage.PLAN else None,
+            tracking_error_m=self._pilot.tracking_error_m if self._stage is Stage.PLAN else None,
         )
         self._events += self._monitors.check(i, situation)
         before = self._ladder.action
@@ -171,7 +154,7 @@ class FlightCore:
             now.velocity_world_m_s,
             now.yaw_rad,
             arm.angle_rad if arm is not None else now.arm_rad,
-            self._fold_rad,
+            self._pilot.fold_rad,
             safety.land_speed_m_s,
             self._config.vehicle,
         )
@@ -240,10 +223,10 @@ class FlightCore:
         assert i.vehicle is not None and i.arm is not None and i.force is not None
         if self._tare_start_s is None:
             self._tare_start_s = i.t_s
-        self._sensing.collect(i.force, i.vehicle.attitude_wxyz, i.arm.angle_rad)
+        self._pilot.collect_tare(i)
         if i.t_s - self._tare_start_s < seq.TARE_S:
             return
-        self._sensing.finish_tare()
+        self._pilot.finish_tare()
         yaw = euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2]
         problems = check_start(
             self._config.mission, self._config.vehicle, i.vehicle.position_world_m, yaw, i.arm.angle_rad
@@ -256,7 +239,6 @@ class FlightCore:
         self._plan = Plan.build(
             self._config.mission, self._config.vehicle, i.vehicle.position_world_m, yaw, i.arm.angle_rad
         )
-        self._arm_target = i.arm.angle_rad
         self._enter(Stage.OFFBOARD, i)
 
     def _refuse(self, i: Inputs, event_id: str, text: str) -> None:
@@ -305,63 +287,18 @@ class FlightCore:
 
     # -- command ---------------------------------------------------------------------------------------------------
 
-    def _command(
-        self, dt_s: float, i: Inputs
-    ) -> tuple[Reference | None, AttitudeSetpoint | None, Vec2 | None, ControlLog | None]:
-        vehicle, arm = i.vehicle, i.arm
-        if self._stage in (Stage.WAIT, Stage.DONE) or vehicle is None:
-            return None, None, None, None
-        if self._stage in (Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN) and self._plan is not None:
-            return self._fly_law(dt_s, i)
-        torque = None
-        if arm is not None:
-            target = self._fold_target() if self._stage is Stage.AUTOPILOT_LAND else (self._arm_target or arm.angle_rad)
-            torque = hold_torque_nm(
-                self._manipulator, arm.angle_rad, arm.velocity_rad_s, target, (0.0, 0.0), vehicle.attitude_wxyz
-            )
-        if self._stage is Stage.AUTOPILOT_LAND and not self._zero_thrust:
-            return None, None, torque, None
-        yaw = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
-        return None, AttitudeSetpoint(quat_from_euler_zyx(0.0, 0.0, yaw), 0.0), torque, None
-
-    def _fold_target(self) -> Vec2:
-        """The folded pose, approached at a bounded rate from where the arm is."""
-        goal = self._fold_rad
-        now = self._arm_target or goal
-        step = FOLD_RATE_RAD_S * NOMINAL_DT_S
-        self._arm_target = (
-            now[0] + max(-step, min(step, goal[0] - now[0])),
-            now[1] + max(-step, min(step, goal[1] - now[1])),
-        )
-        return self._arm_target
-
-    def _fly_law(
-        self, dt_s: float, i: Inputs
-    ) -> tuple[Reference | None, AttitudeSetpoint | None, Vec2 | None, ControlLog | None]:
-        assert self._plan is not None and i.vehicle is not None and self._stage_s is not None
-        vehicle, arm = i.vehicle, i.arm
+    def _command(self, dt_s: float, i: Inputs) -> tuple[Reference | None, Command]:
+        if self._stage in (Stage.WAIT, Stage.DONE):
+            return None, Command()
+        if self._stage is Stage.AUTOPILOT_LAND:
+            folding = self._pilot.fold(i, dt_s)
+            return None, dataclasses.replace(folding, attitude=self._pilot.level(i)) if self._zero_thrust else folding
+        if self._plan is None or self._stage not in (Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN):
+            return None, self._pilot.wait(i)
         reference = self._plan.reference(i.t_s - self._plan_start_s if self._stage is not Stage.SPOOL else 0.0)
-        arm_rad = arm.angle_rad if arm is not None else reference.arm_rad
-        arm_rate = arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s
-        self._arm_target = arm_rad
-        force = None
-        if i.force is not None and i.t_s - i.force.stamp_s <= self._config.vehicle.safety.force_timeout_s:
-            force = self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
-        state = PlantState(
-            position_world_m=vehicle.position_world_m,
-            velocity_world_m_s=vehicle.velocity_world_m_s,
-            acceleration_world_m_s2=acceleration_world_m_s2(vehicle),
-            attitude_wxyz=vehicle.attitude_wxyz,
-            angular_rate_body_rad_s=vehicle.angular_rate_body_rad_s,
-            arm_rad=arm_rad,
-            arm_rate_rad_s=arm_rate,
-            force_ext_world_n=force,
-        )
-        wrench = self._controller.step(dt_s, state, reference, self._vertical_scale(i))
-        self._note_flight(i, wrench)
-        thrust = min(1.0, wrench.collective_n / self._weight_n * self._hover_thrust)
-        torque = wrench.arm_torque_nm if arm is not None else None
-        return reference, AttitudeSetpoint(wrench.attitude_wxyz, thrust), torque, wrench.log
+        command = self._pilot.fly(i, dt_s, reference, self._vertical_scale(i))
+        self._watch_for_catch(i, command.log)
+        return reference, command
 
     def _vertical_scale(self, i: Inputs) -> float:
         assert self._stage_s is not None
@@ -374,15 +311,13 @@ class FlightCore:
             return seq.SPOOL_SHARE + (1.0 - seq.SPOOL_SHARE) * elapsed / seq.SPOOL_TO_FULL_S
         return 1.0
 
-    def _note_flight(self, i: Inputs, wrench: Wrench) -> None:
-        """What flying by the law teaches: tracking error, catch."""
-        e = wrench.log.error
-        self._tracking_error_m = (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]) ** 0.5
-        if self._stage is Stage.PLAN and self._phase_kind(i.t_s) is PhaseKind.FLIGHT:
-            if self._catch.update(i.t_s, wrench.log.force_ext_world_n) and self._mission_start_s is not None:
-                at = (self._catch.caught_s or i.t_s) - self._mission_start_s
-                text = f"payload caught at t = {at:.2f} s"
-                self._event(i, "catch", Severity.INFO, SafetyAction.NOMINAL, text, self._catch.caught_s)
+    def _watch_for_catch(self, i: Inputs, log: ControlLog | None) -> None:
+        if log is None or self._stage is not Stage.PLAN or self._phase_kind(i.t_s) is not PhaseKind.FLIGHT:
+            return
+        caught_s = self._pilot.catch_s(i.t_s, log)
+        if caught_s is not None and self._mission_start_s is not None:
+            text = f"payload caught at t = {caught_s - self._mission_start_s:.2f} s"
+            self._event(i, "catch", Severity.INFO, SafetyAction.NOMINAL, text, caught_s)
 
     # -- words -----------------------------------------------------------------------------------------------------
 

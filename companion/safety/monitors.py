@@ -84,6 +84,8 @@ class Monitors:
         if i.arm is not None and any(i.arm.hardware_error):
             text = f"servo hardware error {i.arm.hardware_error}"
             found.append(_Finding("servo_error", SafetyAction.LAND, text))
+        if i.recorder_dropped:
+            found.append(_Finding("recorder_drops", SafetyAction.WARN, "the recorder loses samples"))
         if i.force is not None and i.force.overload:
             found.append(_Finding("force_overload", SafetyAction.WARN, "force sensor overloaded"))
         status = i.status

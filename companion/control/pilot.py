@@ -1,0 +1,122 @@
+"""Hands on the controls: from inputs and a reference to an attitude setpoint and joint torques. Pure; time is an argument."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from companion.config.loader import FlightConfig
+from companion.control.adaptive import AdaptiveController
+from companion.control.arm_hold import hold_torque_nm
+from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.sensing import CatchDetector, ForceSensing, acceleration_world_m_s2
+from companion.control.types import Controller, PlantState
+from companion.frames import euler_zyx_from_quat, quat_from_euler_zyx
+from companion.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2
+
+FOLD_RATE_RAD_S = 1.2
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What one tick wants to send; the gate has the last word."""
+
+    attitude: AttitudeSetpoint | None = None
+    arm_torque_nm: Vec2 | None = None
+    log: ControlLog | None = None
+
+
+class Pilot:
+    """Owns the control law, the force sensor's tare and the arm's holding target.
+
+    Args:
+        config: the effective configuration; `vehicle.airframe.hover_thrust` must be known by now.
+
+    Raises:
+        ValueError: the hover thrust is not known.
+    """
+
+    def __init__(self, config: FlightConfig) -> None:
+        vehicle = config.vehicle
+        hover_thrust = vehicle.airframe.hover_thrust
+        if hover_thrust is None:
+            raise ValueError("hover_thrust must be in the effective configuration before the core starts")
+        self._thrust_per_n = hover_thrust / (vehicle.airframe.mass_kg * GRAVITY_M_S2)
+        self._force_timeout_s = vehicle.safety.force_timeout_s
+        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._sensing = ForceSensing(vehicle.tool, self._manipulator)
+        self._catch = CatchDetector()
+        self._controller: Controller = AdaptiveController(config.controller, vehicle, hover_thrust)
+        fold = vehicle.safety.fold_arm_deg
+        self.fold_rad: Vec2 = (math.radians(fold[0]), math.radians(fold[1]))
+        self._arm_target_rad: Vec2 | None = None
+        self.tracking_error_m: float | None = None
+        """Distance from the reference in the last tick that the law flew."""
+
+    def collect_tare(self, i: Inputs) -> None:
+        """Add this tick's force sample, at rest, to the tare; the arm is to be held where it is."""
+        if i.vehicle is not None and i.arm is not None and i.force is not None:
+            self._sensing.collect(i.force, i.vehicle.attitude_wxyz, i.arm.angle_rad)
+            self._arm_target_rad = i.arm.angle_rad
+
+    def finish_tare(self) -> None:
+        """Fix the force sensor's bias."""
+        self._sensing.finish_tare()
+
+    def level(self, i: Inputs) -> AttitudeSetpoint | None:
+        """Level, at the present yaw, no thrust; None if the attitude is not known."""
+        if i.vehicle is None:
+            return None
+        yaw = euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2]
+        return AttitudeSetpoint(quat_from_euler_zyx(0.0, 0.0, yaw), 0.0)
+
+    def wait(self, i: Inputs) -> Command:
+        """No thrust, the arm held where it is: what streams before take-off and after touch-down."""
+        return Command(self.level(i), self._hold(i))
+
+    def fold(self, i: Inputs, dt_s: float) -> Command:
+        """Nothing for the vehicle; the arm moves to its folded pose at a bounded rate."""
+        goal, now, step = self.fold_rad, self._arm_target_rad or self.fold_rad, FOLD_RATE_RAD_S * dt_s
+        self._arm_target_rad = (
+            now[0] + max(-step, min(step, goal[0] - now[0])),
+            now[1] + max(-step, min(step, goal[1] - now[1])),
+        )
+        return Command(None, self._hold(i))
+
+    def _hold(self, i: Inputs) -> Vec2 | None:
+        if i.arm is None or i.vehicle is None:
+            return None
+        target = self._arm_target_rad or i.arm.angle_rad
+        return hold_torque_nm(
+            self._manipulator, i.arm.angle_rad, i.arm.velocity_rad_s, target, (0.0, 0.0), i.vehicle.attitude_wxyz
+        )
+
+    def fly(self, i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:
+        """One tick of the control law. `vertical_scale` as in `Controller.step`."""
+        vehicle, arm = i.vehicle, i.arm
+        if vehicle is None:
+            return Command()
+        arm_rad = arm.angle_rad if arm is not None else reference.arm_rad
+        self._arm_target_rad = arm_rad
+        force = None
+        if i.force is not None and i.t_s - i.force.stamp_s <= self._force_timeout_s:
+            force = self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
+        state = PlantState(
+            position_world_m=vehicle.position_world_m,
+            velocity_world_m_s=vehicle.velocity_world_m_s,
+            acceleration_world_m_s2=acceleration_world_m_s2(vehicle),
+            attitude_wxyz=vehicle.attitude_wxyz,
+            angular_rate_body_rad_s=vehicle.angular_rate_body_rad_s,
+            arm_rad=arm_rad,
+            arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
+            force_ext_world_n=force,
+        )
+        wrench = self._controller.step(dt_s, state, reference, vertical_scale)
+        self.tracking_error_m = math.hypot(*wrench.log.error[0:3])
+        thrust = min(1.0, wrench.collective_n * self._thrust_per_n)
+        torque = wrench.arm_torque_nm if arm is not None else None
+        return Command(AttitudeSetpoint(wrench.attitude_wxyz, thrust), torque, wrench.log)
+
+    def catch_s(self, t_s: float, log: ControlLog) -> float | None:
+        """Time of the blow, in the one tick in which a catch becomes certain."""
+        return self._catch.caught_s if self._catch.update(t_s, log.force_ext_world_n) else None
