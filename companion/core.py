@@ -16,7 +16,7 @@ from companion.mission.check import check_start
 from companion.mission.plan import Plan, landing_from
 from companion.mission.sequencer import Stage
 from companion.safety.gate import Gate
-from companion.safety.monitors import Monitors, Situation
+from companion.safety.monitors import Monitors, Situation, unfused
 from companion.safety.supervisor import SupervisorState, update
 from companion.types import (
     AutopilotRequest,
@@ -105,7 +105,7 @@ class FlightCore:
 
     def _judge(self, i: Inputs) -> None:
         """Monitors, ladder, and what the ladder's rung means for the sequence."""
-        if self._stage is Stage.WAIT and not _complete(i):
+        if self._stage is Stage.WAIT and _missing(i):
             return
         situation = Situation(
             airborne=self._stage in seq.LIFTING,
@@ -215,12 +215,15 @@ class FlightCore:
         return AutopilotRequest.NONE
 
     def _wait(self, i: Inputs, elapsed_s: float) -> None:
-        if not _complete(i):
+        """On the ground: until every input is there and PX4 demonstrably follows motion capture, for as long as the tare takes."""
+        missing = _missing(i)
+        problem = f"no data from: {', '.join(missing)}" if missing else unfused(i)
+        if problem is not None:
             self._tare_start_s = None
             if elapsed_s > seq.WAIT_TIMEOUT_S:
-                self._refuse(i, "inputs_missing", f"no data from: {', '.join(_missing(i))}")
+                self._refuse(i, "inputs_missing" if missing else "vision_not_fused", problem)
             return
-        assert i.vehicle is not None and i.arm is not None and i.force is not None
+        assert i.vehicle is not None and i.arm is not None
         if self._tare_start_s is None:
             self._tare_start_s = i.t_s
         self._pilot.collect_tare(i)
@@ -356,7 +359,3 @@ def _missing(i: Inputs) -> list[str]:
         "force sensor": i.force,
     }
     return [name for name, value in devices.items() if value is None]
-
-
-def _complete(i: Inputs) -> bool:
-    return not _missing(i)

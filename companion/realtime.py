@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 from companion.clock import Clock
 
@@ -22,7 +24,10 @@ def claim_realtime() -> str:
     gc.freeze()
     gc.disable()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        # Every thread of the process: the tick waits for the bus thread, and what MAVSDK's threads receive is what it flies on.
+        for thread in Path("/proc/self/task").iterdir():
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (OSError, AttributeError) as error:
         return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO); garbage collection off"
     return f"SCHED_FIFO {PRIORITY}; garbage collection off"

@@ -23,13 +23,13 @@ h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .
 .badge { display: inline-block; padding: .1rem .7rem; border-radius: 1rem; color: #fff; font-size: .9rem; vertical-align: .2rem;
   background: var(--bad); }
 .badge.completed { background: var(--good); }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(17rem, 1fr)); gap: 1rem; }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(24rem, 1fr)); gap: 1rem; }
 .card { background: var(--card); border-radius: .5rem; padding: .8rem 1rem; }
 .card h3 { margin: 0 0 .4rem; font-size: .95rem; color: var(--soft); font-weight: 600; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 td, th { padding: .22rem .5rem .22rem 0; text-align: left; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { color: var(--soft); font-weight: 600; font-size: .85rem; } .card tr:last-child td { border-bottom: 0; }
-td.n, th.n { text-align: right; padding-right: .3rem; white-space: nowrap; }
+td.n, th.n { text-align: right; padding: .22rem .3rem .22rem 1rem; white-space: nowrap; }
 tr.warning td { background: #fff7e6; } tr.critical td { background: #fdeaf0; }
 figure { margin: 0 0 1.6rem; break-inside: avoid; } figure img { width: 100%; border: 1px solid var(--line); border-radius: .4rem; }
 figcaption { color: var(--soft); font-size: .88rem; }

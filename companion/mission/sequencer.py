@@ -11,7 +11,7 @@ from enum import Enum
 
 from companion.types import AutopilotStatus, FlightMode, LandedState
 
-WAIT_TIMEOUT_S = 8.0
+WAIT_TIMEOUT_S = 15.0
 TARE_S = 1.0
 STREAM_BEFORE_OFFBOARD_S = 0.8
 OFFBOARD_TIMEOUT_S = 8.0

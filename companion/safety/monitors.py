@@ -6,10 +6,32 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Safety
-from companion.frames import tilt_rad
+from companion.frames import euler_zyx_from_quat, tilt_rad, wrap_rad
 from companion.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction, Severity
 
 CRASH_TILT_RAD = math.radians(70.0)
+
+
+FUSED_WITHIN_M = 0.10
+FUSED_WITHIN_RAD = math.radians(8.0)
+
+
+def unfused(i: Inputs) -> str | None:
+    """Evidence that PX4 fuses vision: position and yaw of its estimate agree with motion capture. None: they do.
+
+    PX4 takes poses that it does not fuse without a word, so having sent them proves nothing.
+    """
+    if i.vehicle is None or i.mocap is None:
+        return "no state to compare"
+    apart_m = math.dist(i.vehicle.position_world_m, i.mocap.position_world_m)
+    yaw_px4, yaw_mocap = (euler_zyx_from_quat(q)[2] for q in (i.vehicle.attitude_wxyz, i.mocap.attitude_wxyz))
+    turned_rad = abs(wrap_rad(yaw_px4 - yaw_mocap))
+    if apart_m <= FUSED_WITHIN_M and turned_rad <= FUSED_WITHIN_RAD:
+        return None
+    return (
+        f"PX4 does not follow motion capture: {apart_m:.2f} m and {math.degrees(turned_rad):.0f} deg of yaw apart; "
+        "check EKF2_EV_CTRL = 11, EKF2_HGT_REF = 3 and the body's axes in Motive"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.frames import quat_from_euler_zyx
 from companion.safety.gate import Gate
-from companion.safety.monitors import Monitors, Situation
+from companion.safety.monitors import Monitors, Situation, unfused
 from companion.safety.supervisor import SupervisorState, update
 from companion.types import (
     ArmState,
@@ -201,3 +201,19 @@ def test_upside_down_terminates(vehicle: Vehicle) -> None:
     flipped = replace(i, vehicle=replace(i.vehicle, attitude_wxyz=quat_from_euler_zyx(math.radians(120), 0, 0)))
     events = [*monitors.check(flipped, FLYING), *monitors.check(_shifted(flipped, 0.4), FLYING)]
     assert ("crashed", SafetyAction.TERMINATE) in [(event.id, event.action) for event in events]
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "fused"),
+    [
+        ((0.0, 0.0, 1.0), 0.4, True),
+        ((0.05, 0.0, 1.0), 0.45, True),
+        ((0.2, 0.0, 1.0), 0.4, False),
+        ((0.0, 0.0, 1.0), 0.9, False),
+    ],
+)
+def test_fusion_is_proved_by_agreement(position: tuple[float, float, float], yaw: float, fused: bool) -> None:
+    i = healthy()
+    assert i.mocap
+    pose = replace(i.mocap, position_world_m=position, attitude_wxyz=quat_from_euler_zyx(0, 0, yaw))
+    assert (unfused(replace(i, mocap=pose)) is None) == fused
