@@ -166,10 +166,12 @@ class ArmState:
     torque_nm: Vec2
     """From the present current and the torque constant."""
     hardware_error: tuple[int, int]
-    """Register 70 of each servo; 0 is healthy. Polled slowly."""
+    """Register 70 of each servo; 0 is healthy. Bit 7 is the companion's own: the bus watchdog had let go and was started again."""
     temperature_c: Vec2
     read_failures: int
     """Consecutive bus cycles without an answer from every servo, up to now."""
+    written_s: float | None = None
+    """When the bus thread had written the newest currents before this read; None before the first."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
+from zstandard import ZstdError
 
 from companion.frames import euler_zyx_from_quat
 from companion.record import RecordError, fingerprint, from_jsonable
@@ -68,7 +69,7 @@ class FlightLog:
             raise LogError(
                 f"{path}: records of another shape ({error}); it was written by {_writer(metadata)}"
             ) from None
-        except (McapError, ValueError, KeyError) as error:
+        except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
         if "companion" not in metadata:
             raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")

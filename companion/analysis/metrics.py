@@ -170,8 +170,16 @@ def lateness(log: FlightLog) -> Percentiles | None:
 
 
 def joint_read_to_write_s(log: FlightLog) -> Array:
-    """Joint state complete -> currents written, of ticks that wrote currents."""
-    used = [s.current_sent_s - s.joint_read_s for s in log.sent if s.arm_torque_sent_nm is not None]
+    """Answers of all servos read -> currents written, both by the bus thread, of ticks that wrote currents.
+
+    The write is known in the next tick's joint state.
+    """
+    used = []
+    for tick, sent, after in zip(log.inputs, log.sent, log.inputs[1:], strict=False):
+        if sent.arm_torque_sent_nm is None or tick.arm is None or after.arm is None or after.arm.written_s is None:
+            continue
+        if after.arm.written_s >= sent.core_s and after.arm.stamp_s > tick.arm.stamp_s:
+            used.append(after.arm.written_s - tick.arm.stamp_s)
     return np.array(used, dtype=np.float64)
 
 

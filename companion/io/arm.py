@@ -54,6 +54,7 @@ class DynamixelArm:
         self._goal_handed_s = 0.0
         self._state: ArmState | None = None
         self._failures = 0
+        self._written_s: float | None = None
         self._problem = ""
         self._scales: tuple[JointScale, JointScale] | None = None
         self._thread: threading.Thread | None = None
@@ -201,6 +202,7 @@ class DynamixelArm:
         except IndexError:
             return sent  # an earlier turn took the newest already
         self._try(lambda: bus.write_currents(goal))
+        self._written_s = self._clock()
         return goal
 
     def _read_once(self, bus: ArmBus) -> bool:
@@ -230,6 +232,7 @@ class DynamixelArm:
             hardware_error=(_errors(a), _errors(b)),
             temperature_c=(float(a.temperature_c), float(b.temperature_c)),
             read_failures=0,
+            written_s=self._written_s,
         )
 
     def _try(self, transaction: Callable[[], None]) -> None:

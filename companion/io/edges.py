@@ -63,7 +63,7 @@ class Mocap(Edge, Protocol):
 
 
 class Arm(Edge, Protocol):
-    """The servo bus. One thread owns the bus; a cycle is `begin_read` -> (joint state ready) -> `write_torque`."""
+    """The servo bus. One thread owns the bus; a cycle is `read`, then `write_torque`."""
 
     def latest(self) -> ArmState | None:
         """Newest joint state."""

@@ -130,7 +130,9 @@ def synthetic_flight(seed: int = 1, end_s: float = LANDED_S) -> Iterator[tuple[I
                 math.floor(t_s), kind is not PhaseKind.GROUND, FlightMode.OFFBOARD, LandedState.IN_AIR, 15.8, 0.9
             ),
             MocapPose(t_s - 0.003, 0.002, tick, actual, attitude, True, 2e-4),
-            ArmState(t_s + 4e-4, joints, (0.0, 0.0), (0.1, 0.05), (0, 0), (31.0, 30.0), 0),
+            ArmState(
+                t_s + 4e-4, joints, (0.0, 0.0), (0.1, 0.05), (0, 0), (31.0, 30.0), 0, t_s - period_s + 4e-4 + 1.5e-3
+            ),
             ForceSample(t_s - 0.002, (noise.gauss(0, 0.05), 0.0, -load_n), (0.0, 0.0, 0.0), False),
             OperatorCommand.NONE,
             0,
