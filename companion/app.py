@@ -13,9 +13,10 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 from companion import status
 from companion.clock import Clock, flight_clock
@@ -28,7 +29,7 @@ from companion.io.edges import DeviceError
 from companion.io.force_torque import RobotousForceTorque
 from companion.io.mocap import NatNetMocap
 from companion.io.recorder import RecorderProcess, epoch_offset_ns
-from companion.realtime import Ticker, claim_realtime
+from companion.realtime import FLIGHT_PRIORITY, Ticker, claim_realtime
 from companion.types import (
     AutopilotRequest,
     Inputs,
@@ -44,6 +45,8 @@ from companion.types import (
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.003
 _HOVER_PARAM = "MPC_THR_HOVER"
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,36 +78,84 @@ async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]
         yield Edges(autopilot, mocap, arm, force)
 
 
+class GivenUp(Exception):
+    """A landing was asked for before the flight began."""
+
+
+class Operator:
+    """What the people on the ground want: the launcher's messages and the signals sent to this process."""
+
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
+        self._land = asyncio.Event()
+
+    @property
+    def command(self) -> OperatorCommand:
+        """A landing that was asked for stays asked for."""
+        return OperatorCommand.LAND if self._land.is_set() else OperatorCommand.NONE
+
+    @contextlib.contextmanager
+    def attention(self) -> Iterator[None]:
+        """While inside, the channel and the signals are listened to."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, self._land.set)
+        loop.add_reader(self._channel, self._listen)
+        try:
+            yield
+        finally:
+            loop.remove_reader(self._channel)
+
+    async def unless_land(self, opening: Coroutine[Any, Any, _T]) -> _T:
+        """The result of `opening`, which is cancelled when a landing is asked for.
+
+        Raises:
+            GivenUp: a landing was asked for first.
+        """
+        task = asyncio.ensure_future(opening)
+        land = asyncio.ensure_future(self._land.wait())
+        try:
+            await asyncio.wait((task, land), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            land.cancel()
+            task.cancel()  # does nothing to one that is done
+            await asyncio.wait((task, land))  # an edge that is opening takes itself back, within a deadline of its own
+        if task.cancelled():
+            raise GivenUp
+        return task.result()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                message = status.receive(self._channel)
+                if message is None:  # nobody watches any more
+                    asyncio.get_running_loop().remove_reader(self._channel)
+                    self._land.set()
+                    return
+                if message.get("type") == "land":
+                    self._land.set()
+
+
 class Flight:
     """One flight over open edges."""
 
     def __init__(
-        self, config: FlightConfig, edges: Edges, recorder: RecorderProcess, channel: socket.socket, clock: Clock
+        self,
+        config: FlightConfig,
+        edges: Edges,
+        recorder: RecorderProcess,
+        channel: socket.socket,
+        operator: Operator,
+        clock: Clock,
     ) -> None:
         self._edges = edges
         self._recorder = recorder
         self._channel = channel
+        self._operator = operator
         self._clock = clock
         self._core = FlightCore(config)
-        self._land = False
         self._missed = 0
         self._period_s = NOMINAL_DT_S
-
-    def land(self) -> None:
-        """Ask for a landing; it stays asked for."""
-        self._land = True
-
-    def listen(self) -> None:
-        """Take the launcher's messages; called when its channel is readable."""
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                message = status.receive(self._channel)
-                if message is None:
-                    asyncio.get_running_loop().remove_reader(self._channel)
-                    self.land()
-                    return
-                if message.get("type") == "land":
-                    self.land()
 
     async def run(self) -> Outcome:
         """Tick until the core says that it is over."""
@@ -131,7 +182,7 @@ class Flight:
             mocap=edges.mocap.latest(),
             arm=arm_state,
             force=edges.force.latest(),
-            command=OperatorCommand.LAND if self._land else OperatorCommand.NONE,
+            command=self._operator.command,
             recorder_dropped=self._recorder.client.dropped,
         )
         outputs = self._core.step(inputs)
@@ -204,11 +255,14 @@ async def fly(config: FlightConfig, out: Path, channel: socket.socket) -> Outcom
 
     Raises:
         DeviceError: a device is not there or not as it must be; nothing was armed.
+        GivenUp: a landing was asked for while the devices were being opened; nothing was armed.
     """
     clock = flight_clock()
-    loop = asyncio.get_running_loop()
-    async with open_edges(config, clock) as edges:
-        config = await with_hover_thrust(config, edges.autopilot)
+    operator = Operator(channel)
+    async with contextlib.AsyncExitStack() as stack:
+        stack.enter_context(operator.attention())
+        edges = await operator.unless_land(stack.enter_async_context(open_edges(config, clock)))
+        config = await operator.unless_land(with_hover_thrust(config, edges.autopilot))
         recorder = await asyncio.to_thread(
             RecorderProcess.start,
             out / "flight.mcap",
@@ -218,16 +272,13 @@ async def fly(config: FlightConfig, out: Path, channel: socket.socket) -> Outcom
         )
         try:
             recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
-            flight = Flight(config, edges, recorder, channel, clock)
-            for number in (signal.SIGTERM, signal.SIGHUP):
-                loop.add_signal_handler(number, flight.land)
-            loop.add_reader(channel, flight.listen)
+            flight = Flight(config, edges, recorder, channel, operator, clock)
             status.send(
-                channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": claim_realtime()}
+                channel,
+                {"type": "started", "recorder_pid": recorder.process.pid, "realtime": claim_realtime(FLIGHT_PRIORITY)},
             )
             outcome = await flight.run()
         finally:
-            loop.remove_reader(channel)
             report = await asyncio.to_thread(recorder.finish)
         recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}
         status.send(channel, {"type": "result", "outcome": outcome.value, "recorder": recorded})
@@ -270,6 +321,9 @@ def main(argv: list[str] | None = None) -> int:
     except DeviceError as error:
         status.send(channel, {"type": "refused", "lines": str(error).splitlines()})
         return EXIT_REFUSED
+    except GivenUp:
+        outcome = Outcome.ABORTED
+        status.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
     return EXIT_CODES[outcome]
 
 

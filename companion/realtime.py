@@ -6,16 +6,21 @@ import asyncio
 import contextlib
 import gc
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 from companion.clock import Clock
 
-PRIORITY = 50
+GIL_SWITCH_S = 0.0005
+"""The bus thread gets the interpreter this soon from a tick that computes on; Python's default is 5 ms, a whole period."""
+FLIGHT_PRIORITY = 50
+WORLD_PRIORITY = 40
+"""Of the simulated world: below the flight that it must not disturb."""
 
 
-def claim_realtime() -> str:
-    """Switch garbage collection off and ask for real-time scheduling.
+def claim_realtime(priority: int) -> str:
+    """Switch garbage collection off and ask for real-time scheduling of every thread of this process.
 
     Returns:
         One line that says what was got. Without the permission (rtprio) the flight goes on at normal priority.
@@ -23,14 +28,15 @@ def claim_realtime() -> str:
     gc.collect()
     gc.freeze()
     gc.disable()
+    sys.setswitchinterval(GIL_SWITCH_S)
     try:
-        # Every thread of the process: the tick waits for the bus thread, and what MAVSDK's threads receive is what it flies on.
+        # Every thread: the tick waits for the bus thread, and what MAVSDK's threads receive is what it flies on.
         for thread in Path("/proc/self/task").iterdir():
             with contextlib.suppress(ProcessLookupError):  # it has just ended
-                os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(PRIORITY))
+                os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO); garbage collection off"
-    return f"SCHED_FIFO {PRIORITY}; garbage collection off"
+    return f"SCHED_FIFO {priority}; garbage collection off"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import gc
 import json
 import os
 import signal
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config.loader import FlightConfig
+from companion.realtime import WORLD_PRIORITY, claim_realtime
 from sitl.autopilot.mavlink import LinkError
 from sitl.server import Ports, Sitl, start_of
 
@@ -44,9 +44,7 @@ async def _serve(config: FlightConfig, for_launcher: bool) -> None:
             _leave_with_launcher(sitl)
         else:
             _introduce(devices)
-        gc.collect()
-        gc.freeze()
-        gc.disable()
+        claim_realtime(WORLD_PRIORITY)
         await sitl.run()
     if for_launcher:
         _say({"type": "final", "world": sitl.final()})

@@ -171,6 +171,10 @@ class Safety(Model):
     """Oldest joint state; beyond it the vehicle lands."""
     force_timeout_s: Positive = 0.25
     """Oldest force sample; beyond it the law flies on without force, and says so."""
+    loop_late_s: Positive = 0.05
+    """A control tick that comes later than this is told."""
+    loop_stalled_s: Positive = 0.3
+    """A control tick that comes later than this lands the vehicle."""
     estimate_disagreement_m: Positive = 0.30
     """Between PX4's position and mocap, held for 0.2 s."""
     tilt_abort_deg: Annotated[float, Field(gt=0, le=80)] = 40.0

@@ -10,6 +10,10 @@ from companion.frames import euler_zyx_from_quat, tilt_rad, wrap_rad
 from companion.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction, Severity
 
 CRASH_TILT_RAD = math.radians(70.0)
+AWAKE_STEP_MAX_S = 0.02
+"""A tick counts for no more than this in the age of inputs."""
+WATCHDOG_RESTARTED = 0x80
+"""Bit of `ArmState.hardware_error` that is the companion's own."""
 
 
 FUSED_WITHIN_M = 0.10
@@ -54,17 +58,43 @@ class _Finding:
     """Must be true for this long."""
 
 
+class _Age:
+    """Age of an input in time that this process was awake.
+
+    When the process itself is held up, every stamp grows old though nothing was lost: what arrived meanwhile is read a moment
+    later. The hold-up is a finding of its own (`loop_late`, `loop_stalled`), not the device's fault.
+    """
+
+    def __init__(self) -> None:
+        self._stamp_s: float | None = None
+        self._seen_awake_s = 0.0
+
+    def update(self, awake_s: float, stamp_s: float | None) -> float:
+        """Awake seconds since the stamp last changed; infinite without one."""
+        if stamp_s is None:
+            return math.inf
+        if stamp_s != self._stamp_s:
+            self._stamp_s, self._seen_awake_s = stamp_s, awake_s
+        return awake_s - self._seen_awake_s
+
+
 class Monitors:
-    """All monitors of the first flight; state is only how long each finding has lasted."""
+    """All monitors of the first flight; state is how long each finding has lasted and how old each input is."""
 
     def __init__(self, safety: Safety) -> None:
         self._s = safety
         self._since: dict[str, float] = {}
         self._reported: set[str] = set()
+        self._awake_s = 0.0
+        self._last_t_s: float | None = None
+        self._ages = {name: _Age() for name in ("mocap", "position", "attitude", "imu", "heartbeat", "arm", "force")}
 
     def check(self, inputs: Inputs, situation: Situation) -> tuple[Event, ...]:
         """Events that begin in this tick."""
-        found = [*self._freshness(inputs), *self._machine(inputs, situation)]
+        gap_s = inputs.t_s - self._last_t_s if self._last_t_s is not None else 0.0
+        self._last_t_s = inputs.t_s
+        self._awake_s += min(gap_s, AWAKE_STEP_MAX_S)
+        found = [*self._loop(gap_s), *self._freshness(inputs), *self._machine(inputs, situation)]
         if situation.airborne:
             found += self._flight(inputs, situation)
         ids = {finding.id for finding in found}
@@ -78,34 +108,49 @@ class Monitors:
                 events.append(_event(inputs.t_s, finding, situation.airborne))
         return tuple(events)
 
+    def _loop(self, gap_s: float) -> list[_Finding]:
+        text = f"the control loop was held up for {gap_s * 1e3:.0f} ms"
+        if gap_s > self._s.loop_stalled_s:
+            return [_Finding("loop_stalled", SafetyAction.LAND, text)]
+        if gap_s > self._s.loop_late_s:
+            return [_Finding("loop_late", SafetyAction.WARN, text)]
+        return []
+
     def _freshness(self, i: Inputs) -> list[_Finding]:
         s, found = self._s, []
 
-        def old(stamp_s: float | None, limit_s: float) -> bool:
-            return stamp_s is None or i.t_s - stamp_s > limit_s
+        def age_s(name: str, stamp_s: float | None) -> float:
+            return self._ages[name].update(self._awake_s, stamp_s)
 
-        mocap = i.mocap
-        if old(mocap.stamp_s if mocap else None, s.mocap_timeout_s):
+        mocap, v = i.mocap, i.vehicle
+        if age_s("mocap", mocap.stamp_s if mocap else None) > s.mocap_timeout_s:
             found.append(_Finding("mocap_lost", SafetyAction.AUTOPILOT_LAND, "no motion capture"))
         elif mocap is not None and not mocap.tracking_valid:
             text = "motion capture does not see the body"
             found.append(_Finding("mocap_invalid", SafetyAction.AUTOPILOT_LAND, text, s.mocap_timeout_s))
-        v = i.vehicle
-        if v is None or old(min(v.position_stamp_s, v.attitude_stamp_s, v.imu_stamp_s), s.vehicle_timeout_s):
+        vehicle_s = max(
+            age_s("position", v.position_stamp_s if v else None),
+            age_s("attitude", v.attitude_stamp_s if v else None),
+            age_s("imu", v.imu_stamp_s if v else None),
+        )
+        if vehicle_s > s.vehicle_timeout_s:
             found.append(_Finding("vehicle_state_lost", SafetyAction.AUTOPILOT_LAND, "no fresh state from PX4"))
-        if old(i.status.heartbeat_stamp_s if i.status else None, s.heartbeat_timeout_s):
+        if age_s("heartbeat", i.status.heartbeat_stamp_s if i.status else None) > s.heartbeat_timeout_s:
             found.append(_Finding("heartbeat_lost", SafetyAction.AUTOPILOT_LAND, "no heartbeat from PX4"))
-        if old(i.arm.stamp_s if i.arm else None, s.arm_timeout_s):
+        if age_s("arm", i.arm.stamp_s if i.arm else None) > s.arm_timeout_s:
             found.append(_Finding("arm_lost", SafetyAction.LAND, "no joint state from the arm"))
-        if old(i.force.stamp_s if i.force else None, s.force_timeout_s):
+        if age_s("force", i.force.stamp_s if i.force else None) > s.force_timeout_s:
             found.append(_Finding("force_lost", SafetyAction.WARN, "no force samples; the law flies on without"))
         return found
 
     def _machine(self, i: Inputs, situation: Situation) -> list[_Finding]:
         found = []
-        if i.arm is not None and any(i.arm.hardware_error):
-            text = f"servo hardware error {i.arm.hardware_error}"
-            found.append(_Finding("servo_error", SafetyAction.LAND, text))
+        errors = i.arm.hardware_error if i.arm is not None else (0, 0)
+        if any(error & ~WATCHDOG_RESTARTED for error in errors):
+            found.append(_Finding("servo_error", SafetyAction.LAND, f"servo hardware error {errors} (register 70)"))
+        if any(error & WATCHDOG_RESTARTED for error in errors):
+            text = "the arm's bus watchdog had let go; torque is back"
+            found.append(_Finding("arm_let_go", SafetyAction.WARN, text))
         if i.recorder_dropped:
             found.append(_Finding("recorder_drops", SafetyAction.WARN, "the recorder loses samples"))
         if i.force is not None and i.force.overload:

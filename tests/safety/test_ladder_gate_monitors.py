@@ -117,14 +117,13 @@ def broken(name: str) -> Inputs:
     i = healthy()
     assert i.vehicle and i.status and i.mocap and i.arm and i.force
     tilted = quat_from_euler_zyx(math.radians(45), 0, 0)
+    silent = dict.fromkeys(FROZEN, i)
     return {
-        "mocap_lost": replace(i, mocap=replace(i.mocap, stamp_s=9.8)),
+        **silent,
         "mocap_invalid": replace(i, mocap=replace(i.mocap, tracking_valid=False)),
-        "vehicle_state_lost": replace(i, vehicle=replace(i.vehicle, attitude_stamp_s=9.5)),
-        "heartbeat_lost": replace(i, status=replace(i.status, heartbeat_stamp_s=7.0)),
-        "arm_lost": replace(i, arm=replace(i.arm, stamp_s=9.8)),
         "force_lost": replace(i, force=None),
         "force_overload": replace(i, force=replace(i.force, overload=True)),
+        "arm_let_go": replace(i, arm=replace(i.arm, hardware_error=(0x80, 0))),
         "recorder_drops": replace(i, recorder_dropped=3),
         "servo_error": replace(i, arm=replace(i.arm, hardware_error=(0, 32))),
         "battery_low": replace(i, status=replace(i.status, battery_remaining=0.1)),
@@ -146,6 +145,7 @@ def broken(name: str) -> Inputs:
         ("arm_lost", SafetyAction.LAND),
         ("force_lost", SafetyAction.WARN),
         ("force_overload", SafetyAction.WARN),
+        ("arm_let_go", SafetyAction.WARN),
         ("recorder_drops", SafetyAction.WARN),
         ("servo_error", SafetyAction.LAND),
         ("battery_low", SafetyAction.LAND),
@@ -160,37 +160,76 @@ def test_each_monitor_speaks_once_and_asks_for_its_rung(vehicle: Vehicle, name: 
     monitors = Monitors(vehicle.safety)
     assert monitors.check(healthy(), FLYING) == ()
     spoken: list[Event] = []
-    for k in range(300):
-        i = broken(name)
-        shift = k * 0.005
-        spoken += monitors.check(_shifted(i, shift), FLYING)
+    for k in range(1, 600):
+        spoken += monitors.check(_later(broken(name), k * 0.005, frozen=FROZEN.get(name)), FLYING)
     assert [(event.id, event.action) for event in spoken] == [(name, action)]
 
 
-def _shifted(i: Inputs, by_s: float) -> Inputs:
-    """The same inputs later: every stamp ages along, so that a fault stays as old as it was."""
-    assert i.vehicle and i.status and i.mocap and i.arm
+FROZEN = {
+    "mocap_lost": "mocap",
+    "vehicle_state_lost": "vehicle",
+    "heartbeat_lost": "status",
+    "arm_lost": "arm",
+}
+
+
+def _later(i: Inputs, by_s: float, frozen: str | None = None) -> Inputs:
+    """The same inputs later, every stamp with them but those of the device that fell silent."""
+    assert i.vehicle
+    assert i.status
+    assert i.mocap
+    assert i.arm
     v = i.vehicle
-    return replace(
-        i,
-        t_s=i.t_s + by_s,
-        vehicle=replace(
+    moved = {
+        "vehicle": replace(
             v,
             position_stamp_s=v.position_stamp_s + by_s,
             attitude_stamp_s=v.attitude_stamp_s + by_s,
             imu_stamp_s=v.imu_stamp_s + by_s,
         ),
-        status=replace(i.status, heartbeat_stamp_s=i.status.heartbeat_stamp_s + by_s),
-        mocap=replace(i.mocap, stamp_s=i.mocap.stamp_s + by_s),
-        arm=replace(i.arm, stamp_s=i.arm.stamp_s + by_s),
-        force=replace(i.force, stamp_s=i.force.stamp_s + by_s) if i.force else None,
-    )
+        "status": replace(i.status, heartbeat_stamp_s=i.status.heartbeat_stamp_s + by_s),
+        "mocap": replace(i.mocap, stamp_s=i.mocap.stamp_s + by_s),
+        "arm": replace(i.arm, stamp_s=i.arm.stamp_s + by_s),
+        "force": replace(i.force, stamp_s=i.force.stamp_s + by_s) if i.force else None,
+    }
+    if frozen is not None:
+        del moved[frozen]
+    return replace(i, t_s=i.t_s + by_s, **moved)
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "spoken"),
+    [(0.04, []), (0.2, [("loop_late", SafetyAction.WARN)]), (1.0, [("loop_stalled", SafetyAction.LAND)])],
+)
+def test_a_held_up_process_blames_itself_and_no_device(
+    vehicle: Vehicle, gap_s: float, spoken: list[tuple[str, SafetyAction]]
+) -> None:
+    """The first tick after a hold-up sees old stamps of everything; a moment later all is fresh."""
+    monitors = Monitors(vehicle.safety)
+    monitors.check(healthy(), FLYING)
+    events = [*monitors.check(replace(healthy(), t_s=10.0 + gap_s), FLYING)]
+    events += monitors.check(_later(healthy(), gap_s + 0.005), FLYING)
+    assert [(event.id, event.action) for event in events] == spoken
+
+
+def test_a_mocap_that_stays_away_after_a_hold_up_is_lost(vehicle: Vehicle) -> None:
+    monitors = Monitors(vehicle.safety)
+    monitors.check(healthy(), FLYING)
+    events: list[Event] = []
+    for k in range(40):
+        events += monitors.check(_later(healthy(), 0.2 + k * 0.005, frozen="mocap"), FLYING)
+    assert [event.id for event in events] == ["loop_late", "mocap_lost"]
+
+
+def _after(monitors: Monitors, i: Inputs, situation: Situation) -> list[Event]:
+    """Events of the next half second."""
+    return [event for k in range(1, 100) for event in monitors.check(_later(i, k * 0.005), situation)]
 
 
 def test_being_lost_from_the_reference_lands(vehicle: Vehicle) -> None:
     monitors = Monitors(vehicle.safety)
     lost = replace(FLYING, tracking_error_m=1.2)
-    events = [*monitors.check(healthy(), lost), *monitors.check(_shifted(healthy(), 0.25), lost)]
+    events = [*monitors.check(healthy(), lost), *_after(monitors, healthy(), lost)]
     assert [(event.id, event.action) for event in events] == [("tracking_error", SafetyAction.LAND)]
 
 
@@ -199,7 +238,7 @@ def test_upside_down_terminates(vehicle: Vehicle) -> None:
     i = healthy()
     assert i.vehicle
     flipped = replace(i, vehicle=replace(i.vehicle, attitude_wxyz=quat_from_euler_zyx(math.radians(120), 0, 0)))
-    events = [*monitors.check(flipped, FLYING), *monitors.check(_shifted(flipped, 0.4), FLYING)]
+    events = [*monitors.check(flipped, FLYING), *_after(monitors, flipped, FLYING)]
     assert ("crashed", SafetyAction.TERMINATE) in [(event.id, event.action) for event in events]
 
 
