@@ -74,7 +74,8 @@ def _introduce(devices: dict[str, dict[str, Any]]) -> None:
     mocap = devices["mocap"]
     print(
         "companion sitl is running; Ctrl-C ends it\n"
-        f"  PX4 stub      MAVLink 2 on UDP 127.0.0.1:14540 (MAVSDK: udpin://0.0.0.0:14540), from port 14580\n"
+        f"  PX4 stub      MAVLink 2 on UDP 127.0.0.1:14540 (MAVSDK: udpin://0.0.0.0:14540), from port 14580;\n"
+        "                ground stations on 14550; it arms once somebody forwards mocap as VISION_POSITION_ESTIMATE\n"
         f"  mocap         NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port "
         f"{mocap.get('data_port')}\n"
         f"  arm bus       {devices['arm']['port']}\n"

@@ -115,5 +115,6 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     <gyro name="gyro" site="imu"/>
     <force name="force" site="net"/>
     <torque name="torque" site="net"/>
+    <tendonlimitfrc name="tether" tendon="tether"/>
   </sensor>
 </mujoco>"""

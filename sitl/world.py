@@ -68,7 +68,7 @@ class World:
             self._catch = m.equality("catch").id
         self._park = [m.equality(name).id for name in ("park1", "park2")]
         self._parked = True
-        self._sensor = {name: int(m.sensor(name).adr[0]) for name in ("accel", "gyro", "force", "torque")}
+        self._sensor = {name: int(m.sensor(name).adr[0]) for name in ("accel", "gyro", "force", "torque", "tether")}
         self._lag = math.exp(-PHYSICS_DT_S / config.rotor_lag_s)
         self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
         self._thrust = np.zeros(4)
@@ -190,5 +190,5 @@ class World:
             joint_velocity_rad_s=(v[jv[0]], v[jv[1]]),
             force_sensor_n=(-f[0], -f[1], -f[2]),
             torque_sensor_nm=(-tq[0], -tq[1], -tq[2]),
-            tether_tension_n=0.0,
+            tether_tension_n=sensors[s["tether"]],
         )

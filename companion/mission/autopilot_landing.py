@@ -61,7 +61,7 @@ class AutopilotLanding:
         heard = i.status is not None and i.t_s - i.status.heartbeat_stamp_s < _HEARTBEAT_FRESH_S
         if heard and not is_armed(i.status) and elapsed > 0.5:
             return LandingStep(AutopilotRequest.NONE, False, True, True)
-        if elapsed > TIMEOUT_S:
+        if elapsed > TIMEOUT_S and not (self._pilot and heard):  # a pilot may fly on for as long as they like
             return LandingStep(AutopilotRequest.NONE, False, True, False, "the landing could not be confirmed")
         if not heard and self._stands_by_mocap(i):
             text = "the vehicle stands, motion capture says; PX4 does not answer: go and disarm it by hand, with care"

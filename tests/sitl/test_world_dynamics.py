@@ -157,3 +157,19 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
     away = d.xpos[payload] - d.xpos[m.body("net").id]
     assert np.linalg.norm(away) < 1.1 * vehicle.tool.net_radius_m, "the net did not keep the payload"
     assert np.linalg.norm(momentum() - before) <= 0.005 * np.linalg.norm(before)
+
+
+def test_a_taut_tether_pulls_and_a_slack_one_does_not(vehicle: Vehicle) -> None:
+    world = World(vehicle, NO_PAYLOAD, (0.0, 0.0), 0.0, ARM_START)
+    hover = world.hover_command * 1.3
+    rotors = (hover, hover, hover, hover)
+    tension = []
+    for _ in range(int(2.5 / PHYSICS_DT_S)):
+        world.step(rotors, (0, 0), False)
+        truth = world.truth()
+        tension.append(truth.tether_tension_n)
+        away = math.dist(truth.position_world_m, vehicle.tether.anchor_world_m)
+        assert away < vehicle.tether.length_m + 0.1
+        if away < vehicle.tether.length_m - 0.05:
+            assert truth.tether_tension_n == 0.0
+    assert max(tension) > 1.0

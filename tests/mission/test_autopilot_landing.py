@@ -1,0 +1,105 @@
+"""The landing in PX4's LAND mode: what the companion asks for, and when it lets go."""
+
+from __future__ import annotations
+
+from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding
+from companion.types import (
+    AutopilotRequest,
+    AutopilotStatus,
+    FlightMode,
+    Inputs,
+    LandedState,
+    MocapPose,
+    OperatorCommand,
+    VehicleState,
+)
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+ZERO = (0.0, 0.0, 0.0)
+CLEARANCE_M = 0.3
+
+
+def seen(
+    t_s: float,
+    height_m: float,
+    *,
+    sink_m_s: float = 0.0,
+    mode: FlightMode = FlightMode.LAND,
+    landed: LandedState = LandedState.IN_AIR,
+    armed: bool = True,
+    heard_s: float | None = None,
+    mocap: bool = True,
+) -> Inputs:
+    position = (0.0, 0.0, height_m)
+    return Inputs(
+        tick=0,
+        t_s=t_s,
+        vehicle=VehicleState(t_s, t_s, t_s, position, (0.0, 0.0, -sink_m_s), LEVEL, ZERO, (0.0, 0.0, 9.81)),
+        status=AutopilotStatus(t_s if heard_s is None else heard_s, armed, mode, landed, 16.0, 0.9),
+        mocap=MocapPose(t_s if mocap else 0.0, None, 1, position, LEVEL, True, 0.0),
+        arm=None,
+        force=None,
+        command=OperatorCommand.NONE,
+        recorder_dropped=0,
+    )
+
+
+def test_it_asks_for_land_until_touchdown_then_takes_offboard_back_with_zero_thrust_and_disarms() -> None:
+    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    step = landing.step(seen(0.1, 1.0, sink_m_s=0.7, mocap=False))
+    assert (step.request, step.zero_thrust) == (AutopilotRequest.LAND, False)
+    requests = []
+    for k in range(300):
+        t_s = 2.0 + k * 0.005
+        mode = FlightMode.OFFBOARD if AutopilotRequest.OFFBOARD in requests else FlightMode.LAND
+        landed = LandedState.ON_GROUND if t_s > 3.3 else LandedState.IN_AIR
+        step = landing.step(seen(t_s, 0.31, mode=mode, landed=landed, mocap=False))
+        requests.append(step.request)
+        if step.request is not AutopilotRequest.LAND:
+            assert step.zero_thrust
+    order = [request for k, request in enumerate(requests) if k == 0 or request is not requests[k - 1]]
+    assert order == [
+        AutopilotRequest.LAND,
+        AutopilotRequest.NONE,
+        AutopilotRequest.OFFBOARD,
+        AutopilotRequest.NONE,
+        AutopilotRequest.DISARM,
+    ]
+    assert landing.step(seen(4.0, 0.31, armed=False)).ended
+
+
+def test_a_height_that_nobody_can_vouch_for_is_no_touchdown() -> None:
+    """Without vision for longer than PX4's height holds, thrust is not cut on its word."""
+    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    for k in range(400):
+        step = landing.step(seen(5.0 + k * 0.005, 0.31, mocap=False))
+        assert not step.zero_thrust
+
+
+def test_sinking_is_no_touchdown() -> None:
+    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    for k in range(300):
+        assert not landing.step(seen(1.0 + k * 0.005, 0.35, sink_m_s=0.2)).zero_thrust
+
+
+def test_nothing_is_asked_against_a_pilot_for_as_long_as_they_fly() -> None:
+    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=True)
+    for t_s in (0.1, 1.0, TIMEOUT_S + 1.0, 600.0):
+        step = landing.step(seen(t_s, 1.0, mode=FlightMode.MANUAL))
+        assert step.request is AutopilotRequest.NONE
+        assert not step.zero_thrust
+        assert not step.ended
+    assert landing.step(seen(700.0, 0.3, mode=FlightMode.MANUAL, armed=False)).ended
+
+
+def test_a_silent_px4_that_stands_is_landed_and_one_in_the_air_is_not() -> None:
+    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    steps = [landing.step(seen(4.0 + k * 0.05, 0.31, heard_s=0.0)) for k in range(80)]
+    assert steps[-1].ended
+    assert steps[-1].landed
+    assert "by hand" in (steps[-1].text or "")
+    hovering = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    assert not any(hovering.step(seen(4.0 + k * 0.05, 1.0, heard_s=0.0)).ended for k in range(80))
+    late = hovering.step(seen(TIMEOUT_S + 1.0, 1.0, heard_s=0.0))
+    assert late.ended
+    assert not late.landed
