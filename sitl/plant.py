@@ -86,7 +86,7 @@ class Plant:
         self._px4 = px4
         self._drives = drives
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
-        self.truth: Truth = self.world.truth()
+        self._truth: Truth | None = None
         self._noise = Noise(config.seed)
         self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self._tick = 0
@@ -104,6 +104,13 @@ class Plant:
     def t_s(self) -> float:
         """World time."""
         return self.world.t_s
+
+    @property
+    def truth(self) -> Truth:
+        """The world's state after the last step; read out only when somebody looks."""
+        if self._truth is None:
+            self._truth = self.world.truth()
+        return self._truth
 
     def mission_t_s(self) -> float | None:
         """Seconds since the rotors were armed."""
@@ -124,19 +131,18 @@ class Plant:
         """Advance by one physics step."""
         if armed and self.armed_t_s is None:
             self.armed_t_s = self.t_s
-        truth = self.truth
+        t_s = self.t_s
+        angle, velocity = self.world.joints()
         torque = []
         for i, drive in enumerate(self._drives):
             joint = self._vehicle.arm.joints[i]
-            current = drive.update(
-                truth.t_s, self._servo_angle(i, truth.joint_angle_rad[i]), joint.sign * truth.joint_velocity_rad_s[i]
-            )
+            current = drive.update(t_s, self._servo_angle(i, angle[i]), joint.sign * velocity[i])
             torque.append(joint.sign * current * self._vehicle.arm.torque_per_amp_nm_a)
         if self._tick % IMU_EVERY == 0:
-            self._rotors = self._px4.step(self._imu(truth))
+            self._rotors = self._px4.step(self._imu(self.truth))
         self._tick += 1
         self.world.step(self._rotors, (torque[0], torque[1]), armed)
-        self.truth = self.world.truth()
+        self._truth = None
         self._expose_mocap()
 
     def _imu(self, truth: Truth) -> ImuSample:

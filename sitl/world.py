@@ -56,8 +56,8 @@ class World:
         self.model = mujoco.MjModel.from_xml_string(mjcf(vehicle, config, PHYSICS_DT_S))
         self.data = mujoco.MjData(self.model)
         m = self.model
-        self._joint_q = np.array([m.jnt_qposadr[m.joint(name).id] for name in ("alpha1", "alpha2")])
-        self._joint_v = np.array([m.jnt_dofadr[m.joint(name).id] for name in ("alpha1", "alpha2")])
+        self._joint_q = [int(m.jnt_qposadr[m.joint(name).id]) for name in ("alpha1", "alpha2")]
+        self._joint_v = [int(m.jnt_dofadr[m.joint(name).id]) for name in ("alpha1", "alpha2")]
         self._base = m.body("base").id
         self._net = m.body("net").id
         self._has_payload = config.payload_kg > 0
@@ -71,13 +71,14 @@ class World:
         self._sensor = {name: int(m.sensor(name).adr[0]) for name in ("accel", "gyro", "force", "torque", "tether")}
         self._lag = math.exp(-PHYSICS_DT_S / config.rotor_lag_s)
         self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
-        self._thrust = np.zeros(4)
+        self._thrust = [0.0, 0.0, 0.0, 0.0]
         self.thrown_t_s: float | None = None
         self.caught_t_s: float | None = None
         self.missed = False
         self.crashed = False
         self._events: list[WorldEvent] = []
         self._last_x = start_position_m[0]
+        self._drag_force = self.data.xfrc_applied[self._base, 0:3]  # a view
         self._place(start_position_m, start_yaw_rad, arm_rad)
 
     def _place(self, position_m: Vec2, yaw_rad: float, arm_rad: Vec2) -> None:
@@ -103,14 +104,15 @@ class World:
     def step(self, rotor_commands: Vec4, joint_torque_nm: Vec2, airborne: bool = True, *, drag: bool = True) -> None:
         """Advance by one physics step; `airborne`: the throw may happen."""
         d = self.data
-        self._thrust += (1.0 - self._lag) * (np.array(rotor_commands) * self._rotor_max_n - self._thrust)
-        d.ctrl[0:4] = self._thrust
-        d.ctrl[4:6] = joint_torque_nm
+        k, most = 1.0 - self._lag, self._rotor_max_n
+        self._thrust = [now + k * (c * most - now) for now, c in zip(self._thrust, rotor_commands, strict=True)]
+        d.ctrl[:] = (*self._thrust, *joint_torque_nm)
         if self._parked and all(joint_torque_nm):
             self.release_arm()
-        wind = self._config.wind_m_s
-        for i in range(3):
-            d.xfrc_applied[self._base, i] = DRAG_N_PER_M_S * (wind[i] - d.qvel[i]) if drag else 0.0
+        if drag:
+            (wx, wy, wz), (vx, vy, vz) = self._config.wind_m_s, d.qvel[0:3].tolist()
+            c = DRAG_N_PER_M_S
+            self._drag_force[:] = (c * (wx - vx), c * (wy - vy), c * (wz - vz))
         mujoco.mj_step(self.model, d)
         if self._has_payload and self.caught_t_s is None:
             self._throw_and_catch(airborne)
@@ -161,9 +163,8 @@ class World:
         """Rotors or hull in the floor: far below standing height or upside down."""
         if self.crashed:
             return
-        d = self.data
-        z = float(d.qpos[2])
-        up = 1.0 - 2.0 * (float(d.qpos[4]) ** 2 + float(d.qpos[5]) ** 2)
+        z, _, x, y = self.data.qpos[2:6].tolist()
+        up = 1.0 - 2.0 * (x * x + y * y)
         if z < 0.6 * self._vehicle.airframe.ground_clearance_m or up < 0.3 or not math.isfinite(z):
             self.crashed = True
             self._events.append(WorldEvent(self.t_s, "crashed"))
@@ -172,6 +173,11 @@ class World:
         """Events since the last call."""
         events, self._events = self._events, []
         return events
+
+    def joints(self) -> tuple[Vec2, Vec2]:
+        """Joint angles (rad) and velocities (rad/s) after the last step."""
+        q, v, jq, jv = self.data.qpos, self.data.qvel, self._joint_q, self._joint_v
+        return (float(q[jq[0]]), float(q[jq[1]])), (float(v[jv[0]]), float(v[jv[1]]))
 
     def truth(self) -> Truth:
         """The state after the last step."""
