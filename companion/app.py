@@ -213,6 +213,7 @@ class Flight:
         for event in outputs.events:
             message = {
                 "type": "event",
+                "tick": tick,
                 "t_s": outputs.mission_t_s,
                 "id": event.id,
                 "severity": event.severity.value,

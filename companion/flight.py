@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,10 @@ from rich.console import Console
 
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import empty_summary, summarise, write_summary
+from companion.children import LaunchError
 from companion.config.loader import FlightConfig
-from companion.exit_codes import EXIT_REFUSED
-from companion.launcher import FlightResult, Launcher, LaunchError
-from companion.terminal import FlightDisplay, print_result
+from companion.launcher import FlightResult, Launcher, landing_signals
+from companion.terminal import FlightDisplay, print_result, tell
 from companion.types import Outcome
 
 
@@ -22,30 +21,44 @@ def run_flight(config: FlightConfig, out: Path, *, sitl: bool, console: Console)
     """Fly, then write summary and report; returns the exit code."""
     where = "SITL" if sitl else config.vehicle.name
     title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
-    with FlightDisplay(console, title) as display:
-        launcher = Launcher(config, out, sitl=sitl, on_message=display.on_message)
+    display = FlightDisplay(console, title)
+    launcher = Launcher(config, out, sitl=sitl, on_message=display.on_message)
+    # A second Ctrl-C may come when a short flight is over already: it must not cost the summary.
+    with landing_signals(launcher.ask_to_land):
+        with display:
+            try:
+                result = launcher.run()
+            except LaunchError as error:
+                result = FlightResult(Outcome.REFUSED, lines=(str(error),))
+        for line in result.lines:
+            tell(line)
         try:
-            result = launcher.run()
-        except LaunchError as error:
-            print(error, file=sys.stderr)
-            return EXIT_REFUSED
-    for line in result.refusal:
-        print(line, file=sys.stderr)
-    summary, report = _results(config, result, out, console)
+            log, summary = _summary(config, result, out)
+        except OSError as error:
+            tell(f"{out}: summary.json cannot be written: {error.strerror}")
+            return result.exit_code
+    report = None
+    if log is not None:
+        try:
+            with console.status("writing the report"):
+                report = report_of(log, summary, out)
+        except KeyboardInterrupt:
+            tell(f"report given up; make it with: companion report {out / 'flight.mcap'}")
+        except OSError as error:
+            tell(f"{out}: the report cannot be written: {error.strerror}")
     print_result(console, summary, out, report)
     return result.exit_code
 
 
-def _results(
-    config: FlightConfig, result: FlightResult, out: Path, console: Console
-) -> tuple[dict[str, Any], Path | None]:
+def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[FlightLog | None, dict[str, Any]]:
+    """Read the log, if the flight left one; write summary.json."""
     log = None
     path = out / "flight.mcap"
     if path.exists():
         try:
             log = FlightLog.read(path)
         except LogError as error:
-            print(error, file=sys.stderr)
+            tell(error)
     about: dict[str, Any] = {
         "outcome": result.outcome.value,
         "controller": config.controller.law,
@@ -55,10 +68,7 @@ def _results(
     }
     summary = summarise(log, **about) if log is not None else empty_summary(**about)
     write_summary(summary, out / "summary.json")
-    if log is None:
-        return summary, None
-    with console.status("writing the report"):
-        return summary, report_of(log, summary, out)
+    return log, summary
 
 
 def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None:

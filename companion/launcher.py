@@ -20,20 +20,19 @@ from pathlib import Path
 from typing import Any
 
 from companion import status
+from companion.children import LaunchError, holds_traceback, how_it_ended, last_line, terminate, write_text
 from companion.config.loader import FlightConfig
 from companion.exit_codes import EXIT_CODES
-from companion.types import Outcome
+from companion.sitl_process import SitlProcess
+from companion.types import Outcome, PhaseKind, SafetyAction, Severity
 
-SITL_READY_TIMEOUT_S = 30.0
 SITL_SETTLE_TIMEOUT_S = 40.0
 """After the flight process is gone: how long the world may take to come to rest."""
+SILENT_FLIGHT_S = 5.0
+"""A flight process that says nothing for this long hangs; killed, it leaves PX4 to its own offboard-loss landing."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
 
 OnMessage = Callable[[status.Message], None]
-
-
-class LaunchError(Exception):
-    """A process of the flight could not be started; one line."""
 
 
 @dataclass
@@ -44,7 +43,8 @@ class FlightResult:
     recorder: dict[str, Any] | None = None
     world: dict[str, Any] = field(default_factory=dict)
     """SITL truth: payload_kg, caught, crashed, ..."""
-    refusal: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
+    """For the user: why the flight was refused, or which process failed and where its log is."""
 
     @property
     def exit_code(self) -> int:
@@ -52,89 +52,15 @@ class FlightResult:
         return EXIT_CODES[self.outcome]
 
 
-class SitlProcess:
-    """The simulated world as a child process."""
-
-    def __init__(self, config: FlightConfig, out: Path) -> None:
-        path = out / "sitl_config.json"
-        path.write_text(config.model_dump_json(indent=1), encoding="utf-8")
-        with open(out / "sitl.log", "wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "sitl", "--config", str(path), "--for-launcher"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                start_new_session=True,
-            )
-        self._log = out / "sitl.log"
-        self._buffer = b""
-        self.final: dict[str, Any] = {}
-        self.at_rest = False
-
-    def devices(self) -> dict[str, dict[str, Any]]:
-        """Addresses of the simulated devices, once they are open."""
-        for message in self.messages(time.monotonic() + SITL_READY_TIMEOUT_S):
-            if message.get("type") == "ready":
-                devices: dict[str, dict[str, Any]] = message["devices"]
-                return devices
-            if message.get("type") == "error":
-                raise LaunchError(str(message["text"]))
-        raise LaunchError(f"sitl: did not come up; see {self._log}")
-
-    def messages(self, deadline_s: float) -> Iterator[dict[str, Any]]:
-        """JSON lines until the deadline (0: only what is there) or the end of the process."""
-        assert self.process.stdout is not None
-        fd = self.process.stdout.fileno()
-        while True:
-            while b"\n" in self._buffer:
-                line, _, self._buffer = self._buffer.partition(b"\n")
-                with contextlib.suppress(ValueError):
-                    message = json.loads(line)
-                    self._note(message)
-                    yield message
-            left_s = max(0.0, deadline_s - time.monotonic())
-            if not select.select([fd], [], [], left_s)[0]:
-                return
-            data = os.read(fd, 65536)
-            if not data:
-                return
-            self._buffer += data
-
-    def _note(self, message: dict[str, Any]) -> None:
-        if message.get("type") == "final":
-            self.final = message["world"]
-        if message.get("type") == "at_rest":
-            self.at_rest = bool(message["at_rest"])
-
-    def wait_at_rest(self, deadline_s: float) -> None:
-        """Until the world's rotors stand, or the deadline."""
-        for _ in self.messages(0.0):
-            pass
-        while not self.at_rest and time.monotonic() < deadline_s and self.process.poll() is None:
-            for _ in self.messages(time.monotonic() + 0.2):
-                pass
-
-    def stop(self) -> None:
-        """Ask for the end, take the last words, make sure."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError):
-            self.process.stdin.close()
-        for _ in self.messages(time.monotonic() + 5.0):
-            pass
-        terminate(self.process)
-
-
-def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None:
-    """End a child: wait, then SIGTERM, then SIGKILL; reaped in any case, its pipes closed."""
-    for number in (0, signal.SIGTERM, signal.SIGKILL):  # 0 sends nothing
-        process.send_signal(number)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(patience_s)
-            break
-    for pipe in (process.stdin, process.stdout, process.stderr):
-        if pipe is not None:
-            with contextlib.suppress(OSError):
-                pipe.close()
+@contextlib.contextmanager
+def landing_signals(land: Callable[[], None]) -> Iterator[None]:
+    """While inside: SIGINT, SIGTERM and SIGHUP call `land`, and end nothing."""
+    handlers = {number: signal.signal(number, lambda *_: land()) for number in _LAND_SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 class Launcher:
@@ -155,8 +81,15 @@ class Launcher:
         self._stop_asked = False
         self._channel: socket.socket | None = None
         self._result: dict[str, Any] | None = None
-        self._refusal: tuple[str, ...] = ()
+        self._refused: list[str] | None = None
+        self._grave: list[tuple[int, str]] = []
+        """Events that end a flight, by tick; the first ones are the cause, the others what followed from it."""
+        self._px4: list[str] = []
+        """What PX4 said since the flight began."""
+        self._failures: list[str] = []
         self._recorder_pid: int | None = None
+        self._flying = False
+        """Ticking, and not over yet: messages come ten times a second."""
 
     def ask_to_land(self) -> None:
         """Ctrl-C: land; asking again changes nothing."""
@@ -165,12 +98,11 @@ class Launcher:
             status.send(self._channel, {"type": "land"})
 
     def run(self) -> FlightResult:
-        """Fly.
+        """Fly. To be called inside of `landing_signals(launcher.ask_to_land)`.
 
         Raises:
-            LaunchError: the simulated world could not be started.
+            LaunchError: a process of the flight could not be started.
         """
-        handlers = {number: signal.signal(number, lambda *_: self.ask_to_land()) for number in _LAND_SIGNALS}
         sitl: SitlProcess | None = None
         try:
             config = self._config
@@ -178,24 +110,32 @@ class Launcher:
                 sitl = SitlProcess(config, self._out)
                 config = with_devices(config, sitl.devices())
             path = self._out / "config.json"
-            path.write_text(config.model_dump_json(indent=1), encoding="utf-8")
-            outcome = self._fly(path, sitl)
+            write_text(path, config.model_dump_json(indent=1))
+            outcome = Outcome.ABORTED if self._stop_asked else self._fly(path, sitl)
+        except LaunchError:
+            if not self._stop_asked:
+                raise
+            outcome = (
+                Outcome.ABORTED
+            )  # a child that has not left the terminal's process group yet takes its Ctrl-C, too
         finally:
             if sitl is not None:
                 sitl.stop()
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
         world = sitl.final if sitl is not None else {}
         if world.get("crashed") and outcome is not Outcome.REFUSED:
             outcome = Outcome.CRASHED
         recorder = self._result.get("recorder") if self._result else None
-        return FlightResult(outcome, recorder, world, self._refusal)
+        return FlightResult(outcome, recorder, world, self._lines(outcome))
 
     def _fly(self, config_path: Path, sitl: SitlProcess | None) -> Outcome:
+        log_path = self._out / "flight.log"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # The flight holds the world's standard input open as well: the world stays until both are gone. Should this process be
+        # killed, the flight lands and hears that it has landed.
+        shared = () if sitl is None or sitl.process.stdin is None else (sitl.process.stdin.fileno(),)
         with ours:
             ours.setblocking(False)
-            with theirs, open(self._out / "flight.log", "wb") as log:
+            with theirs, open(log_path, "wb") as log:
                 process = subprocess.Popen(
                     [
                         *(sys.executable, "-m", "companion.app", "--config", str(config_path)),
@@ -204,36 +144,81 @@ class Launcher:
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
-                    pass_fds=(theirs.fileno(),),
+                    pass_fds=(theirs.fileno(), *shared),
                     start_new_session=True,
                 )
-            (self._out / "flight.pid").write_text(str(process.pid))
             self._channel = ours
-            if self._stop_asked:
-                self.ask_to_land()
             try:
+                write_text(self._out / "flight.pid", str(process.pid))
+                if self._stop_asked:
+                    self.ask_to_land()
                 self._watch(process, ours, sitl)
             finally:
                 self._channel = None
                 terminate(process, patience_s=30.0 if self._result is None else 10.0)
         self._await_recorder()
-        if process.returncode < 0 or (self._result is None and not self._refusal):
-            if sitl is not None:
-                sitl.wait_at_rest(time.monotonic() + SITL_SETTLE_TIMEOUT_S)
-            return Outcome.LOST
-        return Outcome.REFUSED if self._result is None else Outcome(self._result["outcome"])
+        return self._judge(process.returncode, log_path, sitl)
+
+    def _judge(self, code: int, log_path: Path, sitl: SitlProcess | None) -> Outcome:
+        """The outcome of a flight process that is gone, by what it said and how it ended."""
+        if self._refused is not None:
+            outcome, expected = Outcome.REFUSED, EXIT_CODES[Outcome.REFUSED]
+        elif self._result is not None and code >= 0:
+            outcome = Outcome(self._result["outcome"])
+            expected = EXIT_CODES[outcome]
+        elif self._recorder_pid is None and self._stop_asked and -code in _LAND_SIGNALS:
+            outcome, expected = Outcome.ABORTED, code  # as in `run`
+        elif self._recorder_pid is None:
+            outcome, expected = Outcome.REFUSED, None  # it never began: nothing can have been armed
+        else:
+            outcome, expected = Outcome.LOST, None
+        if sitl is not None and sitl.ended:
+            self._failures.append(sitl.epitaph())
+        elif code != expected:
+            self._failures.append(
+                f"flight: the flight process {how_it_ended(code)}{last_line(log_path)}; see {log_path}"
+            )
+        elif holds_traceback(log_path):
+            self._failures.append(f"flight: an internal error was logged{last_line(log_path)}; see {log_path}")
+        if outcome is Outcome.LOST and sitl is not None:
+            sitl.wait_at_rest(time.monotonic() + SITL_SETTLE_TIMEOUT_S)
+        return outcome
+
+    def _lines(self, outcome: Outcome) -> tuple[str, ...]:
+        if outcome is not Outcome.REFUSED:
+            return tuple(self._failures)
+        reasons = self._refused
+        if reasons is None:
+            said = "; ".join(dict.fromkeys(self._px4))
+            reasons = [
+                f"{text}; PX4 said: {said}" if said and "PX4" in text else text
+                for tick, text in self._grave
+                if tick == self._grave[0][0]
+            ]
+        return (*reasons, *self._failures)
 
     def _watch(self, process: subprocess.Popen[bytes], channel: socket.socket, sitl: SitlProcess | None) -> None:
-        """Pass the flight's messages on until it closes its channel."""
+        """Pass the flight's messages on until it closes its channel, or hangs."""
+        heard_s = time.monotonic()
         while True:
             readable, _, _ = select.select([channel], [], [], 0.5)
             if sitl is not None:
                 for message in sitl.messages(0.0):
                     self._on_message({**message, "source": "sitl"})
+                if sitl.ended:
+                    process.kill()  # there is nothing left that it could land
+                    return
             if not readable:
                 if process.poll() is not None:
                     return
+                if self._flying and time.monotonic() - heard_s > SILENT_FLIGHT_S:
+                    self._failures.append(
+                        f"flight: the flight process said nothing for {SILENT_FLIGHT_S:g} s and was killed"
+                    )
+                    process.kill()
+                    return
                 continue
+            heard_s = time.monotonic()
             with contextlib.suppress(BlockingIOError):
                 while True:
                     received = status.receive(channel)
@@ -246,9 +231,17 @@ class Launcher:
         if kind == "result":
             self._result = message
         elif kind == "refused":
-            self._refusal = tuple(message["lines"])
+            self._refused = message["lines"]
         elif kind == "started":
             self._recorder_pid = message["recorder_pid"]
+        elif kind == "status":
+            self._flying = message["kind"] != PhaseKind.DONE.value
+        elif kind == "event":
+            ends = SafetyAction(message["action"]).rank >= SafetyAction.LAND.rank
+            if ends or message["severity"] == Severity.CRITICAL.value:
+                self._grave.append((message["tick"], message["text"]))
+        elif kind == "px4":
+            self._px4.append(message["text"])
         self._on_message(message)
 
     def _await_recorder(self) -> None:

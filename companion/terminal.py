@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, TextIO, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -12,6 +15,51 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.status import Message
+
+
+class SteadyStream:
+    """A text stream whose reader may go away (a pipe that closes, a terminal that hangs up): then it takes everything and shows
+    nothing. A flight must not care.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write what still can be written."""
+        try:
+            return self._stream.write(text)
+        except OSError:
+            self._let_go()
+            return len(text)
+
+    def flush(self) -> None:
+        """Flush what still can be flushed."""
+        try:
+            self._stream.flush()
+        except OSError:
+            self._let_go()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _let_go(self) -> None:
+        # The interpreter flushes once more at its end, and would change the exit code if that failed.
+        with contextlib.suppress(OSError), open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), self._stream.fileno())
+
+
+def terminal_console() -> Console:
+    """The console on standard output."""
+    return Console(file=cast("IO[str]", SteadyStream(sys.stdout)))
+
+
+def tell(text: object) -> None:
+    """One line on standard error."""
+    stream = SteadyStream(sys.stderr)
+    stream.write(f"{text}\n")
+    stream.flush()
+
 
 _SEVERITY_STYLE = {"info": "cyan", "warning": "yellow", "critical": "bold red"}
 _OUTCOME_STYLE = {"completed": "bold green", "aborted": "bold yellow", "refused": "bold yellow"}

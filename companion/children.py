@@ -1,0 +1,71 @@
+"""Child processes: ended for sure, and what can be said of one that ended by itself."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+
+class LaunchError(Exception):
+    """A process of the flight could not be started; one line."""
+
+
+def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None:
+    """End a child: wait, then SIGTERM, then SIGKILL; reaped in any case, its pipes closed."""
+    for number in (0, signal.SIGTERM, signal.SIGKILL):  # 0 sends nothing
+        process.send_signal(number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(patience_s)
+            break
+    for pipe in (process.stdin, process.stdout, process.stderr):
+        if pipe is not None:
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file of the flight's folder.
+
+    Raises:
+        LaunchError: it cannot be written.
+    """
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LaunchError(f"{path}: cannot be written: {error.strerror}; choose another --out") from None
+
+
+def how_it_ended(code: int) -> str:
+    """What a return code of `subprocess` says, for people."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        return f"was ended by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was ended by signal {-code}"
+
+
+_LOG_TAIL_BYTES = 65536
+_LINE_CHARACTERS = 200
+
+
+def _tail(path: Path) -> str:
+    with contextlib.suppress(OSError), open(path, "rb") as log:
+        log.seek(max(0, log.seek(0, os.SEEK_END) - _LOG_TAIL_BYTES))
+        return log.read().decode(errors="replace")
+    return ""
+
+
+def holds_traceback(path: Path) -> bool:
+    """The end of a log shows an internal error."""
+    return "Traceback (most recent call last)" in _tail(path)
+
+
+def last_line(path: Path) -> str:
+    """` (ValueError: what it said)`: the last line of a log, if there is one."""
+    lines = _tail(path).split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return f" ({last[:_LINE_CHARACTERS]})" if last else ""

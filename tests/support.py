@@ -1,0 +1,325 @@
+"""What tests of whole programs share: a place to run `companion` in, a simulated world on its own, proof that nothing is left.
+
+Everything that a `Sandbox` starts carries a mark in its environment, and children inherit it: whoever still has it afterwards was
+left behind. A pty lives as long as the process that holds its master, so no process means no pty.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from companion.config.loader import load_flight
+
+ROOT = Path(__file__).parents[1]
+CATCH = ROOT / "configs/missions/catch.yaml"
+HOVER = ROOT / "configs/missions/hover.yaml"
+DEADLINE_S = 90.0
+"""For everything that a test waits for: far beyond what it takes, on a loaded machine too."""
+_MARK = "COMPANION_TEST_MARK"
+
+SUMMARY_KEYS: dict[str, Any] = {
+    "outcome": None,
+    "controller": None,
+    "preset": None,
+    "payload_kg": None,
+    "catch_t_s": None,
+    "rms": dict.fromkeys(("pre", "post"), dict.fromkeys(("e_p_m", "e_q_deg", "e_alpha_deg"))),
+    "impedance_error": dict.fromkeys(("position_n", "arm_nm")),
+    "final_e_z_m": None,
+    "loop": {"rate_hz": None, "ticks": None, "missed": None, "lateness_ms": dict.fromkeys(("p50", "p99", "max"))},
+    "latency_ms": dict.fromkeys(("mocap_to_setpoint", "joint_read_to_write"), dict.fromkeys(("p50", "p99", "max"))),
+    "recorder": dict.fromkeys(("samples", "dropped")),
+    "events": None,
+    "tether": {"min_slack_m": None},
+}
+"""Keys of summary.json that outside scripts rely on."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A program that ran to its end."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def err_lines(self) -> list[str]:
+        return self.err.splitlines()
+
+
+class Sandbox:
+    """A current directory, a TMPDIR and a mark for everything started in it."""
+
+    def __init__(self, folder: Path, environment: Mapping[str, str] | None = None) -> None:
+        self.cwd = folder / "cwd"
+        self.tmp = folder / "tmp"
+        self.cwd.mkdir(parents=True)
+        self.tmp.mkdir()
+        self._mark = uuid.uuid4().hex
+        self._environment = dict(environment or {})
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return {**os.environ, "TMPDIR": str(self.tmp), _MARK: self._mark, "COLUMNS": "200", **self._environment}
+
+    def start(self, *arguments: object) -> Running:
+        """`companion ARGUMENTS`, in a process group of its own, as a terminal would start it."""
+        return Running(self, arguments)
+
+    def run(self, *arguments: object) -> Ended:
+        """`companion ARGUMENTS` to its end."""
+        with self.start(*arguments) as running:
+            return running.end()
+
+    def survivors(self) -> dict[int, str]:
+        """Processes that carry the mark: pid and command line."""
+        mark = f"{_MARK}={self._mark}".encode()
+        found = {}
+        for entry in Path("/proc").iterdir():
+            if not entry.name.isdecimal():
+                continue
+            with contextlib.suppress(OSError):  # it ended while we looked, or is another user's
+                if mark in (entry / "environ").read_bytes().split(b"\0"):
+                    found[int(entry.name)] = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+        return found
+
+    def pid_of(self, module: str) -> int:
+        """The one marked process that runs `python -m MODULE`."""
+        found = [pid for pid, command in self.survivors().items() if f"-m {module} " in f"{command} "]
+        assert len(found) == 1, (module, self.survivors())
+        return found[0]
+
+    def assert_nobody_left(self, within_s: float = 0.0, *, but_files: str = "") -> None:
+        """No process that was started here runs any more, after `within_s` at the latest, and TMPDIR is empty.
+
+        Args:
+            but_files: pattern of names that may be left in TMPDIR, by programs that were killed.
+        """
+        wait_until(lambda: not self.survivors(), lambda: f"left behind: {self.survivors()}", within_s)
+        left = [path.name for path in self.tmp.iterdir() if not path.match(but_files or "-")]
+        assert not left, f"files left in TMPDIR: {left}"
+
+    def end_survivors(self) -> None:
+        """For a test's teardown: a test that failed half way leaves nothing either."""
+        for pid in self.survivors():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def sandbox_in(folder: Path, environment: Mapping[str, str] | None = None) -> Iterator[Sandbox]:
+    """A sandbox that is empty of processes afterwards, whatever happens."""
+    sandbox = Sandbox(folder, environment)
+    try:
+        yield sandbox
+    finally:
+        sandbox.end_survivors()
+
+
+class Running:
+    """A `companion` command that runs; its output is read as it comes."""
+
+    def __init__(self, sandbox: Sandbox, arguments: Sequence[object]) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "companion.cli", *map(str, arguments)],
+            cwd=sandbox.cwd,
+            env=sandbox.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        self._read = {"out": b"", "err": b""}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        for pipe in (self.process.stdout, self.process.stderr):
+            assert pipe is not None
+            pipe.close()
+
+    def wait_for(self, text: str) -> None:
+        """Until standard output has shown `text`."""
+        deadline_s = time.monotonic() + DEADLINE_S
+        while text not in self._text("out"):
+            assert self._pump(deadline_s), (f"{text!r} did not come", self._text("out"), self._text("err"))
+
+    def signal(self, number: signal.Signals) -> None:
+        """To the whole process group, as the terminal's Ctrl-C."""
+        os.killpg(self.process.pid, number)
+
+    def close_output(self) -> None:
+        """Nobody reads standard output any more."""
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    def end(self) -> Ended:
+        """Read both streams to their end; both close with the last process that holds them."""
+        deadline_s = time.monotonic() + DEADLINE_S
+        while self._pump(deadline_s):
+            pass
+        code = self.process.wait(max(0.0, deadline_s - time.monotonic()))
+        return Ended(code, self._text("out"), self._text("err"))
+
+    def _text(self, name: str) -> str:
+        return self._read[name].decode()
+
+    def _pump(self, deadline_s: float) -> bool:
+        """Take what comes next; False: both streams have ended."""
+        assert self.process.stdout is not None and self.process.stderr is not None
+        pipes = [pipe for pipe in (self.process.stdout, self.process.stderr) if not pipe.closed]
+        if not pipes:
+            return False
+        ready, _, _ = select.select(pipes, [], [], max(0.0, deadline_s - time.monotonic()))
+        assert ready, ("the command is still busy", self._text("out"), self._text("err"))
+        for pipe in ready:
+            data = os.read(pipe.fileno(), 65536)
+            self._read["out" if pipe is self.process.stdout else "err"] += data
+            if not data:
+                pipe.close()
+        return True
+
+
+class World:
+    """The simulated world on its own, as the launcher starts it: real wires, device addresses, and the truth of what happens in it."""
+
+    def __init__(self, sandbox: Sandbox, mission: Path = CATCH, overrides: Sequence[str] = ()) -> None:
+        self._config = sandbox.cwd / "world.json"
+        self._config.write_text(load_flight(mission, overrides=overrides).model_dump_json(), encoding="utf-8")
+        self._log = sandbox.cwd / "world.log"
+        with open(self._log, "wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "sitl", "--config", str(self._config), "--for-launcher"],
+                env=sandbox.environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                start_new_session=True,
+            )
+        self._messages: list[dict[str, Any]] = []
+        self._changed = threading.Condition()
+        self._closed = False
+        self._reader = threading.Thread(target=self._listen, name="world")
+        self._reader.start()
+        self.devices: dict[str, dict[str, Any]] = {}
+
+    def __enter__(self) -> Self:
+        try:
+            self.devices = self.wait_for(lambda message: message["type"] == "ready")["devices"]
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self.process.stdin is not None and self.process.stdout is not None
+        self.process.stdin.close()
+        self.process.terminate()
+        try:
+            self.process.wait(DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join()
+        self.process.stdout.close()
+
+    @property
+    def messages(self) -> list[dict[str, Any]]:
+        """Everything that the world has said."""
+        with self._changed:
+            return list(self._messages)
+
+    @property
+    def armings(self) -> int:
+        """How often the rotors were armed."""
+        return sum(message["type"] == "at_rest" and not message["at_rest"] for message in self.messages)
+
+    @property
+    def crashes(self) -> int:
+        return sum(message["type"] == "event" and message["kind"] == "crashed" for message in self.messages)
+
+    def wait_for(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The first message, past or to come, that is wanted."""
+        deadline_s = time.monotonic() + DEADLINE_S
+        with self._changed:
+            while True:
+                for message in self._messages:
+                    if wanted(message):
+                        return message
+                left_s = deadline_s - time.monotonic()
+                assert not self._closed and left_s > 0, (
+                    "the world did not say it",
+                    self._messages,
+                    self._log.read_text(),
+                )
+                self._changed.wait(left_s)
+
+    def addresses(self, **but: Mapping[str, object]) -> list[str]:
+        """`--set` options that lead a companion to this world; `but` replaces settings: `arm={"baud": 57600}`."""
+        devices = {name: {**settings, **but.get(name, {})} for name, settings in self.devices.items()}
+        return set_options(
+            **{f"vehicle.devices.{name}.{key}": value for name, keys in devices.items() for key, value in keys.items()}
+        )
+
+    def _listen(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._changed:
+                self._messages.append(json.loads(line))
+                self._changed.notify_all()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+def set_options(**values: object) -> list[str]:
+    """`--set KEY=VALUE` each; keys as in `**{"world.seed": 3}`."""
+    return [word for key, value in values.items() for word in ("--set", f"{key}={json.dumps(value)}")]
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """summary.json, with every key of the contract."""
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    _assert_keys(summary, SUMMARY_KEYS, "summary")
+    for event in summary["events"]:
+        assert {"t_s", "id", "severity", "action"} <= set(event)
+    return summary
+
+
+def _assert_keys(found: Any, wanted: dict[str, Any], where: str) -> None:
+    missing = set(wanted) - set(found)
+    assert not missing, f"{where} lacks {sorted(missing)}"
+    for key, below in wanted.items():
+        if below is not None:
+            _assert_keys(found[key], below, f"{where}.{key}")
+
+
+def wait_until(condition: Callable[[], bool], why: Callable[[], str], within_s: float = DEADLINE_S) -> None:
+    """Look again and again until the condition holds; what to say if it never does."""
+    deadline_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < deadline_s, why()
+        time.sleep(0.05)

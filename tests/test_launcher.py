@@ -1,0 +1,237 @@
+"""What the user started outlives its children and leaves nothing behind: Ctrl-C at every stage, a killed launcher, worlds and
+flights that die.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+
+from companion.analysis.log import FlightLog
+from companion.config.loader import load_flight
+from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.sitl_process import SitlProcess
+from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options
+
+FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=1.0")
+IN_FLIGHT = "  hold\n"
+"""Shown when the vehicle has reached its height."""
+OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path) as sandbox:
+        yield sandbox
+
+
+def events_of(summary: dict[str, Any]) -> list[str]:
+    return [event["id"] for event in summary["events"]]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_given_up_while_the_world_starts(sandbox: Sandbox, number: signal.Signals) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("Ctrl-C lands")
+        running.signal(number)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_ABORTED, "")
+    summary = read_summary(sandbox.cwd / "out")
+    assert summary["outcome"] == "aborted"
+    assert "takeoff" not in events_of(summary)
+
+
+@contextmanager
+def pty_that_never_answers() -> Iterator[tuple[int, str]]:
+    """Master and name of a raw serial port."""
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        yield master, os.ttyname(slave)
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signal.Signals) -> None:
+    with pty_that_never_answers() as (master, port):
+        options = set_options(**{"vehicle.devices.force.port": port})
+        with sandbox.start("fly", HOVER, "--out", "out", *options) as running:
+            assert os.read(master, 1)  # the flight process speaks to the sensor
+            running.signal(number)
+            ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_ABORTED, "")
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
+    assert not (sandbox.cwd / "out/flight.mcap").exists()
+
+
+def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
+    with pty_that_never_answers() as (master, port):
+        options = set_options(**{"vehicle.devices.force.port": port})
+        with sandbox.start("fly", HOVER, "--out", "out", *options) as running:
+            assert os.read(master, 1)
+            running.process.kill()
+            sandbox.assert_nobody_left(DEADLINE_S)
+
+
+def test_given_up_before_arming(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("  wait\n")  # it weighs the net for a second
+        running.signal(signal.SIGINT)
+        running.wait_for("landing was asked for")
+        running.signal(signal.SIGINT)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_ABORTED
+    assert "Traceback" not in ended.err
+    summary = read_summary(sandbox.cwd / "out")
+    assert summary["outcome"] == "aborted"
+    assert events_of(summary) == ["operator_land"]
+    log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert log.closed
+    assert not any(inputs.status is not None and inputs.status.armed for inputs in log.inputs)
+
+
+@pytest.mark.flight
+@pytest.mark.parametrize("numbers", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)])
+def test_asked_to_land_in_flight(sandbox: Sandbox, numbers: tuple[signal.Signals, ...]) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for(IN_FLIGHT)
+        running.signal(numbers[0])
+        running.wait_for("landing was asked for")
+        for number in numbers[1:]:
+            running.signal(number)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_ABORTED, "")
+    summary = read_summary(sandbox.cwd / "out")
+    assert summary["outcome"] == "aborted"
+    assert {"takeoff", "operator_land", "touchdown"} <= set(events_of(summary))
+    assert (sandbox.cwd / "out/report.html").exists()
+    assert_landed(FlightLog.read(sandbox.cwd / "out/flight.mcap"))
+
+
+def assert_landed(log: FlightLog) -> None:
+    """Closed by the recorder; at its end the vehicle stands, disarmed."""
+    assert log.closed
+    last = log.inputs[-1]
+    assert last.status is not None and not last.status.armed
+    assert last.mocap is not None and last.mocap.position_world_m[2] < 0.4
+
+
+@pytest.mark.flight
+def test_killed_launcher_leaves_a_flight_that_lands_by_itself(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for(IN_FLIGHT)
+        running.process.kill()
+        sandbox.assert_nobody_left(DEADLINE_S)
+    log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert "operator_land" in [event.id for outputs in log.outputs for event in outputs.events]
+    assert_landed(log)
+    assert (sandbox.cwd / "out/flight.log").read_text(encoding="utf-8") == ""
+    assert (sandbox.cwd / "out/sitl.log").read_text(encoding="utf-8") == ""
+
+
+@pytest.mark.flight
+def test_a_terminal_that_goes_away_does_not_disturb_the_flight(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("  wait\n")
+        running.close_output()
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_OK, "")
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "completed"
+
+
+@pytest.mark.flight
+def test_world_that_dies_in_flight_is_named_in_one_line(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("  take-off\n")
+        os.kill(sandbox.pid_of("sitl"), signal.SIGKILL)
+        ended = running.end()
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    assert ended.err == "sitl: the simulated world was ended by SIGKILL; see out/sitl.log\n"
+    assert ended.code == EXIT_LOST
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"
+    assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
+
+
+@pytest.mark.flight
+def test_flight_process_that_dies_in_flight_is_named_in_one_line(tmp_path: Path) -> None:
+    with sandbox_in(tmp_path, {"PYTHONFAULTHANDLER": "1"}) as sandbox:
+        with sandbox.start(*FLY) as running:
+            running.wait_for("  take-off\n")
+            os.kill(sandbox.pid_of("companion.app"), signal.SIGABRT)
+            ended = running.end()
+        sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+        log = (sandbox.cwd / "out/flight.log").read_text(encoding="utf-8")
+        summary = read_summary(sandbox.cwd / "out")
+        assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
+    assert "Fatal Python error: Aborted" in log
+    assert len(ended.err_lines) == 1, ended.err
+    assert ended.err.startswith("flight: the flight process was ended by SIGABRT")
+    assert ended.err.endswith("; see out/flight.log\n")
+    assert ended.code == EXIT_LOST
+    assert summary["outcome"] in ("lost", "crashed")
+
+
+@pytest.mark.parametrize(
+    ("package", "line"),
+    [
+        (
+            "mujoco",
+            r"sitl: the simulated world ended with exit code 1 (ImportError: a broken mujoco); see out/sitl.log",
+        ),
+        (
+            "mavsdk",
+            r"flight: the flight process ended with exit code 1 (ImportError: a broken mavsdk); see out/flight.log",
+        ),
+    ],
+)
+def test_process_that_cannot_start_is_named_in_one_line(tmp_path: Path, package: str, line: str) -> None:
+    broken = tmp_path / "packages"
+    broken.mkdir()
+    (broken / f"{package}.py").write_text(f"raise ImportError('a broken {package}')\n", encoding="utf-8")
+    with sandbox_in(tmp_path / "sandbox", {"PYTHONPATH": str(broken)}) as sandbox:
+        ended = sandbox.run(*FLY)
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+    assert (ended.code, ended.err) == (EXIT_REFUSED, f"{line}\n")
+    assert summary["outcome"] == "refused"
+
+
+def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
+    # Armed, it would stay until its rotors stand: longer than the launcher waits.
+    world = SitlProcess(load_flight(HOVER), tmp_path)
+    try:
+        address = world.devices()["autopilot"]["address"].removeprefix("udpout://")
+        with closing(mavutil.mavlink_connection(f"udpout:{address}", source_system=255)) as ground:
+            ground.mav.param_set_send(1, 1, b"COM_DISARM_PRFLT", 0.0, mavutil.mavlink.MAV_PARAM_TYPE_REAL32)
+            deadline_s = time.monotonic() + DEADLINE_S
+            armed = False
+            while not armed:
+                assert time.monotonic() < deadline_s, "the world's PX4 did not arm"
+                ground.mav.set_attitude_target_send(0, 1, 1, 0b111, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, 0.0)
+                ground.mav.command_long_send(1, 1, mavutil.mavlink.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
+                ground.mav.command_long_send(1, 1, mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)
+                said = world.messages(time.monotonic() + 0.05)
+                armed = any(message["type"] == "at_rest" and not message["at_rest"] for message in said)
+    finally:
+        world.stop()
+    assert world.ended
+    assert world.process.returncode == 0, "it was killed"
+    assert world.final["payload_kg"] == json.loads((tmp_path / "sitl_config.json").read_text())["world"]["payload_kg"]
+    assert not world.final["crashed"]
