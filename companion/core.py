@@ -46,6 +46,8 @@ class FlightCore:
         vehicle = config.vehicle
         self._config = config
         self._pilot = Pilot(config)
+        # Solved here once, so that the plan from the measured start costs a tick next to nothing.
+        Plan.build(config.mission, config.vehicle)
         self._monitors = Monitors(vehicle.safety)
         self._gate = Gate(vehicle)
         self._ladder = SupervisorState()
@@ -217,7 +219,7 @@ class FlightCore:
     def _wait(self, i: Inputs, elapsed_s: float) -> None:
         """On the ground: until every input is there and PX4 demonstrably follows motion capture, for as long as the tare takes."""
         missing = _missing(i)
-        problem = f"no data from: {', '.join(missing)}" if missing else unfused(i)
+        problem = _nothing_from(missing) if missing else unfused(i)
         if problem is not None:
             self._tare_start_s = None
             if elapsed_s > seq.WAIT_TIMEOUT_S:
@@ -359,3 +361,10 @@ def _missing(i: Inputs) -> list[str]:
         "force sensor": i.force,
     }
     return [name for name, value in devices.items() if value is None]
+
+
+def _nothing_from(missing: list[str]) -> str:
+    hint = (
+        "; PX4 sends no local position: check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3" if "PX4 state" in missing else ""
+    )
+    return f"no data from: {', '.join(missing)}{hint}"

@@ -127,6 +127,11 @@ class Plant:
                     return fault
         return None
 
+    def _push(self) -> Vec3:
+        push, now = self._config.push, self.mission_t_s()
+        active = push is not None and now is not None and push.t_s <= now < push.t_s + push.duration_s
+        return push.force_world_n if push is not None and active else (0.0, 0.0, 0.0)
+
     def step(self, armed: bool) -> None:
         """Advance by one physics step."""
         if armed and self.armed_t_s is None:
@@ -141,6 +146,7 @@ class Plant:
         if self._tick % IMU_EVERY == 0:
             self._rotors = self._px4.step(self._imu(self.truth))
         self._tick += 1
+        self.world.push_world_n = self._push()
         self.world.step(self._rotors, (torque[0], torque[1]), armed)
         self._truth = None
         self._expose_mocap()

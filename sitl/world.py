@@ -75,6 +75,8 @@ class World:
         self.thrown_t_s: float | None = None
         self.caught_t_s: float | None = None
         self.missed = False
+        self.push_world_n: Vec3 = (0.0, 0.0, 0.0)
+        """Force on the net's centre from now on."""
         self.crashed = False
         self._events: list[WorldEvent] = []
         self._last_x = start_position_m[0]
@@ -113,6 +115,7 @@ class World:
             (wx, wy, wz), (vx, vy, vz) = self._config.wind_m_s, d.qvel[0:3].tolist()
             c = DRAG_N_PER_M_S
             self._drag_force[:] = (c * (wx - vx), c * (wy - vy), c * (wz - vz))
+        d.xfrc_applied[self._net, 0:3] = self.push_world_n
         mujoco.mj_step(self.model, d)
         if self._has_payload and self.caught_t_s is None:
             self._throw_and_catch(airborne)

@@ -39,6 +39,7 @@ Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Positive2 = tuple[Positive, Positive]
+Positive3 = tuple[Positive, Positive, Positive]
 
 
 def _ordered(span: Vector2) -> Vector2:

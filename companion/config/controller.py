@@ -1,12 +1,12 @@
-"""The controller file: gains of the adaptive impedance law (paper, tab:control_parameters)."""
+"""The controller file: one of three laws with its gains."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from companion.config.base import Location, Model, NonNegative, Positive, refuse
+from companion.config.base import Location, Model, NonNegative, Positive, Positive2, Positive3, refuse
 
 Positive8 = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive, Positive]
 NonNegative8 = tuple[
@@ -17,7 +17,10 @@ Positive4 = tuple[Positive, Positive, Positive, Positive]
 
 
 class AdaptiveConfig(Model):
-    """Adaptive impedance control; rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal."""
+    """Adaptive impedance control (paper, tab:control_parameters).
+
+    Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
+    """
 
     schema_version: Literal[1]
     law: Literal["adaptive"]
@@ -74,3 +77,74 @@ class AdaptiveConfig(Model):
                 )
         refuse("controller", problems)
         return self
+
+
+class _ComparisonConfig(Model):
+    """What the two comparison laws have in common with each other and with the adaptive one."""
+
+    desired_force_time_s: Positive | None = None
+    """T_d of F_d = lowpass(F_ext) on the joint rows; absent: F_d = 0, the arm sags under a carried payload."""
+    force_lowpass_hz: Positive
+    lateral_force_max_n: Positive = 12.0
+    attitude_filter_rad_s: Positive = 30.0
+    attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
+
+
+class CscConfig(_ComparisonConfig):
+    """Complete-system compliance (after Cataldi et al., IROS 2016): one impedance for vehicle and arm, realised by the nominal model.
+
+    Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
+    """
+
+    schema_version: Literal[1]
+    law: Literal["csc"]
+    preset: str
+    inertia_md: Positive8
+    """M_d: kg and kg m^2."""
+    damping_kd: Positive8
+    """K_d. On the attitude rows: how PX4's attitude loop is expected to damp, not a command."""
+    stiffness_kp: Positive8
+    """K_p. On the attitude rows: how PX4's attitude loop is expected to turn, not a command."""
+    external_xyz: NonNegative3 = (1.0, 1.0, 1.0)
+    """Share of the measured F_ext, per world axis, that the base's impedance answers and the model cancels."""
+    desired_force_xyz: NonNegative3 = (0.0, 0.0, 0.0)
+    """Share of F_d that the base carries (0: the base, too, gives way to a carried payload)."""
+    model_mass_scale: Positive = 1.0
+    """Masses and inertias of the model against the vehicle file's; for studies of a wrong model."""
+
+
+class PscConfig(_ComparisonConfig):
+    """Partitioned compliance (after Wang et al., RA-L 2024): impedance of the arm alone, position control of the vehicle alone."""
+
+    schema_version: Literal[1]
+    law: Literal["psc"]
+    preset: str
+    position_kp_xyz: Positive3
+    """1/s^2."""
+    position_kd_xyz: Positive3
+    """1/s."""
+    position_ki_xyz: NonNegative3
+    """1/s^3; 0: no integral part."""
+    integral_max_m_s2: NonNegative = 1.5
+    """Largest acceleration that the integral part may ask for, per axis."""
+    arm_inertia_md: Positive2
+    """M_d of the joints, kg m^2."""
+    arm_damping_kd: Positive2
+    arm_stiffness_kp: Positive2
+    payload_time_s: Positive
+    """Time constant of the payload's mass estimate."""
+    payload_max_kg: NonNegative = 1.0
+    """Bound of the estimate; 0 switches it off."""
+    thrust_lag_s: NonNegative = 0.05
+    """From the thrust commanded to the thrust given, for the estimate."""
+
+
+ControllerConfig: TypeAlias = Annotated[AdaptiveConfig | CscConfig | PscConfig, Field(discriminator="law")]
+"""Any law's configuration."""
+LAWS: dict[str, type[AdaptiveConfig] | type[CscConfig] | type[PscConfig]] = {
+    "adaptive": AdaptiveConfig,
+    "csc": CscConfig,
+    "psc": PscConfig,
+}
+PRESETS: dict[str, tuple[str, ...]] = {"adaptive": ("paper", "recommended"), "csc": ("tuned",), "psc": ("tuned",)}
+"""Built-in presets of each law, the default last."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +11,19 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from companion.config.base import Location, Model
-from companion.config.controller import AdaptiveConfig
-from companion.config.document import ConfigError, Data, Document, key_path, problem_lines
-from companion.config.explain import validate
+from companion.config.controller import LAWS, ControllerConfig
+from companion.config.controller import PRESETS as PRESETS
+from companion.config.document import (
+    RANK_MISSING,
+    RANK_VALUE,
+    ConfigError,
+    Data,
+    Document,
+    Problem,
+    key_path,
+    problem_lines,
+)
+from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.vehicle import Vehicle
@@ -23,8 +34,6 @@ M = TypeVar("M", bound=Model)
 
 PRESET_DIRECTORY = Path(__file__).parent / "presets"
 """Built-in controller files are package data, so that they are found wherever the package is installed."""
-PRESETS: dict[str, tuple[str, ...]] = {"adaptive": ("paper", "recommended")}
-"""Built-in presets of each law, the default last."""
 
 
 class Sources(Model):
@@ -43,7 +52,7 @@ class FlightConfig(Model):
 
     mission: Mission
     vehicle: Vehicle
-    controller: AdaptiveConfig
+    controller: ControllerConfig
     world: World
     sources: Sources
 
@@ -60,8 +69,8 @@ def load_flight(
     Args:
         mission_path: mission file.
         vehicle_path: vehicle file instead of the one that the mission names.
-        controller_law: law instead of the one that the mission names (`adaptive`).
-        preset: built-in preset of the law instead of the mission's choice (`paper` or `recommended`).
+        controller_law: law instead of the one that the mission names (a key of `PRESETS`).
+        preset: built-in preset of that law, or of the mission's, instead of the mission's choice.
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked.
 
     Raises:
@@ -77,17 +86,17 @@ def load_flight(
     if vehicle_file is not None:
         vehicle = _check(Vehicle, vehicle_file, "vehicle", parsed, lines)
 
-    controller: AdaptiveConfig | None = None
+    controller: ControllerConfig | None = None
     controller_file: Document | None = None
     choice = mission.controller if mission is not None else _controller_choice(mission_file)
     if controller_law is not None or preset is not None:
-        controller_file = _open_preset(controller_law, preset)
+        controller_file = _open_preset(controller_law or (choice.law if choice is not None else None), preset)
     elif choice is not None and choice.file is not None:
         controller_file = _open_named(mission_file, ("controller", "file"), None, lines)
     elif choice is not None:
         controller_file = _open_preset(choice.law, choice.preset)
     if controller_file is not None:
-        controller = _check(AdaptiveConfig, controller_file, "controller", parsed, lines)
+        controller = _check_controller(controller_file, parsed, lines)
 
     world = _check(World, Document("world", {}), "world", parsed, lines)
     if lines or mission is None or vehicle is None or controller is None or world is None:
@@ -139,10 +148,36 @@ def _check(
     model: type[M], document: Document, section: Section, overrides: list[Override], lines: list[str]
 ) -> M | None:
     """One document, overridden and validated; what is wrong with it is appended to `lines`."""
+    _override(document, section, overrides, lines)
+    return _validated(model, document, lines)
+
+
+def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:
+    """The same for a controller file, whose law says which model it is."""
+    _override(document, "controller", overrides, lines)
+    law = _value(document, ("law",))
+    if isinstance(law, str) and law in LAWS:
+        return _validated(LAWS[law], document, lines)
+    expected = f"expected one of {', '.join(LAWS)}"
+    if law is None:
+        document.problems.append(Problem(RANK_MISSING, document.origin(()), f"law: missing; {expected}"))
+    else:
+        close = nearest(str(law), list(LAWS))
+        hint = f" (did you mean {close}?)" if close else ""
+        text = f"law: {expected}, got {json.dumps(law)}{hint}"
+        document.problems.append(Problem(RANK_VALUE, document.origin(("law",)), text))
+    lines += problem_lines(document.problems)
+    return None
+
+
+def _override(document: Document, section: Section, overrides: list[Override], lines: list[str]) -> None:
     try:
         apply_overrides(document, section, overrides)
     except ConfigError as error:
         lines += error.lines
+
+
+def _validated(model: type[M], document: Document, lines: list[str]) -> M | None:
     built = validate(model, document)
     lines += problem_lines(document.problems)
     return built

@@ -5,14 +5,18 @@ Positions are of the body's origin in the world frame (z up, 0 on the floor); an
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from companion.config.base import Location, Model, NonNegative, Positive, Vector2, Vector3, refuse
+from companion.config.controller import PRESETS
 
 Duration = Annotated[float, Field(gt=0, le=600)]
 Delay = Annotated[float, Field(ge=0, le=600)]
+POINTS_APART_M = 0.01
+"""Consecutive points of a path must lie so far apart."""
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
@@ -35,12 +39,13 @@ class Hold(Model):
 
 
 class Line(Model):
-    """Straight to a point, from rest to rest; the arm may move on the way."""
+    """Straight to a point, from rest to rest by minimum snap; the arm may move on the way."""
 
     type: Literal["line"]
     name: Name | None = None
     to_m: Vector3
-    duration_s: Duration
+    duration_s: Duration | None = None
+    """Absent: the least that the limits allow."""
     arm_deg: Vector2 | None = None
     """Where the arm goes meanwhile; absent: it stays."""
     arm_delay_s: Delay | None = None
@@ -57,12 +62,25 @@ class Line(Model):
                     problems.append(((key,), "says when the arm moves, but arm_deg, where it moves to, is missing"))
         else:
             end_s = (self.arm_delay_s or 0.0) + (self.arm_duration_s or 0.0)
-            if end_s > self.duration_s or (self.arm_delay_s or 0.0) >= self.duration_s:
+            if self.duration_s is not None and (
+                end_s > self.duration_s or (self.arm_delay_s or 0.0) >= self.duration_s
+            ):
                 key = "arm_delay_s" if self.arm_duration_s is None else "arm_duration_s"
                 text = f"the arm's move would end {end_s:g} s into a line of {self.duration_s:g} s; it must end within"
                 problems.append(((key,), text))
         refuse("line", problems)
         return self
+
+
+class Path(Model):
+    """Through points without a stop, from rest to rest by minimum snap; the arm stays."""
+
+    type: Literal["path"]
+    name: Name | None = None
+    through_m: Annotated[tuple[Vector3, ...], Field(min_length=1, max_length=30)]
+    """The last point is where it ends; where it begins is not among them."""
+    duration_s: Duration | None = None
+    """Absent: the least that the limits allow."""
 
 
 class ArmMove(Model):
@@ -71,7 +89,8 @@ class ArmMove(Model):
     type: Literal["arm"]
     name: Name | None = None
     arm_deg: Vector2
-    duration_s: Duration
+    duration_s: Duration | None = None
+    """Absent: the least that the limits allow."""
 
 
 class Land(Model):
@@ -82,7 +101,7 @@ class Land(Model):
     speed_m_s: Annotated[float, Field(ge=0.05, le=1.0)]
 
 
-Phase = Annotated[Takeoff | Hold | Line | ArmMove | Land, Field(discriminator="type")]
+Phase = Annotated[Takeoff | Hold | Line | Path | ArmMove | Land, Field(discriminator="type")]
 
 
 class Start(Model):
@@ -103,8 +122,10 @@ class Limits(Model):
 
     speed_max_m_s: Positive
     acceleration_max_m_s2: Positive
+    jerk_max_m_s3: Positive = 8.0
     arm_speed_max_deg_s: Positive
     arm_acceleration_max_deg_s2: Positive
+    arm_jerk_max_deg_s3: Positive = 600.0
     thrust_share_max: Annotated[float, Field(gt=0, le=1)] = 0.8
     """Share of airframe.thrust_max_n that the plan may need, with the largest payload on board."""
 
@@ -120,9 +141,9 @@ class Catch(Model):
 class ControllerChoice(Model):
     """A controller file, or a law and one of its presets."""
 
-    law: Literal["adaptive"] = "adaptive"
-    preset: Literal["paper", "recommended"] | None = None
-    """Absent, and no file: recommended."""
+    law: Literal["adaptive", "csc", "psc"] = "adaptive"
+    preset: Literal["paper", "recommended", "tuned"] | None = None
+    """Absent, and no file: the law's default (recommended, or tuned)."""
     file: str | None = None
     """Relative to the mission file."""
 
@@ -130,6 +151,9 @@ class ControllerChoice(Model):
     def _one_source(self) -> Self:
         if self.file is not None and self.preset is not None:
             refuse("controller", [(("preset",), "either a preset or a file, not both")])
+        if self.preset is not None and self.preset not in PRESETS[self.law]:
+            text = f"no such preset of '{self.law}', got \"{self.preset}\"; available: {', '.join(PRESETS[self.law])}"
+            refuse("controller", [(("preset",), text)])
         return self
 
 
@@ -160,6 +184,24 @@ class Mission(Model):
         refuse("mission", problems)
         return self
 
+    @model_validator(mode="after")
+    def _paths_go_somewhere(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        at_m = (*self.start.position_m, 0.0)
+        for index, phase in enumerate(self.phases):
+            if isinstance(phase, Takeoff):
+                at_m = (*self.start.position_m, phase.height_m)
+            elif isinstance(phase, Line):
+                at_m = phase.to_m
+            elif isinstance(phase, Path):
+                for number, point_m in enumerate(phase.through_m):
+                    if math.dist(at_m, point_m) < POINTS_APART_M:
+                        text = f"is where the path already is; points must be {POINTS_APART_M:g} m apart or more"
+                        problems.append((("phases", index, "through_m", number), text))
+                    at_m = point_m
+        refuse("mission", problems)
+        return self
+
 
 __all__ = [
     "ArmMove",
@@ -170,6 +212,7 @@ __all__ = [
     "Limits",
     "Line",
     "Mission",
+    "Path",
     "Phase",
     "Start",
     "Takeoff",

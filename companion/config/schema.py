@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from companion.config.base import Model
-from companion.config.controller import AdaptiveConfig
+from pydantic import TypeAdapter
+
+from companion.config.controller import ControllerConfig
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.config.world import World
 
-KINDS: dict[str, type[Model]] = {"mission": Mission, "vehicle": Vehicle, "controller": AdaptiveConfig, "world": World}
+KINDS: dict[str, TypeAdapter[Any]] = {
+    "mission": TypeAdapter(Mission),
+    "vehicle": TypeAdapter(Vehicle),
+    "controller": TypeAdapter(ControllerConfig),
+    "world": TypeAdapter(World),
+}
 
 
 def schema_json(kind: str) -> str:
@@ -20,8 +26,7 @@ def schema_json(kind: str) -> str:
     Raises:
         KeyError: if the kind is none of `KINDS`.
     """
-    model = KINDS[kind]
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    schema |= model.model_json_schema()
+    schema |= KINDS[kind].json_schema()
     schema["title"] = f"companion {kind}"
     return json.dumps(schema, indent=2, ensure_ascii=False)

@@ -13,6 +13,7 @@ from companion.config.base import (
     NonNegative,
     Positive,
     Positive2,
+    Positive3,
     Span,
     Vector2,
     Vector3,
@@ -25,10 +26,14 @@ class Airframe(Model):
 
     mass_kg: Positive
     """Whole machine, arm and net included, ready to fly, without payload."""
+    inertia_kg_m2: Positive3 = (0.045, 0.045, 0.075)
+    """Of the base without arm and tool, about the body's x, y, z at its origin; for the laws that are built on a model."""
     thrust_max_n: Positive
     """All rotors at full command, at the voltage of a charged battery."""
     hover_thrust: Fraction | None = None
     """Normalised thrust that holds `mass_kg`; absent: PX4's MPC_THR_HOVER is read and used."""
+    hover_thrust_adapt: bool = True
+    """Go on estimating it in flight, from thrust sent, IMU and force sensor; false: it stays what it was at the start."""
     tilt_max_deg: Annotated[float, Field(gt=0, le=45)] = 20.0
     """No attitude setpoint leans further than this."""
     ground_clearance_m: Positive
@@ -62,6 +67,8 @@ class Arm(Model):
     link_com_m: Positive2
     """From the link's own joint outwards."""
     torque_per_amp_nm_a: Positive = 1.3
+    joint_armature_kg_m2: NonNegative = 0.008
+    """Inertia of rotor and gears of one servo, felt at the joint; for the laws that are built on a model."""
     joints: tuple[Joint, Joint]
 
 

@@ -20,6 +20,15 @@ class Fault(Model):
     servo: Literal[1, 2] = 1
 
 
+class Push(Model):
+    """A known force on the net's centre."""
+
+    t_s: NonNegative
+    """On the world's mission clock: seconds since the rotors were armed."""
+    duration_s: Positive
+    force_world_n: Vector3
+
+
 class World(Model):
     """The simulated world."""
 
@@ -49,5 +58,7 @@ class World(Model):
     mass_error: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     """Relative error of the vehicle file's base mass against the truth."""
     battery_start: Fraction = 1.0
+    push: Push | None = None
+    """For tests of the impedance."""
     natnet_version: Literal["3.0", "4.1"] = "4.1"
     faults: tuple[Fault, ...] = ()

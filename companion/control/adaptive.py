@@ -11,19 +11,12 @@ from collections.abc import Sequence
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.vehicle import Vehicle
+from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors, vec8
 from companion.control.impedance import Impedance, LowPass
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
-from companion.control.thrust import (
-    ForceLimits,
-    TiltFilter,
-    attitude_from_roll_pitch_yaw,
-    collective_n,
-    roll_pitch_from_force,
-    saturate_force,
-)
 from companion.control.types import PlantState, Wrench
-from companion.frames import euler_zyx_from_quat, quat_conjugate, quat_rotate, wrap_rad
-from companion.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
+from companion.frames import quat_conjugate, quat_rotate
+from companion.types import ControlLog, Reference, Vec2, Vec3, Vec4
 
 _ACTIVE_ROWS = (0, 1, 2, 6, 7)
 
@@ -60,33 +53,24 @@ class AdaptiveController:
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         self._c = config
-        self._arm = vehicle.arm
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._impedance = Impedance(config)
         self._adaptation = Adaptation(config)
         self._acceleration_filter = LowPass(config.acceleration_lowpass_hz)
-        self._force_filter = LowPass(config.force_lowpass_hz)
+        self._force = ForceFilter(config.force_lowpass_hz)
+        self._desired = DesiredForce(config.desired_force_time_s)
         self._arm_acceleration_filter = LowPass(config.acceleration_lowpass_hz)
-        self._tilt = TiltFilter(config.attitude_filter_rad_s, config.attitude_filter_damping)
-        mass = vehicle.airframe.mass_kg
-        self._weight_n = mass * GRAVITY_M_S2
+        self._actuation = Actuation(config, vehicle, hover_thrust)
+        self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self._hover_thrust = hover_thrust
-        self._limits = ForceLimits(
-            vertical_min_n=0.3 * self._weight_n,
-            vertical_max_n=min(0.9 * vehicle.airframe.thrust_max_n, 0.9 / hover_thrust * self._weight_n),
-            lateral_max_n=config.lateral_force_max_n,
-            tilt_max_rad=math.radians(vehicle.airframe.tilt_max_deg),
-        )
-        self._desired_force: Vec3 = (0.0, 0.0, 0.0)
-        self._clipped = (False, False, False)
         self._arm_rate_previous: Vec2 | None = None
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """One tick of `dt_s`; see `companion.control.types.Controller`."""
         c = self._c
         acceleration = self._acceleration(dt_s, state)
-        force = self._force(dt_s, state)
-        error, error_rate = self._errors(state, reference)
+        force = self._force.step(dt_s, state.force_ext_world_n)
+        error, error_rate = tracking_errors(state, reference)
         e_tau, tau_d = self._torque_error(state, force)
         s = self._impedance.sliding(error, error_rate)
         weights = c.row_weights_s
@@ -95,28 +79,27 @@ class AdaptiveController:
         regressor: Vec4 = (1.0, x, x * x, min(_weighted_norm(weights, acceleration), c.acceleration_cap))
         rho = self._adaptation.rho(regressor)
         tau = self._tau(s, norm_s, rho, error_rate, tau_d, state, reference, force)
-        clipped_before = any(self._clipped)
-        wrench = self._saturate(dt_s, tau, state, reference, vertical_scale)
+        clipped_before = any(self._actuation.clipped)
+        sent = self._actuation.step(dt_s, (tau[0], tau[1], tau[2]), (tau[6], tau[7]), state, reference, vertical_scale)
         self._adaptation.advance(dt_s, norm_s, regressor, clipped_before)
         self._impedance.advance(dt_s, e_tau)
-        self._advance_desired_force(dt_s, force)
-        attitude, collective, arm_torque, force_sent, angles = wrench
+        self._desired.advance(dt_s, force)
         log = ControlLog(
-            error=_vec8(error),
-            error_rate=_vec8(error_rate),
-            sliding=_vec8(s),
-            gamma=_vec8(self._impedance.gamma),
-            tau=_vec8((*force_sent, 0.0, 0.0, 0.0, *arm_torque)),
-            e_tau=_vec8(e_tau),
+            error=vec8(error),
+            error_rate=vec8(error_rate),
+            sliding=vec8(s),
+            gamma=vec8(self._impedance.gamma),
+            tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
+            e_tau=vec8(e_tau),
             h_hat=(self._adaptation.h[0], self._adaptation.h[1], self._adaptation.h[2], self._adaptation.h[3]),
             zeta=self._adaptation.zeta,
             rho=rho,
             force_ext_world_n=force,
-            attitude_desired_rad=angles,
+            attitude_desired_rad=sent.roll_pitch_yaw_rad,
             hover_thrust=self._hover_thrust,
-            saturated=self._clipped,
+            saturated=sent.clipped,
         )
-        return Wrench(attitude, collective, arm_torque, log)
+        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
 
     def _acceleration(self, dt_s: float, state: PlantState) -> list[float]:
         """chi_dd, low-passed; attitude rows 0 (masked)."""
@@ -127,56 +110,14 @@ class AdaptiveController:
         arm = self._arm_acceleration_filter.step(dt_s, rate)
         return [*linear, 0.0, 0.0, 0.0, *arm]
 
-    def _force(self, dt_s: float, state: PlantState) -> Vec3:
-        sample = state.force_ext_world_n
-        if sample is None:
-            self._force_filter.reset((0.0, 0.0, 0.0))
-            return (0.0, 0.0, 0.0)
-        fx, fy, fz = self._force_filter.step(dt_s, sample)
-        return (fx, fy, fz)
-
-    def _errors(self, state: PlantState, reference: Reference) -> tuple[list[float], list[float]]:
-        p, v, r = state.position_world_m, state.velocity_world_m_s, reference
-        yaw = euler_zyx_from_quat(state.attitude_wxyz)[2]
-        yaw_rate = state.angular_rate_body_rad_s[2]
-        error = [
-            p[0] - r.position_world_m[0],
-            p[1] - r.position_world_m[1],
-            p[2] - r.position_world_m[2],
-            0.0,
-            0.0,
-            wrap_rad(yaw - r.yaw_rad),
-            state.arm_rad[0] - r.arm_rad[0],
-            state.arm_rad[1] - r.arm_rad[1],
-        ]
-        rate = [
-            v[0] - r.velocity_world_m_s[0],
-            v[1] - r.velocity_world_m_s[1],
-            v[2] - r.velocity_world_m_s[2],
-            0.0,
-            0.0,
-            yaw_rate - r.yaw_rate_rad_s,
-            state.arm_rate_rad_s[0] - r.arm_rate_rad_s[0],
-            state.arm_rate_rad_s[1] - r.arm_rate_rad_s[1],
-        ]
-        return error, rate
-
     def _torque_error(self, state: PlantState, force: Vec3) -> tuple[list[float], list[float]]:
         """e_tau = tau_ext - tau_d and tau_d, 8 rows."""
         to_body = quat_conjugate(state.attitude_wxyz)
         ext = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force))
-        desired = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, self._desired_force))
+        desired = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, self._desired.world_n))
         base = [share * f for share, f in zip(self._c.base_compliance_xyz, force, strict=True)]
         e_tau = [*base, 0.0, 0.0, 0.0, ext[0] - desired[0], ext[1] - desired[1]]
         return e_tau, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, desired[0], desired[1]]
-
-    def _advance_desired_force(self, dt_s: float, force: Vec3) -> None:
-        """F_d follows F_ext slowly, so that a carried payload is no disturbance for ever."""
-        if self._c.desired_force_time_s is None:
-            return
-        k = min(1.0, dt_s / self._c.desired_force_time_s)
-        d = self._desired_force
-        self._desired_force = (d[0] + k * (force[0] - d[0]), d[1] + k * (force[1] - d[1]), d[2] + k * (force[2] - d[2]))
 
     def _tau(
         self,
@@ -211,25 +152,6 @@ class AdaptiveController:
         tau[7] += gravity[1]
         return tau
 
-    def _saturate(
-        self, dt_s: float, tau: Sequence[float], state: PlantState, reference: Reference, vertical_scale: float
-    ) -> tuple[tuple[float, float, float, float], float, Vec2, Vec3, Vec3]:
-        force, clipped_z, clipped_xy = saturate_force((tau[0], tau[1], tau[2]), self._limits)
-        if vertical_scale < 1.0:
-            force = (0.0, 0.0, force[2] * vertical_scale)
-        roll, pitch = self._tilt.step(dt_s, *roll_pitch_from_force(force, reference.yaw_rad))
-        collective = max(0.0, collective_n(force, state.attitude_wxyz))
-        limit = (self._arm.joints[0].torque_max_nm, self._arm.joints[1].torque_max_nm)
-        torque: Vec2 = (max(-limit[0], min(limit[0], tau[6])), max(-limit[1], min(limit[1], tau[7])))
-        self._clipped = (clipped_z, clipped_xy, torque != (tau[6], tau[7]))
-        attitude = attitude_from_roll_pitch_yaw(roll, pitch, reference.yaw_rad)
-        return attitude, collective, torque, force, (roll, pitch, reference.yaw_rad)
-
 
 def _weighted_norm(weights: Sequence[float], vector: Sequence[float]) -> float:
     return math.sqrt(sum((w * v) ** 2 for w, v in zip(weights, vector, strict=True)))
-
-
-def _vec8(values: Sequence[float]) -> Vec8:
-    a, b, c, d, e, f, g, h = values
-    return (a, b, c, d, e, f, g, h)

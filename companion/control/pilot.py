@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
 from companion.config.loader import FlightConfig
-from companion.control.adaptive import AdaptiveController
 from companion.control.arm_hold import hold_torque_nm
+from companion.control.factory import build_controller
+from companion.control.hover import HoverThrust, off_the_ground
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, acceleration_world_m_s2
 from companion.control.types import Controller, PlantState
@@ -41,12 +43,14 @@ class Pilot:
         hover_thrust = vehicle.airframe.hover_thrust
         if hover_thrust is None:
             raise ValueError("hover_thrust must be in the effective configuration before the core starts")
-        self._thrust_per_n = hover_thrust / (vehicle.airframe.mass_kg * GRAVITY_M_S2)
+        self._hover = HoverThrust(hover_thrust, vehicle.airframe.mass_kg)
+        self._airframe = vehicle.airframe
+        self._thrust_sent = 0.0
         self._force_timeout_s = vehicle.safety.force_timeout_s
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._sensing = ForceSensing(vehicle.tool, self._manipulator)
         self._catch = CatchDetector()
-        self._controller: Controller = AdaptiveController(config.controller, vehicle, hover_thrust)
+        self._controller: Controller = build_controller(config.controller, vehicle, hover_thrust)
         fold = vehicle.safety.fold_arm_deg
         self.fold_rad: Vec2 = (math.radians(fold[0]), math.radians(fold[1]))
         self._arm_target_rad: Vec2 | None = None
@@ -111,11 +115,16 @@ class Pilot:
             arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
             force_ext_world_n=force,
         )
+        if self._airframe.hover_thrust_adapt:
+            airborne = off_the_ground(i, self._airframe.ground_clearance_m)
+            self._hover.step(dt_s, self._thrust_sent, state, airborne, self._catch.caught_s is not None)
         wrench = self._controller.step(dt_s, state, reference, vertical_scale)
         self.tracking_error_m = math.hypot(*wrench.log.error[0:3])
-        thrust = min(1.0, wrench.collective_n * self._thrust_per_n)
+        hover = self._hover.value
+        self._thrust_sent = min(1.0, wrench.collective_n * hover / (self._airframe.mass_kg * GRAVITY_M_S2))
         torque = wrench.arm_torque_nm if arm is not None else None
-        return Command(AttitudeSetpoint(wrench.attitude_wxyz, thrust), torque, wrench.log)
+        log = dataclasses.replace(wrench.log, hover_thrust=hover)
+        return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, log)
 
     def catch_s(self, t_s: float, log: ControlLog) -> float | None:
         """Time of the blow, in the one tick in which a catch becomes certain."""

@@ -13,6 +13,7 @@ from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.frames import quat_from_euler_zyx, wrap_rad
+from companion.mission.minsnap import Progress
 from companion.mission.plan import Plan, Segment
 from companion.safety.tether import allowed_m, distance_m
 from companion.types import PhaseKind, Reference, Vec2, Vec3
@@ -49,6 +50,7 @@ def check_mission(
     start_yaw_rad: float | None = None,
     start_arm_rad: Vec2 | None = None,
     phase_origins: Sequence[str] = (),
+    progress: Progress | None = None,
 ) -> list[str]:
     """Every reason not to fly this mission, one clear line each: what, where, when, how to fix; empty if there is none.
 
@@ -61,11 +63,12 @@ def check_mission(
         start_yaw_rad: measured; None: as the mission says.
         start_arm_rad: measured, the paper's angles; None: as the mission says.
         phase_origins: file:line:col of each phase (`FlightConfig.sources.phases`).
+        progress: told the share of the planning that is done, 0 to 1, while paths are solved.
     """
     start = mission.start
     position = start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m)
     yaw_rad = math.radians(start.yaw_deg) if start_yaw_rad is None else start_yaw_rad
-    plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad)
+    plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad, progress)
     problems = check_start(mission, vehicle, position, yaw_rad, start_arm_rad)
     problems += _whole(mission, vehicle, plan, phase_origins)
     judge = _Judge(mission, vehicle)
@@ -75,7 +78,7 @@ def check_mission(
         worst: dict[str, tuple[_Violation, float, Reference]] = {}
         for t_s in _samples(segment):
             reference = plan.reference(t_s)
-            for violation in judge.violations(reference, segment.kind):
+            for violation in judge.violations(reference, plan.jerks(t_s), segment.kind):
                 known = worst.get(violation.limit)
                 if known is None or violation.excess > known[0].excess:
                     worst[violation.limit] = (violation, t_s, reference)
@@ -102,8 +105,9 @@ def _place(mission: Mission, segment: Segment, phase_origins: Sequence[str]) -> 
 def _samples(segment: Segment) -> Iterator[float]:
     duration_s = segment.end_s - segment.start_s
     count = min(SAMPLES_PER_SEGMENT_MAX, max(20, math.ceil(duration_s / SAMPLE_S)))
-    for index in range(count + 1):
+    for index in range(count):
         yield segment.start_s + duration_s * index / count
+    yield segment.end_s - 1e-9  # the end itself is the next one's beginning
 
 
 def check_start(
@@ -186,7 +190,7 @@ class _Judge:
         payload_kg = mission.catch.payload_max_kg if mission.catch is not None else 0.0
         self._mass_kg = vehicle.airframe.mass_kg + payload_kg
 
-    def violations(self, reference: Reference, kind: PhaseKind) -> Iterator[_Violation]:
+    def violations(self, reference: Reference, jerks: tuple[Vec3, Vec2], kind: PhaseKind) -> Iterator[_Violation]:
         clearance_m = self._vehicle.airframe.ground_clearance_m
         x_m, y_m, z_m = reference.position_world_m
         if kind is PhaseKind.LANDING and z_m < clearance_m:
@@ -202,7 +206,7 @@ class _Judge:
         position = (x_m, y_m, max(z_m, clearance_m)) if kind is PhaseKind.TAKEOFF else reference.position_world_m
         yield from self._space(position, reference)
         yield from self._arm(position, reference)
-        yield from self._motion(reference)
+        yield from self._motion(reference, jerks)
 
     def _space(self, position: Vec3, reference: Reference) -> Iterator[_Violation]:
         vehicle = self._vehicle
@@ -256,20 +260,27 @@ class _Judge:
                     f"floor {part}", FLOOR_GAP_M - lowest_m, what, detail, "fly higher or fold the arm first"
                 )
 
-    def _motion(self, reference: Reference) -> Iterator[_Violation]:
+    def _motion(self, reference: Reference, jerks: tuple[Vec3, Vec2]) -> Iterator[_Violation]:
         limits = self._limits
         speed = math.hypot(*reference.velocity_world_m_s)
         acceleration = math.hypot(*reference.acceleration_world_m_s2)
         arm_speed = math.degrees(max(map(abs, reference.arm_rate_rad_s)))
         arm_acceleration = math.degrees(max(map(abs, reference.arm_acceleration_rad_s2)))
-        checked = [
+        jerk = math.hypot(*jerks[0])
+        arm_jerk = math.degrees(max(map(abs, jerks[1])))
+        checked = (
             ("speed_max_m_s", speed, limits.speed_max_m_s, "m/s", "flies too fast"),
             ("acceleration_max_m_s2", acceleration, limits.acceleration_max_m_s2, "m/s^2", "accelerates too hard"),
+            ("jerk_max_m_s3", jerk, limits.jerk_max_m_s3, "m/s^3", "starts or stops too abruptly"),
             ("arm_speed_max_deg_s", arm_speed, limits.arm_speed_max_deg_s, "deg/s", "turns a joint too fast"),
-        ]
-        limit = limits.arm_acceleration_max_deg_s2
-        checked.append(
-            ("arm_acceleration_max_deg_s2", arm_acceleration, limit, "deg/s^2", "accelerates a joint too hard")
+            (
+                "arm_acceleration_max_deg_s2",
+                arm_acceleration,
+                limits.arm_acceleration_max_deg_s2,
+                "deg/s^2",
+                "accelerates a joint too hard",
+            ),
+            ("arm_jerk_max_deg_s3", arm_jerk, limits.arm_jerk_max_deg_s3, "deg/s^3", "jerks a joint"),
         )
         for key, value, limit, unit, what in checked:
             if value > limit * (1.0 + TOLERANCE):

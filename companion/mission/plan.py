@@ -9,13 +9,19 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass
 
-from companion.config.mission import ArmMove, Land, Line, Mission, Phase, Takeoff
+from companion.config.mission import ArmMove, Land, Line, Mission, Path, Phase, Takeoff
 from companion.config.vehicle import Vehicle
 from companion.frames import wrap_rad
+from companion.mission.arm_motion import ArmLimits, plan_arm
+from companion.mission.minsnap import Progress, VehicleLimits, least_line_s, route
 from companion.mission.reference import (
     REST_TO_REST_PEAK_SPEED,
+    Curve,
+    Motion,
     Move,
+    Profile,
     Track,
+    minimum_snap,
     reference_at,
     rest_to_rest,
     slow_down,
@@ -34,6 +40,8 @@ STOP_ACCELERATION_M_S2 = 2.0
 STOP_MIN_S = 0.5
 FOLD_SPEED_RAD_S = math.radians(75.0)
 FOLD_MIN_S = 0.5
+ARM_LEAST_S = 0.1
+"""A move of the arm to where it is takes so long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,53 +73,75 @@ class Plan:
         cls,
         mission: Mission,
         vehicle: Vehicle,
-        start_position_world_m: Vec3,
-        start_yaw_rad: float,
+        start_position_world_m: Vec3 | None = None,
+        start_yaw_rad: float | None = None,
         start_arm_rad: Vec2 | None = None,
+        progress: Progress | None = None,
     ) -> Plan:
         """Plan a mission from where the machine really stands.
 
         The take-off ends over the mission's start point, at the mission's yaw and with the mission's arm angles: what is measured
         differs from them by the start's tolerances at most (`check_mission`), and that difference is taken out on the way up.
+        What is asked for in less time than the limits allow is planned in that time all the same: `check_mission` then tells
+        which limit breaks, where and when.
+
+        A path takes up to seconds to solve, once in a process: whatever starts there, the same path is the same motion, and is
+        remembered. So build a mission with paths once before the first control tick.
 
         Args:
             mission: phases; positions in the world frame.
-            vehicle: for the height of the body's origin on the ground.
-            start_position_world_m: measured, body origin.
-            start_yaw_rad: measured.
+            vehicle: for the height of the body's origin on the ground, and the speed of the joints.
+            start_position_world_m: measured, body origin; None: as the mission says, standing on the floor.
+            start_yaw_rad: measured; None: as the mission says.
             start_arm_rad: measured, the paper's angles; None: as the mission says.
+            progress: told the share of the planning that is done, 0 to 1, while paths are solved.
         """
-        arm_start = _radians(mission.start.arm_deg)
-        builder = _Builder(start_position_world_m, start_yaw_rad, start_arm_rad or arm_start)
+        start = mission.start
+        arm_start = _radians(start.arm_deg)
+        yaw_start = math.radians(start.yaw_deg)
+        builder = _Builder(
+            start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m),
+            yaw_start if start_yaw_rad is None else start_yaw_rad,
+            start_arm_rad or arm_start,
+        )
+        limits, arm_limits = _vehicle_limits(mission), _arm_limits(mission, vehicle)
+        paths, solved = sum(isinstance(phase, Path) for phase in mission.phases), 0
         for index, phase in enumerate(mission.phases):
             start_s = builder.t_s
             kind = PhaseKind.FLIGHT
             if isinstance(phase, Takeoff):
                 kind = PhaseKind.TAKEOFF
-                x_m, y_m = mission.start.position_m
+                x_m, y_m = start.position_m
                 builder.move_vehicle((x_m, y_m, phase.height_m), phase.duration_s)
-                builder.turn(math.radians(mission.start.yaw_deg), phase.duration_s)
-                builder.move_arm(arm_start, 0.0, phase.duration_s)
+                builder.turn(yaw_start, phase.duration_s)
+                builder.move_arm(arm_start, 0.0, phase.duration_s, arm_limits)
+                builder.t_s += phase.duration_s
             elif isinstance(phase, Line):
-                builder.move_vehicle(phase.to_m, phase.duration_s)
-                if phase.arm_deg is not None:
-                    delay_s = phase.arm_delay_s or 0.0
-                    builder.move_arm(
-                        _radians(phase.arm_deg), delay_s, phase.arm_duration_s or phase.duration_s - delay_s
-                    )
+                builder.t_s += _line(builder, phase, limits, arm_limits)
+            elif isinstance(phase, Path):
+                builder.t_s += builder.follow(phase.through_m, phase.duration_s, limits, _part(progress, solved, paths))
+                solved += 1
             elif isinstance(phase, ArmMove):
-                builder.move_arm(_radians(phase.arm_deg), 0.0, phase.duration_s)
-            if isinstance(phase, Land):
+                to_rad = _radians(phase.arm_deg)
+                duration_s = phase.duration_s or builder.least_arm_s(to_rad, arm_limits)
+                builder.move_arm(to_rad, 0.0, duration_s, arm_limits)
+                builder.t_s += duration_s
+            elif isinstance(phase, Land):
                 kind = PhaseKind.LANDING
                 builder.t_s = builder.descend(phase.speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
             else:
-                builder.t_s = start_s + phase.duration_s
+                builder.t_s += phase.duration_s
             builder.segments.append(Segment(phase.name or _default_name(phase), kind, start_s, builder.t_s, index))
         return builder.plan(mission.name)
 
     def reference(self, t_s: float) -> Reference:
         """Where the machine should be; at rest before 0 and after `duration_s`. Position, yaw and arm are C2 in time."""
         return reference_at(self._position, self._yaw, self._arm, t_s)
+
+    def jerks(self, t_s: float) -> tuple[Vec3, Vec2]:
+        """Third derivatives of position (world frame, m/s^3) and joint angles (rad/s^3), for checks."""
+        (x, y, z), (first, second) = self._position.at(t_s)[3], self._arm.at(t_s)[3]
+        return (x, y, z), (first, second)
 
     def segment(self, t_s: float) -> Segment:
         """The segment at a time: the first before 0, the last after the end."""
@@ -147,7 +177,7 @@ def landing_from(
     builder = _Builder(position_world_m, yaw_rad, arm_rad)
     fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
     fold_s = max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * fold_rad / FOLD_SPEED_RAD_S)
-    builder.move_arm(arm_fold_rad, 0.0, fold_s)
+    builder.fold_arm(arm_fold_rad, fold_s)
     stop_s = builder.stop(velocity_world_m_s)
     arm = vehicle.arm
     reach_m = sum(arm.link_lengths_m) - arm.shoulder_body_m[2] + vehicle.tool.net_radius_m
@@ -169,22 +199,53 @@ class _Builder:
         self.segments: list[Segment] = []
         self._initial = (position_world_m, (yaw_rad,), arm_rad)
         self._at: list[tuple[float, ...]] = list(self._initial)
-        self._moves: list[list[Move]] = [[], [], []]
+        self._moves: list[list[Motion]] = [[], [], []]
 
     @property
     def height_m(self) -> float:
         return self._at[0][2]
 
+    def line_m(self, to_world_m: Vec3) -> float:
+        """How far a point is from where the vehicle is."""
+        return math.dist(self._at[0], to_world_m)
+
     def move_vehicle(self, to_world_m: Vec3, duration_s: float) -> None:
-        self._go(0, to_world_m, self.t_s, duration_s)
+        self._go(0, to_world_m, self.t_s, duration_s, minimum_snap)
+
+    def follow(
+        self, points_m: tuple[Vec3, ...], duration_s: float | None, limits: VehicleLimits, progress: Progress | None
+    ) -> float:
+        """Through points without a stop; returns how long it takes, s."""
+        if len(points_m) == 1:
+            duration_s = duration_s or least_line_s(self.line_m(points_m[0]), limits)
+            self.move_vehicle(points_m[0], duration_s)
+            return duration_s
+        x_m, y_m, z_m = self._at[0]
+        way = route(((x_m, y_m, z_m), *points_m), limits, progress)
+        scale_s = way.least_scale_s if duration_s is None else duration_s / way.knots[-1]
+        duration_s = duration_s or scale_s * way.knots[-1]
+        self._append(0, Curve(self.t_s, duration_s, scale_s, way.knots, way.pieces, points_m[-1]))
+        return duration_s
 
     def turn(self, to_yaw_rad: float, duration_s: float) -> None:
         """By the shorter way round."""
         yaw_rad = self._at[1][0]
-        self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s)
+        self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s, rest_to_rest)
 
-    def move_arm(self, to_rad: Vec2, delay_s: float, duration_s: float) -> None:
-        self._go(2, to_rad, self.t_s + delay_s, duration_s)
+    def least_arm_s(self, to_rad: Vec2, limits: ArmLimits) -> float:
+        """Least duration of a move of the arm."""
+        delta_rad = self._arm_delta(to_rad)
+        return plan_arm(delta_rad, limits).duration_s if any(delta_rad) else ARM_LEAST_S
+
+    def move_arm(self, to_rad: Vec2, delay_s: float, duration_s: float, limits: ArmLimits) -> None:
+        delta_rad = self._arm_delta(to_rad)
+        if any(delta_rad):
+            profile = plan_arm(delta_rad, limits, duration_s).profile
+            self._go(2, to_rad, self.t_s + delay_s, duration_s, profile)
+
+    def fold_arm(self, to_rad: Vec2, duration_s: float) -> None:
+        """Without ruckig: an emergency waits for nobody's answer."""
+        self._go(2, to_rad, self.t_s, duration_s, rest_to_rest)
 
     def stop(self, velocity_world_m_s: Vec3) -> float:
         """Come to rest from a velocity; returns the end, s."""
@@ -203,7 +264,7 @@ class _Builder:
         ramps_m = 0.5 * speed_m_s * (LAND_SPEED_UP_S + LAND_SLOW_DOWN_S)
         if depth_m <= ramps_m:
             duration_s = max(STOP_MIN_S, REST_TO_REST_PEAK_SPEED * depth_m / speed_m_s)
-            self._go(0, (x_m, y_m, min(z_m, to_height_m)), self.t_s, duration_s)
+            self._go(0, (x_m, y_m, min(z_m, to_height_m)), self.t_s, duration_s, rest_to_rest)
             return self.t_s + duration_s
         t_s = self.t_s
         steady_s = (depth_m - ramps_m) / speed_m_s
@@ -220,14 +281,58 @@ class _Builder:
         starts_s = tuple(segment.start_s for segment in self.segments)
         return Plan(name, tuple(self.segments), self.t_s, starts_s, position, yaw, arm)
 
-    def _go(self, track: int, to: tuple[float, ...], start_s: float, duration_s: float) -> None:
+    def _arm_delta(self, to_rad: Vec2) -> Vec2:
+        first_rad, second_rad = self._at[2]
+        return (to_rad[0] - first_rad, to_rad[1] - second_rad)
+
+    def _go(self, track: int, to: tuple[float, ...], start_s: float, duration_s: float, profile: Profile) -> None:
         delta = tuple(b - a for a, b in zip(self._at[track], to, strict=True))
         if any(delta):
-            self._append(track, Move(start_s, duration_s, self._at[track], delta, rest_to_rest))
+            self._append(track, Move(start_s, duration_s, self._at[track], delta, profile))
+            self._at[track] = to  # not the last bit's difference: what comes next does not depend on what came before
 
-    def _append(self, track: int, move: Move) -> None:
+    def _append(self, track: int, move: Motion) -> None:
         self._moves[track].append(move)
         self._at[track] = move.end
+
+
+def _line(builder: _Builder, phase: Line, limits: VehicleLimits, arm_limits: ArmLimits) -> float:
+    """Append a line and what the arm does meanwhile; returns how long it takes, s."""
+    arm_rad = None if phase.arm_deg is None else _radians(phase.arm_deg)
+    delay_s = phase.arm_delay_s or 0.0
+    duration_s = phase.duration_s
+    if duration_s is None:
+        duration_s = least_line_s(builder.line_m(phase.to_m), limits)
+        if arm_rad is not None:
+            arm_s = phase.arm_duration_s or builder.least_arm_s(arm_rad, arm_limits)
+            duration_s = max(duration_s, delay_s + arm_s)
+    builder.move_vehicle(phase.to_m, duration_s)
+    if arm_rad is not None:
+        builder.move_arm(arm_rad, delay_s, phase.arm_duration_s or duration_s - delay_s, arm_limits)
+    return duration_s
+
+
+def _vehicle_limits(mission: Mission) -> VehicleLimits:
+    limits = mission.limits
+    return VehicleLimits(limits.speed_max_m_s, limits.acceleration_max_m_s2, limits.jerk_max_m_s3)
+
+
+def _arm_limits(mission: Mission, vehicle: Vehicle) -> ArmLimits:
+    limits = mission.limits
+    first, second = vehicle.arm.joints
+    return ArmLimits(
+        speed_max_rad_s=(
+            math.radians(min(limits.arm_speed_max_deg_s, first.velocity_max_deg_s)),
+            math.radians(min(limits.arm_speed_max_deg_s, second.velocity_max_deg_s)),
+        ),
+        acceleration_max_rad_s2=math.radians(limits.arm_acceleration_max_deg_s2),
+        jerk_max_rad_s3=math.radians(limits.arm_jerk_max_deg_s3),
+    )
+
+
+def _part(progress: Progress | None, done: int, count: int) -> Progress | None:
+    """The progress of one of several paths as that of all."""
+    return None if progress is None else lambda share: progress((done + share) / count)
 
 
 def _radians(angle_deg: Vec2) -> Vec2:
@@ -240,6 +345,8 @@ _PLAIN_NAMES = {"takeoff": "take-off", "hold": "hold", "land": "land"}
 def _default_name(phase: Phase) -> str:
     if isinstance(phase, Line):
         return f"line to ({', '.join(f'{value:g}' for value in phase.to_m)}) m"
+    if isinstance(phase, Path):
+        return f"path to ({', '.join(f'{value:g}' for value in phase.through_m[-1])}) m"
     if isinstance(phase, ArmMove):
         return f"arm to ({', '.join(f'{value:g}' for value in phase.arm_deg)}) deg"
     return _PLAIN_NAMES[phase.type]

@@ -1,4 +1,4 @@
-"""Smooth motion in one piece: polynomial profiles along straight moves, and tracks made of moves.
+"""Smooth motion in one piece: polynomial profiles along straight moves, curves of polynomials, and tracks made of both.
 
 Plain tuples and arithmetic, no arrays: a track is asked in every control tick.
 """
@@ -13,11 +13,26 @@ from typing import TypeAlias
 
 from companion.types import Reference, Vec2, Vec3
 
-Shape: TypeAlias = tuple[float, float, float]
-"""f, f', f'' of a profile at u in [0, 1]."""
+Shape: TypeAlias = tuple[float, float, float, float]
+"""f, f', f'', f''' of a profile at u in [0, 1]."""
 Profile: TypeAlias = Callable[[float], Shape]
-Sample: TypeAlias = tuple[tuple[float, ...], tuple[float, ...], float, float, float]
-"""Origin, delta, f, f' / s, f'' / s^2: the value is origin + delta f."""
+Values: TypeAlias = tuple[float, ...]
+Sample: TypeAlias = tuple[Values, Values, Values, Values]
+"""Value, and its first, second and third derivative by time."""
+Septic: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+"""Coefficients of one axis, the constant first, in the piece's own time from 0."""
+
+
+def minimum_snap(u: float) -> Shape:
+    """The least integral of f'''' squared from 0 to 1 with f', f'' and f''' zero on both ends: 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7."""
+    u2 = u * u
+    u3 = u2 * u
+    return (
+        u2 * u2 * (35.0 + u * (u * (70.0 - 20.0 * u) - 84.0)),
+        140.0 * u3 * (1.0 + u * (u * (3.0 - u) - 3.0)),
+        420.0 * u2 * (1.0 + u * (u * (5.0 - 2.0 * u) - 4.0)),
+        840.0 * u * (1.0 + u * (u * (10.0 - 5.0 * u) - 6.0)),
+    )
 
 
 def rest_to_rest(u: float) -> Shape:
@@ -27,25 +42,26 @@ def rest_to_rest(u: float) -> Shape:
         u2 * u * (10.0 + u * (6.0 * u - 15.0)),
         30.0 * u2 * (1.0 + u * (u - 2.0)),
         60.0 * u * (1.0 + u * (2.0 * u - 3.0)),
+        60.0 * (1.0 + u * (6.0 * u - 6.0)),
     )
 
 
 def speed_up(u: float) -> Shape:
     """From rest to f' = 1, which itself rises as `rest_to_rest`; covers 1/2."""
     u2 = u * u
-    speed, acceleration, _ = rest_to_rest(u)
-    return (u2 * u2 * (2.5 + u * (u - 3.0)), speed, acceleration)
+    speed, acceleration, jerk, _ = rest_to_rest(u)
+    return (u2 * u2 * (2.5 + u * (u - 3.0)), speed, acceleration, jerk)
 
 
 def slow_down(u: float) -> Shape:
     """From f' = 1 to rest, the mirror of `speed_up`; covers 1/2."""
-    distance, speed, acceleration = speed_up(u)
-    return (u - distance, 1.0 - speed, -acceleration)
+    distance, speed, acceleration, jerk = speed_up(u)
+    return (u - distance, 1.0 - speed, -acceleration, -jerk)
 
 
 def steady(u: float) -> Shape:
     """f' = 1 throughout; covers 1."""
-    return (u, 1.0, 0.0)
+    return (u, 1.0, 0.0, 0.0)
 
 
 REST_TO_REST_PEAK_SPEED = 1.875
@@ -58,8 +74,8 @@ class Move:
 
     start_s: float
     duration_s: float
-    origin: tuple[float, ...]
-    delta: tuple[float, ...]
+    origin: Values
+    delta: Values
     profile: Profile
 
     @property
@@ -68,21 +84,84 @@ class Move:
         return self.start_s + self.duration_s
 
     @property
-    def end(self) -> tuple[float, ...]:
+    def end(self) -> Values:
         """Value at the end of the move."""
         share = self.profile(1.0)[0]
         return tuple(origin + delta * share for origin, delta in zip(self.origin, self.delta, strict=True))
 
+    def at(self, t_s: float) -> Sample:
+        """Value and derivatives between start and end."""
+        duration_s = self.duration_s
+        f, df, ddf, dddf = self.profile((t_s - self.start_s) / duration_s)
+        df /= duration_s
+        ddf /= duration_s * duration_s
+        dddf /= duration_s * duration_s * duration_s
+        delta = self.delta
+        return (
+            tuple([a + d * f for a, d in zip(self.origin, delta, strict=True)]),
+            tuple([d * df for d in delta]),
+            tuple([d * ddf for d in delta]),
+            tuple([d * dddf for d in delta]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Polynomials of degree 7 in every axis, one piece after another; at rest before and after."""
+
+    start_s: float
+    duration_s: float
+    scale_s: float
+    """Seconds per unit of the time in which knots and pieces are given."""
+    knots: tuple[float, ...]
+    """Where each piece begins, from 0, and where the last one ends."""
+    pieces: tuple[tuple[Septic, ...], ...]
+    end: Values
+
+    @property
+    def end_s(self) -> float:
+        """Time at the end of the curve."""
+        return self.start_s + self.duration_s
+
+    def at(self, t_s: float) -> Sample:
+        """Value and derivatives between start and end."""
+        scale_s = self.scale_s
+        t = (t_s - self.start_s) / scale_s
+        index = min(len(self.pieces), max(1, bisect_right(self.knots, t))) - 1
+        t -= self.knots[index]
+        once, twice = 1.0 / scale_s, 1.0 / (scale_s * scale_s)
+        thrice = twice * once
+        values, rates, accelerations, jerks = [], [], [], []
+        for c0, c1, c2, c3, c4, c5, c6, c7 in self.pieces[index]:
+            values.append(c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * (c5 + t * (c6 + t * c7)))))))
+            rates.append(
+                once
+                * (
+                    c1
+                    + t * (2.0 * c2 + t * (3.0 * c3 + t * (4.0 * c4 + t * (5.0 * c5 + t * (6.0 * c6 + t * 7.0 * c7)))))
+                )
+            )
+            accelerations.append(
+                twice
+                * (2.0 * c2 + t * (6.0 * c3 + t * (12.0 * c4 + t * (20.0 * c5 + t * (30.0 * c6 + t * 42.0 * c7)))))
+            )
+            jerks.append(thrice * (6.0 * c3 + t * (24.0 * c4 + t * (60.0 * c5 + t * (120.0 * c6 + t * 210.0 * c7)))))
+        return (tuple(values), tuple(rates), tuple(accelerations), tuple(jerks))
+
+
+Motion: TypeAlias = Move | Curve
+
 
 class Track:
-    """One quantity over time: moves one after another, constant between them."""
+    """One quantity over time: motions one after another, constant between them."""
 
-    __slots__ = ("_initial", "_moves", "_starts_s")
+    __slots__ = ("_initial", "_moves", "_starts_s", "_zero")
 
-    def __init__(self, initial: tuple[float, ...], moves: tuple[Move, ...]) -> None:
+    def __init__(self, initial: Values, moves: tuple[Motion, ...]) -> None:
         self._initial = initial
         self._moves = moves
         self._starts_s = [move.start_s for move in moves]
+        self._zero = (0.0,) * len(initial)
         for before, after in pairwise(moves):
             if after.start_s < before.end_s - 1e-9:
                 raise ValueError(
@@ -91,32 +170,30 @@ class Track:
 
     def at(self, t_s: float) -> Sample:
         """Value and derivatives at any time."""
+        zero = self._zero
         index = bisect_right(self._starts_s, t_s) - 1
         if index < 0:
-            return (self._initial, self._initial, 0.0, 0.0, 0.0)
+            return (self._initial, zero, zero, zero)
         move = self._moves[index]
-        duration_s = move.duration_s
-        u = (t_s - move.start_s) / duration_s
-        if u >= 1.0:
-            return (move.origin, move.delta, move.profile(1.0)[0], 0.0, 0.0)
-        f, df, ddf = move.profile(u)
-        return (move.origin, move.delta, f, df / duration_s, ddf / (duration_s * duration_s))
+        if t_s >= move.end_s:
+            return (move.end, zero, zero, zero)
+        return move.at(t_s)
 
 
 def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Reference:
     """The three tracks at one instant."""
-    (x, y, z), (dx, dy, dz), f, df, ddf = position.at(t_s)
-    (psi,), (dpsi,), g, dg, _ = yaw.at(t_s)
-    (a1, a2), (da1, da2), h, dh, ddh = arm.at(t_s)
+    (x, y, z), (vx, vy, vz), (ax, ay, az), _ = position.at(t_s)
+    (psi,), (dpsi,), _, _ = yaw.at(t_s)
+    (a1, a2), (da1, da2), (dda1, dda2), _ = arm.at(t_s)
     return Reference(
-        position_world_m=(x + dx * f, y + dy * f, z + dz * f),
-        velocity_world_m_s=(dx * df, dy * df, dz * df),
-        acceleration_world_m_s2=(dx * ddf, dy * ddf, dz * ddf),
-        yaw_rad=psi + dpsi * g,
-        yaw_rate_rad_s=dpsi * dg,
-        arm_rad=(a1 + da1 * h, a2 + da2 * h),
-        arm_rate_rad_s=(da1 * dh, da2 * dh),
-        arm_acceleration_rad_s2=(da1 * ddh, da2 * ddh),
+        position_world_m=(x, y, z),
+        velocity_world_m_s=(vx, vy, vz),
+        acceleration_world_m_s2=(ax, ay, az),
+        yaw_rad=psi,
+        yaw_rate_rad_s=dpsi,
+        arm_rad=(a1, a2),
+        arm_rate_rad_s=(da1, da2),
+        arm_acceleration_rad_s2=(dda1, dda2),
     )
 
 

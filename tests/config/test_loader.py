@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.config.controller import LAWS, AdaptiveConfig
 from companion.config.document import ConfigError
 from companion.config.loader import PRESETS, FlightConfig, load_flight, load_vehicle, load_world
 
@@ -107,14 +108,14 @@ BAD_MISSION = [
         "type: takeoff ",
         "type: takeof ",
         [
-            f'{CATCH}:29:11: phases[0].type: expected one of arm, hold, land, line, takeoff, got "takeof" '
+            f'{CATCH}:29:11: phases[0].type: expected one of arm, hold, land, line, path, takeoff, got "takeof" '
             "(did you mean takeoff?)"
         ],
     ),
     (
         "type: takeoff               # 0.0 s\n    height_m: 1.0",
         "height_m: 1.0",
-        [f"{CATCH}:29:5: phases[0].type: missing; expected one of arm, hold, land, line, takeoff"],
+        [f"{CATCH}:29:5: phases[0].type: missing; expected one of arm, hold, land, line, path, takeoff"],
     ),
     ("  - type: land                  # 18.0 s\n    speed_m_s: 0.35\n", "", [f"{CATCH}:51:11: phases[5].type: the last phase must be a land"]),
     (
@@ -134,7 +135,7 @@ BAD_MISSION = [
         "preset: recommended",
         "preset: recomended",
         [
-            f'{CATCH}:9:37: controller.preset: expected one of "paper", "recommended", got "recomended" '
+            f'{CATCH}:9:37: controller.preset: expected one of "paper", "recommended", "tuned", got "recomended" '
             "(did you mean recommended?)"
         ],
     ),
@@ -255,12 +256,81 @@ def test_problems_of_all_files_are_told_together(project: Path) -> None:
 
 
 def test_unknown_controller_and_preset(project: Path) -> None:
-    assert lines_of(lambda: load_flight(CATCH, controller_law="csc")) == [
-        "--controller csc: no such controller; available: adaptive"
+    assert lines_of(lambda: load_flight(CATCH, controller_law="cscc")) == [
+        "--controller cscc: no such controller; available: adaptive, csc, psc"
+    ]
+    assert lines_of(lambda: load_flight(CATCH, controller_law="psc", preset="paper")) == [
+        "--preset paper: no such preset of 'psc'; available: tuned"
     ]
     assert lines_of(lambda: load_flight(CATCH, preset="papr")) == [
         "--preset papr: no such preset of 'adaptive'; available: paper, recommended"
     ]
+
+
+BAD_LAW_IN_MISSION = [
+    (
+        "{law: psk}",
+        'controller.law: expected one of "adaptive", "csc", "psc", got "psk" (did you mean psc?)',
+    ),
+    (
+        "{law: psc, preset: paper}",
+        "controller.preset: no such preset of 'psc', got \"paper\"; available: tuned",
+    ),
+    (
+        "{preset: tuned}",
+        "controller.preset: no such preset of 'adaptive', got \"tuned\"; available: paper, recommended",
+    ),
+]
+
+
+@pytest.mark.parametrize(("choice", "end"), BAD_LAW_IN_MISSION)
+def test_unknown_law_or_preset_in_a_mission(project: Path, choice: str, end: str) -> None:
+    path = project / CATCH
+    path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", choice))
+    [line] = lines_of(lambda: load_flight(CATCH))
+    assert line.startswith(f"{CATCH}:9:")
+    assert line.endswith(": " + end)
+
+
+def test_the_preset_option_is_of_the_missions_law(project: Path) -> None:
+    path = project / CATCH
+    path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", "{law: csc}"))
+    assert load_flight(CATCH).controller.law == "csc"
+    assert load_flight(CATCH, preset="tuned").controller.law == "csc"
+    assert load_flight(CATCH, controller_law="psc").controller.law == "psc"
+    assert lines_of(lambda: load_flight(CATCH, preset="paper")) == [
+        "--preset paper: no such preset of 'csc'; available: tuned"
+    ]
+
+
+BAD_LAW_IN_FILE = [
+    ("law: csk", ':5:6: law: expected one of adaptive, csc, psc, got "csk" (did you mean csc?)'),
+    ("law: 3", ":5:6: law: expected one of adaptive, csc, psc, got 3"),
+    ("", ":4:1: law: missing; expected one of adaptive, csc, psc"),
+]
+
+
+@pytest.mark.parametrize(("law", "end"), BAD_LAW_IN_FILE)
+def test_unknown_law_in_a_controller_file(project: Path, law: str, end: str) -> None:
+    path = project / CATCH
+    text = (ROOT / "configs/controllers/csc_tuned.yaml").read_text()
+    (path.parent / "mine.yaml").write_text(text.replace("law: csc", law, 1))
+    path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", "{file: mine.yaml}"))
+    assert lines_of(lambda: load_flight(CATCH)) == [f"configs/missions/mine.yaml{end}"]
+
+
+BAD_COMPARISON_OVERRIDES = [
+    ("csc", "controller.model_mass_scale=0", "expected a number > 0, got 0"),
+    ("csc", "controller.stiffness=4", "unknown key; did you mean stiffness_kp?"),
+    ("psc", "controller.arm_inertia_md=[0.1]", "expected a list of 2 numbers > 0, got [0.1]"),
+    ("psc", "controller.payload_time_ms=100", "unknown key; write payload_time_s, in s (not in ms)"),
+]
+
+
+@pytest.mark.parametrize(("law", "option", "text"), BAD_COMPARISON_OVERRIDES)
+def test_bad_override_of_a_comparison_law(project: Path, law: str, option: str, text: str) -> None:
+    lines = lines_of(lambda: load_flight(CATCH, controller_law=law, overrides=[option]))
+    assert lines == [f"--set {option.partition('=')[0]}: {text}"]
 
 
 def test_missing_mission() -> None:
@@ -282,6 +352,7 @@ def test_overrides_reach_every_section(project: Path) -> None:
     )
     assert config.world.payload_kg == 0.3
     assert config.vehicle.safety.mocap_timeout_s == 0.2
+    assert isinstance(config.controller, AdaptiveConfig)
     assert config.controller.rho_max == 4.0
     assert isinstance(config.controller.rho_max, float)
     assert config.mission.phases[2].model_dump()["duration_s"] == 5.0
@@ -297,12 +368,16 @@ def test_override_of_a_key_and_a_section_that_the_file_leaves_to_defaults(projec
     assert config.vehicle.airframe.hover_thrust == 0.5
 
 
-@pytest.mark.parametrize("preset", PRESETS["adaptive"])
+@pytest.mark.parametrize(("law", "preset"), [(law, preset) for law, presets in PRESETS.items() for preset in presets])
 @pytest.mark.parametrize("mission", ["catch", "hover"])
-def test_config_survives_a_json_round_trip(mission: str, preset: str) -> None:
+def test_config_survives_a_json_round_trip(mission: str, law: str, preset: str) -> None:
     config = load_flight(
-        ROOT / "configs" / "missions" / f"{mission}.yaml", preset=preset, overrides=["world.payload_kg=0.1"]
+        ROOT / "configs" / "missions" / f"{mission}.yaml",
+        controller_law=law,
+        preset=preset,
+        overrides=["world.payload_kg=0.1"],
     )
+    assert type(config.controller) is LAWS[law]
     again = FlightConfig.model_validate_json(config.model_dump_json())
     assert again == config
     assert again.model_dump_json() == config.model_dump_json()
@@ -311,6 +386,7 @@ def test_config_survives_a_json_round_trip(mission: str, preset: str) -> None:
 
 def test_paper_preset_is_the_papers_table() -> None:
     controller = load_flight(ROOT / CATCH, preset="paper").controller
+    assert isinstance(controller, AdaptiveConfig)
     assert controller.inertia_md == (1, 1, 1, 0.015, 0.015, 0.015, 0.1, 0.1)
     assert controller.lambda_gain == (1.5, 1.5, 2.0, 3.5, 3.5, 2.5, 1.0, 1.0)
     assert controller.phi == (4, 4, 4, 3, 3, 3, 3.5, 3.5)

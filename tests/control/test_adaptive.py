@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.impedance import Impedance
@@ -22,6 +23,11 @@ HOVER = 0.49
 @pytest.fixture(scope="module", params=["paper", "recommended"])
 def config(request: pytest.FixtureRequest) -> FlightConfig:
     return load_flight("configs/missions/catch.yaml", preset=request.param)
+
+
+def law(config: FlightConfig) -> AdaptiveConfig:
+    assert isinstance(config.controller, AdaptiveConfig)
+    return config.controller
 
 
 def reference(position: Vec3 = (0.0, 0.0, 1.0), arm: Vec2 = FOLD) -> Reference:
@@ -41,7 +47,7 @@ def state(
 
 
 def settled(config: FlightConfig, plant: PlantState, ticks: int = 400) -> Wrench:
-    controller = AdaptiveController(config.controller, config.vehicle, HOVER)
+    controller = AdaptiveController(law(config), config.vehicle, HOVER)
     for _ in range(ticks):
         wrench = controller.step(0.005, plant, reference(), 1.0)
     return wrench
@@ -61,7 +67,7 @@ def test_it_pushes_against_the_position_error(config: FlightConfig, axis: int) -
     tau = settled(config, state(position=(off[0], off[1], off[2])), 1).log.tau
     rest = (0.0, 0.0, config.vehicle.airframe.mass_kg * 9.81)
     # At least the free-motion stiffness Lambda Phi.
-    stiffness = config.controller.lambda_gain[axis] * config.controller.phi[axis]
+    stiffness = law(config).lambda_gain[axis] * law(config).phi[axis]
     assert tau[axis] - rest[axis] <= -0.1 * stiffness * 0.999
 
 
@@ -118,7 +124,7 @@ def test_adaptive_gains_stay_nonnegative_for_any_input(
     inputs: list[tuple[float, float, float, bool]], dt_s: float
 ) -> None:
     """Property: H and zeta stay >= 0 and rho stays within its cap, whatever ||s||, ||xi|| and ||chi_dd|| do."""
-    controller = load_flight("configs/missions/catch.yaml").controller
+    controller = law(load_flight("configs/missions/catch.yaml"))
     adaptation = Adaptation(controller)
     for norm_s, x, acceleration, frozen in inputs:
         regressor = (1.0, x, x * x, acceleration)
@@ -130,7 +136,7 @@ def test_adaptive_gains_stay_nonnegative_for_any_input(
 
 def test_gamma_is_the_exact_solution(config: FlightConfig) -> None:
     """M_d gamma' = e_tau - D gamma for a held e_tau, against a fine Euler integration."""
-    impedance = Impedance(config.controller)
+    impedance = Impedance(law(config))
     e_tau = [0.3, -0.2, 1.0, 0.0, 0.0, 0.0, 0.5, -0.4]
     for _ in range(20):
         impedance.advance(0.005, e_tau)

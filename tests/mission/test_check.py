@@ -11,6 +11,7 @@ import pytest
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.mission.check import check_mission
+from companion.mission.plan import Plan
 from companion.safety.tether import allowed_m, attachment_world_m, distance_m, slack_m
 
 ROOT = Path(__file__).parents[2]
@@ -25,7 +26,7 @@ def problems(*overrides: str, **measured: Any) -> list[str]:
     return check_mission(config.mission, config.vehicle, **measured)
 
 
-@pytest.mark.parametrize("mission", ["catch", "hover"])
+@pytest.mark.parametrize("mission", ["catch", "hover", "circuit"])
 def test_committed_missions_are_flyable(mission: str) -> None:
     config = load(mission=mission)
     assert check_mission(config.mission, config.vehicle) == []
@@ -48,12 +49,14 @@ REFUSED = [
     (["mission.phases[4].arm_deg=[100, 60]"], "phase 'land' drags the net over the floor"),
     (["mission.phases[4].arm_deg=[50, 140]"], "phase 'return' drives joint 1 through its wall at t = 17.0 s, (-1.00, 0.00, 1.00) m: 50.0 deg, 60 to 175 deg allowed; change arm_deg (also in 'above the start', 'land')"),
     (["mission.phases[2].arm_deg=[100, -20]"], "phase 'catch' drives joint 2 through its wall"),
-    (["mission.phases[2].duration_s=4"], "phase 'catch' flies too fast at t = 5.5 s, (0.00, 0.00, 1.00) m: 0.938 m/s, limits.speed_max_m_s is 0.8; take longer or go less far"),
-    (["mission.phases[2].duration_s=3"], "phase 'catch' accelerates too hard at t = 4.1 s, (-0.86, 0.00, 1.00) m: 1.28 m/s^2, limits.acceleration_max_m_s2 is 1; take longer or go less far"),
-    (["mission.phases[2].arm_duration_s=1"], "phase 'catch' turns a joint too fast at t = 4.0 s, (-0.99, 0.00, 1.00) m: 150 deg/s, limits.arm_speed_max_deg_s is 90"),
+    (["mission.phases[2].duration_s=4"], "phase 'catch' flies too fast at t = 5.5 s, (0.00, 0.00, 1.00) m: 1.09 m/s, limits.speed_max_m_s is 0.8; take longer or go less far"),
+    (["mission.phases[2].duration_s=3"], "phase 'catch' accelerates too hard at t = 5.7 s, (0.81, 0.00, 1.00) m: 1.67 m/s^2, limits.acceleration_max_m_s2 is 1; take longer or go less far"),
+    (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2"], "phase 'catch' starts or stops too abruptly at t = 4.6 s, (0.00, 0.00, 1.00) m: 9.86 m/s^3, limits.jerk_max_m_s3 is 4"),
+    (["mission.phases[2].arm_duration_s=1"], "phase 'catch' turns a joint too fast at t = 4.0 s, (-1.00, 0.00, 1.00) m: 152 deg/s, limits.arm_speed_max_deg_s is 90"),
     (["mission.phases[2].arm_duration_s=1"], "phase 'catch' accelerates a joint too hard"),
-    (["vehicle.arm.joints[1].velocity_max_deg_s=50"], "phase 'catch' turns joint 2 faster than it can"),
-    (["mission.catch.payload_max_kg=2"], "phase 'take-off' needs too much thrust at t = 0.6 s"),
+    (["mission.phases[2].arm_duration_s=1"], "phase 'catch' jerks a joint at t = 3.5 s"),
+    (["vehicle.arm.joints[1].velocity_max_deg_s=30"], "phase 'catch' turns joint 2 faster than it can"),
+    (["mission.catch.payload_max_kg=2"], "phase 'take-off' needs too much thrust at t = 0.8 s"),
     (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2", "vehicle.airframe.tilt_max_deg=10"], "phase 'catch' leans too far"),
     (["mission.phases[0].height_m=0.4"], "phase 'take-off' ends at 0.4 m, but the body's origin is 0.3 m above the floor when the vehicle stands; set height_m to 0.5 or more"),
     (["mission.catch.expected_at_m=[0, 0.5]"], "mission 'catch': expects the payload at (0, 0.5) m, but never comes nearer than 0.50 m; change catch.expected_at_m or the lines"),
@@ -103,8 +106,42 @@ def test_a_problem_points_at_its_phase_in_the_file() -> None:
 
 
 def test_limits_may_be_used_to_the_full() -> None:
-    assert problems("mission.limits.speed_max_m_s=0.625", "mission.limits.arm_speed_max_deg_s=60") == []
-    assert problems("mission.limits.speed_max_m_s=0.6249") != []
+    assert problems("mission.limits.speed_max_m_s=0.7291667") == []
+    assert problems("mission.limits.speed_max_m_s=0.7291") != []
+    least_s = Plan.build(load("mission.phases[2]={type: arm, arm_deg: [100, 60]}").mission, load().vehicle).segments[2]
+    arm_s = least_s.end_s - least_s.start_s
+    assert problems(f"mission.phases[2].arm_duration_s={arm_s}") == []
+    assert problems(f"mission.phases[2].arm_duration_s={0.999 * arm_s}") != []
+
+
+def test_what_has_no_duration_takes_the_least_that_the_limits_allow() -> None:
+    free = [
+        "mission.phases[2]={type: line, to_m: [1, 0, 1], arm_deg: [100, 60]}",
+        "mission.phases[3]={type: arm, arm_deg: [120, 90]}",
+        "mission.phases[4]={type: path, through_m: [[0, 0.4, 1.1], [-1, 0, 1]]}",
+        "mission.phases[5]={type: arm, arm_deg: [165, 140]}",
+    ]
+    assert problems(*free, "mission.catch=null") == []
+    for index in range(2, 6):
+        config = load(*free)
+        segment = Plan.build(config.mission, config.vehicle).segments[index]
+        shorter = f"mission.phases[{index}].duration_s={0.995 * (segment.end_s - segment.start_s)}"
+        assert any("limits." in problem for problem in problems(*free, shorter))
+
+
+def test_a_path_that_overshoots_the_room_is_refused() -> None:
+    swing = "mission.phases[2]={type: path, through_m: [[1.2, 0, 1], [1.2, 0.5, 1], [-1, 0, 1]]}"
+    fits_the_points = 1.2 + load().vehicle.airframe.radius_m + 0.01
+    assert any("leaves the room" in p for p in problems(swing, f"vehicle.room.x_m=[-2.2, {fits_the_points}]"))
+    assert problems(swing, "mission.catch.expected_at_m=[1.2, 0]") == []
+
+
+def test_progress_of_the_planning_is_told() -> None:
+    told: list[float] = []
+    config = load(mission="circuit")
+    assert check_mission(config.mission, config.vehicle, progress=told.append) == []
+    assert told == sorted(told)
+    assert told[-1] == 1.0
 
 
 def test_a_yawed_vehicle_reaches_elsewhere_with_its_net() -> None:

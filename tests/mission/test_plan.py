@@ -9,15 +9,28 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from companion.config.loader import load_flight
 from companion.config.mission import Mission
+from companion.mission import minsnap
 from companion.mission.plan import BELOW_GROUND_M, STOP_SPEED_MAX_M_S, Plan, landing_from
-from companion.mission.reference import Profile, Track, at_rest, rest_to_rest, slow_down, speed_up, steady
+from companion.mission.reference import (
+    Move,
+    Profile,
+    Track,
+    at_rest,
+    minimum_snap,
+    rest_to_rest,
+    slow_down,
+    speed_up,
+    steady,
+)
 from companion.types import PhaseKind, Reference, Vec2, Vec3
 
 ROOT = Path(__file__).parents[2]
 CONFIG = load_flight(ROOT / "configs/missions/catch.yaml")
+CIRCUIT = load_flight(ROOT / "configs/missions/circuit.yaml").mission
 VEHICLE = CONFIG.vehicle
 CLEARANCE_M = VEHICLE.airframe.ground_clearance_m
 START: Vec3 = (-1.0, 0.0, CLEARANCE_M)
@@ -52,7 +65,8 @@ def assert_smooth(plan: Plan) -> None:
     for track in (plan._position, plan._yaw, plan._arm):
         for move in track._moves:
             edges |= {move.start_s, move.end_s}
-            jerk = max(jerk, 60.0 * max(map(abs, move.delta)) / move.duration_s**3)
+            inside = [move.start_s + move.duration_s * share / 50 for share in range(50)] + [move.end_s - 1e-9]
+            jerk = max(jerk, *(abs(value) for t_s in inside for value in move.at(t_s)[3]))
     step_s = 1e-9
     for edge_s in edges:
         before, after = plan.reference(edge_s - step_s), plan.reference(edge_s + step_s)
@@ -75,7 +89,7 @@ def missions(draw: st.DrawFn) -> Mission:
         {"type": "takeoff", "height_m": draw(st.floats(0.1, 5.0)), "duration_s": draw(duration)}
     ]
     for _ in range(draw(st.integers(0, 5))):
-        kind = draw(st.sampled_from(["hold", "line", "arm"]))
+        kind = draw(st.sampled_from(["hold", "line", "arm", "path"]))
         seconds = draw(duration)
         phase: dict[str, object] = {"type": kind, "duration_s": seconds}
         if kind == "line":
@@ -85,6 +99,11 @@ def missions(draw: st.DrawFn) -> Mission:
                 phase |= {"arm_deg": draw(st.tuples(length, length)), "arm_delay_s": delay}
                 if draw(st.booleans()):
                     phase["arm_duration_s"] = (seconds - delay) * draw(st.floats(0.1, 0.99))
+        elif kind == "path":
+            # each point a step away from the one before it, wherever that is: no two alike
+            phase["through_m"] = [
+                (6.0 + 6.0 * len(phases) + k, *draw(st.tuples(length, length))) for k in range(draw(st.integers(1, 4)))
+            ]
         elif kind == "arm":
             phase["arm_deg"] = draw(st.tuples(length, length))
         phases.append(phase)
@@ -183,6 +202,41 @@ def test_a_small_difference_at_the_start_is_taken_out_during_take_off() -> None:
     assert values(reference) == pytest.approx((-1.0, 0.0, 1.0, 2 * math.pi, *FOLD))
 
 
+@pytest.mark.parametrize(
+    ("through_m", "number"),
+    [([(-1.0, 0.0, 1.0), (0.0, 0.0, 1.0)], 0), ([(0.0, 0.0, 1.0), (0.0, 0.0, 1.005)], 1)],
+    ids=["where it stands", "twice the same"],
+)
+def test_a_path_that_stays_where_it_is_is_refused(through_m: list[Vec3], number: int) -> None:
+    document = CONFIG.mission.model_dump(mode="json")
+    document["phases"][1] = {"type": "path", "through_m": through_m}
+    with pytest.raises(ValidationError, match="is where the path already is") as caught:
+        Mission.model_validate(document)
+    assert caught.value.errors()[0]["loc"] == ("phases", 1, "through_m", number)
+
+
+def test_a_path_with_a_duration_takes_it_and_passes_its_points() -> None:
+    document = CIRCUIT.model_dump(mode="json")
+    document["phases"][2]["duration_s"] = 20.0
+    plan = Plan.build(Mission.model_validate(document), VEHICLE)
+    segment = plan.segments[2]
+    assert segment.end_s - segment.start_s == 20.0
+    flown = [plan.reference(segment.start_s + 0.002 * k).position_world_m for k in range(10001)]
+    for point in document["phases"][2]["through_m"]:
+        assert min(math.dist(point, position) for position in flown) < 0.002
+    inside = [plan.reference(segment.start_s + 0.1 * k).velocity_world_m_s for k in range(20, 181)]
+    assert min(math.hypot(*velocity) for velocity in inside) > 0.05, "it stops on the way"
+
+
+def test_paths_are_the_same_wherever_the_machine_stood_and_solved_once() -> None:
+    minsnap._known.clear()
+    first = Plan.build(CIRCUIT, VEHICLE)
+    other = Plan.build(CIRCUIT, VEHICLE, (-1.07, 0.031, CLEARANCE_M + 0.013), 0.1)
+    assert len(minsnap._known) == 1
+    later = [first.segments[2].start_s + 0.05 * k for k in range(200)]
+    assert all(first.reference(t_s).position_world_m == other.reference(t_s).position_world_m for t_s in later)
+
+
 def test_yaw_turns_by_the_shorter_way() -> None:
     document = CONFIG.mission.model_dump(mode="json")
     document["start"]["yaw_deg"] = 179.0
@@ -190,19 +244,21 @@ def test_yaw_turns_by_the_shorter_way() -> None:
     assert plan.reference(3.0).yaw_rad == pytest.approx(math.radians(-181.0))
 
 
-@pytest.mark.parametrize("profile", [rest_to_rest, speed_up, slow_down, steady])
+@pytest.mark.parametrize("profile", [minimum_snap, rest_to_rest, speed_up, slow_down, steady])
 def test_profiles_are_what_their_derivatives_say(profile: Profile) -> None:
     h = 1e-6
     for index in range(1, 100):
         u = index / 100
-        (f0, d0, _), (_, d1, dd1), (f2, d2, _) = profile(u - h), profile(u), profile(u + h)
+        (f0, d0, dd0, _), (_, d1, dd1, ddd1), (f2, d2, dd2, _) = profile(u - h), profile(u), profile(u + h)
         assert (f2 - f0) / (2 * h) == pytest.approx(d1, abs=1e-6)
         assert (d2 - d0) / (2 * h) == pytest.approx(dd1, abs=1e-6)
+        assert (dd2 - dd0) / (2 * h) == pytest.approx(ddd1, abs=1e-6)
 
 
 @pytest.mark.parametrize(
     ("profile", "covered", "speeds"),
     [
+        (minimum_snap, 1.0, (0.0, 0.0)),
         (rest_to_rest, 1.0, (0.0, 0.0)),
         (speed_up, 0.5, (0.0, 1.0)),
         (slow_down, 0.5, (1.0, 0.0)),
@@ -210,18 +266,22 @@ def test_profiles_are_what_their_derivatives_say(profile: Profile) -> None:
     ],
 )
 def test_profiles_cover_what_they_promise(profile: Profile, covered: float, speeds: tuple[float, float]) -> None:
-    assert profile(0.0) == (0.0, speeds[0], 0.0)
-    assert profile(1.0) == pytest.approx((covered, speeds[1], 0.0))
+    assert profile(0.0)[:3] == (0.0, speeds[0], 0.0)
+    assert profile(1.0)[:3] == pytest.approx((covered, speeds[1], 0.0))
 
 
 def test_moves_that_overlap_are_refused() -> None:
     plan = Plan.build(CONFIG.mission, VEHICLE, START, 0.0)
     first = plan._position._moves[0]
+    assert isinstance(first, Move)
     with pytest.raises(ValueError, match="a move starts at"):
         Track((0.0, 0.0, 0.0), (first, first))
 
 
-def test_the_same_start_gives_the_same_plan_bit_for_bit() -> None:
-    build: Callable[[], Plan] = lambda: Plan.build(CONFIG.mission, VEHICLE, (-1.03, 0.02, 0.31), 0.03)  # noqa: E731
-    one, other = build(), build()
+@pytest.mark.parametrize("mission", [CONFIG.mission, CIRCUIT], ids=["catch", "circuit"])
+def test_the_same_start_gives_the_same_plan_bit_for_bit(mission: Mission) -> None:
+    build: Callable[[], Plan] = lambda: Plan.build(mission, VEHICLE, (-1.03, 0.02, 0.31), 0.03)  # noqa: E731
+    one = build()
+    minsnap._known.clear()
+    other = build()
     assert all(one.reference(0.005 * k) == other.reference(0.005 * k) for k in range(4400))

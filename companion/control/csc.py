@@ -1,0 +1,103 @@
+"""Complete-system compliance: one impedance for vehicle and arm, realised by inverting the nominal model.
+
+After Cataldi et al., "Impedance control of an aerial-manipulator: preliminary results", IROS 2016: everything that moves is one system
+with a known model. On every row
+
+    M_d e'' + K_d e' + K_p e = tau_ext - tau_d,        chi''_cmd = chi''_d - M_d^-1 (K_d e' + K_p e - (tau_ext - tau_d)),
+    tau = M(chi) chi''_cmd + C(chi, chi') chi' + g(chi) - tau_ext,
+
+with tau_ext = [F; 0; J'F] as measured. The model knows no payload and nothing adapts: a payload is a lasting external force, to
+which the whole system gives way by F / K_p. The attitude rows are PX4's: their chi'' is what PX4's loop is expected to do towards
+the attitude last asked for, and enters through the coupling alone.
+"""
+
+from __future__ import annotations
+
+from companion.config.controller import CscConfig
+from companion.config.vehicle import Vehicle
+from companion.control.common import ZERO8, Actuation, DesiredForce, ForceFilter, tracking_errors, vec8
+from companion.control.dynamics import Dynamics, chi_rate_from_body_rate, rotation_matrix
+from companion.control.manipulator import Manipulator
+from companion.control.types import PlantState, Wrench
+from companion.frames import euler_zyx_from_quat, quat_conjugate, quat_rotate
+from companion.types import ControlLog, Reference, Vec3, Vec8
+
+
+class CscController:
+    """The whole law for vehicle and arm."""
+
+    def __init__(self, config: CscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
+        self._c = config
+        self._dynamics = Dynamics(vehicle, config.model_mass_scale)
+        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._force = ForceFilter(config.force_lowpass_hz)
+        self._desired = DesiredForce(config.desired_force_time_s)
+        self._actuation = Actuation(config, vehicle, hover_thrust)
+        self._hover_thrust = hover_thrust
+
+    def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
+        """One tick of `dt_s`; see `companion.control.types.Controller`."""
+        force = self._force.step(dt_s, state.force_ext_world_n)
+        error, error_rate = tracking_errors(state, reference)
+        tau_ext, e_tau = self._external(state, force)
+        tau = self._tau(state, reference, error, error_rate, e_tau)
+        sent = self._actuation.step(
+            dt_s,
+            (tau[0] - tau_ext[0], tau[1] - tau_ext[1], tau[2] - tau_ext[2]),
+            (tau[6] - tau_ext[6], tau[7] - tau_ext[7]),
+            state,
+            reference,
+            vertical_scale,
+        )
+        self._desired.advance(dt_s, force)
+        log = ControlLog(
+            error=vec8(error),
+            error_rate=vec8(error_rate),
+            sliding=ZERO8,
+            gamma=ZERO8,
+            tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
+            e_tau=e_tau,
+            h_hat=(0.0, 0.0, 0.0, 0.0),
+            zeta=0.0,
+            rho=0.0,
+            force_ext_world_n=force,
+            attitude_desired_rad=sent.roll_pitch_yaw_rad,
+            hover_thrust=self._hover_thrust,
+            saturated=sent.clipped,
+        )
+        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
+
+    def _external(self, state: PlantState, force: Vec3) -> tuple[Vec8, Vec8]:
+        """tau_ext and tau_ext - tau_d; the base's share as configured."""
+        to_body = quat_conjugate(state.attitude_wxyz)
+        ext = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force))
+        lasting = self._desired.world_n
+        desired = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, lasting))
+        x, y, z = (share * f for share, f in zip(self._c.external_xyz, force, strict=True))
+        dx, dy, dz = (share * f for share, f in zip(self._c.desired_force_xyz, lasting, strict=True))
+        return (
+            (x, y, z, 0.0, 0.0, 0.0, *ext),
+            (x - dx, y - dy, z - dz, 0.0, 0.0, 0.0, ext[0] - desired[0], ext[1] - desired[1]),
+        )
+
+    def _tau(
+        self, state: PlantState, reference: Reference, error: list[float], error_rate: list[float], e_tau: Vec8
+    ) -> list[float]:
+        """M chi''_cmd + C chi' + g, 8 rows."""
+        rpy = euler_zyx_from_quat(state.attitude_wxyz)
+        q_rate = chi_rate_from_body_rate(rpy, state.angular_rate_body_rad_s)
+        roll_d, pitch_d = self._actuation.roll_pitch_rad
+        e = [*error[0:3], rpy[0] - roll_d, rpy[1] - pitch_d, *error[5:8]]
+        e_rate = [*error_rate[0:3], q_rate[0], q_rate[1], q_rate[2] - reference.yaw_rate_rad_s, *error_rate[6:8]]
+        feed = (*reference.acceleration_world_m_s2, 0.0, 0.0, 0.0, *reference.arm_acceleration_rad_s2)
+        c = self._c
+        chi_dd = [
+            feed[i] - (c.damping_kd[i] * e_rate[i] + c.stiffness_kp[i] * e[i] - e_tau[i]) / c.inertia_md[i]
+            for i in range(8)
+        ]
+        chi_rate: Vec8 = (*state.velocity_world_m_s, *q_rate, *state.arm_rate_rad_s)
+        terms = self._dynamics.terms(rotation_matrix(state.attitude_wxyz), rpy, state.arm_rad, chi_rate)
+        return [
+            sum(m * a for m, a in zip(row, chi_dd, strict=True)) + coriolis + gravity
+            for row, coriolis, gravity in zip(terms.mass, terms.coriolis, terms.gravity, strict=True)
+        ]

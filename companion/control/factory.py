@@ -1,0 +1,21 @@
+"""The law that a configuration asks for."""
+
+from __future__ import annotations
+
+from companion.config.controller import AdaptiveConfig, ControllerConfig, CscConfig, PscConfig
+from companion.config.vehicle import Vehicle
+from companion.control.adaptive import AdaptiveController
+from companion.control.csc import CscController
+from companion.control.psc import PscController
+from companion.control.types import Controller
+
+
+def build_controller(config: ControllerConfig, vehicle: Vehicle, hover_thrust: float) -> Controller:
+    """A fresh controller; `hover_thrust` is the normalised thrust that holds the vehicle's own mass."""
+    match config:
+        case AdaptiveConfig():
+            return AdaptiveController(config, vehicle, hover_thrust)
+        case CscConfig():
+            return CscController(config, vehicle, hover_thrust)
+        case PscConfig():
+            return PscController(config, vehicle, hover_thrust)

@@ -1,0 +1,153 @@
+"""Hover thrust, estimated in flight: which normalised thrust carries the machine without payload. Pure; time is an argument.
+
+Balance along body z, the machine taken as one mass:  (m g / h) u = m f_z - F_z,  with u the thrust that the rotors give now (commanded
+thrust behind delay and rotor lag), h the hover thrust, f_z the specific force along body z (IMU) and F_z the measured force on the net:
+a caught payload pulls on the sensor and is no change of h. What is left in h is battery, propellers, air density and the true mass.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from companion.control.manipulator import GRAVITY_M_S2
+from companion.control.sensing import acceleration_world_m_s2
+from companion.control.types import PlantState
+from companion.frames import quat_conjugate, quat_rotate
+from companion.types import Inputs, LandedState, PhaseKind, Quat, Vec3
+
+if TYPE_CHECKING:
+    from companion.analysis.log import FlightLog
+
+SHARE_MAX = 0.25
+"""The estimate stays within this share of its start value: a broken accelerometer must not take the vehicle down."""
+AIRBORNE_M = 0.10
+"""Height above standing from which the floor no longer carries."""
+_LAG_S = 0.05
+"""Command to thrust: transmission and rotor lag. Over the estimator's own seconds its exact value does not matter."""
+_TIME_MIN_S, _TIME_MAX_S = 1.0, 6.0
+"""The estimate is a running mean over the time in the air, at first over the shorter, at last over the longer."""
+_TILT_COS_MIN = math.cos(math.radians(15.0))
+_ACCELERATION_MAX_M_S2 = 1.5
+_ACCELERATION_LOWPASS_S = 0.05
+
+
+class _Balance:
+    """Thrust given and load carried, tick by tick, wherever the balance can be trusted."""
+
+    def __init__(self, mass_kg: float) -> None:
+        self._mass_kg = mass_kg
+        self._thrust: float | None = None
+        self._acceleration_z_m_s2 = 0.0
+
+    def step(
+        self, dt_s: float, thrust_sent: float, acceleration_world_m_s2: Vec3, force_world_n: Vec3, attitude_wxyz: Quat
+    ) -> tuple[float, float] | None:
+        """Normalised thrust that the rotors give now, and the load as a share of the weight (1: hover without payload).
+
+        None: leaning, jerked up or down, or the command at its limits.
+        """
+        before = thrust_sent if self._thrust is None else self._thrust
+        self._thrust = before + (1.0 - math.exp(-dt_s / _LAG_S)) * (thrust_sent - before)
+        ax, ay, az = acceleration_world_m_s2
+        self._acceleration_z_m_s2 += (1.0 - math.exp(-dt_s / _ACCELERATION_LOWPASS_S)) * (
+            az - self._acceleration_z_m_s2
+        )
+        _, qx, qy, _ = attitude_wxyz
+        leaning = 1.0 - 2.0 * (qx * qx + qy * qy) < _TILT_COS_MIN
+        if leaning or abs(self._acceleration_z_m_s2) > _ACCELERATION_MAX_M_S2 or not 0.0 < thrust_sent < 1.0:
+            return None
+        m, g = self._mass_kg, GRAVITY_M_S2
+        fx, fy, fz = force_world_n
+        carried_m_s2 = quat_rotate(quat_conjugate(attitude_wxyz), (ax - fx / m, ay - fy / m, az + g - fz / m))[2]
+        return self._thrust, carried_m_s2 / g
+
+
+class HoverThrust:
+    """The estimator.
+
+    Args:
+        start: hover thrust to begin with (PX4's MPC_THR_HOVER or the vehicle file), 0 to 1.
+        mass_kg: nominal mass of the whole machine, without payload.
+    """
+
+    def __init__(self, start: float, mass_kg: float) -> None:
+        self._balance = _Balance(mass_kg)
+        self._low, self._high = (1.0 - SHARE_MAX) * start, (1.0 + SHARE_MAX) * start
+        self._learnt_s = 0.0
+        self.value = start
+
+    def step(self, dt_s: float, thrust_sent: float, state: PlantState, airborne: bool, carrying: bool) -> float:
+        """One tick; the estimate, 0 to 1.
+
+        Args:
+            dt_s: since the last step.
+            thrust_sent: normalised thrust commanded in the last tick; at its limits nothing is learnt.
+            state: of this tick.
+            airborne: nothing but the rotors carries the machine.
+            carrying: a payload was caught; without force sensor nothing is learnt then.
+        """
+        force = state.force_ext_world_n
+        # The filters follow in any case: when learning sets in they must not start from stale values.
+        balance = self._balance.step(
+            dt_s, thrust_sent, state.acceleration_world_m_s2, force or (0.0, 0.0, 0.0), state.attitude_wxyz
+        )
+        if balance is None or not airborne or (carrying and force is None):
+            return self.value
+        thrust, load = balance
+        self._learnt_s += dt_s
+        gain = dt_s / min(_TIME_MAX_S, max(_TIME_MIN_S, self._learnt_s))
+        # Linear in the noisy load, so that its noise leaves no bias.
+        self.value = min(self._high, max(self._low, self.value + gain * (thrust - self.value * load)))
+        return self.value
+
+
+def off_the_ground(inputs: Inputs, ground_clearance_m: float) -> bool:
+    """Nothing but the rotors carries: PX4 says so, and the height does."""
+    if inputs.vehicle is None or inputs.status is None or inputs.status.landed is not LandedState.IN_AIR:
+        return False
+    return inputs.vehicle.position_world_m[2] > ground_clearance_m + AIRBORNE_M
+
+
+class HoverFitError(ValueError):
+    """The log does not show enough hovering: one line for the user."""
+
+
+FIT_MIN_S = 2.0
+
+
+def fit_hover_thrust(log: FlightLog) -> float:
+    """Hover thrust of the machine without payload, from the calm parts of a flight: least squares over the balance above.
+
+    Raises:
+        HoverFitError: less than `FIT_MIN_S` of calm flight under the law, or no mass in the log's configuration.
+    """
+    vehicle = log.config.get("vehicle") or {}
+    mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
+    force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)
+    if mass_kg is None:
+        raise HoverFitError(f"{log.path}: no vehicle.airframe.mass_kg in its configuration; expected a flight's log")
+    balance = _Balance(mass_kg)
+    sent: float | None = None
+    before_s: float | None = None
+    carrying = False
+    thrust_load = load_load = calm_s = 0.0
+    for i, o, _ in log.rows():
+        dt_s = 0.0 if before_s is None else i.t_s - before_s
+        before_s = i.t_s
+        carrying = carrying or any(event.id == "catch" for event in o.events)
+        if sent is not None and i.vehicle is not None and o.control is not None:
+            force = o.control.force_ext_world_n
+            now = balance.step(dt_s, sent, acceleration_world_m_s2(i.vehicle), force, i.vehicle.attitude_wxyz)
+            blind = i.force is None or i.t_s - i.force.stamp_s > force_timeout_s
+            if now is not None and o.phase_kind is PhaseKind.FLIGHT and not (carrying and blind):
+                thrust, load = now
+                thrust_load += thrust * load * dt_s
+                load_load += load * load * dt_s
+                calm_s += dt_s
+        sent = o.attitude.thrust if o.attitude is not None else None
+    if calm_s < FIT_MIN_S:
+        raise HoverFitError(
+            f"{log.path}: {calm_s:.1f} s of calm flight, expected {FIT_MIN_S:g} s or more; fly a hover of some seconds"
+        )
+    return thrust_load / load_load

@@ -1,0 +1,152 @@
+"""Partitioned compliance: the arm alone is compliant, the vehicle holds its position by itself, each as if the other were not there.
+
+After Wang et al., "Impact absorbing and compensation for heavy object catching with an unmanned aerial manipulator", RA-L 2024.
+The arm: impedance of the joints on a base that stands still,
+
+    tau = M_arm (alpha''_d - M_d^-1 (K_d e' + K_p e - (tau_ext - tau_d))) + C_arm alpha' + g_arm - tau_ext,    tau_ext = J'F.
+
+The vehicle: PID with the mass of machine and payload, (m + m_hat) (p''_d - K_d e' - K_p e - K_i int e + g e_z). m_hat comes from what a
+companion can know: the thrust it commanded and the acceleration that the IMU felt.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.controller import PscConfig
+from companion.config.vehicle import Vehicle
+from companion.control.common import ZERO8, Actuation, DesiredForce, ForceFilter, tracking_errors, vec8
+from companion.control.dynamics import Dynamics
+from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.thrust import collective_n
+from companion.control.types import PlantState, Wrench
+from companion.frames import quat_conjugate, quat_rotate
+from companion.types import ControlLog, Reference, Vec2, Vec3
+
+
+class PayloadEstimator:
+    """Mass carried beyond the machine's own: thrust / specific force along body z, low-passed.
+
+    In the air the rotors' thrust is the only force that an accelerometer on the machine feels (drag aside), so their ratio is the mass
+    that hangs on it, whatever the machine does. The thrust is the one commanded, delayed as the rotors delay it.
+    """
+
+    _LIFTING_SHARE = 0.7
+    """Of the machine's weight: below it the ground may carry a part."""
+
+    def __init__(self, config: PscConfig, mass_kg: float) -> None:
+        self._mass_kg = mass_kg
+        self._time_s = config.payload_time_s
+        self._max_kg = config.payload_max_kg
+        self._lag_s = config.thrust_lag_s
+        self._thrust_n: float | None = None
+        self.payload_kg = 0.0
+
+    def step(self, dt_s: float, commanded_n: float, specific_force_z_m_s2: float, airborne: bool) -> float:
+        """One tick with the thrust that was commanded in the last one; the estimate, kg, within [0, payload_max_kg]."""
+        if self._thrust_n is None:
+            self._thrust_n = commanded_n
+        k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0
+        self._thrust_n += k * (commanded_n - self._thrust_n)
+        least_n = self._LIFTING_SHARE * self._mass_kg * GRAVITY_M_S2
+        if airborne and self._thrust_n > least_n and specific_force_z_m_s2 > self._LIFTING_SHARE * GRAVITY_M_S2:
+            sample_kg = self._thrust_n / specific_force_z_m_s2 - self._mass_kg
+            self.payload_kg += (1.0 - math.exp(-dt_s / self._time_s)) * (sample_kg - self.payload_kg)
+            self.payload_kg = max(0.0, min(self._max_kg, self.payload_kg))
+        return self.payload_kg
+
+
+class PscController:
+    """Both laws, side by side."""
+
+    def __init__(self, config: PscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
+        self._c = config
+        self._mass_kg = vehicle.airframe.mass_kg
+        self._dynamics = Dynamics(vehicle)
+        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._force = ForceFilter(config.force_lowpass_hz)
+        self._desired = DesiredForce(config.desired_force_time_s)
+        self._actuation = Actuation(config, vehicle, hover_thrust)
+        self._hover_thrust = hover_thrust
+        self._estimator = PayloadEstimator(config, self._mass_kg)
+        self._integral_m_s2 = [0.0, 0.0, 0.0]
+        self._commanded_n = 0.0
+
+    @property
+    def payload_kg(self) -> float:
+        """Estimated mass of the payload."""
+        return self._estimator.payload_kg
+
+    def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
+        """One tick of `dt_s`; see `companion.control.types.Controller`."""
+        flying = vertical_scale >= 1.0
+        felt = state.acceleration_world_m_s2
+        specific_z = collective_n((felt[0], felt[1], felt[2] + GRAVITY_M_S2), state.attitude_wxyz)
+        payload_kg = self._estimator.step(dt_s, self._commanded_n, specific_z, flying)
+
+        force = self._force.step(dt_s, state.force_ext_world_n)
+        error, error_rate = tracking_errors(state, reference)
+        e_tau, torque = self._arm(state, reference, error, error_rate, force)
+        wanted = self._vehicle(reference, error, error_rate, self._mass_kg + payload_kg)
+        sent = self._actuation.step(dt_s, wanted, torque, state, reference, vertical_scale)
+        self._commanded_n = sent.collective_n
+        self._integrate(dt_s, error, flying, sent.clipped)
+        self._desired.advance(dt_s, force)
+        log = ControlLog(
+            error=vec8(error),
+            error_rate=vec8(error_rate),
+            sliding=ZERO8,
+            gamma=ZERO8,
+            tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
+            e_tau=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau),
+            h_hat=(0.0, 0.0, 0.0, 0.0),
+            zeta=0.0,
+            rho=0.0,
+            force_ext_world_n=force,
+            attitude_desired_rad=sent.roll_pitch_yaw_rad,
+            hover_thrust=self._hover_thrust,
+            saturated=sent.clipped,
+        )
+        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
+
+    def _vehicle(self, reference: Reference, error: list[float], error_rate: list[float], mass_kg: float) -> Vec3:
+        """Force on the vehicle, world, N."""
+        c = self._c
+        x, y, z = (
+            mass_kg * (feed - c.position_kd_xyz[i] * error_rate[i] - c.position_kp_xyz[i] * error[i] - integral)
+            for i, (feed, integral) in enumerate(
+                zip(reference.acceleration_world_m_s2, self._integral_m_s2, strict=True)
+            )
+        )
+        return (x, y, z + mass_kg * GRAVITY_M_S2)
+
+    def _integrate(self, dt_s: float, error: list[float], flying: bool, clipped: tuple[bool, bool, bool]) -> None:
+        """The integral part stands still on the ground and where the actuators clip."""
+        limit = self._c.integral_max_m_s2
+        for i, held in enumerate((clipped[1], clipped[1], clipped[0])):
+            if flying and not held:
+                grown = self._integral_m_s2[i] + dt_s * self._c.position_ki_xyz[i] * error[i]
+                self._integral_m_s2[i] = max(-limit, min(limit, grown))
+
+    def _arm(
+        self, state: PlantState, reference: Reference, error: list[float], error_rate: list[float], force: Vec3
+    ) -> tuple[Vec2, Vec2]:
+        """tau_ext - tau_d and the motors' torques, N m."""
+        c, manipulator = self._c, self._manipulator
+        to_body = quat_conjugate(state.attitude_wxyz)
+        ext = manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force))
+        desired = manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, self._desired.world_n))
+        e_tau: Vec2 = (ext[0] - desired[0], ext[1] - desired[1])
+        a1, a2 = (
+            reference.arm_acceleration_rad_s2[i]
+            - (c.arm_damping_kd[i] * error_rate[6 + i] + c.arm_stiffness_kp[i] * error[6 + i] - e_tau[i])
+            / c.arm_inertia_md[i]
+            for i in range(2)
+        )
+        terms = self._dynamics.arm_terms(state.arm_rad, state.arm_rate_rad_s)
+        gravity = manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
+        (m11, m12), (m21, m22) = terms.mass
+        return e_tau, (
+            m11 * a1 + m12 * a2 + terms.coriolis[0] + gravity[0] - ext[0],
+            m21 * a1 + m22 * a2 + terms.coriolis[1] + gravity[1] - ext[1],
+        )

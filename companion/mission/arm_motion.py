@@ -1,0 +1,118 @@
+"""Jerk-limited motion of the arm by ruckig: from rest to rest, both joints in step.
+
+Both joints follow one share of their way, so the arm moves straight in joint space, and the joint with the least reserve decides.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import ruckig
+
+from companion.mission.reference import Shape
+from companion.types import Vec2
+
+_DECIMALS = 12
+"""Times of the profile are rounded, so that a replay on another machine, whose roots differ in the last bit, builds the same plan."""
+
+
+JERK_BOUND = 32.0
+"""Jerk times duration cubed over distance of the fastest move that only jerk limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmLimits:
+    """What the planned motion of the joints may not exceed."""
+
+    speed_max_rad_s: Vec2
+    acceleration_max_rad_s2: float
+    jerk_max_rad_s3: float
+
+
+@dataclass(frozen=True, slots=True)
+class JerkLimited:
+    """A share from 0 at u = 0 to 1 at u = 1, at rest on both ends: cubics, one after another. A `Profile`."""
+
+    knots: tuple[float, ...]
+    """Where each cubic begins."""
+    cubics: tuple[tuple[float, float, float, float], ...]
+    """Share, f', f'' / 2, f''' / 6 at the beginning of each."""
+
+    def __call__(self, u: float) -> Shape:
+        """f, f', f'', f''' at u in [0, 1]."""
+        if u >= 1.0:
+            return (1.0, 0.0, 0.0, 0.0)
+        index = max(0, bisect_right(self.knots, u) - 1)
+        w = u - self.knots[index]
+        c0, c1, c2, c3 = self.cubics[index]
+        return (
+            c0 + w * (c1 + w * (c2 + w * c3)),
+            c1 + w * (2.0 * c2 + w * 3.0 * c3),
+            2.0 * c2 + w * 6.0 * c3,
+            6.0 * c3,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ArmMotion:
+    """How a move of the arm is made."""
+
+    profile: JerkLimited
+    duration_s: float
+    """As ruckig planned it: at least the least duration, or what was asked for if that is longer."""
+
+
+def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> ArmMotion:
+    """Plan one move; some microseconds.
+
+    Args:
+        delta_rad: how far each joint goes; not both zero.
+        limits: of each joint's speed, of any joint's acceleration and jerk.
+        duration_s: the least duration wanted.
+
+    Raises:
+        ValueError: ruckig refuses, which finite angles and positive limits give no reason for.
+    """
+    farthest_rad = max(map(abs, delta_rad))
+    if not farthest_rad > 0.0:
+        raise ValueError("a move of the arm that goes nowhere")
+    jerk_per_s3 = limits.jerk_max_rad_s3 / farthest_rad
+    acceleration_per_s2 = limits.acceleration_max_rad_s2 / farthest_rad
+    speed_per_s = min(
+        limit / abs(delta) for limit, delta in zip(limits.speed_max_rad_s, delta_rad, strict=True) if delta
+    )
+    # Ruckig plans in units of about the whole duration, where its numbers are neither large nor small.
+    unit_s = duration_s or (JERK_BOUND / jerk_per_s3) ** (1.0 / 3.0)
+    wanted = ruckig.InputParameter(1)
+    wanted.current_position = [0.0]
+    wanted.target_position = [1.0]
+    wanted.max_velocity = [speed_per_s * unit_s]
+    wanted.max_acceleration = [acceleration_per_s2 * unit_s**2]
+    wanted.max_jerk = [jerk_per_s3 * unit_s**3]
+    wanted.minimum_duration = 1.0 if duration_s else None
+    trajectory = ruckig.Trajectory(1)
+    result = ruckig.Ruckig(1).calculate(wanted, trajectory)
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise ValueError(f"ruckig finds no motion of the arm over {delta_rad} rad within {limits}: {result.name}")
+    profile = trajectory.profiles[0][0]
+    return ArmMotion(_share(profile.t, profile.j), max(duration_s, round(trajectory.duration * unit_s, _DECIMALS)))
+
+
+def _share(times: Sequence[float], jerks: Sequence[float]) -> JerkLimited:
+    """The profile over u from phases of constant jerk, which bring a thing at rest to rest."""
+    total, strongest = math.fsum(times), max(map(abs, jerks))
+    knots, cubics = [], []
+    at = f = df = ddf = 0.0
+    for time, jerk in zip(times, jerks, strict=True):
+        width, dddf = round(time / total, _DECIMALS), round(jerk / strongest, _DECIMALS)
+        if width > 0.0:
+            knots.append(at)
+            cubics.append((f, df, ddf / 2.0, dddf / 6.0))
+            f += width * (df + width * (ddf / 2.0 + width * dddf / 6.0))
+            df += width * (ddf + width * dddf / 2.0)
+            ddf += width * dddf
+            at += width
+    return JerkLimited(tuple(knots), tuple((a / f, b / f, c / f, d / f) for a, b, c, d in cubics))

@@ -1,0 +1,169 @@
+"""Complete-system compliance: the impedance on every row, and whole missions in the fast loop."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from companion.config.controller import AdaptiveConfig, CscConfig
+from companion.config.loader import FlightConfig, load_flight
+from companion.control.csc import CscController
+from companion.control.dynamics import Dynamics, rotation_matrix
+from companion.control.factory import build_controller
+from companion.control.types import PlantState, Wrench
+from companion.core import FlightCore
+from companion.frames import quat_rotate
+from companion.types import IDENTITY_QUAT, Outcome, Reference, Vec2, Vec3
+from sitl.fast import FastFlight, FastResult
+from tests.flights.test_fast_flights import error_after_catch_m, event_ids
+
+MISSION = "configs/missions/catch.yaml"
+POSE: Vec2 = (math.radians(100), math.radians(60))
+WEIGHT_N = 3.0 * 9.81
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+
+
+def configured(*overrides: str) -> FlightConfig:
+    return load_flight(MISSION, controller_law="csc", overrides=overrides)
+
+
+def law(config: FlightConfig) -> CscConfig:
+    assert isinstance(config.controller, CscConfig)
+    return config.controller
+
+
+@cache
+def flown(*overrides: str) -> FastResult:
+    return FastFlight(configured(*overrides)).run()
+
+
+def at(
+    position: Vec3 = (0.0, 0.0, 1.0),
+    velocity: Vec3 = ZERO,
+    arm: Vec2 = POSE,
+    arm_rate: Vec2 = (0.0, 0.0),
+    force: Vec3 | None = ZERO,
+) -> PlantState:
+    return PlantState(position, velocity, ZERO, IDENTITY_QUAT, ZERO, arm, arm_rate, force)
+
+
+def stepped(config: FlightConfig, state: PlantState, acceleration: Vec3 = ZERO, vertical_scale: float = 1.0) -> Wrench:
+    """The first tick: level, and nothing filtered yet."""
+    reference = Reference((0.0, 0.0, 1.0), ZERO, acceleration, 0.0, 0.0, POSE, (0.0, 0.0), (0.0, 0.0))
+    return CscController(law(config), config.vehicle, 0.49).step(0.005, state, reference, vertical_scale)
+
+
+def acceleration(config: FlightConfig, state: PlantState, wrench: Wrench) -> np.ndarray:
+    """chi'' of position and joints that the nominal machine has under the wrench, the attitude being held level."""
+    terms = Dynamics(config.vehicle).terms(
+        rotation_matrix(IDENTITY_QUAT),
+        ZERO,
+        state.arm_rad,
+        (*state.velocity_world_m_s, 0.0, 0.0, 0.0, *state.arm_rate_rad_s),
+    )
+    force = state.force_ext_world_n or ZERO
+    c = CscController(law(config), config.vehicle, 0.49)
+    external = [*force, *c._manipulator.joint_torque_from_force(state.arm_rad, force)]
+    rows = [0, 1, 2, 6, 7]
+    mass = np.array(terms.mass)[np.ix_(rows, rows)]
+    bias = (np.array(terms.coriolis) + np.array(terms.gravity))[rows]
+    applied = np.array([*wrench.log.tau[0:3], *wrench.arm_torque_nm])
+    out: np.ndarray = np.linalg.solve(mass, applied + np.array(external) - bias)
+    return out
+
+
+def test_at_rest_it_asks_for_hover_and_arm_gravity() -> None:
+    config = configured()
+    wrench = stepped(config, at())
+    assert wrench.collective_n == pytest.approx(WEIGHT_N, abs=1e-9)
+    assert wrench.attitude_wxyz == pytest.approx(IDENTITY_QUAT, abs=1e-12)
+    np.testing.assert_allclose(acceleration(config, at(), wrench), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        at(position=(0.02, -0.01, 1.02)),
+        at(velocity=(0.1, -0.1, 0.05), arm_rate=(0.3, -0.4)),
+        at(arm=(POSE[0] + 0.1, POSE[1] - 0.1)),
+        at(force=(0.5, -0.3, -1.0)),
+        at((0.01, 0.02, 0.99), (0.05, 0.0, -0.05), (POSE[0] - 0.05, POSE[1]), (0.2, 0.2), (0.2, 0.1, -0.5)),
+    ],
+)
+def test_the_nominal_machine_moves_as_the_target_impedance(state: PlantState) -> None:
+    """M_d e'' + K_d e' + K_p e = tau_ext on position and joint rows, coupling included."""
+    config = configured("controller.desired_force_time_s=1000")
+    c = law(config)
+    wrench = stepped(config, state, acceleration=(0.1, 0.0, -0.1))
+    assert wrench.log.saturated == (False, False, False)
+    e, e_rate = np.array(wrench.log.error), np.array(wrench.log.error_rate)
+    wanted = [0.1, 0.0, -0.1, 0, 0, 0, 0, 0] - (
+        np.array(c.damping_kd) * e_rate + np.array(c.stiffness_kp) * e - np.array(wrench.log.e_tau)
+    ) / np.array(c.inertia_md)
+    np.testing.assert_allclose(acceleration(config, state, wrench), wanted[[0, 1, 2, 6, 7]], atol=1e-9)
+
+
+def test_without_force_sensor_it_flies_on() -> None:
+    wrench = stepped(configured(), at(force=None))
+    assert wrench.log.force_ext_world_n == ZERO
+    assert wrench.collective_n == pytest.approx(WEIGHT_N, abs=1e-9)
+
+
+def test_spooling_scales_the_vertical_force_alone() -> None:
+    wrench = stepped(configured(), at(position=(0.1, 0.0, 1.0)), vertical_scale=0.4)
+    assert wrench.log.tau[0:2] == (0.0, 0.0)
+    assert wrench.collective_n == pytest.approx(0.4 * WEIGHT_N, rel=0.05)
+
+
+def test_it_saturates_and_says_so() -> None:
+    config = configured()
+    wrench = stepped(config, at(position=(9.0, 0.0, -9.0), arm=(POSE[0] + 3.0, POSE[1] - 3.0)))
+    assert wrench.log.saturated == (True, True, True)
+    limits = [joint.torque_max_nm for joint in config.vehicle.arm.joints]
+    assert all(abs(torque) <= limit for torque, limit in zip(wrench.arm_torque_nm, limits, strict=True))
+    force = np.array(wrench.log.tau[0:3])
+    assert math.atan2(math.hypot(force[0], force[1]), force[2]) <= math.radians(20) + 1e-9
+
+
+@pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.1, 0.04), (0.2, 0.06), (0.3, 0.08)])
+def test_it_catches_the_payload_and_comes_home(payload_kg: float, limit_m: float) -> None:
+    result = flown(f"world.payload_kg={payload_kg}")
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert event_ids(result) == ["takeoff", "catch", "touchdown"]
+    assert error_after_catch_m(result) <= limit_m
+
+
+def test_a_wrong_model_is_visibly_worse() -> None:
+    """15 % low in every mass: it hangs below its reference, payload or not; a law without a model would not care."""
+    right, wrong = flown("world.payload_kg=0.2"), flown("world.payload_kg=0.2", "controller.model_mass_scale=0.85")
+    assert error_after_catch_m(wrong) > 1.5 * error_after_catch_m(right)
+
+
+def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
+    flight = FastFlight(configured("world.payload_kg=0.2"))
+    again = FlightCore(FlightConfig.model_validate_json(flight.config.model_dump_json()))
+    result = flown("world.payload_kg=0.2")
+    assert [again.step(inputs) for inputs in result.inputs] == result.outputs
+
+
+def test_the_factory_builds_the_law_that_is_asked_for() -> None:
+    config = configured()
+    assert isinstance(build_controller(config.controller, config.vehicle, 0.49), CscController)
+    adaptive = load_flight(MISSION)
+    assert isinstance(adaptive.controller, AdaptiveConfig)
+    assert type(build_controller(adaptive.controller, adaptive.vehicle, 0.49)).__name__ == "AdaptiveController"
+
+
+def test_the_net_force_is_felt_in_the_body_frame() -> None:
+    """A force along the body's y axis turns no joint."""
+    config = configured()
+    c = CscController(law(config), config.vehicle, 0.49)
+    tilted = PlantState(
+        (0.0, 0.0, 1.0), ZERO, ZERO, (math.cos(0.1), math.sin(0.1), 0.0, 0.0), ZERO, POSE, (0.0, 0.0), ZERO
+    )
+    sideways = quat_rotate(tilted.attitude_wxyz, (0.0, 2.0, 0.0))
+    tau_ext, _ = c._external(tilted, sideways)
+    assert tau_ext[6:8] == pytest.approx((0.0, 0.0), abs=1e-12)

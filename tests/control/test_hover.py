@@ -1,0 +1,190 @@
+"""Hover thrust: learnt in the air, not on the ground, not from a payload, never beyond its bounds; and fitted from a log."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from companion.analysis.log import FlightLog
+from companion.config.loader import FlightConfig, load_flight
+from companion.control.hover import SHARE_MAX, HoverFitError, HoverThrust, fit_hover_thrust
+from companion.control.manipulator import GRAVITY_M_S2
+from companion.control.types import PlantState
+from companion.frames import quat_from_euler_zyx
+from companion.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Sent, Vec3
+from sitl.fast import FastFlight, FastResult
+
+MASS_KG = 3.0
+START, TRUE = 0.5, 0.45
+DT_S = 0.005
+
+
+def state(
+    acceleration: Vec3 = (0.0, 0.0, 0.0), attitude: Quat = IDENTITY_QUAT, force: Vec3 | None = (0.0, 0.0, 0.0)
+) -> PlantState:
+    zero: Vec3 = (0.0, 0.0, 0.0)
+    return PlantState(zero, zero, acceleration, attitude, zero, (1.7, 1.0), (0.0, 0.0), force)
+
+
+def learnt(
+    thrust: float, plant: PlantState, *, seconds: float = 30.0, airborne: bool = True, carrying: bool = False
+) -> float:
+    hover = HoverThrust(START, MASS_KG)
+    for _ in range(round(seconds / DT_S)):
+        hover.step(DT_S, thrust, plant, airborne, carrying)
+    return hover.value
+
+
+def test_it_finds_the_thrust_that_hovers() -> None:
+    assert learnt(TRUE, state()) == pytest.approx(TRUE, rel=1e-3)
+
+
+def test_it_is_quick_in_take_off_and_slow_later() -> None:
+    """Two thirds of an error are gone after 3 s of flight; a change after a minute takes as long for its first third."""
+    assert abs(learnt(TRUE, state(), seconds=3.0) - TRUE) < 0.2 * (START - TRUE)
+    hover = HoverThrust(START, MASS_KG)
+    for _ in range(12_000):
+        hover.step(DT_S, START, state(), True, False)
+    for _ in range(200):
+        hover.step(DT_S, TRUE, state(), True, False)
+    assert START - hover.value < 0.25 * (START - TRUE)
+
+
+def test_steady_climb_and_acceleration_are_no_change() -> None:
+    """Accelerating upwards at 1 m/s^2 takes more thrust; the IMU feels as much."""
+    assert learnt(TRUE * (1.0 + 1.0 / GRAVITY_M_S2), state((0.0, 0.0, 1.0))) == pytest.approx(TRUE, rel=1e-3)
+
+
+def test_leaning_into_a_turn_is_no_change() -> None:
+    pitch = math.radians(10.0)
+    plant = state((GRAVITY_M_S2 * math.tan(pitch), 0.0, 0.0), quat_from_euler_zyx(0.0, pitch, 0.0))
+    assert learnt(TRUE / math.cos(pitch), plant) == pytest.approx(TRUE, rel=1e-3)
+
+
+@pytest.mark.parametrize("carrying", [False, True])
+def test_a_payload_is_no_change(carrying: bool) -> None:
+    payload_kg = 0.3
+    plant = state(force=(0.0, 0.0, -payload_kg * GRAVITY_M_S2))
+    assert learnt(TRUE * (1.0 + payload_kg / MASS_KG), plant, carrying=carrying) == pytest.approx(TRUE, rel=1e-3)
+
+
+LEANING = quat_from_euler_zyx(math.radians(18.0), 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("thrust", "plant", "airborne", "carrying"),
+    [
+        pytest.param(TRUE, state(), False, False, id="on the ground"),
+        pytest.param(1.0, state(), True, False, id="thrust at its upper limit"),
+        pytest.param(0.0, state(), True, False, id="no thrust"),
+        pytest.param(TRUE, state(force=None), True, True, id="carrying without force sensor"),
+        pytest.param(TRUE, state(attitude=LEANING), True, False, id="leaning far"),
+    ],
+)
+def test_it_stands_still(thrust: float, plant: PlantState, airborne: bool, carrying: bool) -> None:
+    assert learnt(thrust, plant, airborne=airborne, carrying=carrying) == START
+
+
+def test_it_stands_still_while_jerked() -> None:
+    hover = HoverThrust(START, MASS_KG)
+    for _ in range(100):  # until the acceleration's filter has seen it
+        hover.step(DT_S, TRUE, state((0.0, 0.0, 4.0)), True, False)
+    before = hover.value
+    for _ in range(400):
+        hover.step(DT_S, TRUE, state((0.0, 0.0, 4.0)), True, False)
+    assert hover.value == before
+
+
+@pytest.mark.parametrize(("thrust", "bound"), [(0.99, 1.0 + SHARE_MAX), (0.05, 1.0 - SHARE_MAX)])
+def test_it_is_bounded(thrust: float, bound: float) -> None:
+    assert learnt(thrust, state(), seconds=60.0) == pytest.approx(START * bound)
+
+
+# -- whole flights in the fast loop ----------------------------------------------------------------------------------------------
+
+
+@cache
+def flown(error: float, adapt: bool = True, preset: str = "recommended", faults: str = "[]") -> FastResult:
+    result = FastFlight(configured(error, adapt, preset, faults)).run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    return result
+
+
+def configured(error: float, adapt: bool, preset: str, faults: str = "[]") -> FlightConfig:
+    overrides = (
+        f"world.hover_thrust_error={error}",
+        f"vehicle.airframe.hover_thrust_adapt={str(adapt).lower()}",
+        f"world.faults={faults}",
+    )
+    return load_flight("configs/missions/catch.yaml", preset=preset, overrides=overrides)
+
+
+def true_hover_thrust() -> float:
+    return FastFlight(configured(0.0, True, "recommended")).plant.world.hover_command
+
+
+def height_errors_m(result: FastResult, from_s: float) -> list[float]:
+    """True height against the reference, FLIGHT phases from so long after take-off."""
+    return [
+        truth.position_world_m[2] - outputs.reference.position_world_m[2]
+        for outputs, truth in zip(result.outputs, result.truth, strict=True)
+        if outputs.reference and outputs.phase_kind is PhaseKind.FLIGHT and outputs.mission_t_s >= from_s
+    ]
+
+
+@pytest.mark.parametrize("error", [-0.1, 0.1])
+def test_a_wrong_parameter_is_flown_out(error: float) -> None:
+    """10 % would be 5 cm of height for ever; from 4 s on it is below 2 cm, catch and payload included."""
+    assert max(abs(e) for e in height_errors_m(flown(error), 4.0)) < 0.02
+    assert max(abs(e) for e in height_errors_m(flown(error, adapt=False), 4.0)) > 0.04
+
+
+@pytest.mark.parametrize("error", [-0.1, 0.0, 0.1])
+@pytest.mark.parametrize("preset", ["paper", "recommended"])
+def test_the_log_tells_what_was_used_and_it_ends_near_the_truth(error: float, preset: str) -> None:
+    result = flown(error, preset=preset)
+    used = [outputs.control.hover_thrust for outputs in result.outputs if outputs.control]
+    assert used[0] == pytest.approx(true_hover_thrust() * (1.0 + error))
+    assert used[-1] == pytest.approx(true_hover_thrust(), rel=0.01)
+
+
+def test_switched_off_it_stays_at_the_parameter() -> None:
+    used = {o.control.hover_thrust for o in flown(0.1, adapt=False).outputs if o.control}
+    assert used == {true_hover_thrust() * 1.1}
+
+
+def test_a_catch_without_force_sensor_does_not_move_it() -> None:
+    """The sensor dies after the catch: what hangs there can no longer be told from a weak motor."""
+    result = flown(0.0, faults="[{kind: force_loss, t_s: 9.0}]")
+    lost_s = next(e.t_s for o in result.outputs for e in o.events if e.id == "force_lost")
+    later = {o.control.hover_thrust for o in result.outputs if o.control and o.t_s > lost_s + 0.1}
+    assert len(later) == 1
+
+
+def log_of(result: FastResult, config: FlightConfig) -> FlightLog:
+    sent = tuple(Sent(i.tick, True, None, i.t_s, 0.0, i.t_s, i.t_s, i.t_s, i.t_s) for i in result.inputs)
+    metadata = {"config": {"json": json.dumps(config.model_dump(mode="json"))}}
+    return FlightLog(Path("flight.mcap"), tuple(result.inputs), tuple(result.outputs), sent, metadata, True)
+
+
+@pytest.mark.parametrize("error", [-0.1, 0.0, 0.1])
+def test_the_fit_of_a_log_is_the_truth(error: float) -> None:
+    """Whatever the parameter was, adapting or not, with a payload for two thirds of the flight."""
+    for adapt in (False, True):
+        log = log_of(flown(error, adapt), configured(error, adapt, "recommended"))
+        assert fit_hover_thrust(log) == pytest.approx(true_hover_thrust(), rel=0.005)
+
+
+def test_a_log_without_hovering_is_refused_in_one_line() -> None:
+    result, config = flown(0.0), configured(0.0, True, "recommended")
+    short = FastResult(result.inputs[:900], result.outputs[:900])
+    with pytest.raises(HoverFitError, match=r"^flight\.mcap: 0\.\d s of calm flight, expected 2 s or more[^\n]*$"):
+        fit_hover_thrust(log_of(short, config))
+    bare = log_of(short, config)
+    bare.metadata["config"]["json"] = "{}"
+    with pytest.raises(HoverFitError, match=r"^flight\.mcap: no vehicle\.airframe\.mass_kg[^\n]*$"):
+        fit_hover_thrust(bare)

@@ -1,0 +1,199 @@
+"""Partitioned compliance: arm and vehicle each by itself, the payload's estimated mass, and whole missions in the fast loop."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from companion.config.controller import PscConfig
+from companion.config.loader import FlightConfig, load_flight
+from companion.control.dynamics import Dynamics
+from companion.control.manipulator import Manipulator
+from companion.control.psc import PayloadEstimator, PscController
+from companion.control.types import PlantState, Wrench
+from companion.core import FlightCore
+from companion.types import IDENTITY_QUAT, Inputs, Outcome, Outputs, PhaseKind, Reference, Vec2, Vec3
+from sitl.fast import FastFlight, FastResult
+from tests.flights.test_fast_flights import error_after_catch_m, event_ids
+
+MISSION = "configs/missions/catch.yaml"
+POSE: Vec2 = (math.radians(100), math.radians(60))
+MASS_KG, G = 3.0, 9.81
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+
+
+def configured(*overrides: str) -> FlightConfig:
+    return load_flight(MISSION, controller_law="psc", overrides=overrides)
+
+
+def law(config: FlightConfig) -> PscConfig:
+    assert isinstance(config.controller, PscConfig)
+    return config.controller
+
+
+def controller(config: FlightConfig) -> PscController:
+    return PscController(law(config), config.vehicle, 0.49)
+
+
+@cache
+def flown(*overrides: str) -> FastResult:
+    return FastFlight(configured(*overrides)).run()
+
+
+def at(
+    position: Vec3 = (0.0, 0.0, 1.0),
+    velocity: Vec3 = ZERO,
+    arm: Vec2 = POSE,
+    arm_rate: Vec2 = (0.0, 0.0),
+    force: Vec3 | None = ZERO,
+) -> PlantState:
+    return PlantState(position, velocity, ZERO, IDENTITY_QUAT, ZERO, arm, arm_rate, force)
+
+
+REFERENCE = Reference((0.0, 0.0, 1.0), ZERO, (0.2, 0.0, 0.1), 0.0, 0.0, POSE, (0.0, 0.0), (0.3, -0.2))
+
+
+def stepped(config: FlightConfig, state: PlantState) -> Wrench:
+    return controller(config).step(0.005, state, REFERENCE, 1.0)
+
+
+def test_the_vehicle_follows_its_own_law_and_ignores_the_arm() -> None:
+    config = configured()
+    c = law(config)
+    wanted = [
+        MASS_KG * (feed - kd * v - kp * e)
+        for feed, kd, v, kp, e in zip(
+            (0.2, 0.0, 0.1), c.position_kd_xyz, (0.1, 0.0, -0.1), c.position_kp_xyz, (0.02, -0.03, 0.01), strict=True
+        )
+    ]
+    for state in (
+        at((0.02, -0.03, 1.01), (0.1, 0.0, -0.1)),
+        at((0.02, -0.03, 1.01), (0.1, 0.0, -0.1), (1.2, 0.3), (2.0, -2.0), (3.0, 0.0, -3.0)),
+    ):
+        force = stepped(config, state).log.tau[0:3]
+        assert force == pytest.approx((wanted[0], wanted[1], wanted[2] + MASS_KG * G), abs=1e-9)
+
+
+def test_the_arm_on_a_still_base_moves_as_its_target_impedance() -> None:
+    config = configured()
+    c = law(config)
+    state = at(arm=(POSE[0] + 0.05, POSE[1] - 0.04), arm_rate=(0.2, -0.1), force=(0.3, 0.0, -0.5))
+    wrench = stepped(config, state)
+    manipulator = Manipulator(config.vehicle.arm, config.vehicle.tool)
+    terms = Dynamics(config.vehicle).arm_terms(state.arm_rad, state.arm_rate_rad_s)
+    external = np.array(manipulator.joint_torque_from_force(state.arm_rad, (0.3, 0.0, -0.5)))
+    gravity = np.array(manipulator.gravity_torque_nm(state.arm_rad, IDENTITY_QUAT))
+    applied = np.array(wrench.arm_torque_nm)
+    found = np.linalg.solve(np.array(terms.mass), applied + external - gravity - np.array(terms.coriolis))
+    e, e_rate = np.array(wrench.log.error[6:8]), np.array(wrench.log.error_rate[6:8])
+    wanted = np.array([0.3, -0.2]) - (
+        np.array(c.arm_damping_kd) * e_rate + np.array(c.arm_stiffness_kp) * e - external
+    ) / np.array(c.arm_inertia_md)
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_the_integral_part_ends_a_lasting_error_and_is_bounded() -> None:
+    config = configured("controller.payload_max_kg=0")
+    c = law(config)
+    one = controller(config)
+    low = at(position=(0.0, 0.0, 0.99))
+    before = one.step(0.005, low, REFERENCE, 1.0).collective_n
+    for _ in range(2000):
+        after = one.step(0.005, low, REFERENCE, 1.0).collective_n
+    gained = MASS_KG * min(c.integral_max_m_s2, 0.01 * c.position_ki_xyz[2] * 10.0)
+    assert after - before == pytest.approx(gained, rel=1e-3, abs=1e-6)
+    grounded = controller(config)
+    for _ in range(400):
+        grounded.step(0.005, low, REFERENCE, 0.99)
+    assert grounded.step(0.005, low, REFERENCE, 1.0).collective_n == pytest.approx(before, abs=1e-9)
+
+
+@pytest.mark.parametrize("climb_m_s2", [0.0, 1.0, -1.0])
+def test_the_estimate_is_thrust_over_specific_force_whatever_the_machine_does(climb_m_s2: float) -> None:
+    estimator = PayloadEstimator(law(configured()), MASS_KG)
+    for _ in range(2000):
+        estimator.step(0.005, (MASS_KG + 0.25) * (G + climb_m_s2), G + climb_m_s2, True)
+    assert estimator.payload_kg == pytest.approx(0.25, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("thrust_n", "specific", "airborne", "wanted_kg"),
+    [
+        (40.0, G, False, 0.0),  # on the ground
+        (15.0, G, True, 0.0),  # the ground may carry a part
+        (28.0, G, True, 0.0),  # lighter than itself: bounded
+        (58.0, G, True, 1.0),  # bounded above
+        (40.0, 0.0, True, 0.0),  # falling: nothing to divide by
+    ],
+)
+def test_the_estimate_is_gated_and_bounded(thrust_n: float, specific: float, airborne: bool, wanted_kg: float) -> None:
+    estimator = PayloadEstimator(law(configured()), MASS_KG)
+    for _ in range(4000):
+        estimator.step(0.005, thrust_n, specific, airborne)
+    assert estimator.payload_kg == pytest.approx(wanted_kg, abs=1e-6)
+
+
+def test_no_estimate_without_its_switch() -> None:
+    estimator = PayloadEstimator(law(configured("controller.payload_max_kg=0")), MASS_KG)
+    assert estimator.step(0.005, 40.0, G, True) == 0.0
+
+
+class WatchedCore(FlightCore):
+    """The core, and its law's estimate in every tick."""
+
+    def __init__(self, config: FlightConfig) -> None:
+        super().__init__(config)
+        self.payload_kg: list[float] = []
+
+    def step(self, inputs: Inputs) -> Outputs:
+        outputs = super().step(inputs)
+        one = self._pilot._controller
+        assert isinstance(one, PscController)
+        self.payload_kg.append(one.payload_kg)
+        return outputs
+
+
+@pytest.mark.parametrize("payload_kg", [0.1, 0.2, 0.3])
+def test_the_mass_estimate_converges_after_the_catch(payload_kg: float) -> None:
+    """Within 20 %, from thrust and IMU alone, with their noise; from 2 s after the catch to the landing."""
+    overrides = f"world.payload_kg={payload_kg}"
+    core = WatchedCore(FastFlight(configured(overrides)).config)
+    result = flown(overrides)
+    for inputs in result.inputs:
+        core.step(inputs)
+    catch_s = next(event.t_s for outputs in result.outputs for event in outputs.events if event.id == "catch")
+    carried = [
+        estimate
+        for outputs, estimate in zip(result.outputs, core.payload_kg, strict=True)
+        if outputs.phase_kind is PhaseKind.FLIGHT and outputs.t_s > catch_s + 2.0
+    ]
+    before = [
+        estimate
+        for outputs, estimate in zip(result.outputs, core.payload_kg, strict=True)
+        if outputs.phase_kind is PhaseKind.FLIGHT and outputs.t_s < catch_s
+    ]
+    assert np.mean(carried) == pytest.approx(payload_kg, rel=0.2)
+    assert np.mean(before) < 0.05
+
+
+@pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.1, 0.02), (0.2, 0.025), (0.3, 0.03)])
+def test_it_catches_the_payload_and_comes_home(payload_kg: float, limit_m: float) -> None:
+    result = flown(f"world.payload_kg={payload_kg}")
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert event_ids(result) == ["takeoff", "catch", "touchdown"]
+    assert error_after_catch_m(result) <= limit_m
+
+
+def test_without_force_sensor_the_mission_goes_on() -> None:
+    result = flown("world.payload_kg=0.2", "world.faults=[{kind: force_loss, t_s: 5.0}]")
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+
+
+def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
+    flight = FastFlight(configured("world.payload_kg=0.2"))
+    again = FlightCore(FlightConfig.model_validate_json(flight.config.model_dump_json()))
+    result = flown("world.payload_kg=0.2")
+    assert [again.step(inputs) for inputs in result.inputs] == result.outputs
