@@ -1,26 +1,30 @@
-"""The commands: fly, check, schema, sitl, report, replay."""
+"""The commands: fly, check, schema, sitl, compare, report, replay."""
 
 from __future__ import annotations
 
 import argparse
 import datetime
-import subprocess
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from rich.console import Console
-
+from companion import compare_command
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
-from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.mission.check import check_mission
+from companion.terminal import tell, terminal_console
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse, with one line per mistake."""
+    """argparse, with one line per mistake and no abbreviations."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(allow_abbrev=False, **settings)
 
     def error(self, message: str) -> None:  # type: ignore[override]
         sys.stderr.write(f"{self.prog}: {message}; see {self.prog} --help\n")
@@ -29,15 +33,24 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `companion`."""
-    arguments = _parser().parse_args(_normalised(list(sys.argv[1:] if argv is None else argv)))
+    parser = _parser()
+    arguments, unknown = parser.parse_known_args(_normalised(list(sys.argv[1:] if argv is None else argv)))
+    if unknown:
+        tell(
+            f"companion {arguments.command}: unknown arguments: {' '.join(unknown)}; see companion {arguments.command} --help"
+        )
+        return EXIT_BAD_INPUT
     try:
         code: int = arguments.run(arguments)
     except ConfigError as error:
         for line in error.lines:
-            print(line, file=sys.stderr)
+            tell(line)
         return EXIT_BAD_INPUT
     except BrokenPipeError:
         return EXIT_OK
+    except KeyboardInterrupt:
+        tell(f"companion {arguments.command}: interrupted")
+        return EXIT_ABORTED
     return code
 
 
@@ -56,7 +69,7 @@ def _normalised(argv: list[str]) -> list[str]:
                 out.append(word)  # no KEY=VALUE: the loader says so
                 in_set = False
                 continue
-            in_set = word == "--set"
+            in_set = word == "--set" or word.startswith("--set=")
             out.append(word)
     return out
 
@@ -70,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     fly = commands.add_parser("fly", help="fly a mission", description="Fly a mission, on the vehicle or in SITL.")
     _add_flight_options(fly)
     fly.add_argument("--sitl", metavar="stub", help="fly in the simulated world")
-    fly.add_argument("--out", type=Path, metavar="DIR", help="where log and report go (default: flights/TIME-MISSION)")
+    fly.add_argument("--out", metavar="DIR", help="where log and report go (default: flights/TIME-MISSION)")
     fly.set_defaults(run=_fly)
 
     check = commands.add_parser("check", help="check a mission without flying it")
@@ -84,6 +97,8 @@ def _parser() -> argparse.ArgumentParser:
     sitl = commands.add_parser("sitl", help="run the simulated world alone, for QGroundControl or a script of your own")
     _add_flight_options(sitl, mission_default=True)
     sitl.set_defaults(run=_sitl)
+
+    compare_command.add_parser(commands)
 
     report = commands.add_parser("report", help="make summary and report of a log again")
     report.add_argument("log", type=Path)
@@ -112,6 +127,9 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
 
 
 def _load(arguments: argparse.Namespace) -> FlightConfig:
+    for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
+        if path is not None and not path.strip():
+            raise ConfigError([f"companion {arguments.command}: {name}: expected the name of a file, got an empty one"])
     return load_flight(
         arguments.mission, arguments.vehicle, arguments.controller, arguments.preset, arguments.overrides
     )
@@ -125,7 +143,7 @@ def _check(arguments: argparse.Namespace) -> int:
     config = _load(arguments)
     problems = _problems(config)
     for line in problems:
-        print(line, file=sys.stderr)
+        tell(line)
     if problems:
         return EXIT_BAD_INPUT
     print(f"{arguments.mission}: mission {config.mission.name!r} can be flown by {config.vehicle.name}")
@@ -135,39 +153,53 @@ def _check(arguments: argparse.Namespace) -> int:
 def _fly(arguments: argparse.Namespace) -> int:
     from companion.flight import run_flight
 
+    if arguments.sitl == "px4":
+        tell(
+            "companion fly: --sitl=px4: a real PX4 in the loop is not supported yet; use --sitl, which brings its own stub"
+        )
+        return EXIT_BAD_INPUT
     if arguments.sitl not in (None, "stub"):
-        print(f"companion fly: --sitl={arguments.sitl}: expected --sitl or --sitl=stub", file=sys.stderr)
+        tell(f"companion fly: --sitl={arguments.sitl}: expected --sitl or --sitl=stub")
+        return EXIT_BAD_INPUT
+    if arguments.out is not None and not arguments.out.strip():
+        tell("companion fly: --out: expected the name of a folder, got an empty one")
         return EXIT_BAD_INPUT
     config = _load(arguments)
     problems = _problems(config)
     if problems:
         for line in problems:
-            print(line, file=sys.stderr)
+            tell(line)
         return EXIT_BAD_INPUT
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    out = arguments.out or Path("flights") / f"{stamp}-{config.mission.name}"
+    out = Path(arguments.out) if arguments.out else Path("flights") / f"{stamp}-{config.mission.name}"
+    problem = _why_unusable(out)
+    if problem is not None:
+        tell(f"companion fly: --out {out}: {problem}")
+        return EXIT_BAD_INPUT
+    return run_flight(config, out, sitl=arguments.sitl is not None, console=terminal_console())
+
+
+def _why_unusable(out: Path) -> str | None:
+    """Make the folder; None if a flight can leave its files there."""
     try:
+        if out.exists() and not out.is_dir():
+            return "is a file; choose a folder"
+        if (out / "flight.mcap").exists():
+            return "there is a flight.mcap already; choose another folder"
         out.mkdir(parents=True, exist_ok=True)
+        # Only trying tells: root may write where the permissions say no, and nobody may in some file systems.
+        with tempfile.TemporaryFile(dir=out):
+            return None
     except OSError as error:
-        print(f"companion fly: --out {out}: {error.strerror}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    if (out / "flight.mcap").exists():
-        print(f"companion fly: --out {out}: there is a flight.mcap already; choose another folder", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    return run_flight(config, out, sitl=arguments.sitl is not None, console=Console())
+        return f"{error.strerror}; choose a folder that can be written to"
 
 
 def _sitl(arguments: argparse.Namespace) -> int:
     config = _load(arguments)
-    with tempfile.NamedTemporaryFile("w", suffix=".json", encoding="utf-8") as file:
-        file.write(config.model_dump_json())
-        file.flush()
-        process = subprocess.Popen([sys.executable, "-m", "sitl", "--config", file.name])
-        while True:
-            try:
-                return process.wait()
-            except KeyboardInterrupt:
-                continue  # the world got it too and ends by itself
+    # In place of this process: signals reach the world itself, and there is nobody whom it could outlive.
+    file = os.memfd_create("sitl-config", 0)
+    os.write(file, config.model_dump_json().encode())
+    os.execv(sys.executable, [sys.executable, "-m", "sitl", "--config", f"/proc/self/fd/{file}"])
 
 
 def _report(arguments: argparse.Namespace) -> int:
@@ -177,10 +209,10 @@ def _report(arguments: argparse.Namespace) -> int:
     try:
         report = report_again(arguments.log, arguments.out or arguments.log.parent)
     except LogError as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return EXIT_BAD_INPUT
     if report is None:
-        print("companion report: plots need matplotlib: pip install 'companion[analysis]'", file=sys.stderr)
+        tell("companion report: plots need matplotlib: pip install 'companion[analysis]'")
         return EXIT_REFUSED
     print(report)
     return EXIT_OK

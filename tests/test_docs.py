@@ -228,7 +228,9 @@ def test_preset_table_matches() -> None:
     }
     for key, *cells in table(LAW, "key", "paper", "recommended"):
         for preset, cell in zip(("paper", "recommended"), cells, strict=True):
-            assert cell == preset_text(laws[preset], key), f"{key}, {preset}"
+            law = laws[preset]
+            assert isinstance(law, AdaptiveConfig)
+            assert cell == preset_text(law, key), f"{key}, {preset}"
 
 
 def preset_text(law: AdaptiveConfig, key: str) -> str:

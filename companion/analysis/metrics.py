@@ -101,25 +101,52 @@ def final_e_z_m(log: FlightLog) -> float | None:
 
 
 def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
-    """RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m).
+    """RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m); None for rows without a desired impedance.
 
-    dI = M_d s' + (K_d - M_d Phi) s: what keeps the machine from its desired impedance. s' is the central difference of s,
-    low-passed at 10 Hz without phase shift.
+    dI = M_d e'' + K_d e' + K_p e - e_tau: what keeps the machine from its desired impedance. Laws with a sliding variable s log the
+    same as M_d s' + (K_d - M_d Phi) s. Derivatives are central differences, low-passed at 10 Hz without phase shift.
     """
-    gains = _diagonals(log.config.get("controller"), "inertia_md", "damping_kd", "phi")
     pre, post = flight_masks(log)
     used = np.array([o.control is not None for o in log.outputs], dtype=np.bool_) & (pre | post)
-    if gains is None or not (used & post).any() or int(used.sum()) < 10:
+    if not (used & post).any() or int(used.sum()) < 10:
         return None, None
-    inertia, damping, phi = gains
-    sliding = log.column(lambda i, o, s: o.control.sliding if o.control else None, 8)[used]
     t_s = log.columns.t_s[used]
-    if not np.isfinite(sliding).all() or not (np.diff(t_s) > 0).all():
+    if not (np.diff(t_s) > 0).all():
         return None, None
-    smooth = lowpass_zero_phase(sliding, float(np.median(np.diff(t_s))), SLIDING_LOWPASS_HZ)
-    d_i = inertia * np.gradient(smooth, t_s, axis=0) + (damping - inertia * phi) * sliding
+    d_i = _impedance_residual(log, used, t_s)
+    if d_i is None:
+        return None, None
     after = d_i[post[used]]
     return rms_norm(after[:, 0:3]), rms_norm(after[:, 6:8])
+
+
+def _impedance_residual(log: FlightLog, used: Mask, t_s: Array) -> Array | None:
+    """dI of the ticks of the mask, 8 rows; NaN on rows that the law gives no impedance."""
+    controller = log.config.get("controller")
+    period = float(np.median(np.diff(t_s)))
+
+    def rows(name: str) -> Array:
+        return log.column(lambda i, o, s: getattr(o.control, name) if o.control else None, 8)[used]
+
+    def smooth(values: Array) -> Array:
+        return lowpass_zero_phase(values, period, SLIDING_LOWPASS_HZ)
+
+    gains = _diagonals(controller, "inertia_md", "damping_kd", "phi")
+    if gains is not None:
+        inertia, damping, phi = gains
+        sliding = rows("sliding")
+        if not np.isfinite(sliding).all():
+            return None
+        out: Array = inertia * np.gradient(smooth(sliding), t_s, axis=0) + (damping - inertia * phi) * sliding
+        return out
+    gains = _diagonals(controller, "inertia_md", "damping_kd", "stiffness_kp") or _arm_diagonals(controller)
+    error, rate, e_tau = rows("error"), rows("error_rate"), rows("e_tau")
+    if gains is None or not all(np.isfinite(values).all() for values in (error, rate, e_tau)):
+        return None
+    inertia, damping, stiffness = gains
+    # e_tau is smoothed as e'' is, or a blow would be held against itself, smoothed.
+    out = inertia * np.gradient(smooth(rate), t_s, axis=0) + damping * rate + stiffness * error - smooth(e_tau)
+    return out
 
 
 def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
@@ -231,6 +258,16 @@ def _diagonals(controller: Any, *names: str) -> tuple[Array, ...] | None:
     if not all(isinstance(row, list) and len(row) == 8 for row in rows):
         return None
     return tuple(np.array(row, dtype=np.float64) for row in rows)
+
+
+def _arm_diagonals(controller: Any) -> tuple[Array, ...] | None:
+    """M_d, K_d, K_p of a law whose arm alone has an impedance: NaN above the joint rows."""
+    if not isinstance(controller, dict):
+        return None
+    rows = [controller.get(f"arm_{name}") for name in ("inertia_md", "damping_kd", "stiffness_kp")]
+    if not all(isinstance(row, list) and len(row) == 2 for row in rows):
+        return None
+    return tuple(np.array([np.nan] * 6 + [float(value) for value in row or ()]) for row in rows)
 
 
 def _wrapped(angles_rad: Array) -> Array:

@@ -1,0 +1,295 @@
+"""Grids of fast flights: one flight's row, and the same rows over one process, two processes and a Dask cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import json
+import math
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.analysis import metrics
+from companion.config.loader import load_flight
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
+from companion.types import Outcome, PhaseKind
+from sitl import campaign
+from sitl.fast import FastFlight, FastResult
+from tests.support import CATCH, DEADLINE_S, Ended, Sandbox, sandbox_in, wait_until
+
+CONFIG = load_flight(CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
+FLIGHT: dict[str, Any] = {
+    "variant": 0,
+    "controller": "adaptive",
+    "preset": "recommended",
+    "payload_kg": 0.2,
+    "seed": 3,
+    "series": True,
+}
+
+
+@pytest.fixture(scope="module")
+def fast() -> tuple[FastFlight, FastResult]:
+    """The flight of `FLIGHT`, flown without the campaign."""
+    flight = FastFlight(CONFIG)
+    return flight, flight.run()
+
+
+@pytest.fixture(scope="module")
+def result() -> dict[str, Any]:
+    """The same flight, flown by the campaign from a configuration with another payload and seed."""
+    other = load_flight(CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
+    return campaign.fly(other.model_dump_json(), FLIGHT)
+
+
+def test_a_row_is_what_the_flight_was(fast: tuple[FastFlight, FastResult], result: dict[str, Any]) -> None:
+    _, flown = fast
+    row = result["row"]
+    assert {key: row[key] for key in ("controller", "preset", "payload_kg", "seed")} == {
+        "controller": "adaptive",
+        "preset": "recommended",
+        "payload_kg": 0.2,
+        "seed": 3,
+    }
+    assert (row["outcome"], row["error"]) == ("completed", None)
+    catch = next(event for outputs in flown.outputs for event in outputs.events if event.id == "catch")
+    parts: dict[str, list[float]] = {"pre": [], "post": []}
+    for i, o in zip(flown.inputs, flown.outputs, strict=True):
+        if o.phase_kind is PhaseKind.FLIGHT:
+            assert i.mocap is not None and o.reference is not None
+            error = math.dist(i.mocap.position_world_m, o.reference.position_world_m)
+            parts["post" if o.t_s >= catch.t_s - 1e-9 else "pre"].append(error)
+    for part, errors in parts.items():
+        rms = math.sqrt(math.fsum(error**2 for error in errors) / len(errors))
+        assert row["rms"][part]["e_p_m"] == pytest.approx(rms, rel=1e-9)
+    assert row["peak_e_p_m"] == pytest.approx(max(parts["pre"] + parts["post"]), rel=1e-9)
+    torques = [o.arm_torque_nm for o in flown.outputs if o.phase_kind is PhaseKind.FLIGHT]
+    changes = [math.dist(a, b) for a, b in itertools.pairwise(torques) if a is not None and b is not None]
+    assert row["torque_activity_nm"] == pytest.approx(
+        math.sqrt(math.fsum(c * c for c in changes) / len(changes)), rel=1e-9
+    )
+
+
+def test_a_series_is_the_course_of_the_flight(fast: tuple[FastFlight, FastResult], result: dict[str, Any]) -> None:
+    series, (_, flown) = result["series"], fast
+    t_s = series["t_s"]
+    assert t_s == sorted(t_s)
+    assert t_s[1] - t_s[0] == pytest.approx(0.02)
+    for key in ("e_p_m", "e_q_deg"):
+        assert len(series[key]) == len(t_s)
+    k = len(t_s) // 2
+    at = min(range(len(flown.outputs)), key=lambda n: abs(flown.outputs[n].mission_t_s - t_s[k]))
+    arm = flown.inputs[at].arm
+    assert arm is not None
+    assert [series["alpha_deg"][j][k] for j in range(2)] == pytest.approx(
+        [math.degrees(a) for a in arm.angle_rad], abs=1e-5
+    )
+    assert series["catch_t_s"] == result["row"]["catch_t_s"]
+
+
+def test_a_catch_that_nobody_noticed_still_parts_before_from_after(fast: tuple[FastFlight, FastResult]) -> None:
+    flight, flown = fast
+    blind = FastResult(
+        inputs=flown.inputs,
+        outputs=[
+            dataclasses.replace(o, events=tuple(event for event in o.events if event.id != "catch"))
+            for o in flown.outputs
+        ],
+    )
+    caught_t_s = flight.plant.world.caught_t_s
+    assert caught_t_s is not None
+    row, log = campaign.row_of(flight.config, blind, caught_t_s)
+    index = metrics.catch_index(log)
+    assert index is not None
+    assert log.outputs[index].t_s == pytest.approx(caught_t_s, abs=0.006)
+    seen, _ = campaign.row_of(flight.config, flown, caught_t_s)
+    assert row["catch_t_s"] == pytest.approx(seen["catch_t_s"], abs=0.1)
+    assert row["rms"]["post"]["e_p_m"] == pytest.approx(seen["rms"]["post"]["e_p_m"], rel=0.1)
+
+
+def test_what_was_not_flown_to_its_end_is_not_graded(fast: tuple[FastFlight, FastResult]) -> None:
+    flight, flown = fast
+    caught_t_s = flight.plant.world.caught_t_s
+    assert caught_t_s is not None
+    for end_s, graded in ((caught_t_s - 1.0, set()), (caught_t_s + 2.0, {"pre"})):
+        count = sum(o.t_s <= end_s for o in flown.outputs)
+        short = FastResult(inputs=flown.inputs[:count], outputs=flown.outputs[:count], crashed=True)
+        row, _ = campaign.row_of(flight.config, short, caught_t_s)
+        assert row["outcome"] == Outcome.CRASHED.value
+        assert {part for part, rms in row["rms"].items() if rms["e_p_m"] is not None} == graded
+        for name in ("final_e_z_m", "peak_e_p_m", "torque_activity_nm"):
+            assert row[name] is None
+        assert set(row["impedance_error"].values()) == {None}
+
+
+def test_a_law_that_breaks_loses_its_flight_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks(_: FastFlight) -> FastResult:
+        raise ZeroDivisionError("float division by zero")
+
+    monkeypatch.setattr(FastFlight, "run", breaks)
+    row = campaign.fly(CONFIG.model_dump_json(), FLIGHT)["row"]
+    assert (row["outcome"], row["error"]) == ("lost", "ZeroDivisionError: float division by zero")
+    assert row["rms"]["pre"]["e_p_m"] is None
+
+
+# -- over cores and machines -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path_factory.mktemp("campaign")) as sandbox:
+        yield sandbox
+
+
+TINY = (
+    *(
+        "compare",
+        "--mission",
+        CATCH,
+        "--payloads",
+        "0.2",
+        "--controllers",
+        "adaptive",
+        "--presets",
+        "paper,recommended",
+    ),
+    "--json",
+)
+
+
+@pytest.fixture(scope="module")
+def flown(place: Sandbox) -> Ended:
+    """Two presets with one seed, one after the other in one process."""
+    ended = place.run(*TINY, "--seeds", "1", "--jobs", "1", "--out", "one")
+    assert ended.code == EXIT_OK, ended.err
+    return ended
+
+
+def test_two_processes_fly_the_same_rows(flown: Ended, place: Sandbox) -> None:
+    two = place.run(*TINY, "--seeds", "1", "--jobs", "2", "--out", "two")
+    assert two.code == EXIT_OK, two.err
+    assert two.out == flown.out
+    place.assert_nobody_left(DEADLINE_S)
+
+
+def test_a_dask_cluster_flies_the_same_rows(flown: Ended, place: Sandbox, tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed (extra cluster)")
+    with cluster(place, tmp_path, workers=2) as address:
+        ended = place.run(*TINY, "--seeds", "1", "--scheduler", address, "--out", "dask")
+    assert ended.code == EXIT_OK, ended.err
+    assert ended.out == flown.out
+
+
+def test_a_scheduler_that_is_not_there_is_bad_input(place: Sandbox) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed (extra cluster)")
+    ended = place.run(*TINY, "--scheduler", "tcp://127.0.0.1:9", "--out", "nowhere")
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1 and "tcp://127.0.0.1:9: no Dask scheduler answers" in ended.err
+    assert not (place.cwd / "nowhere").exists()
+
+
+def test_ctrl_c_ends_the_workers_and_shows_what_is_there(place: Sandbox) -> None:
+    arguments = [*map(str, TINY), "--seeds", "500", "--jobs", "2", "--out", "part"]
+    with (
+        terminal() as (theirs, seen),
+        subprocess.Popen(
+            [sys.executable, "-m", "companion.cli", *arguments],
+            cwd=place.cwd,
+            env={**place.environment, "TERM": "xterm"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=theirs,
+            start_new_session=True,
+        ) as process,
+    ):
+        os.close(theirs)
+        bar = re.compile(rb"\b[1-9]\d*/1000")
+        wait_until(lambda: bool(bar.search(seen)), lambda: f"no flight has ended: {bytes(seen)!r}")
+        os.killpg(process.pid, signal.SIGINT)
+        out, _ = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == EXIT_ABORTED
+    place.assert_nobody_left(DEADLINE_S)
+    rows = json.loads(out)["rows"]
+    assert 1 <= len(rows) < 1000
+    assert f"{len(rows)} of 1000 flights were flown".encode() in seen
+    assert (place.cwd / "part/compare.html").exists()
+
+
+def test_a_campaign_leaves_with_whoever_started_it(place: Sandbox) -> None:
+    flights = [{**FLIGHT, "seed": seed, "series": False} for seed in range(1, 500)]
+    job = {"configs": [CONFIG.model_dump(mode="json")], "flights": flights, "jobs": 2, "scheduler": None}
+    with subprocess.Popen(
+        [sys.executable, "-m", "sitl.campaign"],
+        cwd=place.cwd,
+        env=place.environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None
+        process.stdin.write(json.dumps(job).encode() + b"\n")
+        process.stdin.flush()
+        first = json.loads(process.stdout.readline())
+        assert first["row"]["outcome"] == "completed"
+        process.stdin.close()
+        process.wait(DEADLINE_S)
+    assert process.returncode != 0
+    place.assert_nobody_left(DEADLINE_S)
+
+
+@contextlib.contextmanager
+def terminal() -> Iterator[tuple[int, bytearray]]:
+    """A terminal: the end for a program, and what that has shown."""
+    ours, theirs = pty.openpty()
+    seen = bytearray()
+
+    def listen() -> None:
+        with contextlib.suppress(OSError):  # the other end is closed
+            while data := os.read(ours, 65536):
+                seen.extend(data)
+
+    reader = threading.Thread(target=listen)
+    reader.start()
+    try:
+        yield theirs, seen
+    finally:
+        reader.join(DEADLINE_S)
+        os.close(ours)
+
+
+@contextlib.contextmanager
+def cluster(place: Sandbox, folder: Path, workers: int) -> Iterator[str]:
+    """A Dask scheduler and its workers, one thread each; its address."""
+    file = folder / "scheduler.json"
+    with contextlib.ExitStack() as stack:
+        log = stack.enter_context(open(folder / "dask.log", "wb"))
+
+        def start(module: str, *arguments: str) -> None:
+            process = subprocess.Popen(
+                [sys.executable, "-m", f"distributed.cli.{module}", "--no-dashboard", *arguments],
+                cwd=folder,
+                env={**place.environment, "TMPDIR": str(folder)},
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+            stack.callback(process.wait, DEADLINE_S)
+            stack.callback(process.terminate)
+
+        start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
+        wait_until(lambda: file.exists() and file.stat().st_size > 0, lambda: (folder / "dask.log").read_text())
+        address = str(json.loads(file.read_text(encoding="utf-8"))["address"])
+        for _ in range(workers):
+            start("dask_worker", address, "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny")
+        yield address
