@@ -304,17 +304,16 @@ def test_the_preset_option_is_of_the_missions_law(project: Path) -> None:
 
 
 BAD_LAW_IN_FILE = [
-    ("law: csk", ':5:6: law: expected one of adaptive, csc, psc, got "csk" (did you mean csc?)'),
-    ("law: 3", ":5:6: law: expected one of adaptive, csc, psc, got 3"),
-    ("", ":4:1: law: missing; expected one of adaptive, csc, psc"),
+    ("law: csk", ':2:6: law: expected one of adaptive, csc, psc, got "csk" (did you mean csc?)'),
+    ("law: 3", ":2:6: law: expected one of adaptive, csc, psc, got 3"),
+    ("# law: csc", ":1:1: law: missing; expected one of adaptive, csc, psc"),
 ]
 
 
 @pytest.mark.parametrize(("law", "end"), BAD_LAW_IN_FILE)
 def test_unknown_law_in_a_controller_file(project: Path, law: str, end: str) -> None:
     path = project / CATCH
-    text = (ROOT / "configs/controllers/csc_tuned.yaml").read_text()
-    (path.parent / "mine.yaml").write_text(text.replace("law: csc", law, 1))
+    (path.parent / "mine.yaml").write_text(f"schema_version: 1\n{law}\npreset: mine\n")
     path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", "{file: mine.yaml}"))
     assert lines_of(lambda: load_flight(CATCH)) == [f"configs/missions/mine.yaml{end}"]
 

@@ -16,7 +16,7 @@ from companion.control.factory import build_controller
 from companion.control.types import PlantState, Wrench
 from companion.core import FlightCore
 from companion.frames import quat_rotate
-from companion.types import IDENTITY_QUAT, Outcome, Reference, Vec2, Vec3
+from companion.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference, Vec2, Vec3
 from sitl.fast import FastFlight, FastResult
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 
@@ -136,10 +136,25 @@ def test_it_catches_the_payload_and_comes_home(payload_kg: float, limit_m: float
     assert error_after_catch_m(result) <= limit_m
 
 
-def test_a_wrong_model_is_visibly_worse() -> None:
-    """15 % low in every mass: it hangs below its reference, payload or not; a law without a model would not care."""
-    right, wrong = flown("world.payload_kg=0.2"), flown("world.payload_kg=0.2", "controller.model_mass_scale=0.85")
-    assert error_after_catch_m(wrong) > 1.5 * error_after_catch_m(right)
+def height_error_before_catch_m(result: FastResult) -> float:
+    """Mean over the phases of flight; negative: it hangs low."""
+    catch_s = next(event.t_s for outputs in result.outputs for event in outputs.events if event.id == "catch")
+    errors = [
+        inputs.mocap.position_world_m[2] - outputs.reference.position_world_m[2]
+        for inputs, outputs in zip(result.inputs, result.outputs, strict=True)
+        if outputs.phase_kind is PhaseKind.FLIGHT and outputs.t_s < catch_s and inputs.mocap and outputs.reference
+    ]
+    return sum(errors) / len(errors)
+
+
+@pytest.mark.parametrize(("scale", "sign"), [(0.85, -1), (1.15, 1)])
+def test_a_wrong_model_is_visibly_worse(scale: float, sign: int) -> None:
+    """15 % in every mass: off its height by the missing weight over the stiffness, payload or not."""
+    right = flown("world.payload_kg=0.2")
+    wrong = flown("world.payload_kg=0.2", f"controller.model_mass_scale={scale}")
+    assert abs(height_error_before_catch_m(right)) < 0.003
+    assert sign * height_error_before_catch_m(wrong) > 0.006
+    assert error_after_catch_m(wrong) > 1.25 * error_after_catch_m(right)
 
 
 def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
