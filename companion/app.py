@@ -13,6 +13,7 @@ import os
 import signal
 import socket
 import sys
+import traceback
 from collections.abc import AsyncIterator, Coroutine, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ from companion.realtime import FLIGHT_PRIORITY, Ticker, claim_realtime
 from companion.types import (
     AutopilotRequest,
     Inputs,
+    LandedState,
     MocapPose,
     OperatorCommand,
     Outcome,
@@ -44,6 +46,9 @@ from companion.types import (
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.003
+HAND_OVER_S = 30.0
+HAND_OVER_MIN_S = 1.5
+"""PX4 says once a second whether it is armed; an older word does not count."""
 _HOVER_PARAM = "MPC_THR_HOVER"
 
 _T = TypeVar("_T")
@@ -170,6 +175,23 @@ class Flight:
                 return outputs.outcome
             tick += 1
 
+    async def hand_over(self) -> Outcome:
+        """The last resort after an error of our own: PX4 lands, motion capture goes on flowing to it, nothing else is sent.
+
+        Returns:
+            ABORTED once PX4 has disarmed, LOST if it has not within `HAND_OVER_S`.
+        """
+        autopilot, start_s = self._edges.autopilot, self._clock()
+        while self._clock() - start_s < HAND_OVER_S:
+            now = autopilot.status()
+            if now is not None and not now.armed and self._clock() - start_s > HAND_OVER_MIN_S:
+                return Outcome.ABORTED
+            stands = now is not None and now.landed is LandedState.ON_GROUND
+            autopilot.request(AutopilotRequest.DISARM if stands else AutopilotRequest.LAND)
+            status.send(self._channel, {"type": "handed over"})
+            await asyncio.sleep(0.05)
+        return Outcome.LOST
+
     async def _tick(self, tick: int, start_s: float, lateness_s: float) -> tuple[Outputs, Sent]:
         edges = self._edges
         arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S)
@@ -278,7 +300,11 @@ async def fly(config: FlightConfig, out: Path, channel: socket.socket) -> Outcom
                 channel,
                 {"type": "started", "recorder_pid": recorder.process.pid, "realtime": claim_realtime(FLIGHT_PRIORITY)},
             )
-            outcome = await flight.run()
+            try:
+                outcome = await flight.run()
+            except Exception:  # whatever broke in here, the vehicle may be in the air
+                traceback.print_exc()
+                outcome = await flight.hand_over()
         finally:
             report = await asyncio.to_thread(recorder.finish)
         recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}

@@ -235,3 +235,16 @@ def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -
     assert world.process.returncode == 0, "it was killed"
     assert world.final["payload_kg"] == json.loads((tmp_path / "sitl_config.json").read_text())["world"]["payload_kg"]
     assert not world.final["crashed"]
+
+
+@pytest.mark.flight
+def test_a_flight_process_that_hangs_in_the_air_is_ended(sandbox: Sandbox) -> None:
+    """SIGSTOP: nothing is sent any more, PX4 lands by itself; the launcher notices, ends the process and tells."""
+    with sandbox.start(*FLY) as running:
+        running.wait_for(IN_FLIGHT)
+        os.kill(int((sandbox.cwd / "out/flight.pid").read_text()), signal.SIGSTOP)
+        ended = running.end()
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    assert ended.code == EXIT_LOST
+    assert "said nothing for 5 s" in ended.err
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"

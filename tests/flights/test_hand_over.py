@@ -1,0 +1,46 @@
+"""An error of our own in mid-air: the flight process hands the vehicle to PX4 and goes on feeding it motion capture."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from pathlib import Path
+
+import pytest
+
+from companion import app
+from companion.config.loader import load_flight
+from companion.core import FlightCore
+from companion.launcher import with_devices
+from companion.types import Inputs, Outcome, Outputs
+from tests.support import HOVER, World, sandbox_in
+
+BREAKS_AFTER_S = 4.0
+
+
+class BreakingCore(FlightCore):
+    """The real core, until it meets a bug at height."""
+
+    def step(self, inputs: Inputs) -> Outputs:
+        outputs = super().step(inputs)
+        if outputs.mission_t_s > BREAKS_AFTER_S:
+            raise ZeroDivisionError("a bug")
+        return outputs
+
+
+@pytest.mark.flight
+def test_an_internal_error_in_the_air_lands_by_px4(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(app, "FlightCore", BreakingCore)
+    monkeypatch.setattr(app, "claim_realtime", lambda priority: "not for the test's own process")
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    theirs.setblocking(False)
+    with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs:
+        config = with_devices(load_flight(HOVER), world.devices)
+        outcome = asyncio.run(app.fly(config, tmp_path, theirs))
+        assert outcome is Outcome.ABORTED
+        rest = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]
+        assert rest[-2:] == [False, True], "it armed, and stands disarmed"
+        assert not world.crashes
+    assert "ZeroDivisionError: a bug" in capfd.readouterr().err
