@@ -119,8 +119,8 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
     else:
         parser.add_argument("mission", help="mission file, YAML")
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
-    parser.add_argument("--controller", metavar="LAW", help="control law: adaptive")
-    parser.add_argument("--preset", metavar="NAME", help="gains: paper or recommended")
+    parser.add_argument("--controller", metavar="LAW", help="control law: adaptive, csc or psc")
+    parser.add_argument("--preset", metavar="NAME", help="gains: paper or recommended (adaptive), tuned (csc, psc)")
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="e.g. world.payload_kg=0.3"
     )

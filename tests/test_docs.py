@@ -29,7 +29,7 @@ LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
 # What a flight writes, or what a user is told to make: no files of the repository.
 MADE_LATER = {
     "flight.mcap", "flight.log", "flight.pid", "summary.json", "report.html", "config.json", "sitl_config.json", "sitl.log",
-    "mine.yaml", "my_vehicle.yaml", "flights/",
+    "mine.yaml", "my_vehicle.yaml", "flights/", "compare.json", "compare.html",
 }  # fmt: skip
 FOLDERS = ("companion", "sitl", "configs", "tests", "docs", "benchmarks")
 KNOWN_NAMES = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.*")}
