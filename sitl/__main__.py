@@ -25,7 +25,9 @@ _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1
 
 def _say(message: dict[str, Any]) -> None:
     with contextlib.suppress(OSError):  # the launcher is gone; standard input will say so
-        print(json.dumps(message), flush=True)
+        os.write(
+            1, json.dumps(message).encode() + b"\n"
+        )  # unbuffered: nothing is left to be flushed into a closed pipe
 
 
 async def _serve(config: FlightConfig, for_launcher: bool) -> None:

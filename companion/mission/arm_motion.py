@@ -56,6 +56,10 @@ class JerkLimited:
         )
 
 
+SPEED_ENOUGH, ACCELERATION_ENOUGH, JERK_ENOUGH = 20.0, 400.0, 2.0e4
+"""In units of the whole move and its least duration: a move with these takes an eighth of it."""
+
+
 @dataclass(frozen=True, slots=True)
 class ArmMotion:
     """How a move of the arm is made."""
@@ -89,16 +93,22 @@ def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> Arm
     wanted = ruckig.InputParameter(1)
     wanted.current_position = [0.0]
     wanted.target_position = [1.0]
-    wanted.max_velocity = [speed_per_s * unit_s]
-    wanted.max_acceleration = [acceleration_per_s2 * unit_s**2]
-    wanted.max_jerk = [jerk_per_s3 * unit_s**3]
+    # Limits far beyond what a move of one unit needs only make ruckig's equations ill-conditioned: a small move in a long time.
+    wanted.max_velocity = [min(speed_per_s * unit_s, SPEED_ENOUGH)]
+    wanted.max_acceleration = [min(acceleration_per_s2 * unit_s**2, ACCELERATION_ENOUGH)]
+    wanted.max_jerk = [min(jerk_per_s3 * unit_s**3, JERK_ENOUGH)]
     wanted.minimum_duration = 1.0 if duration_s else None
     trajectory = ruckig.Trajectory(1)
-    result = ruckig.Ruckig(1).calculate(wanted, trajectory)
+    try:
+        result = ruckig.Ruckig(1).calculate(wanted, trajectory)
+    except ruckig.RuckigError as error:
+        raise ValueError(f"ruckig finds no motion of the arm over {delta_rad} rad within {limits}") from error
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise ValueError(f"ruckig finds no motion of the arm over {delta_rad} rad within {limits}: {result.name}")
     profile = trajectory.profiles[0][0]
-    return ArmMotion(_share(profile.t, profile.j), max(duration_s, round(trajectory.duration * unit_s, _DECIMALS)))
+    planned_s = round(trajectory.duration * unit_s, _DECIMALS)
+    # The least duration comes back with ruckig's rounding in it.
+    return ArmMotion(_share(profile.t, profile.j), planned_s if planned_s > duration_s * (1.0 + 1e-9) else duration_s)
 
 
 def _share(times: Sequence[float], jerks: Sequence[float]) -> JerkLimited:

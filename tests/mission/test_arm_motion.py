@@ -85,3 +85,10 @@ def test_a_slow_joint_sets_the_pace() -> None:
 def test_a_move_to_where_it_is_is_no_move() -> None:
     with pytest.raises(ValueError, match="goes nowhere"):
         plan_arm((0.0, 0.0), LIMITS)
+
+
+@pytest.mark.parametrize("duration_s", [1.0, 33.0, 600.0])
+@pytest.mark.parametrize("delta_rad", [1e-4, 0.109375 * math.pi / 180.0, 0.109375, 2.0])
+def test_a_small_move_in_a_long_time_is_planned(delta_rad: float, duration_s: float) -> None:
+    motion = plan_arm((0.0, delta_rad), ArmLimits((1.0, 0.5), 2.8125, 132.5), max(duration_s, 10.0 * delta_rad))
+    assert motion.duration_s == pytest.approx(max(duration_s, 10.0 * delta_rad))
