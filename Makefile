@@ -26,7 +26,8 @@ lint: install
 	$(BIN)/mypy
 
 unit: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not flight"
+	$(BIN)/python -m pytest -m flight
 
 bench: install
 	$(BIN)/python benchmarks/wire_latency.py

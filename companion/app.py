@@ -1,6 +1,7 @@
 """The flight process of `companion fly`: opens the edges, ticks the core, closes down in order.
 
-Started by the launcher as `python -m companion.app --config FILE --out DIR --channel FD`. Ends with the outcome's exit code.
+Started by the launcher as `python -m companion.app --config FILE --out DIR --channel FD --guardian FD`. Ends with the outcome's exit
+code.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import signal
 import socket
 import sys
+import time
 import traceback
 from collections.abc import AsyncIterator, Coroutine, Iterator
 from dataclasses import dataclass
@@ -23,14 +25,17 @@ from companion import status
 from companion.clock import Clock, flight_clock
 from companion.config.loader import FlightConfig
 from companion.core import NOMINAL_DT_S, FlightCore
-from companion.exit_codes import EXIT_CODES, EXIT_REFUSED
+from companion.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
+from companion.flight_guard import FlightGuard
+from companion.guardian.client import GuardianClient
 from companion.io.arm import DynamixelArm
 from companion.io.autopilot import MavsdkAutopilot
 from companion.io.edges import DeviceError
 from companion.io.force_torque import RobotousForceTorque
 from companion.io.mocap import NatNetMocap
 from companion.io.recorder import RecorderProcess, epoch_offset_ns
-from companion.realtime import FLIGHT_PRIORITY, Ticker, claim_realtime
+from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.ticker import Ticker
 from companion.types import (
     AutopilotRequest,
     Inputs,
@@ -54,10 +59,18 @@ _HOVER_PARAM = "MPC_THR_HOVER"
 _T = TypeVar("_T")
 
 
+@dataclass(slots=True)
+class VisionValve:
+    """Whether poses are passed on to PX4; the core shuts it while it does not believe them."""
+
+    open: bool = True
+
+
 @dataclass(frozen=True, slots=True)
 class Edges:
     """Everything on a wire, open."""
 
+    vision: VisionValve
     autopilot: MavsdkAutopilot
     mocap: NatNetMocap
     arm: DynamixelArm
@@ -69,9 +82,10 @@ async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]
     """Open every device; the arm, which gets torque, last. Motion capture flows to PX4 from the first frame on."""
     devices = config.vehicle.devices
     forward: list[MavsdkAutopilot] = []
+    valve = VisionValve()
 
     def on_pose(pose: MocapPose) -> None:
-        if forward and pose.tracking_valid:
+        if forward and valve.open and pose.tracking_valid:
             forward[0].send_vision(pose)
 
     async with contextlib.AsyncExitStack() as stack:
@@ -80,7 +94,7 @@ async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]
         autopilot = await stack.enter_async_context(MavsdkAutopilot(devices.autopilot, clock))
         forward.append(autopilot)
         arm = await stack.enter_async_context(DynamixelArm(devices.arm, config.vehicle.arm, clock))
-        yield Edges(autopilot, mocap, arm, force)
+        yield Edges(valve, autopilot, mocap, arm, force)
 
 
 class GivenUp(Exception):
@@ -152,7 +166,9 @@ class Flight:
         channel: socket.socket,
         operator: Operator,
         clock: Clock,
+        guardian: FlightGuard | None,
     ) -> None:
+        self._guardian = guardian
         self._edges = edges
         self._recorder = recorder
         self._channel = channel
@@ -167,16 +183,18 @@ class Flight:
         ticker = Ticker(self._period_s, self._clock)
         tick = 0
         while True:
-            time = await ticker.next()
-            outputs, sent = await self._tick(tick, time.start_s, time.lateness_s)
-            self._missed += time.lateness_s > self._period_s
+            now = await ticker.next()
+            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s)
+            self._missed += now.lateness_s > self._period_s
             self._report(tick, outputs, sent)
+            if self._guardian is not None:
+                self._guardian.tick(inputs, outputs)
             if outputs.outcome is not None:
                 return outputs.outcome
             tick += 1
 
     async def hand_over(self) -> Outcome:
-        """The last resort after an error of our own: PX4 lands, motion capture goes on flowing to it, nothing else is sent.
+        """After an error of our own, without a guardian: PX4 lands, motion capture goes on flowing to it, nothing else is sent.
 
         Returns:
             ABORTED once PX4 has disarmed, LOST if it has not within `HAND_OVER_S`.
@@ -189,10 +207,12 @@ class Flight:
             stands = now is not None and now.landed is LandedState.ON_GROUND
             autopilot.request(AutopilotRequest.DISARM if stands else AutopilotRequest.LAND)
             status.send(self._channel, {"type": "handed over"})
+            if self._guardian is not None:
+                self._guardian.still_here()
             await asyncio.sleep(0.05)
         return Outcome.LOST
 
-    async def _tick(self, tick: int, start_s: float, lateness_s: float) -> tuple[Outputs, Sent]:
+    async def _tick(self, tick: int, start_s: float, lateness_s: float) -> tuple[Inputs, Outputs, Sent]:
         edges = self._edges
         arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S)
         joint_read_s = self._clock()
@@ -206,8 +226,10 @@ class Flight:
             force=edges.force.latest(),
             command=self._operator.command,
             recorder_dropped=self._recorder.client.dropped,
+            guardian_ready=self._guardian.ready if self._guardian is not None else None,
         )
         outputs = self._core.step(inputs)
+        edges.vision.open = outputs.mocap_trusted
         core_s = self._clock()
         torque_sent: Vec2 | None = None
         if outputs.arm_torque_nm is not None:
@@ -229,7 +251,7 @@ class Flight:
             current_sent_s=current_s,
         )
         self._recorder.client.record(inputs, outputs, sent)
-        return outputs, sent
+        return inputs, outputs, sent
 
     def _report(self, tick: int, outputs: Outputs, sent: Sent) -> None:
         for event in outputs.events:
@@ -237,6 +259,7 @@ class Flight:
                 "type": "event",
                 "tick": tick,
                 "t_s": outputs.mission_t_s,
+                "flight_t_s": event.t_s,
                 "id": event.id,
                 "severity": event.severity.value,
                 "action": event.action.value,
@@ -273,19 +296,31 @@ class Flight:
         }
 
 
-async def fly(config: FlightConfig, out: Path, channel: socket.socket) -> Outcome:
+async def fly(
+    config: FlightConfig, out: Path, channel: socket.socket, guardian_channel: socket.socket | None = None
+) -> Outcome:
     """Open, fly, close.
+
+    Args:
+        config: checked.
+        out: folder of the flight.
+        channel: to the launcher.
+        guardian_channel: to the guardian; None: nobody stands by.
 
     Raises:
         DeviceError: a device is not there or not as it must be; nothing was armed.
         GivenUp: a landing was asked for while the devices were being opened; nothing was armed.
     """
-    clock = flight_clock()
+    origin_s = time.monotonic()
+    clock = flight_clock(origin_s)
+    client = GuardianClient(guardian_channel, clock) if guardian_channel is not None else None
     operator = Operator(channel)
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(operator.attention())
         edges = await operator.unless_land(stack.enter_async_context(open_edges(config, clock)))
         config = await operator.unless_land(with_hover_thrust(config, edges.autopilot))
+        if client is not None:
+            await operator.unless_land(client.wait_ready())
         recorder = await asyncio.to_thread(
             RecorderProcess.start,
             out / "flight.mcap",
@@ -295,7 +330,10 @@ async def fly(config: FlightConfig, out: Path, channel: socket.socket) -> Outcom
         )
         try:
             recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
-            flight = Flight(config, edges, recorder, channel, operator, clock)
+            guardian = FlightGuard(client, edges.autopilot.identity(), origin_s) if client is not None else None
+            if client is not None:
+                client.share_recorder(recorder.client.fileno())
+            flight = Flight(config, edges, recorder, channel, operator, clock, guardian)
             status.send(
                 channel,
                 {"type": "started", "recorder_pid": recorder.process.pid, "realtime": claim_realtime(FLIGHT_PRIORITY)},
@@ -304,7 +342,12 @@ async def fly(config: FlightConfig, out: Path, channel: socket.socket) -> Outcom
                 outcome = await flight.run()
             except Exception:  # whatever broke in here, the vehicle may be in the air
                 traceback.print_exc()
+                if guardian is not None and guardian.would_take_over:
+                    sys.stderr.flush()
+                    os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
                 outcome = await flight.hand_over()
+            if guardian is not None and outcome is not Outcome.LOST:
+                guardian.goodbye()
         finally:
             report = await asyncio.to_thread(recorder.finish)
         recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}
@@ -337,14 +380,15 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="companion.app")
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--channel", type=int, required=True)
+    parser.add_argument("--channel", type=int, required=True, help="socket to the launcher")
+    parser.add_argument("--guardian", type=int, required=True, help="socket to the guardian")
     arguments = parser.parse_args(argv)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the launcher's: it asks for a landing
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     channel = socket.socket(fileno=arguments.channel)
     channel.setblocking(False)
     try:
-        outcome = asyncio.run(fly(config, arguments.out, channel))
+        outcome = asyncio.run(fly(config, arguments.out, channel, socket.socket(fileno=arguments.guardian)))
     except DeviceError as error:
         status.send(channel, {"type": "refused", "lines": str(error).splitlines()})
         return EXIT_REFUSED

@@ -1,4 +1,4 @@
-"""The companion's end of a campaign: `python -m sitl.campaign` as a child, its results as they come."""
+"""The companion's end of a campaign: `python -m sitl.campaign` or another as a child, its results as they come."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ class CampaignProcess:
     """A running campaign, with a process group of its own for its workers; a context manager, at whose end nobody is left.
 
     Args:
-        job: as on standard input of sitl.campaign.
+        job: as on standard input of the module.
         log: where its standard error goes; removed again if it holds nothing of interest.
+        module: what is to be run.
     """
 
-    def __init__(self, job: Message, log: Path) -> None:
+    def __init__(self, job: Message, log: Path, module: str = "sitl.campaign") -> None:
         self._log = log
         self._buffer = b""
         self._stop_asked = False
@@ -48,7 +49,7 @@ class CampaignProcess:
         environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
         with open(log, "wb") as file:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "sitl.campaign"],
+                [sys.executable, "-m", module],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,

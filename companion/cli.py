@@ -1,4 +1,4 @@
-"""The commands: fly, check, schema, sitl, compare, report, replay."""
+"""The commands: fly, check, schema, sitl, compare, robustness, faults, hover, report, replay."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion import compare_command
+from companion import compare_command, faults_command, hover_command, robustness_command
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
 from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.mission.check import check_mission
+from companion.planning_progress import PlanningProgress
 from companion.terminal import tell, terminal_console
 
 
@@ -99,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
     sitl.set_defaults(run=_sitl)
 
     compare_command.add_parser(commands)
+    robustness_command.add_parser(commands)
+    faults_command.add_parser(commands)
+    hover_command.add_parser(commands)
 
     report = commands.add_parser("report", help="make summary and report of a log again")
     report.add_argument("log", type=Path)
@@ -136,7 +140,8 @@ def _load(arguments: argparse.Namespace) -> FlightConfig:
 
 
 def _problems(config: FlightConfig) -> list[str]:
-    return check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
+    with PlanningProgress() as progress:
+        return check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases, progress=progress)
 
 
 def _check(arguments: argparse.Namespace) -> int:

@@ -13,6 +13,8 @@ EXIT_ABORTED = 4
 """The mission was given up and the machine landed safely."""
 EXIT_LOST = 5
 """Crashed or lost."""
+EXIT_INTERNAL = 70
+"""Of the flight process alone, never of `companion`: an error of its own in the air; the guardian lands."""
 
 EXIT_CODES = {
     Outcome.COMPLETED: EXIT_OK,

@@ -67,6 +67,9 @@ def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[Fli
         "recorder": result.recorder,
     }
     summary = summarise(log, **about) if log is not None else empty_summary(**about)
+    logged = {event["id"] for event in summary["events"]}
+    summary["events"] += [event for event in result.events if event["id"] not in logged]
+    summary["events"] += result.guardian_events
     write_summary(summary, out / "summary.json")
     return log, summary
 
@@ -98,6 +101,9 @@ def report_again(path: Path, out: Path) -> Path | None:
         payload_kg=known.get("payload_kg"),
         recorder=known.get("recorder"),
     )
+    # The guardian acts after the last tick: its events are no outputs of the core.
+    recorded_ids = {event["id"] for event in summary["events"]}
+    summary["events"] += [event for event in known.get("events", ()) if event["id"] not in recorded_ids]
     out.mkdir(parents=True, exist_ok=True)
     write_summary(summary, out / "summary.json")
     return report_of(log, summary, out)

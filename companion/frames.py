@@ -11,8 +11,6 @@ import math
 from companion.types import Quat, Vec3
 
 _SQRT_HALF = math.sqrt(0.5)
-# Rotation by pi about (1, 1, 0)/sqrt(2): NED <-> ENU, its own inverse.
-_Q_NED_ENU: Quat = (0.0, _SQRT_HALF, _SQRT_HALF, 0.0)
 
 
 def quat_multiply(a: Quat, b: Quat) -> Quat:
@@ -58,6 +56,26 @@ def quat_rotate(q: Quat, v: Vec3) -> Vec3:
     )
 
 
+def body_z_component(q: Quat, v: Vec3) -> float:
+    """The last component of a world vector seen from the body: `quat_rotate(quat_conjugate(q), v)[2]`, to the last bit."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx = 2.0 * (z * vy - y * vz)
+    ty = 2.0 * (x * vz - z * vx)
+    tz = 2.0 * (y * vx - x * vy)
+    return vz + w * tz - x * ty + y * tx
+
+
+def body_x_z_axes_world(q: Quat) -> tuple[Vec3, Vec3]:
+    """The body's x and z axis in the world: first and third column of the rotation matrix."""
+    w, x, y, z = q
+    yy = y * y
+    return (
+        (1.0 - 2.0 * (yy + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+        (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + yy)),
+    )
+
+
 def quat_from_euler_zyx(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
     """Attitude from ZYX Euler angles (the paper's q = [roll, pitch, yaw])."""
     cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
@@ -78,6 +96,12 @@ def euler_zyx_from_quat(q: Quat) -> Vec3:
     pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return (roll, pitch, yaw)
+
+
+def yaw_from_quat(q: Quat) -> float:
+    """The yaw of `euler_zyx_from_quat` alone, rad."""
+    w, x, y, z = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def wrap_rad(angle_rad: float) -> float:
@@ -112,19 +136,12 @@ def flu_from_frd(v: Vec3) -> Vec3:
 
 def attitude_ned_frd_from_enu_flu(q: Quat) -> Quat:
     """Attitude FLU->ENU to attitude FRD->NED, w >= 0."""
-    return _canonical(_frd_side(quat_multiply(_Q_NED_ENU, q)))
+    # (0, s, s, 0) * q * (0, 1, 0, 0) with s = sqrt(1/2), up to the sign: rotation by pi about (1, 1, 0), then by pi about x.
+    w, x, y, z = _SQRT_HALF * q[0], _SQRT_HALF * q[1], _SQRT_HALF * q[2], _SQRT_HALF * q[3]
+    w, x, y, z = w + z, x + y, x - y, w - z
+    return (w, x, y, z) if w >= 0.0 else (-w, -x, -y, -z)
 
 
 def attitude_enu_flu_from_ned_frd(q: Quat) -> Quat:
-    """Attitude FRD->NED to attitude FLU->ENU, w >= 0."""
-    return _canonical(_frd_side(quat_multiply(_Q_NED_ENU, q)))
-
-
-def _frd_side(q: Quat) -> Quat:
-    """Right-multiply by the rotation of pi about x: FLU <-> FRD."""
-    w, x, y, z = q
-    return (-x, w, z, -y)
-
-
-def _canonical(q: Quat) -> Quat:
-    return q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
+    """Attitude FRD->NED to attitude FLU->ENU, w >= 0 (its own inverse)."""
+    return attitude_ned_frd_from_enu_flu(q)

@@ -1,6 +1,7 @@
 """What the user started: brings the processes of a flight up, watches them, outlives them, and says how it ended.
 
 launcher --starts--> sitl (with --sitl), flight --starts--> recorder
+         --starts--> guardian, which ends the flight process and lands when that hangs or dies
 """
 
 from __future__ import annotations
@@ -23,13 +24,18 @@ from companion import status
 from companion.children import LaunchError, holds_traceback, how_it_ended, last_line, terminate, write_text
 from companion.config.loader import FlightConfig
 from companion.exit_codes import EXIT_CODES
+from companion.guardian.beat import HANGS
+from companion.guardian_process import GuardianProcess
 from companion.sitl_process import SitlProcess
 from companion.types import Outcome, PhaseKind, SafetyAction, Severity
 
 SITL_SETTLE_TIMEOUT_S = 40.0
 """After the flight process is gone: how long the world may take to come to rest."""
 SILENT_FLIGHT_S = 5.0
-"""A flight process that says nothing for this long hangs; killed, it leaves PX4 to its own offboard-loss landing."""
+"""A flight process that says nothing for this long hangs, and the guardian has not seen to it: on the ground that is not its business,
+and it may be dead itself. Killed, the flight process leaves PX4 to its own offboard-loss landing."""
+GUARDIAN_LEAVE_TIMEOUT_S = 5.0
+"""After the flight process is gone: a guardian that is not needed leaves at once."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
 
 OnMessage = Callable[[status.Message], None]
@@ -43,6 +49,10 @@ class FlightResult:
     recorder: dict[str, Any] | None = None
     world: dict[str, Any] = field(default_factory=dict)
     """SITL truth: payload_kg, caught, crashed, ..."""
+    events: tuple[dict[str, Any], ...] = ()
+    """What the flight process told, as summary.json lists events; the log has them too, unless its recorder died."""
+    guardian_events: tuple[dict[str, Any], ...] = ()
+    """What the guardian did, as summary.json lists events; empty: it was not needed."""
     lines: tuple[str, ...] = ()
     """For the user: why the flight was refused, or which process failed and where its log is."""
 
@@ -84,10 +94,12 @@ class Launcher:
         self._refused: list[str] | None = None
         self._grave: list[tuple[int, str]] = []
         """Events that end a flight, by tick; the first ones are the cause, the others what followed from it."""
+        self._events: list[dict[str, Any]] = []
         self._px4: list[str] = []
         """What PX4 said since the flight began."""
         self._failures: list[str] = []
         self._recorder_pid: int | None = None
+        self._guardian: GuardianProcess | None = None
         self._flying = False
         """Ticking, and not over yet: messages come ten times a second."""
 
@@ -125,44 +137,56 @@ class Launcher:
         if world.get("crashed") and outcome is not Outcome.REFUSED:
             outcome = Outcome.CRASHED
         recorder = self._result.get("recorder") if self._result else None
-        return FlightResult(outcome, recorder, world, self._lines(outcome))
+        events = tuple(self._guardian.summary_events()) if self._guardian is not None else ()
+        return FlightResult(outcome, recorder, world, tuple(self._events), events, self._lines(outcome))
 
     def _fly(self, config_path: Path, sitl: SitlProcess | None) -> Outcome:
         log_path = self._out / "flight.log"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        # The flight holds the world's standard input open as well: the world stays until both are gone. Should this process be
-        # killed, the flight lands and hears that it has landed.
+        beats_out, beats_in = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # Flight and guardian hold the world's standard input open as well: the world stays until all are gone. Should this process
+        # be killed, the flight lands and hears that it has landed.
         shared = () if sitl is None or sitl.process.stdin is None else (sitl.process.stdin.fileno(),)
-        with ours:
+        with ours, beats_in:
             ours.setblocking(False)
-            with theirs, open(log_path, "wb") as log:
+            with theirs, beats_out, open(log_path, "wb") as log:
                 process = subprocess.Popen(
                     [
-                        *(sys.executable, "-m", "companion.app", "--config", str(config_path)),
-                        *("--out", str(self._out), "--channel", str(theirs.fileno())),
+                        *(sys.executable, "-m", "companion.app", "--config", str(config_path), "--out", str(self._out)),
+                        *("--channel", str(theirs.fileno()), "--guardian", str(beats_out.fileno())),
                     ],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
-                    pass_fds=(theirs.fileno(), *shared),
+                    pass_fds=(theirs.fileno(), beats_out.fileno(), *shared),
                     start_new_session=True,
+                    env={**os.environ, **(sitl.flight_environment if sitl is not None else {})},
                 )
             self._channel = ours
             try:
                 write_text(self._out / "flight.pid", str(process.pid))
+                if sitl is not None:
+                    sitl.tell_flight(process.pid)
+                self._guardian = guardian = GuardianProcess(config_path, self._out, process.pid, beats_in, shared)
                 if self._stop_asked:
                     self.ask_to_land()
-                self._watch(process, ours, sitl)
+                self._watch(process, ours, guardian, sitl)
             finally:
                 self._channel = None
                 terminate(process, patience_s=30.0 if self._result is None else 10.0)
+                if self._guardian is not None:
+                    self._guardian.end(GUARDIAN_LEAVE_TIMEOUT_S)
         self._await_recorder()
         return self._judge(process.returncode, log_path, sitl)
 
     def _judge(self, code: int, log_path: Path, sitl: SitlProcess | None) -> Outcome:
         """The outcome of a flight process that is gone, by what it said and how it ended."""
+        guardian = self._guardian
+        expected: int | None
         if self._refused is not None:
             outcome, expected = Outcome.REFUSED, EXIT_CODES[Outcome.REFUSED]
+        elif guardian is not None and guardian.outcome is not None:
+            outcome, expected = guardian.outcome, None
         elif self._result is not None and code >= 0:
             outcome = Outcome(self._result["outcome"])
             expected = EXIT_CODES[outcome]
@@ -174,15 +198,30 @@ class Launcher:
             outcome, expected = Outcome.LOST, None
         if sitl is not None and sitl.ended:
             self._failures.append(sitl.epitaph())
+        elif guardian is not None and guardian.took_over:
+            self._failures.append(self._after_take_over(guardian, code, log_path))
         elif code != expected:
             self._failures.append(
                 f"flight: the flight process {how_it_ended(code)}{last_line(log_path)}; see {log_path}"
             )
         elif holds_traceback(log_path):
             self._failures.append(f"flight: an internal error was logged{last_line(log_path)}; see {log_path}")
-        if outcome is Outcome.LOST and sitl is not None:
+        trouble = guardian.trouble() if guardian is not None and (sitl is None or not sitl.ended) else None
+        if trouble is not None:
+            self._failures.append(trouble)
+        # A flight that was given up without a word from PX4 may still be landing.
+        if outcome in (Outcome.LOST, Outcome.ABORTED) and sitl is not None:
             sitl.wait_at_rest(time.monotonic() + SITL_SETTLE_TIMEOUT_S)
         return outcome
+
+    @staticmethod
+    def _after_take_over(guardian: GuardianProcess, code: int, log_path: Path) -> str:
+        """One line: what became of the flight process, and of the vehicle."""
+        landed = guardian.outcome is Outcome.ABORTED
+        vehicle = "the guardian landed the vehicle" if landed else "the guardian could not confirm a landing"
+        hung = guardian.events[0]["text"].startswith(HANGS)
+        what = "hung and was killed" if hung else f"{how_it_ended(code)}{last_line(log_path)}"
+        return f"flight: the flight process {what}; {vehicle}; see {log_path}"
 
     def _lines(self, outcome: Outcome) -> tuple[str, ...]:
         if outcome is not Outcome.REFUSED:
@@ -197,34 +236,55 @@ class Launcher:
             ]
         return (*reasons, *self._failures)
 
-    def _watch(self, process: subprocess.Popen[bytes], channel: socket.socket, sitl: SitlProcess | None) -> None:
-        """Pass the flight's messages on until it closes its channel, or hangs."""
-        heard_s = time.monotonic()
-        while True:
-            readable, _, _ = select.select([channel], [], [], 0.5)
+    def _watch(
+        self,
+        process: subprocess.Popen[bytes],
+        channel: socket.socket,
+        guardian: GuardianProcess,
+        sitl: SitlProcess | None,
+    ) -> None:
+        """Pass on what the flight and the guardian say, until both have closed their channels; see to one that hangs."""
+        flight_open = True
+        heard_s = flight_open_s = time.monotonic()
+        while flight_open or guardian.open:
+            channels = [channel] * flight_open + [guardian.channel] * guardian.open
+            readable, _, _ = select.select(channels, [], [], 0.5)
             if sitl is not None:
                 for message in sitl.messages(0.0):
                     self._on_message({**message, "source": "sitl"})
-                if sitl.ended:
-                    process.kill()  # there is nothing left that it could land
-                    return
-            if not readable:
-                if process.poll() is not None:
-                    return
-                if self._flying and time.monotonic() - heard_s > SILENT_FLIGHT_S:
-                    self._failures.append(
-                        f"flight: the flight process said nothing for {SILENT_FLIGHT_S:g} s and was killed"
-                    )
+                if sitl.ended:  # there is nothing left that anybody could land
+                    guardian.kill()
                     process.kill()
                     return
-                continue
-            heard_s = time.monotonic()
-            with contextlib.suppress(BlockingIOError):
-                while True:
-                    received = status.receive(channel)
-                    if received is None:
-                        return
-                    self._take(received)
+            for message in guardian.listen():
+                self._on_message(message)
+            now_s = time.monotonic()
+            if channel in readable:
+                heard_s = now_s
+                flight_open = self._hear(channel)
+            elif flight_open and process.poll() is not None:
+                flight_open = False
+            elif flight_open and self._flying and not guardian.took_over and now_s - heard_s > SILENT_FLIGHT_S:
+                text = f"flight: the flight process said nothing for {SILENT_FLIGHT_S:g} s and was killed"
+                self._failures.append(text)
+                process.kill()
+            if flight_open:
+                flight_open_s = now_s
+            alone_s = now_s - flight_open_s
+            if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_LEAVE_TIMEOUT_S):
+                self._failures.append("guardian: the guardian process hangs and was killed")
+                guardian.kill()
+                return
+
+    def _hear(self, channel: socket.socket) -> bool:
+        """Take what the flight has said; False: it has closed its channel."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                received = status.receive(channel)
+                if received is None:
+                    return False
+                self._take(received)
+        return True
 
     def _take(self, message: status.Message) -> None:
         kind = message.get("type")
@@ -237,6 +297,8 @@ class Launcher:
         elif kind == "status":
             self._flying = message["kind"] != PhaseKind.DONE.value
         elif kind == "event":
+            told = {key: message[key] for key in ("id", "severity", "action", "text")}
+            self._events.append({"t_s": message["flight_t_s"], "mission_t_s": message["t_s"], **told})
             ends = SafetyAction(message["action"]).rank >= SafetyAction.LAND.rank
             if ends or message["severity"] == Severity.CRITICAL.value:
                 self._grave.append((message["tick"], message["text"]))

@@ -1,20 +1,18 @@
-"""What the flight process asks of the operating system, and absolute-deadline ticks."""
+"""What a process of the flight asks of the operating system."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import gc
 import os
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-
-from companion.clock import Clock
 
 GIL_SWITCH_S = 0.0005
 """The bus thread gets the interpreter this soon from a tick that computes on; Python's default is 5 ms, a whole period."""
 FLIGHT_PRIORITY = 50
+GUARDIAN_PRIORITY = 60
+"""Above the flight: a flight process that spins must not keep the guardian from noticing."""
 WORLD_PRIORITY = 40
 """Of the simulated world: below the flight that it must not disturb."""
 
@@ -37,36 +35,3 @@ def claim_realtime(priority: int) -> str:
     except (OSError, AttributeError) as error:
         return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO); garbage collection off"
     return f"SCHED_FIFO {priority}; garbage collection off"
-
-
-@dataclass(frozen=True, slots=True)
-class TickTime:
-    """When a tick began."""
-
-    start_s: float
-    lateness_s: float
-    """Behind its deadline."""
-
-
-class Ticker:
-    """Absolute deadlines: an error of one tick does not move the next. Deadlines that are past are skipped, not made up for."""
-
-    def __init__(self, period_s: float, clock: Clock) -> None:
-        self._period_s = period_s
-        self._clock = clock
-        self._deadline_s = clock() + period_s
-        self.skipped = 0
-
-    async def next(self) -> TickTime:
-        """Wait for the next deadline."""
-        now_s = self._clock()
-        late_periods = int((now_s - self._deadline_s) / self._period_s)
-        if late_periods > 0:
-            self.skipped += late_periods
-            self._deadline_s += late_periods * self._period_s
-        # Even when late: the loop must serve its sockets once a tick.
-        await asyncio.sleep(max(0.0, self._deadline_s - now_s))
-        start_s = self._clock()
-        tick = TickTime(start_s, max(0.0, start_s - self._deadline_s))
-        self._deadline_s += self._period_s
-        return tick

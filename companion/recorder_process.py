@@ -34,7 +34,7 @@ from foxglove.messages import FrameTransform, Log, LogLevel, Pose, PoseInFrame, 
 
 from companion import __version__
 from companion.frames import quat_from_euler_zyx
-from companion.io.recorder import CLOSE, METADATA, TEXT, TICK
+from companion.io.packets import CLOSE, METADATA, TEXT, TICK, UNNUMBERED
 from companion.record import fingerprint, json_schema, json_text, jsonable_from_plain, unpack_plain
 from companion.types import Inputs, Outputs, Sent
 
@@ -293,16 +293,20 @@ class Recorder:
         self._expected = 0
         self._told = False
         self._in_chunk = 0
+        self._closed = False
         self.samples = 0
         self.dropped = 0
         self.error: str | None = None
 
     def run(self) -> None:
-        """Until the channel ends."""
+        """Until the channel is said to be closed, or ends with the last process that holds it."""
         flushed_s = synced_s = time.monotonic()
         for packet in self._channel.packets():
             if packet is not None:
                 self._take(packet)
+                if self._closed:
+                    self._channel.stop()  # the guardian may hold the other end a little longer
+                    break
             now_s = time.monotonic()
             if now_s - flushed_s >= FLUSH_PERIOD_S or self._writer.chunk_is_full:
                 flushed_s = now_s
@@ -318,8 +322,10 @@ class Recorder:
 
     def _take(self, packet: bytes) -> None:
         kind, number, *rest = unpack_plain(packet)
-        self.dropped += number - self._expected
-        self._expected = number + (kind != CLOSE)
+        if number != UNNUMBERED:
+            self.dropped += number - self._expected
+            self._expected = number + (kind != CLOSE)
+        self._closed = kind == CLOSE
         if self._disk.error is not None:
             self.dropped += kind != CLOSE
             return

@@ -41,6 +41,8 @@ class SitlProcess:
         self._buffer = b""
         self.final: dict[str, Any] = {}
         self.at_rest = False
+        self.flight_environment: dict[str, str] = {}
+        """What the flight process's environment needs for faults of its own that the world plants."""
         self.ended = False
         """The world closed its end of the pipe: it is gone, or about to be."""
 
@@ -49,6 +51,7 @@ class SitlProcess:
         for message in self.messages(time.monotonic() + SITL_READY_TIMEOUT_S):
             if message.get("type") == "ready":
                 devices: dict[str, dict[str, Any]] = message["devices"]
+                self.flight_environment = message.get("flight_environment", {})
                 return devices
             if message.get("type") == "error":
                 raise LaunchError(str(message["text"]))
@@ -88,6 +91,12 @@ class SitlProcess:
             self.final = message["world"]
         if message.get("type") == "at_rest":
             self.at_rest = bool(message["at_rest"])
+
+    def tell_flight(self, pid: int) -> None:
+        """Name the flight process to the world, which may be asked to kill or to stop it."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):  # a world that is gone is noticed elsewhere
+            os.write(self.process.stdin.fileno(), json.dumps({"type": "flight", "pid": pid}).encode() + b"\n")
 
     def wait_at_rest(self, deadline_s: float) -> None:
         """Until the world's rotors stand, or the deadline."""

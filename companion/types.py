@@ -15,6 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from companion.frozen import quick
+
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Vec4 = tuple[float, float, float, float]
@@ -60,8 +62,8 @@ class SafetyAction(Enum):
 
     NOMINAL = "nominal"
     WARN = "warn"
-    HOLD = "hold"
-    RETRACT = "retract"
+    HOLD = "hold"  # come to rest on the planned way and stay
+    RETRACT = "retract"  # the arm folds, back inward along the tether, then land
     LAND = "land"  # the companion lands, with position
     AUTOPILOT_LAND = "autopilot_land"  # the companion's own state is not to be trusted: PX4's LAND mode
     TERMINATE = "terminate"
@@ -109,9 +111,13 @@ class OperatorCommand(Enum):
     """What the people on the ground ask for."""
 
     NONE = "none"
+    HOLD = "hold"
+    RESUME = "resume"  # go on after a HOLD; nothing else is taken back by it
     LAND = "land"
+    ABORT = "abort"  # land at once, the arm folds; recorded as what it is
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class VehicleState:
     """PX4's fused state, converted to world ENU / body FLU by the autopilot edge."""
@@ -125,8 +131,11 @@ class VehicleState:
     angular_rate_body_rad_s: Vec3
     specific_force_body_m_s2: Vec3
     """What the accelerometer feels: +9.81 on z at rest, level."""
+    boot_s: float | None = None
+    """PX4's own clock, seconds since it started (time_boot_ms of ATTITUDE or ODOMETRY); None: not told."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class AutopilotStatus:
     """Slow state of the autopilot."""
@@ -140,6 +149,7 @@ class AutopilotStatus:
     """0 to 1."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class MocapPose:
     """One motion-capture frame of the vehicle's rigid body, already in the world frame of the mission."""
@@ -155,6 +165,7 @@ class MocapPose:
     marker_error_m: float
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class ArmState:
     """Joint state in the paper's angles: alpha_1 from body +x turning down, alpha_2 turning link 2 the other way."""
@@ -174,6 +185,7 @@ class ArmState:
     """When the bus thread had written the newest currents before this read; None before the first."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class ForceSample:
     """One sample of the force-torque sensor in its own frame, as measured (tare and gravity not removed)."""
@@ -184,6 +196,7 @@ class ForceSample:
     overload: bool
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class Inputs:
     """Everything that `FlightCore.step` may look at."""
@@ -197,8 +210,11 @@ class Inputs:
     force: ForceSample | None
     command: OperatorCommand
     recorder_dropped: int
+    guardian_ready: bool | None = None
+    """The guardian said within the last second that it could take over; None: none stands by (fast loop)."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class Reference:
     """Where the machine should be at one instant."""
@@ -211,8 +227,11 @@ class Reference:
     arm_rad: Vec2
     arm_rate_rad_s: Vec2
     arm_acceleration_rad_s2: Vec2
+    jerk_world_m_s3: Vec3 = (0.0, 0.0, 0.0)
+    """For laws that feed the acceleration forward ahead of time."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class AttitudeSetpoint:
     """SET_ATTITUDE_TARGET in the companion's frames."""
@@ -222,6 +241,7 @@ class AttitudeSetpoint:
     """Collective, normalised 0 to 1."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class Event:
     """Something that happened and that a person may have to understand afterwards."""
@@ -233,6 +253,7 @@ class Event:
     text: str
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class ControlLog:
     """What the law computed in one tick; rows are chi = [p; q; alpha]."""
@@ -254,8 +275,41 @@ class ControlLog:
     hover_thrust: float
     saturated: tuple[bool, bool, bool]
     """Vertical force, lateral force, joint torque."""
+    payload_estimate_kg: float | None = None
+    """Mass that the law believes to carry beyond the machine's own; None: the law estimates none."""
 
 
+@quick
+@dataclass(frozen=True, slots=True)
+class TetherState:
+    """What is known of the safety tether in one tick."""
+
+    range_m: float
+    """Anchor to attachment."""
+    slack_m: float
+    """Length less range."""
+    stop_slack_m: float
+    """Slack where the machine could stop at the soonest: after v t_react + v^2 / (2 a) of its outward speed."""
+    elevation_rad: float
+    """Of the straight line seen from the vehicle, below horizontal positive."""
+    clearance_m: float
+    """Least distance of the hanging line to rotor disk and arm sweep; negative: touches. The arm counts only if the attachment
+    lies outside of the arm's plane (`companion.safety.tether_shape.Clearance.judges_arm`)."""
+    turns: float
+    """Winding about the anchor's vertical, counter-clockwise from above positive, in turns; whole turns come and go."""
+    pull_n: float
+    """Force towards the anchor that rotors, gravity and tool do not explain, low-passed; 0 if unknown, never negative."""
+    taut: bool
+    """Slack used up, or a pull that grows with the range."""
+    snagged: bool
+    """A pull towards the anchor or to the side although there is slack."""
+    separated: bool
+    """Farther away than the line is long, and nothing pulls."""
+    vehicle_turns: float = 0.0
+    """Winding of the line about the vehicle: turns of the anchor's direction in the body's x-y plane."""
+
+
+@quick
 @dataclass(frozen=True, slots=True)
 class Outputs:
     """Everything that one tick decides."""
@@ -279,8 +333,14 @@ class Outputs:
     control: ControlLog | None
     outcome: Outcome | None
     """Set when the flight is over."""
+    mocap_trusted: bool = True
+    """Motion capture is plausible; while False no pose is to be passed on to PX4."""
+    tether: TetherState | None = None
+    bent_by: tuple[str, ...] = ()
+    """What the governor bent the reference for."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class Sent:
     """What really left in one tick, and when: the edges' answer to `Outputs`."""

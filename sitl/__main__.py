@@ -18,9 +18,13 @@ from typing import Any
 from companion.config.loader import FlightConfig
 from companion.realtime import WORLD_PRIORITY, claim_realtime
 from sitl.autopilot.mavlink import LinkError
+from sitl.faults import FaultError, in_time
 from sitl.server import Ports, Sitl, start_of
 
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
+
+WITNESS = "world.json"
+"""Beside the configuration: what really happened in a flight with faults."""
 
 
 def _say(message: dict[str, Any]) -> None:
@@ -30,7 +34,7 @@ def _say(message: dict[str, Any]) -> None:
         )  # unbuffered: nothing is left to be flushed into a closed pipe
 
 
-async def _serve(config: FlightConfig, for_launcher: bool) -> None:
+async def _serve(config: FlightConfig, for_launcher: bool, witness: Path) -> None:
     start = config.mission.start
     ports = Ports() if for_launcher else _STANDARD
     sitl = Sitl(
@@ -42,23 +46,34 @@ async def _serve(config: FlightConfig, for_launcher: bool) -> None:
         loop.add_signal_handler(number, sitl.stop)
     async with sitl.wires() as devices:
         if for_launcher:
-            _say({"type": "ready", "devices": devices})
+            _say({"type": "ready", "devices": devices, "flight_environment": sitl.flight_environment()})
             _leave_with_launcher(sitl)
         else:
             _introduce(devices)
         claim_realtime(WORLD_PRIORITY)
         await sitl.run()
     if for_launcher:
-        _say({"type": "final", "world": sitl.final()})
+        _say_last(sitl, witness if config.world.faults else None)
+
+
+def _say_last(sitl: Sitl, witness: Path | None) -> None:
+    if witness is not None:
+        with contextlib.suppress(OSError):  # the flight's folder may be gone, or full
+            witness.write_text(json.dumps(sitl.witness()), encoding="utf-8")
+    _say({"type": "final", "world": sitl.final()})
 
 
 def _leave_with_launcher(sitl: Sitl) -> None:
-    """Standard input ends when the launcher does; a vehicle that still flies then may land first."""
+    """Standard input names the flight process, and ends when the launcher does; a vehicle that still flies then may land first."""
     loop = asyncio.get_running_loop()
     descriptor = sys.stdin.fileno()
 
     def on_input() -> None:
-        if not os.read(descriptor, 4096):
+        data = os.read(descriptor, 4096)
+        for line in data.splitlines():
+            with contextlib.suppress(ValueError):
+                sitl.flight.pid = int(json.loads(line)["pid"])
+        if not data:
             loop.remove_reader(descriptor)
             sitl.leave()
 
@@ -94,8 +109,9 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     try:
-        asyncio.run(_serve(config, arguments.for_launcher))
-    except (OSError, LinkError) as error:
+        witness = arguments.config.with_name(WITNESS)
+        asyncio.run(_serve(in_time(config), arguments.for_launcher, witness))
+    except (OSError, LinkError, FaultError) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:
             _say({"type": "error", "text": text})

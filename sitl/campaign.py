@@ -21,7 +21,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,8 @@ SERIES_EVERY = 4
 """Ticks per point of a series: 50 Hz."""
 
 Data = dict[str, Any]
+Fly = Callable[[str, Data], Data]
+"""One flight, from its effective configuration and what else is wanted of it: a function of a module, for other processes."""
 
 
 class CampaignError(Exception):
@@ -173,7 +175,7 @@ def _points(values: Array) -> list[float | None]:
 
 
 def fly_all(
-    configs: Sequence[str], flights: Sequence[Data], jobs: int | None, scheduler: str | None
+    configs: Sequence[str], flights: Sequence[Data], jobs: int | None, scheduler: str | None, fly_one: Fly = fly
 ) -> Generator[Data, None, None]:
     """Fly the grid; results with their `index` in the order in which they end.
 
@@ -181,19 +183,21 @@ def fly_all(
         CampaignError: no scheduler, no workers, or a worker that died.
     """
     if scheduler is not None:
-        return _over_machines(configs, flights, scheduler)
-    return _over_cores(configs, flights, jobs or os.cpu_count() or 1)
+        return _over_machines(configs, flights, scheduler, fly_one)
+    return _over_cores(configs, flights, jobs or os.cpu_count() or 1, fly_one)
 
 
-def _indexed(index: int, config_json: str, flight: Data) -> Data:
-    return {"index": index, **fly(config_json, flight)}
+def _indexed(fly_one: Fly, index: int, config_json: str, flight: Data) -> Data:
+    return {"index": index, **fly_one(config_json, flight)}
 
 
-def _over_cores(configs: Sequence[str], flights: Sequence[Data], jobs: int) -> Generator[Data, None, None]:
+def _over_cores(
+    configs: Sequence[str], flights: Sequence[Data], jobs: int, fly_one: Fly
+) -> Generator[Data, None, None]:
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    tasks = [(index, configs[flight["variant"]], flight) for index, flight in enumerate(flights)]
+    tasks = [(fly_one, index, configs[flight["variant"]], flight) for index, flight in enumerate(flights)]
     if min(jobs, len(tasks)) <= 1:
         yield from (_indexed(*task) for task in tasks)
         return
@@ -207,7 +211,9 @@ def _over_cores(configs: Sequence[str], flights: Sequence[Data], jobs: int) -> G
             ) from None
 
 
-def _over_machines(configs: Sequence[str], flights: Sequence[Data], scheduler: str) -> Generator[Data, None, None]:
+def _over_machines(
+    configs: Sequence[str], flights: Sequence[Data], scheduler: str, fly_one: Fly
+) -> Generator[Data, None, None]:
     try:
         from distributed import Client, as_completed
         from distributed.scheduler import KilledWorker
@@ -227,7 +233,7 @@ def _over_machines(configs: Sequence[str], flights: Sequence[Data], scheduler: s
                 f"--scheduler {scheduler}: no worker has joined it; start some: dask worker {scheduler}", bad_input=True
             ) from None
         futures = [
-            client.submit(_indexed, index, configs[flight["variant"]], flight, pure=False)
+            client.submit(_indexed, fly_one, index, configs[flight["variant"]], flight, pure=False)
             for index, flight in enumerate(flights)
         ]
         try:
@@ -260,19 +266,29 @@ def _leave_with_parent() -> None:
     os._exit(1)
 
 
-def main() -> int:
-    """Fly what standard input asks for."""
+def serve(grid: Callable[[Data], tuple[Sequence[str], Sequence[Data]]], fly_one: Fly = fly) -> int:
+    """Fly what standard input asks for; the exit code.
+
+    Args:
+        grid: configurations and flights of a job.
+        fly_one: flies one of them.
+    """
     job = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_leave_with_parent, name="parent", daemon=True).start()
-    configs = [json.dumps(config) for config in job["configs"]]
     try:
-        with closing(fly_all(configs, job["flights"], job["jobs"], job["scheduler"])) as results:
+        configs, flights = grid(job)
+        with closing(fly_all(configs, flights, job["jobs"], job["scheduler"], fly_one)) as results:
             for result in results:
                 _say({"type": "flight", **result})
     except CampaignError as error:
         _say({"type": "error", "text": str(error), "bad_input": error.bad_input})
         return 1
     return 0
+
+
+def main() -> int:
+    """Fly what standard input asks for."""
+    return serve(lambda job: ([json.dumps(config) for config in job["configs"]], job["flights"]))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ YAW_TORQUE_PER_THRUST_M = 0.025
 BASE_INERTIA_KG_M2 = (0.045, 0.045, 0.075)
 JOINT_ARMATURE_KG_M2 = 0.008
 PAYLOAD_RADIUS_M = 0.035
+SECOND, SECOND_CATCH = "payload2", "catch2"
+"""What a fault throws after the payload."""
 # PX4's quad-x order with each rotor's place (body FLU, in units of arm/sqrt 2) and its yaw reaction about body z (up).
 ROTORS = ((1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1))
 
@@ -24,10 +26,17 @@ def base_mass_kg(vehicle: Vehicle, world: World) -> float:
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
 
 
+def link_masses_kg(vehicle: Vehicle, world: World) -> tuple[float, float]:
+    """True masses of the links; what hangs on the wrist is as the vehicle file says."""
+    first, second = vehicle.arm.link_masses_kg
+    return first * (1.0 + world.link_mass_error[0]), second * (1.0 + world.link_mass_error[1])
+
+
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     """The model as MJCF."""
     arm, tool = vehicle.arm, vehicle.tool
     l1, l2 = arm.link_lengths_m
+    m1, m2 = link_masses_kg(vehicle, world)
     offset = ROTOR_ARM_M / math.sqrt(2.0)
     clearance = vehicle.airframe.ground_clearance_m
     rotors = "\n".join(
@@ -53,14 +62,18 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     roll, pitch, yaw = tool.sensor_rpy_deg
     payload = ""
     connect = ""
-    if world.payload_kg > 0:
-        payload = f"""
-    <body name="payload" pos="0 50 {PAYLOAD_RADIUS_M}">
-      <freejoint name="payload"/>
-      <geom name="payload" type="sphere" size="{PAYLOAD_RADIUS_M}" mass="{world.payload_kg}" contype="1" conaffinity="2"/>
+    balls = [("payload", "catch", world.payload_kg)]
+    balls += [(SECOND, SECOND_CATCH, f.magnitude) for f in world.faults if f.kind == "payload_double"][:1]
+    for row, (name, catch, mass_kg) in enumerate(balls):
+        if mass_kg <= 0:
+            continue
+        payload += f"""
+    <body name="{name}" pos="{row} 50 {PAYLOAD_RADIUS_M}">
+      <freejoint name="{name}"/>
+      <geom name="{name}" type="sphere" size="{PAYLOAD_RADIUS_M}" mass="{mass_kg}" contype="1" conaffinity="2"/>
     </body>"""
-        connect = """
-    <connect name="catch" body1="net" body2="payload" anchor="0 0 0" active="false" solref="0.025 1"
+        connect += f"""
+    <connect name="{catch}" body1="net" body2="{name}" anchor="0 0 0" active="false" solref="0.025 1"
              solimp="0.95 0.99 0.01"/>"""
     return f"""
 <mujoco model="{vehicle.name}">
@@ -80,11 +93,11 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
       <body name="link1" pos="{xyz(arm.shoulder_body_m)}">
         <joint name="alpha1" axis="0 1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
                armature="{JOINT_ARMATURE_KG_M2}"/>
-        {rod(arm.link_masses_kg[0], arm.link_com_m[0], l1)}
+        {rod(m1, arm.link_com_m[0], l1)}
         <body name="link2" pos="{l1} 0 0">
           <joint name="alpha2" axis="0 -1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
                  armature="{JOINT_ARMATURE_KG_M2}"/>
-          {rod(arm.link_masses_kg[1], arm.link_com_m[1], l2)}
+          {rod(m2, arm.link_com_m[1], l2)}
           <body name="sensor" pos="{l2} 0 0">
             <inertial pos="0 0 0" mass="{max(tool.sensor_mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
             <body name="net" euler="{math.radians(yaw)} {math.radians(pitch)} {math.radians(roll)}">

@@ -7,19 +7,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from companion.config.faults import Fault, FaultKind
 from companion.config.vehicle import Vehicle
-from companion.config.world import Fault
+from companion.config.world import Push
 from companion.config.world import World as WorldConfig
-from companion.frames import frd_from_flu, quat_from_euler_zyx, quat_multiply
+from companion.frames import quat_from_euler_zyx, quat_multiply
 from companion.types import Quat, Vec2, Vec3, Vec4
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
+from sitl.faults import Faults
 from sitl.world import Truth, World
 
 IMU_EVERY = 2
@@ -38,12 +39,14 @@ class Px4(Protocol):
 class JointDrive(Protocol):
     """One servo's motor, in the servo's own angle convention."""
 
+    goal_delay_s: float
+    """Goal currents take effect that much later than they were written."""
+
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
         """Latch what the servo measures; the current (A) that the motor gives now."""
 
 
-@dataclass(frozen=True, slots=True)
-class MocapFrame:
+class MocapFrame(NamedTuple):
     """One motion-capture frame, delivered `mocap_latency_s` after its exposure."""
 
     number: int
@@ -53,20 +56,23 @@ class MocapFrame:
     valid: bool
 
 
-class Noise:
-    """Standard normal numbers in blocks: a call for three costs well under a microsecond."""
+def battery_voltage_v(remaining: float) -> float:
+    """Voltage at a charge of 0 to 1."""
+    return BATTERY_EMPTY_V + (BATTERY_FULL_V - BATTERY_EMPTY_V) * remaining
 
-    def __init__(self, seed: int, block: int = 4096) -> None:
-        self._rng = np.random.default_rng(seed)
-        self._block = block
-        self._values: list[float] = []
 
-    def take3(self, scale: float) -> Vec3:
-        """Three independent samples."""
-        if len(self._values) < 3:
-            self._values = self._rng.standard_normal(self._block).tolist()
-        v = self._values
-        return (scale * v.pop(), scale * v.pop(), scale * v.pop())
+_NOISE_BLOCK = 4096
+
+
+_MOCAP, _IMU, _FORCE = range(3)
+
+
+def noise(seed: int, sensor: int) -> Iterator[Vec3]:
+    """Standard normal numbers by threes, drawn in blocks: three cost well under a microsecond."""
+    rng = np.random.default_rng((seed, sensor))
+    while True:
+        values = iter(rng.standard_normal(_NOISE_BLOCK).tolist()[::-1])
+        yield from zip(values, values, values, strict=False)
 
 
 class Plant:
@@ -81,24 +87,33 @@ class Plant:
         start: tuple[Vec2, float, Vec2],
     ) -> None:
         position_m, yaw_rad, arm_rad = start
-        self._vehicle = vehicle
         self._config = config
         self._px4 = px4
-        self._drives = drives
+        self._drives = (drives[0], drives[1])
+        for drive in drives:
+            drive.goal_delay_s = config.arm_delay_s
+        first, second = vehicle.arm.joints
+        self._joint_signs = (first.sign, second.sign)
+        self._servo_zeros_rad = (first.zero_count / _COUNTS_PER_RAD, second.zero_count / _COUNTS_PER_RAD)
+        self._torque_per_amp_nm_a = vehicle.arm.torque_per_amp_nm_a
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
-        self._truth: Truth | None = None
-        self._noise = Noise(config.seed)
+        self._seed_noise()
+        self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
         self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self._tick = 0
         self._mocap_queue: deque[tuple[float, MocapFrame]] = deque()
         self._mocap_next_s = 0.0
         self._mocap_number = 0
-        self._servo_start = [self._servo_angle(i, angle) for i, angle in enumerate(arm_rad)]
         self.armed_t_s: float | None = None
+        self.faults: Faults | None = None
+        """Set by whoever has faults; None: nothing goes wrong."""
 
-    def _servo_angle(self, index: int, angle_rad: float) -> float:
-        joint = self._vehicle.arm.joints[index]
-        return joint.zero_count / _COUNTS_PER_RAD + joint.sign * angle_rad
+    def _seed_noise(self) -> None:
+        """A stream per sensor, from the start again at arming: one seed is the same noise in flight, however long the machine stood
+        before and however often each sensor is asked, over wires as in the fast loop."""
+        self._mocap_noise, self._imu_noise, self._force_noise = (
+            noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
+        )
 
     @property
     def t_s(self) -> float:
@@ -107,97 +122,113 @@ class Plant:
 
     @property
     def truth(self) -> Truth:
-        """The world's state after the last step; read out only when somebody looks."""
-        if self._truth is None:
-            self._truth = self.world.truth()
-        return self._truth
+        """The world's state after the last step."""
+        return self.world.truth()
 
     def mission_t_s(self) -> float | None:
         """Seconds since the rotors were armed."""
         return None if self.armed_t_s is None else self.t_s - self.armed_t_s
 
-    def fault(self, kind: str) -> Fault | None:
+    def fault(self, kind: FaultKind) -> Fault | None:
         """The fault of that kind that is active now."""
-        now = self.mission_t_s()
-        if now is None:
-            return None
-        for fault in self._config.faults:
-            if fault.kind == kind and fault.t_s <= now:
-                if fault.duration_s is None or now < fault.t_s + fault.duration_s:
-                    return fault
-        return None
+        return None if self.faults is None else self.faults.active.get(kind)
 
-    def _push(self) -> Vec3:
-        push, now = self._config.push, self.mission_t_s()
-        active = push is not None and now is not None and push.t_s <= now < push.t_s + push.duration_s
-        return push.force_world_n if push is not None and active else (0.0, 0.0, 0.0)
+    def _push(self, push: Push) -> Vec3:
+        now = self.mission_t_s()
+        active = now is not None and push.t_s <= now < push.t_s + push.duration_s
+        return push.force_world_n if active else (0.0, 0.0, 0.0)
 
     def step(self, armed: bool) -> None:
         """Advance by one physics step."""
+        world, config = self.world, self._config
+        t_s = world.t_s
         if armed and self.armed_t_s is None:
-            self.armed_t_s = self.t_s
-        t_s = self.t_s
-        angle, velocity = self.world.joints()
-        torque = []
-        for i, drive in enumerate(self._drives):
-            joint = self._vehicle.arm.joints[i]
-            current = drive.update(t_s, self._servo_angle(i, angle[i]), joint.sign * velocity[i])
-            torque.append(joint.sign * current * self._vehicle.arm.torque_per_amp_nm_a)
+            self.armed_t_s = t_s
+            self._seed_noise()
+        if self.faults is not None:
+            self.faults.step(t_s, self.armed_t_s)
+        q, v, layout = world.q, world.v, world.layout
+        (q1, q2), (v1, v2) = layout.joint_q, layout.joint_v
+        (sign1, sign2), (zero1, zero2) = self._joint_signs, self._servo_zeros_rad
+        drive1, drive2 = self._drives
+        k = self._torque_per_amp_nm_a
+        torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * q[q1], sign1 * v[v1]) * k
+        torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * q[q2], sign2 * v[v2]) * k
         if self._tick % IMU_EVERY == 0:
-            self._rotors = self._px4.step(self._imu(self.truth))
+            self._rotors = self._px4.step(self._imu())
         self._tick += 1
-        self.world.push_world_n = self._push()
-        self.world.step(self._rotors, (torque[0], torque[1]), armed)
-        self._truth = None
-        self._expose_mocap()
+        if config.push is not None:
+            world.push(self._push(config.push))
+        world.step(self._rotors, (torque1, torque2), armed)
+        if world.t_s >= self._mocap_next_s - 1e-9:
+            self._expose_mocap()
 
-    def _imu(self, truth: Truth) -> ImuSample:
-        gyro = self._noise.take3(self._config.gyro_noise_rad_s)
-        accel = self._noise.take3(self._config.accel_noise_m_s2)
-        g, a = truth.angular_rate_body_rad_s, truth.specific_force_body_m_s2
+    def _imu(self) -> ImuSample:
+        world, config = self.world, self._config
+        s, a, g = world.sensors(), world.layout.accel, world.layout.gyro
+        gyro, accel = config.gyro_noise_rad_s, config.accel_noise_m_s2
+        nx, ny, nz = next(self._imu_noise)
+        mx, my, mz = next(self._imu_noise)
         return ImuSample(
-            t_s=truth.t_s,
-            gyro_frd_rad_s=frd_from_flu((g[0] + gyro[0], g[1] + gyro[1], g[2] + gyro[2])),
-            accel_frd_m_s2=frd_from_flu((a[0] + accel[0], a[1] + accel[1], a[2] + accel[2])),
+            world.t_s,
+            (s[g] + gyro * nx, -(s[g + 1] + gyro * ny), -(s[g + 2] + gyro * nz)),
+            (s[a] + accel * mx, -(s[a + 1] + accel * my), -(s[a + 2] + accel * mz)),
         )
 
     def _expose_mocap(self) -> None:
-        if self.t_s < self._mocap_next_s - 1e-9:
-            return
-        self._mocap_next_s += 1.0 / self._config.mocap_rate_hz
+        t_s, config = self.world.t_s, self._config
+        faults, period_s, latency_s, valid = self.faults, 1.0 / config.mocap_rate_hz, config.mocap_latency_s, True
+        if faults is not None:
+            period_s = faults.mocap_period_s(period_s)
+            latency_s += faults.size("mocap_latency")
+        self._mocap_next_s += period_s
         self._mocap_number += 1
-        p = self.truth.position_world_m
-        n = self._noise.take3(self._config.mocap_noise_m)
-        roll, pitch, yaw = self._noise.take3(math.radians(self._config.mocap_noise_deg))
-        frame = MocapFrame(
-            number=self._mocap_number,
-            exposure_t_s=self.t_s,
-            position_world_m=(p[0] + n[0], p[1] + n[1], p[2] + n[2]),
-            attitude_wxyz=quat_multiply(self.truth.attitude_wxyz, quat_from_euler_zyx(roll, pitch, yaw)),
-            valid=True,
-        )
-        self._mocap_queue.append((self.t_s + self._config.mocap_latency_s, frame))
+        x, y, z, qw, qx, qy, qz = self.world.q[0:7]
+        noise_m, noise_rad = config.mocap_noise_m, self._mocap_noise_rad
+        nx, ny, nz = next(self._mocap_noise)
+        roll, pitch, yaw = next(self._mocap_noise)
+        turned = quat_from_euler_zyx(noise_rad * roll, noise_rad * pitch, noise_rad * yaw)
+        position: Vec3 = (x + noise_m * nx, y + noise_m * ny, z + noise_m * nz)
+        attitude = quat_multiply((qw, qx, qy, qz), turned)
+        if faults is not None:
+            position, attitude, valid = faults.pose(position, attitude)
+        self._mocap_queue.append((t_s + latency_s, MocapFrame(self._mocap_number, t_s, position, attitude, valid)))
 
     def take_mocap(self) -> list[MocapFrame]:
         """Frames that leave the motion-capture machine now."""
+        queue, now_s = self._mocap_queue, self.world.t_s + 1e-9
+        if not queue or queue[0][0] > now_s:
+            return []
         frames = []
-        while self._mocap_queue and self._mocap_queue[0][0] <= self.t_s + 1e-9:
-            frames.append(self._mocap_queue.popleft()[1])
+        while queue and queue[0][0] <= now_s:
+            frames.append(queue.popleft()[1])
         return [] if self.fault("mocap_loss") else frames
 
     def battery(self) -> Battery:
         """What the power module measures: emptied by time in the air."""
-        flown_s = self.mission_t_s() or 0.0
-        remaining = max(0.0, self._config.battery_start - flown_s / BATTERY_LIFE_S)
-        voltage = BATTERY_EMPTY_V + (BATTERY_FULL_V - BATTERY_EMPTY_V) * remaining
-        return Battery(voltage_v=voltage, remaining=remaining)
+        remaining = self.battery_remaining()
+        return Battery(voltage_v=battery_voltage_v(remaining) - self.battery_sag_v(), remaining=remaining)
+
+    def battery_sag_v(self) -> float:
+        """Voltage lost to a fault."""
+        return 0.0 if self.faults is None else self.faults.sag_v
+
+    def battery_remaining(self) -> float:
+        """Charge, 0 to 1."""
+        flown_s = 0.0 if self.armed_t_s is None else self.world.t_s - self.armed_t_s
+        remaining = self._config.battery_start - flown_s / BATTERY_LIFE_S
+        return remaining if remaining > 0.0 else 0.0
 
     def force_torque(self) -> tuple[Vec3, Vec3]:
         """What the force-torque sensor reads: noise and bias on, sensor frame."""
-        f, tq, b = self.truth.force_sensor_n, self.truth.torque_sensor_nm, self._config.force_bias_n
-        n = self._noise.take3(self._config.force_noise_n)
-        m = self._noise.take3(self._config.force_noise_n * 0.02)
-        return (
-            (f[0] + b[0] + n[0], f[1] + b[1] + n[1], f[2] + b[2] + n[2]),
-            (tq[0] + m[0], tq[1] + m[1], tq[2] + m[2]),
+        s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
+        bx, by, bz = self._config.force_bias_n
+        noise_n = self._config.force_noise_n
+        noise_nm = noise_n * 0.02
+        nx, ny, nz = next(self._force_noise)
+        mx, my, mz = next(self._force_noise)
+        wrench = (
+            (-s[f] + bx + noise_n * nx, -s[f + 1] + by + noise_n * ny, -s[f + 2] + bz + noise_n * nz),
+            (-s[tq] + noise_nm * mx, -s[tq + 1] + noise_nm * my, -s[tq + 2] + noise_nm * mz),
         )
+        return wrench if self.faults is None else self.faults.wrench(*wrench)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import math
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
+from companion.config.faults import FaultKind
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
 from companion.types import Vec2
@@ -23,6 +25,8 @@ from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.mavlink import GROUND_PORTS, MavlinkServer
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.autopilot.params import Params
+from sitl.faults import Faults, Sample, sample
+from sitl.flight_faults import SIGNALS, FlightFaults, environment, strike
 from sitl.force_torque import ForceTorqueServer
 from sitl.natnet import BodyPose, NatNetServer
 from sitl.plant import MocapFrame, Plant
@@ -31,6 +35,10 @@ from sitl.servo_model import ServoModel
 from sitl.world import PHYSICS_DT_S
 
 _CATCH_UP_S = 0.03
+COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
+STRIKE_AGAIN_S = 0.2
+"""To look for a process takes a moment; one that is not there yet is looked for again."""
+OF_OTHERS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
 _LEAVE_S = 30.0
 
 OnMessage = Callable[[dict[str, Any]], None]
@@ -75,6 +83,24 @@ class Sitl:
         )
         self.plant = Plant(vehicle, config, self.px4, self.servos, (start.position_m, start.yaw_rad, start.arm_rad))
         params.set("MPC_THR_HOVER", self.plant.world.hover_command * (1.0 + config.hover_thrust_error))
+        self.faults = Faults(
+            config,
+            self.plant.world,
+            self.px4,
+            [servo.drive for servo in self.servos],
+            vehicle.tether.anchor_world_m,
+            self.servos,
+        )
+        if config.faults:
+            self.plant.faults = self.faults
+        self.flight = FlightFaults()
+        self.course: list[Sample] = []
+        """Where the machine truly was, from the first fault on."""
+        self._course_due_s = 0.0
+        self.frames: list[tuple[int, float]] = []
+        """Numbers of motion-capture frames that had just been sent, and when: by them a log's clock is told from the world's."""
+        self._struck: set[FaultKind] = set()
+        self._strike_due_s = 0.0
         self._ports = ports
         self.slipped_s = 0.0
         self._at_rest = False
@@ -123,6 +149,11 @@ class Sitl:
                 "force": {"port": self.force.port},
             }
 
+    def flight_environment(self) -> dict[str, str]:
+        """What the flight process's environment needs for the faults of its own."""
+        stalls = [fault.duration_s for fault in self._config.faults if fault.kind == "stall_loop"]
+        return environment({fault.kind for fault in self._config.faults}, stalls[0] if stalls else None)
+
     def stop(self) -> None:
         """End now."""
         self._end_s = -math.inf
@@ -148,7 +179,8 @@ class Sitl:
 
     def _step(self) -> None:
         plant = self.plant
-        self._plant_faults()
+        if plant.faults is not None:
+            self._plant_faults()
         plant.step(self.px4.armed)
         for frame in plant.take_mocap():
             self._publish(frame)
@@ -156,6 +188,9 @@ class Sitl:
         self.force.tick(plant.t_s)
         self.px4.battery = plant.battery()
         self.mavlink.pump(plant.t_s)
+        px4 = self.px4
+        if self.flight.watch(plant.t_s, px4.setpoint_at_s, px4.vision_received, px4.nav_state, px4.armed):
+            self.flight.sample(plant.truth.position_world_m, plant.truth.attitude_wxyz)
         for event in plant.world.take_events():
             self._on_message({"type": "event", "kind": event.kind, "t_s": event.t_s})
         at_rest = not self.px4.armed
@@ -166,11 +201,21 @@ class Sitl:
     def _publish(self, frame: MocapFrame) -> None:
         body = self._vehicle.devices.mocap.rigid_body_id
         pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
-        self.mocap.publish(self.plant.t_s, (pose,), frame.exposure_t_s)
+        clock = self.faults.server_clock_s
+        self.mocap.publish(clock(self.plant.t_s), (pose,), clock(frame.exposure_t_s))
 
     def _plant_faults(self) -> None:
         plant = self.plant
-        self.mavlink.link_down = plant.fault("link_loss") is not None
+        for kind in SIGNALS:
+            if plant.fault(kind) is not None:
+                self.flight.plant(kind, plant.t_s, plant.truth.position_world_m, self.px4.vision_received)
+        self._strike()
+        self._note_course()
+        down = plant.fault("link_loss") is not None or plant.t_s < self.px4.booted_at_s
+        if down is not self.mavlink.link_down:
+            self.mavlink.link_down = down
+        self.mavlink.delay_s = self.faults.size("link_delay")
+        self.bus.damaged = self.faults.packet_lost
         self.force.silent = plant.fault("force_loss") is not None
         fault = plant.fault("servo_loss")
         if fault is not None:
@@ -179,6 +224,36 @@ class Sitl:
         elif self._lost_servo is not None:
             self._lost_servo.fail_silent(False)
             self._lost_servo = None
+
+    def _strike(self) -> None:
+        """Faults of other processes, once each."""
+        active, plant = self.faults.active, self.plant
+        due = [kind for kind in OF_OTHERS if kind in active and kind not in self._struck]
+        if due and self.flight.pid is not None and plant.t_s >= self._strike_due_s:
+            self._strike_due_s = plant.t_s + STRIKE_AGAIN_S
+            self._struck.update(kind for kind in due if strike(kind, self.flight.pid))
+        if self.flight.kind == "stop_flight" and "stop_flight" not in active and "stop_flight" not in self._struck:
+            self._struck.add("stop_flight")
+            self.flight.let_go()
+
+    def _note_course(self) -> None:
+        plant, frame = self.plant, self.mocap.frame_number
+        if not self.frames or (frame > self.frames[-1][0] and plant.t_s >= self.frames[-1][1] + FRAMES_PERIOD_S):
+            self.frames.append((frame, plant.t_s))
+        if self.faults.begun_s is None or plant.t_s < self._course_due_s:
+            return
+        self._course_due_s = plant.t_s + COURSE_PERIOD_S
+        self.course.append(sample(plant.world, self._vehicle.tether.anchor_world_m))
+
+    def witness(self) -> dict[str, Any]:
+        """What a campaign wants to know of a flight with faults."""
+        return {
+            **self.final(),
+            "armed": self.px4.armed,
+            "fault_begun_s": self.faults.begun_s,
+            "mocap_frames": self.frames,
+            "course": [dataclasses.astuple(point) for point in self.course],
+        }
 
     def final(self) -> dict[str, Any]:
         """What the world knows at its end."""
@@ -196,6 +271,7 @@ class Sitl:
             "missed": world.missed,
             "crashed": world.crashed,
             "slipped_s": self.slipped_s,
+            "flight_fault": self.flight.report(),
         }
 
 

@@ -9,7 +9,7 @@ import asyncio
 import os
 import termios
 import tty
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Self
 
@@ -276,6 +276,8 @@ class ServoBus:
         self.line = ServoLine(servos)
         self.dropped_bytes = 0
         """Bytes of answers that nobody took off the line in time."""
+        self.damaged: Callable[[], bool] = lambda: False
+        """Fault: asked at every instruction whether noise damages it."""
         self._wire_time = wire_time
         self._loop: asyncio.AbstractEventLoop | None = None
         self._master_fd = -1
@@ -333,6 +335,9 @@ class ServoBus:
         speed = termios.tcgetattr(self._slave_fd)[5]
         # 0: a rate without a name in termios, which is none of the servos'.
         baud_bps = _BAUD_OF_SPEED.get(speed, 0)
+        if self.damaged():
+            middle = len(data) // 2
+            data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]
         answer, delay_s = self.line.exchange(data, baud_bps)
         if not answer:
             return

@@ -1,21 +1,28 @@
 """One emulated XM430-W210-T: its control table on the side of the bus, its motor on the side of the world. No I/O.
 
+The motor is a `ServoDrive`; writes are carried over to it, and what it measures is carried into the table before somebody looks.
 Time is the world's: the watchdog runs on the `t_s` of `update`.
 """
 
 from __future__ import annotations
 
-import math
 import struct
 
 from sitl import servo_registers as reg
+from sitl.servo_drive import (
+    AMP_PER_COUNT,
+    MODE_CURRENT,
+    MODE_CURRENT_POSITION,
+    MODE_POSITION,
+    RAD_PER_COUNT,
+    RAD_S_PER_COUNT,
+    ServoDrive,
+)
 from sitl.servo_protocol import ALERT, StatusError
 from sitl.servo_registers import Register
 
-COUNTS_PER_TURN = 4096
-RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
-AMP_PER_COUNT = 2.69e-3
-RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
+__all__ = ["AMP_PER_COUNT", "RAD_PER_COUNT", "RAD_S_PER_COUNT", "ServoModel", "ServoRefusal"]
+
 WATCHDOG_UNIT_S = 0.020
 WATCHDOG_TRIPPED = 0xFF
 
@@ -23,16 +30,9 @@ ERROR_VOLTAGE = 0x01
 ERROR_OVERHEATING = 0x04
 ERROR_OVERLOAD = 0x20
 
-MODE_CURRENT, MODE_POSITION, MODE_CURRENT_POSITION = 0, 3, 5
 MODES = (MODE_CURRENT, MODE_POSITION, MODE_CURRENT_POSITION)
 
-# Position loop of modes 3 and 5 at the default P gain: about 23 N m/rad and 1.3 N m s/rad at 1.3 N m/A.
-_AMP_PER_RAD = 17.5
-_AMP_PER_RAD_S = 1.0
 _PRESENT = struct.Struct("<hii")
-_INT16 = struct.Struct("<h")
-_INT32_FIELD = struct.Struct("<i")
-_INT32 = 1 << 31
 
 
 class ServoRefusal(Exception):
@@ -77,15 +77,11 @@ class ServoModel:
         self._set(reg.ID, servo_id)
         self._set(reg.BAUD, reg.BAUDS.index(baud_bps))
         self._set(reg.FIRMWARE, firmware)
-        self._now_s = 0.0
-        self._heard_s = 0.0
-        self._angle_rad = shaft_angle_rad
-        self._velocity_rad_s = 0.0
-        self._turn_counts = 0
+        self.drive = ServoDrive(shaft_angle_rad)
+        """The motor."""
         self._shutdown = False
         self._silent = False
         self._registered: tuple[int, bytes] | None = None
-        self._updated = False
         self._power_on()
 
     # --- side of the world -------------------------------------------------------------------------------------------
@@ -101,27 +97,22 @@ class ServoModel:
         Returns:
             Current in A that flows now, positive towards positive angle; 0 whenever the motor lets go.
         """
-        self._now_s = t_s
-        self._angle_rad = shaft_angle_rad
-        self._velocity_rad_s = shaft_velocity_rad_s
-        if not self._updated:
-            self._updated = True
-            self._heard_s = t_s
-            self._forget_turns()
-        memory = self._memory
-        watchdog = memory[98]
-        if (
-            watchdog
-            and watchdog != WATCHDOG_TRIPPED
-            and memory[64]
-            and t_s - self._heard_s > watchdog * WATCHDOG_UNIT_S
-        ):
+        drive, memory = self.drive, self._memory
+        current_a = drive.update(t_s, shaft_angle_rad, shaft_velocity_rad_s)
+        if drive.watchdog_tripped and memory[98] != WATCHDOG_TRIPPED:
             memory[98] = WATCHDOG_TRIPPED
             for goal in (reg.GOAL_CURRENT, reg.GOAL_VELOCITY):
                 self._set(goal, 0)
-        counts = self._current_counts()
-        self._latch(counts)
-        return counts * AMP_PER_COUNT * self._direction
+        return current_a
+
+    @property
+    def goal_delay_s(self) -> float:
+        """Goal currents take effect that much later than they were written."""
+        return self.drive.goal_delay_s
+
+    @goal_delay_s.setter
+    def goal_delay_s(self, delay_s: float) -> None:
+        self.drive.goal_delay_s = delay_s
 
     def fail_silent(self, silent: bool) -> None:
         """Break (or mend) the data wire: the servo neither hears nor answers, its motor goes on until its watchdog trips."""
@@ -190,7 +181,7 @@ class ServoModel:
 
     def heard_instruction(self) -> None:
         """A valid instruction packet for whomever was on the bus: feeds the watchdog."""
-        self._heard_s = self._now_s
+        self.drive.heard_instruction()
 
     def read(self, address: int, length: int) -> bytes:
         """Bytes of the control table.
@@ -200,6 +191,7 @@ class ServoModel:
         """
         if length == 0:
             raise ServoRefusal(StatusError.DATA_LENGTH)
+        self._show_present()
         return bytes(self._memory[self._resolve(a, StatusError.ACCESS)] for a in range(address, address + length))
 
     def write(self, address: int, data: bytes) -> None:
@@ -255,9 +247,10 @@ class ServoModel:
         Raises:
             ServoRefusal: RESULT_FAIL while the shaft moves.
         """
+        self._show_present()
         if self._memory[122]:
             raise ServoRefusal(StatusError.RESULT_FAIL)
-        self._forget_turns()
+        self.drive.forget_turns()
 
     # --- registers ---------------------------------------------------------------------------------------------------
 
@@ -325,42 +318,61 @@ class ServoModel:
 
     def _apply(self, register: Register, value: int) -> None:
         self._set(register, value)
+        drive, memory = self.drive, self._memory
         if register is reg.TORQUE_ENABLE and value == 1:
-            if self._memory[11] == MODE_POSITION:
-                self._forget_turns()
-            if self._memory[11] != MODE_CURRENT:
-                self._set(reg.GOAL_POSITION, self._get(reg.PRESENT_POSITION))
+            if memory[11] == MODE_POSITION:
+                drive.forget_turns()
+            if memory[11] != MODE_CURRENT:
+                self._set(reg.GOAL_POSITION, drive.present()[2])
         elif register is reg.OPERATING_MODE:
             self._reset_goals()
             if value == MODE_POSITION:
-                self._forget_turns()
+                drive.forget_turns()
         elif register in (reg.HOMING_OFFSET, reg.DRIVE_MODE):
-            self._latch(0)
+            drive.show_no_current()
         elif register in (reg.TEMPERATURE_LIMIT, reg.MIN_VOLTAGE_LIMIT, reg.MAX_VOLTAGE_LIMIT):
             self._check_environment()
+        if register is reg.GOAL_CURRENT:
+            drive.set_goal_current(value)
+        self._settings_to_drive()
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
-    @property
-    def _direction(self) -> int:
-        return -1 if self._memory[10] & 1 else 1
-
     def _power_on(self) -> None:
         self._reset_goals()
-        self._forget_turns()
+        self._settings_to_drive()
+        self.drive.forget_turns()
         self._check_environment()
 
     def _reset_goals(self) -> None:
-        in_current_mode = self._memory[11] == MODE_CURRENT
-        self._set(reg.GOAL_CURRENT, 0 if in_current_mode else self._get(reg.CURRENT_LIMIT))
+        goal = 0 if self._memory[11] == MODE_CURRENT else self._get(reg.CURRENT_LIMIT)
+        self._set(reg.GOAL_CURRENT, goal)
+        self.drive.set_goal_current(goal, at_once=True)
         self._set(reg.GOAL_PWM, self._get(reg.PWM_LIMIT))
         self._set(reg.GOAL_VELOCITY, 0)
 
-    def _forget_turns(self) -> None:
-        """The encoder is absolute within one turn only; which turn it was is lost here."""
-        counts = self._direction * round(self._angle_rad / RAD_PER_COUNT)
-        self._turn_counts = counts - counts % COUNTS_PER_TURN
-        self._latch(0)
+    def _settings_to_drive(self) -> None:
+        """Everything but the goal current, which takes its time."""
+        drive, memory = self.drive, self._memory
+        watchdog = memory[98]
+        drive.torque_on = bool(memory[64])
+        drive.mode = memory[11]
+        drive.direction = -1 if memory[10] & 1 else 1
+        drive.current_limit_counts = self._get(reg.CURRENT_LIMIT)
+        drive.homing_counts = self._get(reg.HOMING_OFFSET)
+        drive.goal_position_counts = self._get(reg.GOAL_POSITION)
+        drive.position_gain = self._get(reg.POSITION_P_GAIN) / reg.POSITION_P_GAIN.initial
+        if watchdog != WATCHDOG_TRIPPED:
+            drive.start_watchdog(watchdog * WATCHDOG_UNIT_S if watchdog else None)
+
+    def _show_present(self) -> None:
+        """Carry what the drive measured at its last update into the table."""
+        memory = self._memory
+        # One slice assignment of one instant's values: a reader never sees a position of one with a velocity of another.
+        current, velocity, position = self.drive.present()
+        memory[126:136] = _PRESENT.pack(current, velocity, position)
+        memory[120:122] = (int(self.drive.now_s * 1e3) % 32768).to_bytes(2, "little")
+        memory[122] = abs(velocity) > self._get(reg.MOVING_THRESHOLD)
 
     def _check_environment(self) -> None:
         if self._get(reg.PRESENT_TEMPERATURE) > self._get(reg.TEMPERATURE_LIMIT):
@@ -374,36 +386,4 @@ class ServoModel:
         if self._memory[63] & bit:
             self._shutdown = True
             self._memory[64] = 0
-
-    def _current_counts(self) -> int:
-        memory = self._memory
-        if not memory[64] or memory[98] == WATCHDOG_TRIPPED:
-            return 0
-        # Read without `_get`: this and `_latch` run at every step of the world.
-        limit: int
-        goal: int
-        (limit,) = _INT16.unpack_from(memory, reg.CURRENT_LIMIT.address)
-        (goal,) = _INT16.unpack_from(memory, reg.GOAL_CURRENT.address)
-        if memory[11] == MODE_CURRENT:
-            return max(-limit, min(limit, goal))
-        if memory[11] == MODE_CURRENT_POSITION:
-            limit = min(limit, abs(goal))
-        offset = self._turn_counts - self._get(reg.HOMING_OFFSET)
-        goal_rad = (self._get(reg.GOAL_POSITION) + offset) * RAD_PER_COUNT
-        gain = self._get(reg.POSITION_P_GAIN) / reg.POSITION_P_GAIN.initial
-        error_rad = goal_rad - self._direction * self._angle_rad
-        current_a = gain * _AMP_PER_RAD * error_rad - _AMP_PER_RAD_S * self._direction * self._velocity_rad_s
-        return max(-limit, min(limit, round(current_a / AMP_PER_COUNT)))
-
-    def _latch(self, current_counts: int) -> None:
-        memory = self._memory
-        direction = self._direction
-        (homing,) = _INT32_FIELD.unpack_from(memory, reg.HOMING_OFFSET.address)
-        position = direction * round(self._angle_rad / RAD_PER_COUNT) - self._turn_counts + homing
-        velocity = direction * round(self._velocity_rad_s / RAD_S_PER_COUNT)
-        position = (position + _INT32) % (2 * _INT32) - _INT32
-        velocity = max(-_INT32, min(_INT32 - 1, velocity))
-        # One slice assignment: a reader never sees a position of one instant with a velocity of another.
-        memory[126:136] = _PRESENT.pack(current_counts, velocity, position)
-        memory[120:122] = (int(self._now_s * 1e3) % 32768).to_bytes(2, "little")
-        memory[122] = abs(velocity) > _INT32_FIELD.unpack_from(memory, reg.MOVING_THRESHOLD.address)[0]
+            self.drive.torque_on = False

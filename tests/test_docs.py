@@ -8,28 +8,34 @@ import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 
+from companion.analysis.faults_table import kinds_markdown
+from companion.analysis.faults_table import written as with_faults
 from companion.analysis.summary import empty_summary
 from companion.cli import _normalised, _parser
 from companion.config.controller import AdaptiveConfig
+from companion.config.faults import KINDS
 from companion.config.loader import PRESETS, load_flight
 from companion.config.vehicle import Safety
 from companion.config.world import Fault, World
 from companion.exit_codes import EXIT_BAD_INPUT, EXIT_CODES
+from companion.safety.supervisor import HOLD_EXPIRED, RETRACT_DONE, RETRACT_EXPIRED
+from companion.safety.table import written
 from companion.types import SafetyAction
 from sitl.autopilot.params import VEHICLE_DEFAULTS, Params
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "benchmarks/README.md", *(ROOT / "docs").rglob("*.md")])
 README, SAFETY, SITL = ROOT / "README.md", ROOT / "docs/safety.md", ROOT / "docs/sitl.md"
+FAULTS = ROOT / "docs/faults.md"
 LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
 # What a flight writes, or what a user is told to make: no files of the repository.
 MADE_LATER = {
-    "flight.mcap", "flight.log", "flight.pid", "summary.json", "report.html", "config.json", "sitl_config.json", "sitl.log",
-    "mine.yaml", "my_vehicle.yaml", "flights/", "compare.json", "compare.html",
+    "flight.mcap", "flight.log", "flight.pid", "guardian.log", "guardian.pid", "summary.json", "report.html", "config.json",
+    "sitl_config.json", "sitl.log", "world.json", "mine.yaml", "my_vehicle.yaml", "flights/", "compare.json", "compare.html",
 }  # fmt: skip
 FOLDERS = ("companion", "sitl", "configs", "tests", "docs", "benchmarks")
 KNOWN_NAMES = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.*")}
@@ -141,7 +147,16 @@ def test_knobs_match() -> None:
     told = {codes(row[0])[0]: json.loads(row[1]) for row in table(SITL, "key", "default")}
     assert told == json.loads(World().model_dump_json())
     assert list(told) == list(World.model_fields)
-    assert [codes(row[0])[0] for row in table(SITL, "kind")] == list(get_args(Fault.model_fields["kind"].annotation))
+    assert f"{len(KINDS)} kinds" in text_of(SITL)
+
+
+def test_faults_match() -> None:
+    """Made by `python -m companion.analysis.faults_table docs/faults.md`."""
+    assert with_faults(text_of(FAULTS), {"kinds": kinds_markdown()}) == text_of(FAULTS)
+    assert [codes(row[0])[0] for row in table(FAULTS, "kind", "what happens")] == list(KINDS)
+    told = [name for row in table(FAULTS, "key", "meaning") for name in codes(row[0])]
+    assert told == ["kind", "t_s", "after", "phase", "duration_s", "size", "servo"]
+    assert set(told) == set(Fault.model_fields)
 
 
 def test_px4_parameters_match_those_that_the_stub_flies_with() -> None:
@@ -150,33 +165,12 @@ def test_px4_parameters_match_those_that_the_stub_flies_with() -> None:
     assert f"{len(Params())} of PX4's own" in text_of(SITL)
 
 
-def test_monitors_match() -> None:
-    limits = json.loads(Safety().model_dump_json())
-    told = {}
-    for monitor, _, limit, held, action in table(SAFETY, "id", "condition"):
-        told[codes(monitor)[0]] = (codes(action)[0], float(held.removesuffix(" s")))
-        for key in codes(limit):
-            assert limits[key] == float(limit.rpartition("=")[2]), key
-    assert told == {name: (action, held) for name, action, held in findings(limits)}
-    named = {key for row in table(SAFETY, "id", "condition") for key in codes(row[2])}
-    assert {key for key in limits if key not in ("land_speed_m_s", "fold_arm_deg")} == named
-
-
-def findings(limits: dict[str, Any]) -> Iterator[tuple[str, str, float]]:
-    """Id, action and holding time of every `_Finding(...)` in the source of the monitors."""
-    for call in calls(ROOT / "companion/safety/monitors.py", "_Finding"):
-        ids, action = call.args[0], call.args[1]
-        assert isinstance(action, ast.Attribute)
-        held: Any = 0.0
-        for node in (*call.args[3:], *(keyword.value for keyword in call.keywords)):
-            held = node.value if isinstance(node, ast.Constant) else limits[attribute(node)]
-        for name in constants(ids):
-            yield name, SafetyAction[action.attr].value, float(held)
-
-
-def attribute(node: ast.expr) -> str:
-    assert isinstance(node, ast.Attribute), ast.dump(node)
-    return node.attr
+def test_monitors_and_ladder_match() -> None:
+    """Made by `python -m companion.safety.table docs/safety.md`."""
+    assert written(text_of(SAFETY)) == text_of(SAFETY)
+    named = {key for row in table(SAFETY, "id", "what is found") for cell in row[2:4] for key in codes(cell)}
+    told = set(codes(text_of(SAFETY)))
+    assert {key for key in Safety.model_fields if key not in named} <= told
 
 
 def constants(node: ast.expr) -> list[str]:
@@ -193,7 +187,10 @@ def calls(path: Path, *names: str) -> Iterator[ast.Call]:
 
 def test_events_match() -> None:
     told = {codes(row[0])[0] for row in table(SAFETY, "id", "when")}
-    made = {name for call in calls(ROOT / "companion/core.py", "_event", "_refuse") for name in constants(call.args[1])}
+    made = {HOLD_EXPIRED, RETRACT_DONE, RETRACT_EXPIRED}
+    for source in ("companion/core.py", "companion/flight_stages.py"):
+        for call in calls(ROOT / source, "tell", "_refuse"):
+            made |= set(constants(call.args[1]))
     assert told == made
 
 
@@ -238,6 +235,8 @@ def preset_text(law: AdaptiveConfig, key: str) -> str:
     value = getattr(law, codes(key)[0])
     if value is None:
         return "absent"
+    if isinstance(value, bool):
+        return str(value).lower()
     if not isinstance(value, tuple):
         return f"{value:g}"
     rows = value[6:8] if key.endswith("arm") else value[0:3]

@@ -72,6 +72,18 @@ def test_round_trips(roll: float, pitch: float, yaw: float) -> None:
     assert abs(frames.tilt_rad(q) - math.acos(max(-1, min(1, math.cos(roll) * math.cos(pitch))))) < 1e-6
 
 
+@given(angles, st.floats(-1.5, 1.5), angles)
+def test_shortcuts_are_what_they_stand_for(roll: float, pitch: float, yaw: float) -> None:
+    """Bit for bit: a shortcut must not change a flight."""
+    q = frames.quat_from_euler_zyx(roll, pitch, yaw)
+    assert frames.yaw_from_quat(q) == frames.euler_zyx_from_quat(q)[2]
+    w, x, y, z = frames.quat_multiply((0.0, S, S, 0.0), q)
+    turned = (-x, w, z, -y)  # on the right, half a turn about x
+    whole = turned if turned[0] >= 0.0 else tuple(-value for value in turned)
+    assert frames.attitude_ned_frd_from_enu_flu(q) == whole
+    assert frames.attitude_enu_flu_from_ned_frd(q) == whole
+
+
 @pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0)])
 def test_a_quaternion_without_direction_is_refused(q: Quat) -> None:
     with pytest.raises(ValueError, match="no direction"):

@@ -183,9 +183,9 @@ def test_flight_process_that_dies_in_flight_is_named_in_one_line(tmp_path: Path)
     assert "Fatal Python error: Aborted" in log
     assert len(ended.err_lines) == 1, ended.err
     assert ended.err.startswith("flight: the flight process was ended by SIGABRT")
-    assert ended.err.endswith("; see out/flight.log\n")
-    assert ended.code == EXIT_LOST
-    assert summary["outcome"] in ("lost", "crashed")
+    assert ended.err.endswith("; the guardian landed the vehicle; see out/flight.log\n")
+    assert ended.code == EXIT_ABORTED
+    assert summary["outcome"] == "aborted"
 
 
 @pytest.mark.parametrize(
@@ -238,13 +238,15 @@ def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -
 
 
 @pytest.mark.flight
-def test_a_flight_process_that_hangs_in_the_air_is_ended(sandbox: Sandbox) -> None:
-    """SIGSTOP: nothing is sent any more, PX4 lands by itself; the launcher notices, ends the process and tells."""
+def test_a_flight_process_that_hangs_in_the_air_is_ended_without_a_guardian(sandbox: Sandbox) -> None:
+    """Both hang: nothing is sent any more, PX4 lands by itself; the launcher notices, ends the processes and tells."""
     with sandbox.start(*FLY) as running:
         running.wait_for(IN_FLIGHT)
+        os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGSTOP)
         os.kill(int((sandbox.cwd / "out/flight.pid").read_text()), signal.SIGSTOP)
         ended = running.end()
     sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
     assert ended.code == EXIT_LOST
-    assert "said nothing for 5 s" in ended.err
+    assert "flight: the flight process said nothing for 5 s and was killed" in ended.err
+    assert "guardian: the guardian process hangs and was killed" in ended.err
     assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"

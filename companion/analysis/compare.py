@@ -31,6 +31,9 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     # A force that the base carries by feed-forward is one that it does not give way to.
     "base rows on": ("controller.base_compliance_xyz=[1, 1, 1]", "controller.force_feedforward_xyz=[0, 0, 0]"),
     "F_d off": ("controller.desired_force_time_s=null",),
+    "disturbance observer off": ("controller.disturbance_time_xyz_s=[0, 0, 0]",),
+    "lead off": ("controller.feedforward_lead_s=0",),
+    "arm inertia and friction off": ("controller.arm_inertia_nominal=false", "controller.arm_friction_share=0"),
 }
 """What is taken from `ABLATED`, as overrides of its controller section. Attitude rows stay masked: PX4 closes that loop."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Sequence
 from html import escape
@@ -19,32 +18,23 @@ from companion.analysis.compare_table import (
     ours_text,
     printed_text,
 )
+from companion.analysis.page import CLOSING, folded, opening, picture
 from companion.analysis.printed import SOURCE
 
 if TYPE_CHECKING:
     from companion.analysis.compare_plots import Picture
 
 _STYLE = """
-:root { --ink: #22303c; --soft: #5b6b79; --line: #dde3e8; --bad: #c2255c; --card: #f6f8fa; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 78rem; color: var(--ink); background: #fff;
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
-.sub, figcaption { color: var(--soft); } .sub { margin: .2rem 0 1.2rem; } figcaption { font-size: .88rem; }
+:root { --width: 78rem; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: .24rem .45rem; border-bottom: 1px solid var(--line); white-space: nowrap; text-align: right; }
-th { color: var(--soft); font-weight: 600; font-size: .85rem; vertical-align: bottom; }
+th, td { padding: .24rem .45rem; white-space: nowrap; text-align: right; }
+th { vertical-align: bottom; }
 th.l, td.l { text-align: left; }
-td { vertical-align: top; } td.less { padding-left: 1.4rem; color: var(--soft); }
+td.less { padding-left: 1.4rem; color: var(--soft); }
 td.paper, th.paper { color: var(--soft); background: var(--card); }
 th.span { text-align: center; } span.bad { color: var(--bad); } tbody tr:first-child td { border-top: 2px solid var(--line); }
-figure { margin: 0 0 1.6rem; break-inside: avoid; }
-figure img { width: 100%; max-width: 60rem; border: 1px solid var(--line); border-radius: .4rem; }
-details { margin-top: .6rem; } summary { cursor: pointer; color: var(--soft); }
-pre { background: var(--card); padding: 1rem; border-radius: .5rem; overflow: auto; font-size: 12px; line-height: 1.4; }
-@media print { body { padding: 0; max-width: none; font-size: 11px; } details { display: none; }
-  td.paper { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
+figure img { max-width: 60rem; }
+@media print { td.paper { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
 """
 
 
@@ -60,9 +50,7 @@ def write_html(
     """Write the page; `notes` are told at its top."""
     failures = [row for row in rows if row["error"]]
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<title>Comparison of controllers</title><style>{_STYLE}</style></head><body>",
+        opening("Comparison of controllers", _STYLE),
         "<h1>Comparison of controllers</h1>",
         f"<p class='sub'>{escape(str(settings['mission']))} · {len(rows)} flights in the fast closed loop · seeds "
         f"{escape(', '.join(str(seed) for seed in settings['seeds']))}</p>",
@@ -74,18 +62,18 @@ def write_html(
         _plain(cells, COMPLIANCE),
         f"<p class='sub'>{_marked(EXPLAINED)}</p>",
         "<h2>Pictures</h2>" if pictures else "",
-        *(_figure(picture) for picture in pictures),
+        *(picture(one.path, one.title, _marked(one.caption)) for one in pictures),
         "<h2>Record</h2>",
-        _folded(
+        folded(
             "Internal errors",
             "\n".join(
                 f"{r['controller']}/{r['preset']} {r['payload_kg']:g} kg seed {r['seed']}: {r['error']}"
                 for r in failures
             ),
         ),
-        _folded("Settings", json.dumps(settings, indent=2)),
-        _folded("Versions", json.dumps(versions, indent=2)),
-        "</body></html>\n",
+        folded("Settings", json.dumps(settings, indent=2)),
+        folded("Versions", json.dumps(versions, indent=2)),
+        CLOSING,
     ]
     path.write_text("\n".join(part for part in parts if part), encoding="utf-8")
 
@@ -144,15 +132,3 @@ def _marked(text: str) -> str:
     for letter in "pqzα":
         marked = marked.replace(f"e_{letter}", f"e<sub>{letter}</sub>")
     return marked.replace("M_d", "M<sub>d</sub>").replace("K_d", "K<sub>d</sub>")
-
-
-def _figure(picture: Picture) -> str:
-    data = base64.b64encode(picture.path.read_bytes()).decode()
-    return (
-        f"<figure><img alt='{escape(picture.title)}' src='data:image/png;base64,{data}'>"
-        f"<figcaption>{_marked(picture.caption)}</figcaption></figure>"
-    )
-
-
-def _folded(title: str, text: str) -> str:
-    return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>" if text else ""

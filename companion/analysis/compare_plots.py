@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from companion.analysis.compare import ABLATED, COMPLETED, Cell
 from companion.analysis.log import Array
+from companion.analysis.plot_style import CATCH, DASHED, INK, dress, mark_catch, new_figure, write_png
 
-DPI = 150
-_INK, _SOFT, _REFERENCE, _CATCH = "#22303c", "#5b6b79", "#8a949d", "#c2255c"
 _COLOURS = (
     "#1f6fb4",
     "#e07b22",
@@ -72,7 +70,7 @@ def write_pictures(tracks: Sequence[Track], cells: Sequence[Cell], out: Path) ->
     overview = _overview(cells, colours)
     if overview is not None:
         path = out / "errors.png"
-        FigureCanvasAgg(overview).print_png(path)
+        write_png(overview, path)
         caption = "RMS of ‖e_p‖ before and after the catch, mean and standard deviation over seeds; diamonds: printed in the paper."
         written.append(Picture(path, "Position errors", caption))
     for payload_kg in sorted({track.payload_kg for track in tracks}):
@@ -87,19 +85,19 @@ def write_pictures(tracks: Sequence[Track], cells: Sequence[Cell], out: Path) ->
                 continue
             path = out / f"{name}_{payload_kg:g}kg.png"
             whole = f"{title}, {payload_kg:g} kg"
-            FigureCanvasAgg(_courses(whole, group, colours)).print_png(path)
+            write_png(_courses(whole, group, colours), path)
             caption = f"Seed {group[0].seed}; dashed vertical line: the catch; a cross: the end of a flight that was not completed."
             written.append(Picture(path, whole, caption))
     return written
 
 
 def _courses(title: str, tracks: Sequence[Track], colours: dict[str, str]) -> Figure:
-    figure = Figure(figsize=(9.0, 8.2), dpi=DPI, layout="constrained", facecolor="white")
+    figure = new_figure(8.2)
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(1.15, 1.0, 1.0, 1.0))
     panes = (("e_p_m", None), ("e_q_deg", None), ("alpha_deg", 0), ("alpha_deg", 1))
     labels = (r"$\|e_p\|$ [m]", r"$\|e_q\|$ [deg]", r"$\alpha_1$ [deg]", r"$\alpha_2$ [deg]")
     for ax, label, (key, joint) in zip(axes, labels, panes, strict=True):
-        _dress(ax)
+        dress(ax)
         ax.set_ylabel(label)
         for track in tracks:
             colour = colours[track.label]
@@ -112,21 +110,13 @@ def _courses(title: str, tracks: Sequence[Track], colours: dict[str, str]) -> Fi
         if joint is not None:
             longest = max(tracks, key=lambda track: len(track.series["t_s"]))
             wanted = _values(longest.series["alpha_reference_deg"], joint)
-            ax.plot(
-                _array(longest.series["t_s"]), wanted, color=_INK, lw=1.1, ls=(0, (4, 2)), label="reference", zorder=4
-            )
+            ax.plot(_array(longest.series["t_s"]), wanted, color=INK, lw=1.1, ls=DASHED, label="reference", zorder=4)
         else:
             ax.set_ylim(bottom=0.0, top=_top(tracks, key))
-        caught = [track.series["catch_t_s"] for track in tracks if track.series["catch_t_s"] is not None]
-        if caught:
-            ax.axvline(float(np.median(caught)), color=_CATCH, lw=1.3, ls=(0, (5, 3)), zorder=2)
         ax.margins(x=0.0)
-    if any(track.series["catch_t_s"] is not None for track in tracks):
-        at = float(np.median([t.series["catch_t_s"] for t in tracks if t.series["catch_t_s"] is not None]))
-        axes[0].annotate(
-            "catch", (at, 0.97), xycoords=axes[0].get_xaxis_transform(), xytext=(-4, 0), textcoords="offset points",
-            ha="right", va="top", fontsize=9, color=_CATCH,
-        )  # fmt: skip
+    caught = [track.series["catch_t_s"] for track in tracks if track.series["catch_t_s"] is not None]
+    if caught:
+        mark_catch(axes, float(np.median(caught)))
     axes[-1].set_xlabel("mission time [s]")
     handles, names = axes[2].get_legend_handles_labels()
     figure.legend(
@@ -156,8 +146,7 @@ def _overview(cells: Sequence[Cell], colours: dict[str, str]) -> Figure | None:
     labels = list(shown)
     if not any(cell.figures["rms.pre.e_p_m"] or cell.figures["rms.post.e_p_m"] for cell in cells):
         return None
-    figure = Figure(figsize=(9.0, 1.5 + 0.16 * len(labels) * len(payloads) + 0.3 * len(payloads)), dpi=DPI,
-                    layout="constrained", facecolor="white")  # fmt: skip
+    figure = new_figure(1.5 + 0.16 * len(labels) * len(payloads) + 0.3 * len(payloads))
     axes = figure.subplots(1, 2, sharey=True)
     step = 0.8 / max(1, len(labels))
     names_of = ("rms.pre.e_p_m", "rms.post.e_p_m")
@@ -165,29 +154,29 @@ def _overview(cells: Sequence[Cell], colours: dict[str, str]) -> Figure | None:
     papers = [cell.printed for cell in cells if cell.printed is not None]
     reached += [figures.e_p_m for paper in papers for figures in (paper.pre, paper.post) if figures is not None]
     for ax, part, title in ((axes[0], "pre", "before the catch"), (axes[1], "post", "after the catch")):
-        _dress(ax)
-        ax.set_title(title, loc="left", fontsize=10, color=_INK)
+        dress(ax)
+        ax.set_title(title, loc="left", fontsize=10, color=INK)
         ax.set_xlabel(r"RMS $\|e_p\|$ [m]")
         for cell in cells:
             y = payloads.index(cell.payload_kg) + (labels.index(cell.label) - (len(labels) - 1) / 2) * step
             spread, colour = cell.figures[f"rms.{part}.e_p_m"], colours[cell.label]
             if spread is not None:
                 ax.barh(y, spread.mean, height=0.85 * step, color=colour, zorder=3)
-                ax.errorbar(spread.mean, y, xerr=spread.std or 0.0, color=_INK, lw=1.0, capsize=2, zorder=4)
+                ax.errorbar(spread.mean, y, xerr=spread.std or 0.0, color=INK, lw=1.0, capsize=2, zorder=4)
             if part == "post" and cell.failures:
                 x = spread.mean if spread is not None else 0.0
                 ax.annotate(cell.failure_text, (x, y), xytext=(8, 0), textcoords="offset points", va="center", fontsize=8,
-                            color=_CATCH, zorder=6)  # fmt: skip
+                            color=CATCH, zorder=6)  # fmt: skip
             figures = None if cell.printed is None else (cell.printed.pre if part == "pre" else cell.printed.post)
             if figures is not None:
-                ax.plot(figures.e_p_m, y, "D", ms=5, mfc="white", mec=_INK, mew=1.2, zorder=5)
+                ax.plot(figures.e_p_m, y, "D", ms=5, mfc="white", mec=INK, mew=1.2, zorder=5)
         ax.set_xlim(0.0, 1.05 * max(reached))
     axes[0].set_yticks(range(len(payloads)), [f"{payload_kg:g} kg" for payload_kg in payloads])
     axes[0].invert_yaxis()
     handles = [axes[0].barh([0], [0], color=colours[label]) for label in labels]
     names = list(shown.values())
     if papers:
-        handles.append(axes[0].plot([], [], "D", ms=5, mfc="white", mec=_INK, mew=1.2)[0])
+        handles.append(axes[0].plot([], [], "D", ms=5, mfc="white", mec=INK, mew=1.2)[0])
         names.append("printed in the paper")
     figure.legend(handles, names, loc="outside upper left", ncols=3, fontsize=8.5, frameon=False, title="Position errors",
                   title_fontproperties={"size": 13, "weight": "bold"}, alignment="left")  # fmt: skip
@@ -206,16 +195,3 @@ def _array(values: Sequence[float | None]) -> Array:
 
 def _values(series: Any, joint: int | None) -> Array:
     return _array(series if joint is None else series[joint])
-
-
-def _dress(ax: Any) -> None:
-    ax.grid(True, color="#e6eaee", lw=0.7)
-    ax.set_axisbelow(True)
-    ax.tick_params(colors=_INK, labelsize=9, length=3)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        ax.spines[side].set_color("#aab4bd")
-    for label in (ax.xaxis.label, ax.yaxis.label):
-        label.set_color(_INK)
-        label.set_size(9.5)

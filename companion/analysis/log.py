@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
 from companion.frames import euler_zyx_from_quat
-from companion.record import RecordError, fingerprint, from_jsonable
+from companion.record import RecordError, from_jsonable
 from companion.types import Inputs, Outputs, Sent
 
 Array = npt.NDArray[np.float64]
@@ -47,7 +47,8 @@ class FlightLog:
         """Read a log.
 
         Raises:
-            LogError: no such file, no MCAP file, not written by the recorder, damaged, or records of another shape.
+            LogError: no such file, no MCAP file, not written by the recorder, damaged, or records of another shape. Records of a
+                version that lacked a field which may be None are no other shape: that field is None.
         """
         rows: dict[str, list[Any]] = {topic: [] for topic in _RECORDS}
         metadata: dict[str, dict[str, str]] = {}
@@ -67,14 +68,12 @@ class FlightLog:
                     closed = True
         except RecordError as error:
             raise LogError(
-                f"{path}: records of another shape ({error}); it was written by {_writer(metadata)}"
+                f"{path}: records of another shape ({error}); it was written by {writer(metadata)}, open it with that version"
             ) from None
         except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
         if "companion" not in metadata:
             raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
-        if metadata["companion"].get("records") != fingerprint(*_RECORDS.values()):
-            raise LogError(f"{path}: records of another shape; it was written by {_writer(metadata)}")
         # Chunks hold whole ticks, so a difference means that the file was not written by the recorder.
         ticks = [[row.tick for row in rows[topic]] for topic in _RECORDS]
         if not ticks[0] == ticks[1] == ticks[2]:
@@ -156,7 +155,8 @@ def _columns(log: FlightLog) -> Columns:
     )
 
 
-def _writer(metadata: dict[str, dict[str, str]]) -> str:
+def writer(metadata: dict[str, dict[str, str]]) -> str:
+    """Version and git revision of the companion that wrote a log with this metadata."""
     about = metadata.get("companion", {})
     return f"companion {about.get('version_companion', 'of unknown version')} ({about.get('version_git', 'no git revision')})"
 

@@ -11,18 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
+from companion.analysis.plot_style import CATCH, DASHED, INK, dress, mark_catch, new_figure, write_png
+from companion.control.manipulator import GRAVITY_M_S2
 from companion.frames import tilt_rad
 from companion.types import PhaseKind
 
-DPI = 150
-_INK = "#22303c"
 _REFERENCE = "#55626e"
-_CATCH = "#c2255c"
 _SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
 _SERIES_DARK = ("#0b365c", "#7d3d05")  # a reference drawn over its own measurement
 _PHASES = {
@@ -30,7 +28,6 @@ _PHASES = {
     PhaseKind.FLIGHT: "#ffffff",
     PhaseKind.LANDING: "#f6f0e3",
 }
-_WIDTH_IN = 9.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +56,7 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
         figure = make(log)
         if figure is not None:
             path = out_dir / f"{name}.png"
-            FigureCanvasAgg(figure).print_png(path)
+            write_png(figure, path)
             written.append(Plot(path, title, caption))
     return written
 
@@ -138,8 +135,12 @@ def _force(log: FlightLog) -> Figure | None:
     figure, axes, t = _stack(log, "Contact force, world frame", (1.0,), height_in=3.2)
     for j, name in enumerate("xyz"):
         _line(axes[0], t, force[:, j], f"$F_{name}$", _SERIES[j])
+    payload_kg = log.column(lambda i, o, s: o.control.payload_estimate_kg if o.control else None)
+    if np.isfinite(payload_kg).any():
+        weight_n = GRAVITY_M_S2 * payload_kg
+        _line(axes[0], t, -weight_n, "weight of the estimated payload", _REFERENCE, reference=True)
     axes[0].set_ylabel("force [N]")
-    _legend(axes[0], columns=3)
+    _legend(axes[0], columns=4)
     return figure
 
 
@@ -147,33 +148,33 @@ def _path(log: FlightLog) -> Figure | None:
     flown, wanted = log.columns.mocap_position_world_m, log.columns.reference_position_world_m
     if not np.isfinite(flown).any():
         return None
-    figure = Figure(figsize=(_WIDTH_IN, 5.2), dpi=DPI, layout="constrained", facecolor="white")
+    figure = new_figure(5.2)
     axes = figure.subplots(2, 1, sharex=True)
     caught = metrics.catch_index(log)
     for ax, row, name in ((axes[0], 1, "y"), (axes[1], 2, "z")):
-        _dress(ax)
-        ax.plot(wanted[:, 0], wanted[:, row], color=_REFERENCE, lw=1.2, ls=(0, (4, 2)), label="reference", zorder=3.5)
+        dress(ax)
+        ax.plot(wanted[:, 0], wanted[:, row], color=_REFERENCE, lw=1.2, ls=DASHED, label="reference", zorder=3.5)
         ax.plot(flown[:, 0], flown[:, row], color=_SERIES[0], lw=1.5, label="flown", zorder=3)
         if caught is not None:
-            ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=_CATCH, mew=1.8, label="catch", zorder=4)
+            ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=CATCH, mew=1.8, label="catch", zorder=4)
         ax.set_ylabel(f"{name} [m]")
         # A straight path gets room: noise of millimetres is not to look like a slalom.
         low, high = np.nanmin([flown[:, row], wanted[:, row]]), np.nanmax([flown[:, row], wanted[:, row]])
         middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
         ax.set_ylim(middle - half, middle + half)
-    axes[0].set_title("From above", loc="left", fontsize=10, color=_INK)
-    axes[1].set_title("From the side", loc="left", fontsize=10, color=_INK)
+    axes[0].set_title("From above", loc="left", fontsize=10, color=INK)
+    axes[1].set_title("From the side", loc="left", fontsize=10, color=INK)
     axes[1].set_xlabel("x [m]")
     _legend(axes[0], columns=3)
-    figure.suptitle("Path", fontsize=13, fontweight="bold", color=_INK)
+    figure.suptitle("Path", fontsize=13, fontweight="bold", color=INK)
     return figure
 
 
 def _timing(log: FlightLog) -> Figure | None:
-    figure = Figure(figsize=(_WIDTH_IN, 5.4), dpi=DPI, layout="constrained", facecolor="white")
+    figure = new_figure(5.4)
     panes: dict[str, Any] = figure.subplot_mosaic([["time", "time", "time"], ["late", "joint", "mocap"]])
     late_ms = 1e3 * log.columns.lateness_s
-    _dress(panes["time"])
+    dress(panes["time"])
     panes["time"].plot(log.columns.t_s, late_ms, color=_SERIES[0], lw=0.6)
     panes["time"].margins(x=0.0)
     panes["time"].set_ylim(bottom=0.0)
@@ -185,8 +186,8 @@ def _timing(log: FlightLog) -> Figure | None:
         ("mocap", "mocap datagram to setpoint", metrics.mocap_to_setpoint_s(log)),
     ):
         ax = panes[name]
-        _dress(ax)
-        ax.set_title(title, fontsize=10, color=_INK)
+        dress(ax)
+        ax.set_title(title, fontsize=10, color=INK)
         ax.set_xlabel("ms")
         spread = metrics.percentiles(values_s)
         if spread is None:
@@ -195,12 +196,12 @@ def _timing(log: FlightLog) -> Figure | None:
         end_ms = max(1.3 * spread.p99_ms, 0.1)
         ax.hist(np.minimum(1e3 * values_s, end_ms), bins=40, range=(0.0, end_ms), color=_SERIES[0], alpha=0.85)
         for value_ms, label, dash in ((spread.p50_ms, "p50", "-"), (spread.p99_ms, "p99", "--")):
-            ax.axvline(value_ms, color=_CATCH, lw=1.2, ls=dash, label=f"{label} {value_ms:.2f} ms")
+            ax.axvline(value_ms, color=CATCH, lw=1.2, ls=dash, label=f"{label} {value_ms:.2f} ms")
         ax.plot([], [], " ", label=f"max {spread.max_ms:.2f} ms")
         ax.set_ylim(top=1.45 * ax.get_ylim()[1])  # room for the legend
         _legend(ax)
     panes["late"].set_ylabel("ticks")
-    figure.suptitle("Timing", fontsize=13, fontweight="bold", color=_INK)
+    figure.suptitle("Timing", fontsize=13, fontweight="bold", color=INK)
     return figure
 
 
@@ -208,19 +209,19 @@ def _stack(
     log: FlightLog, title: str, heights: tuple[float, ...], height_in: float = 6.8
 ) -> tuple[Figure, list[Any], Array]:
     """Axes above each other over the mission clock, phases shaded and named, the catch marked; and the clock itself."""
-    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
+    figure = new_figure(height_in)
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
     axes = [row[0] for row in grid]
     flying = np.array([o.phase_kind in _PHASES for o in log.outputs], dtype=np.bool_)
     t_s = log.columns.mission_t_s
     span = t_s[flying] if flying.any() else t_s
     for ax in axes:
-        _dress(ax)
+        dress(ax)
         ax.set_xlim(float(span[0]), float(max(span[-1], span[0] + 0.1)))
         ax.margins(y=0.12)
     _mark_phases(log, axes)
     axes[-1].set_xlabel("mission time [s]")
-    figure.suptitle(title, fontsize=13, fontweight="bold", color=_INK)
+    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK)
     return figure, axes, np.where(flying, t_s, np.nan) if flying.any() else t_s
 
 
@@ -253,38 +254,12 @@ def _mark_phases(log: FlightLog, axes: list[Any]) -> None:
         start = k
     caught = metrics.catch_index(log)
     if caught is not None:
-        for n, ax in enumerate(axes):
-            ax.axvline(outputs[caught].mission_t_s, color=_CATCH, lw=1.3, ls=(0, (5, 3)), zorder=2)
-            if n == 0:
-                ax.annotate(
-                    "catch",
-                    (outputs[caught].mission_t_s, 0.97),
-                    xycoords=ax.get_xaxis_transform(),
-                    xytext=(-4, 0),
-                    textcoords="offset points",
-                    ha="right",
-                    va="top",
-                    fontsize=9,
-                    color=_CATCH,
-                )
-
-
-def _dress(ax: Any) -> None:
-    ax.grid(True, color="#e6eaee", lw=0.7)
-    ax.set_axisbelow(True)
-    ax.tick_params(colors=_INK, labelsize=9, length=3)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        ax.spines[side].set_color("#aab4bd")
-    for label in (ax.xaxis.label, ax.yaxis.label):
-        label.set_color(_INK)
-        label.set_size(9.5)
+        mark_catch(axes, outputs[caught].mission_t_s)
 
 
 def _line(ax: Any, t: Array, values: Array, label: str, colour: str, *, reference: bool = False) -> None:
     style: dict[str, Any] = (
-        {"lw": 1.2, "ls": (0, (4, 2)), "alpha": 0.9, "zorder": 4} if reference else {"lw": 1.2, "zorder": 3}
+        {"lw": 1.2, "ls": DASHED, "alpha": 0.9, "zorder": 4} if reference else {"lw": 1.2, "zorder": 3}
     )
     ax.plot(t, values, color=colour, label=label, **style)
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Protocol
 
 from companion import __version__
-from companion.analysis.log import FlightLog, LogError
-from companion.record import differences
-from companion.types import Inputs, Outputs
+from companion.analysis.log import FlightLog, LogError, writer
+from companion.record import differences, fingerprint
+from companion.types import Inputs, Outputs, Sent
 
 
 class Core(Protocol):
@@ -79,6 +79,10 @@ def check_replayable(log: FlightLog) -> str:
         found = f"companion {version}" if version else "a companion of unknown version"
         raise LogError(
             f"{log.path}: was recorded by {found}, this is {__version__}; replay it with the version that flew"
+        )
+    if about.get("records") != fingerprint(Inputs, Outputs, Sent):
+        raise LogError(
+            f"{log.path}: its records are not those of today; it was written by {writer(log.metadata)}, replay it with that version"
         )
     config_json = log.config_json
     if config_json is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -11,32 +10,21 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis.log import FlightLog
+from companion.analysis.page import CLOSING, folded, opening, picture
 from companion.analysis.plots import Plot, write_plots
 
 _STYLE = """
-:root { --ink: #22303c; --soft: #5b6b79; --line: #dde3e8; --good: #1f8a5b; --bad: #c2255c; --card: #f6f8fa; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 62rem; color: var(--ink); background: #fff;
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
-.sub { color: var(--soft); margin: .2rem 0 1.2rem; }
+:root { --width: 62rem; }
 .badge { display: inline-block; padding: .1rem .7rem; border-radius: 1rem; color: #fff; font-size: .9rem; vertical-align: .2rem;
   background: var(--bad); }
 .badge.completed { background: var(--good); }
 .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(24rem, 1fr)); gap: 1rem; }
 .card { background: var(--card); border-radius: .5rem; padding: .8rem 1rem; }
 .card h3 { margin: 0 0 .4rem; font-size: .95rem; color: var(--soft); font-weight: 600; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-td, th { padding: .22rem .5rem .22rem 0; text-align: left; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { color: var(--soft); font-weight: 600; font-size: .85rem; } .card tr:last-child td { border-bottom: 0; }
+td, th { padding: .22rem .5rem .22rem 0; text-align: left; } .card tr:last-child td { border-bottom: 0; }
 td.n, th.n { text-align: right; padding: .22rem .3rem .22rem 1rem; white-space: nowrap; }
 tr.warning td { background: #fff7e6; } tr.critical td { background: #fdeaf0; }
-figure { margin: 0 0 1.6rem; break-inside: avoid; } figure img { width: 100%; border: 1px solid var(--line); border-radius: .4rem; }
-figcaption { color: var(--soft); font-size: .88rem; }
-details { margin-top: .6rem; } summary { cursor: pointer; color: var(--soft); }
-pre { background: var(--card); padding: 1rem; border-radius: .5rem; overflow: auto; font-size: 12px; line-height: 1.4; }
-@media print { body { padding: 0; max-width: none; font-size: 11px; } .cards { grid-template-columns: 1fr 1fr; }
-  details { display: none; }
+@media print { .cards { grid-template-columns: 1fr 1fr; }
   .card, .badge { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
 """
 
@@ -67,14 +55,12 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
         if text
     )
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<title>{escape(str(mission))}: {escape(outcome)}</title><style>{_STYLE}</style></head><body>",
+        opening(f"{mission}: {outcome}", _STYLE),
         f"<h1>{escape(str(mission))} <span class='badge {escape(outcome)}'>{escape(outcome)}</span></h1>",
         f"<p class='sub'>{escape(subtitle)}</p>",
         _results(summary),
         "<h2>Plots</h2>" if plots else "",
-        *(_figure(plot) for plot in plots),
+        *(picture(plot.path, plot.title, escape(plot.caption)) for plot in plots),
         _events(summary["events"]),
         "<h2>Record</h2>",
         _rows(
@@ -82,13 +68,13 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
             for name, value in sorted(about.items())
             if name.startswith("version_")
         ),
-        _folded("Effective configuration", json.dumps(log.config, indent=2) if log.config else ""),
+        folded("Effective configuration", json.dumps(log.config, indent=2) if log.config else ""),
         *(
-            _folded(f"Metadata: {name}", json.dumps(values, indent=2, sort_keys=True))
+            folded(f"Metadata: {name}", json.dumps(values, indent=2, sort_keys=True))
             for name, values in sorted(log.metadata.items())
             if name not in ("companion", "config")
         ),
-        "</body></html>\n",
+        CLOSING,
     ]
     return "\n".join(part for part in parts if part)
 
@@ -155,21 +141,9 @@ def _events(events: list[dict[str, Any]]) -> str:
     return f"<h2>Events</h2><table>{head}{rows}</table>"
 
 
-def _figure(plot: Plot) -> str:
-    data = base64.b64encode(plot.path.read_bytes()).decode()
-    return (
-        f"<figure><img alt='{escape(plot.title)}' src='data:image/png;base64,{data}'>"
-        f"<figcaption>{escape(plot.caption)}</figcaption></figure>"
-    )
-
-
 def _rows(rows: Iterable[tuple[str, object]]) -> str:
     body = "".join(f"<tr><td>{escape(name)}</td><td class='n'>{escape(str(value))}</td></tr>" for name, value in rows)
     return f"<table>{body}</table>" if body else ""
-
-
-def _folded(title: str, text: str) -> str:
-    return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>" if text else ""
 
 
 def _number(value: float | None, digits: int, unit: str = "") -> str:

@@ -56,6 +56,19 @@ class AdaptiveConfig(Model):
     """Share of the measured F_ext that the base carries directly, per world axis."""
     base_compliance_xyz: NonNegative3 = (0.0, 0.0, 0.0)
     """Share of the measured F_ext that enters e_tau on the base rows (0: as in the paper)."""
+    disturbance_time_xyz_s: NonNegative3 = (0.0, 0.0, 0.0)
+    """Time constant of the disturbance observer, per world axis: what pushes the base beside the forces asked for and fed forward is
+    estimated and taken back; 0: off, as in the paper."""
+    disturbance_lag_s: NonNegative = 0.1
+    """From the force asked for to the force given, for the observer."""
+    disturbance_max_n: NonNegative = 6.0
+    """Bound of the observer's estimate, per axis."""
+    feedforward_lead_s: NonNegative = 0.0
+    """The reference's horizontal acceleration is fed forward this long ahead (a + lead times jerk): the attitude loop is late by it."""
+    arm_inertia_nominal: bool = False
+    """Feed the arm's own nominal inertia and Coriolis torque forward in place of M_d; vehicle and coupling stay unknown."""
+    arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the vehicle file's `arm.joint_friction_nm` that is fed forward along the wanted joint rate."""
     lateral_force_max_n: Positive = 12.0
     attitude_filter_rad_s: Positive = 30.0
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0

@@ -11,12 +11,23 @@ from companion.config.base import Location
 Data: TypeAlias = "bool | int | float | str | list[Data] | dict[str, Data] | None"
 
 
+LINE_MAX = 1000
+"""Characters of one line for the user; what is cut off is the end of what the user wrote there."""
+
+
 class ConfigError(Exception):
     """The user's input is not usable. `lines` holds one clear line per problem, the most important one first."""
 
     def __init__(self, lines: Sequence[str]) -> None:
-        self.lines = tuple(lines)
+        self.lines = tuple(map(_shown, lines))
         super().__init__("\n".join(self.lines))
+
+
+def _shown(line: str) -> str:
+    """Keys and values are quoted as they were written: nothing in them may break the line, steer the terminal or flood it."""
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    return line if len(line) <= LINE_MAX else line[: LINE_MAX - 3] + "..."
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -30,6 +30,8 @@ UNITS = {
     "hz": "Hz", "khz": "kHz", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "c": "degC", "kgf": "kgf",
 }  # fmt: skip
 """Unit suffixes a person may write behind a key, known here or not."""
+MANY_OPTIONS = 12
+"""More of them are not listed in a line."""
 
 
 def validate(model: type[M], document: Document) -> M | None:
@@ -118,7 +120,10 @@ def describe(node: _Node | None, schema: _Node) -> str:
     if "const" in node:
         return _show(node["const"])
     if "enum" in node:
-        return "one of " + ", ".join(_show(option) for option in node["enum"])
+        shown = [_show(option) for option in node["enum"]]
+        if len(shown) > MANY_OPTIONS:
+            return f"one of {len(shown)} names ({', '.join(shown[:3])}, ...)"
+        return "one of " + ", ".join(shown)
     kind = node.get("type")
     if kind in ("number", "integer"):
         return ("a number" if kind == "number" else "a whole number") + _bounds(node)

@@ -40,6 +40,8 @@ class Airframe(Model):
     """Height of the body origin above the floor when standing on the landing gear."""
     radius_m: Positive = 0.45
     """Horizontal reach around the body origin, rotor disks included."""
+    payload_max_kg: NonNegative = 0.4
+    """Largest payload that a mission which expects none (no `catch:`) is checked with."""
 
 
 class Joint(Model):
@@ -69,6 +71,8 @@ class Arm(Model):
     torque_per_amp_nm_a: Positive = 1.3
     joint_armature_kg_m2: NonNegative = 0.008
     """Inertia of rotor and gears of one servo, felt at the joint; for the laws that are built on a model."""
+    joint_friction_nm: NonNegative = 0.04
+    """Dry friction of one joint; for laws that feed it forward."""
     joints: tuple[Joint, Joint]
 
 
@@ -91,7 +95,31 @@ class Tether(Model):
     length_m: Positive
     attachment_body_m: Vector3 = (0.0, 0.0, 0.0)
     margin_m: NonNegative = 0.25
-    """No planned point comes nearer to the taut sphere than this."""
+    """Slack that is kept: no planned point, and no point at which the machine could stop, comes nearer to the taut sphere."""
+    load_rating_n: Positive = 300.0
+    """Working load of the whole chain, anchor to attachment; must hold the rotors at full command."""
+    weight_n_per_m: NonNegative = 0.1
+    """What hangs from the machine is lifted by it."""
+    react_time_s: NonNegative = 0.15
+    """From a fault to the first deceleration."""
+    stop_deceleration_m_s2: Positive = 2.0
+    """The machine can always stop so fast; stopping distances are computed with it."""
+    turns_max: Positive = 1.5
+    """Turns about the anchor's vertical, and of the line about the vehicle, either way."""
+    taut_slack_m: NonNegative = 0.05
+    """Taut when less than this is left."""
+    pull_min_n: Positive = 2.0
+    """No pull below this is believed, however clear it looks."""
+    pull_filter_s: Positive = 0.1
+    """Time constant of the low-pass of the force that rotors, gravity and tool do not explain."""
+    pull_time_s: NonNegative = 0.8
+    """A pull that lasts shorter is a blow."""
+    separation_m: Positive = 0.3
+    """Farther than the length by this without a pull: the tether holds the machine no more."""
+    rotor_inner_radius_m: NonNegative = 0.15
+    """No blade sweeps nearer to the body's z axis; the line may hang down within."""
+    clearance_min_m: NonNegative = 0.01
+    """Between line and rotor disk or arm sweep."""
 
 
 class Room(Model):
@@ -167,26 +195,97 @@ class Devices(Model):
 
 
 class Safety(Model):
-    """Limits after which the companion stops the mission by itself."""
+    """Limits after which the companion reacts by itself, and how. What each of them does: docs/safety.md."""
 
+    # Motion capture
     mocap_timeout_s: Positive = 0.12
     """Oldest mocap pose; beyond it the arm folds and PX4 lands on its own estimate."""
+    mocap_rate_min_hz: Positive = 50.0
+    """Fewer poses in a second are told."""
+    mocap_latency_warn_s: Positive = 0.05
+    """Mid-exposure to transmission, by Motive's clock; beyond `mocap_timeout_s` a pose is as good as none."""
+    mocap_jump_m: Positive = 0.10
+    """Further from where PX4's velocity says it should be than this, a pose is not believed."""
+    mocap_jump_deg: Positive = 20.0
+    """The same for its attitude, beside what the rates explain."""
+    mocap_frozen_s: Positive = 0.10
+    """New frames with the very same pose for this long, while the vehicle moves."""
+    estimate_disagreement_m: Positive = 0.30
+    """Between PX4's position and mocap."""
+    yaw_disagreement_deg: Positive = 15.0
+    """Between PX4's yaw and mocap's."""
+
+    # PX4 and battery
     vehicle_timeout_s: Positive = 0.25
     """Oldest attitude or position from PX4."""
+    link_lag_max_s: Positive = 0.07
+    """What PX4 says may be so much older than at the best of times; beyond it nobody can steer over this link."""
     heartbeat_timeout_s: Positive = 2.5
+    battery_min: Fraction = 0.2
+    battery_warn: Fraction = 0.3
+    battery_voltage_min_v: Positive | None = 13.2
+    """Under load; 3.3 V per cell of a 4S battery. null: not watched."""
+
+    # Arm and force sensor
     arm_timeout_s: Positive = 0.10
     """Oldest joint state; beyond it the vehicle lands."""
+    arm_read_failures_max: Annotated[int, Field(ge=1)] = 5
+    """Consecutive bus cycles without an answer."""
+    servo_warn_c: Positive = 65.0
+    servo_max_c: Positive = 75.0
+    """The servos shut themselves down at 80."""
+    servo_overload_s: Positive = 1.0
+    """A joint at its torque limit for this long."""
+    joint_jump_deg: Positive = 15.0
+    """Between two reads, beside what the joint's largest speed explains."""
+    joint_rate_max_deg_s: Positive = 700.0
+    """No servo of this kind turns faster, not even when it is driven."""
+    joint_wall_warn_deg: Positive = 3.0
+    joint_wall_max_deg: Positive = 10.0
+    """Beyond a joint's wall."""
+    servo_current_max_a: Positive = 2.3
+    """No command asks for more; the stall current."""
     force_timeout_s: Positive = 0.25
     """Oldest force sample; beyond it the law flies on without force, and says so."""
+    force_stuck_s: Positive = 0.25
+    """New samples with the very same values for this long; then the law flies on without force."""
+    force_drift_n: Positive = 1.5
+    """Lasting force on the net before anything was caught."""
+
+    # The flight itself
     loop_late_s: Positive = 0.05
     """A control tick that comes later than this is told."""
     loop_stalled_s: Positive = 0.3
     """A control tick that comes later than this lands the vehicle."""
-    estimate_disagreement_m: Positive = 0.30
-    """Between PX4's position and mocap, held for 0.2 s."""
+    command_state_age_max_s: Positive = 0.10
+    """Nothing is sent to PX4 that was computed from an older attitude."""
+    thrust_slew_max_per_s: Positive = 100.0
+    """Normalised thrust; far above what a catch asks for."""
     tilt_abort_deg: Annotated[float, Field(gt=0, le=80)] = 40.0
+    tracking_error_warn_m: Positive = 0.45
+    tracking_error_hold_m: Positive = 0.6
     tracking_error_abort_m: Positive = 0.8
-    battery_min: Fraction = 0.2
+    thrust_saturated_s: Positive = 1.0
+    """More of the time at the upper thrust limit than below it, by this much."""
+    speed_max_m_s: Positive = 2.0
+    """Horizontal; a mission's limits must stay below."""
+    climb_max_m_s: Positive = 1.5
+    sink_max_m_s: Positive = 1.5
+    geofence_tolerance_m: NonNegative = 0.10
+    """The rotors may lean out of the room by this much: a mission may use it to the full, and no flight is exact."""
+    tether_stop_slack_min_m: NonNegative = 0.10
+    """Tether left where the vehicle would come to rest."""
+
+    # Reactions
+    guardian_timeout_s: Positive = 0.1
+    """The flight process silent for this long while the rotors turn: the guardian ends it, takes the link over and lands."""
+    hold_max_s: Positive = 20.0
+    """A HOLD that nobody ended by then becomes a landing."""
+    retract_max_s: Positive = 12.0
+    """A RETRACT that has not arrived by then becomes a landing where it is."""
+    retract_speed_m_s: Positive = 0.3
+    retract_slack_m: Positive = 0.6
+    """So much tether is to be free at the end of a RETRACT."""
     land_speed_m_s: Positive = 0.35
     fold_arm_deg: Vector2 = (165.0, 140.0)
 

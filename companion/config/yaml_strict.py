@@ -36,6 +36,7 @@ _HEX = re.compile(r"0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)")
 _NAN = re.compile(r"\.(nan|NaN|NAN)")
+_HALF_CHARACTER = "an escape (\\uD800 to \\uDFFF) that is half a character; write the character itself"
 _DIGITS_MAX = 400  # Python refuses to convert integers of more than 4300 digits with an exception of its own.
 
 
@@ -137,6 +138,12 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
         loader = StrictLoader(text)
         try:
             node = loader.get_single_node()
+        except (
+            ValueError,
+            OverflowError,
+        ) as error:  # PyYAML converts "\\U0011FFFF" and %YAML 1.999... without a look at them
+            at = origin(loader.get_mark())
+            raise ConfigError([f"{at}: not YAML: an escape or a number that means nothing ({error})"]) from None
         finally:
             loader.dispose()
     except yaml.reader.ReaderError as error:
@@ -169,6 +176,9 @@ class _Builder:
             return [self.build(item, (*location, index)) for index, item in enumerate(node.value)]
         assert isinstance(node, yaml.ScalarNode)
         text: str = node.value
+        if not _is_unicode(text):
+            self._refuse(RANK_VALUE, node.start_mark, location, _HALF_CHARACTER)
+            return None
         if node.style is not None:  # quoted or block: text, whatever it looks like
             return text
         try:
@@ -189,6 +199,9 @@ class _Builder:
                     RANK_KEY, key_node.start_mark, location, "merge keys (<<) are not accepted; write the keys out"
                 )
                 continue
+            if not _is_unicode(key):
+                self._refuse(RANK_KEY, key_node.start_mark, location, _HALF_CHARACTER)
+                continue
             at = (*location, key)
             if key in data:
                 first = self._document.keys[at]
@@ -200,6 +213,15 @@ class _Builder:
             self._document.keys[at] = self._at(key_node.start_mark)
             data[key] = self.build(value_node, at)
         return data
+
+
+def _is_unicode(text: str) -> bool:
+    """False: an escape like "\\uD800" left half of a UTF-16 pair, which no JSON and no terminal takes."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _scalar(text: str) -> Data:

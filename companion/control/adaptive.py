@@ -2,156 +2,301 @@
 
 Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. The attitude rows belong to PX4's attitude loop: they are masked out of every
 norm and get no torque. Order of the steps as in docs/control-law.md; zero-order hold is exact, so H and zeta stay >= 0 for any input.
+
+Sums over the five active rows are written out, with the row in every name (`s0` .. `s2` for x y z, `s6` and `s7` for the joints): plain
+floats are several times as fast as loops or arrays, and an equation still stands in one place.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.vehicle import Vehicle
-from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors, vec8
-from companion.control.impedance import Impedance, LowPass
+from companion.control.arm_inertia import ArmInertia
+from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
+from companion.control.disturbance import DisturbanceObserver
+from companion.control.impedance import Impedance
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.control.types import PlantState, Wrench
-from companion.frames import quat_conjugate, quat_rotate
-from companion.types import ControlLog, Reference, Vec2, Vec3, Vec4
+from companion.control.zero_order_hold import HoldTable
+from companion.frames import body_x_z_axes_world
+from companion.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
 
-_ACTIVE_ROWS = (0, 1, 2, 6, 7)
+FRICTION_RATE_RAD_S = 0.1
+"""Below it the friction that is fed forward fades: a joint at rest is not to be shaken."""
+
+Rows = tuple[float, float, float, float, float]
+"""Of the active rows: x, y, z, alpha_1, alpha_2."""
+
+
+def active(rows: tuple[float, ...]) -> Rows:
+    """The active ones of eight rows."""
+    x, y, z, _, _, _, a1, a2 = rows
+    return (x, y, z, a1, a2)
 
 
 class Adaptation:
     """H_0 .. H_3 and zeta (eq. adaptive_law_full), exact zero-order hold."""
 
     def __init__(self, config: AdaptiveConfig) -> None:
-        self._nu = config.nu
         self._epsilon = config.epsilon
         self._varpi = config.boundary_layer
         self._rho_max = config.rho_max
-        self.h: list[float] = list(config.h_initial)
+        nu = config.nu
+
+        def held(dt_s: float) -> tuple[float, ...]:
+            decays = [math.exp(-leakage * dt_s) for leakage in nu]
+            return (*decays, *((1.0 - decay) / leakage for decay, leakage in zip(decays, nu, strict=True)))
+
+        self._held = HoldTable(held)
+        """e^{-nu T} of H_0 .. H_3, then (1 - e^{-nu T}) / nu."""
+        self.h: Vec4 = config.h_initial
         self.zeta = config.zeta_initial
 
     def rho(self, regressor: Vec4) -> float:
         """Gain of the robust term: H . b + zeta, capped."""
-        return min(self._rho_max, sum(h * b for h, b in zip(self.h, regressor, strict=True)) + self.zeta)
+        (h0, h1, h2, h3), (b0, b1, b2, b3) = self.h, regressor
+        rho = h0 * b0 + h1 * b1 + h2 * b2 + h3 * b3 + self.zeta
+        return rho if rho < self._rho_max else self._rho_max
 
     def advance(self, dt_s: float, norm_s: float, regressor: Vec4, frozen: bool) -> None:
         """One step with ||S s|| and the regressor held; `frozen`: the actuators clipped, so nothing is to be learnt."""
+        (h0, h1, h2, h3), (b0, b1, b2, b3) = self.h, regressor
         if norm_s < self._varpi:
-            c = 1.0 + sum(h * b for h, b in zip(self.h, regressor, strict=True)) * norm_s
+            c = 1.0 + (h0 * b0 + h1 * b1 + h2 * b2 + h3 * b3) * norm_s
             decay = math.exp(-c * dt_s)
             self.zeta = decay * self.zeta + (1.0 - decay) * self._epsilon / c
         drive = 0.0 if frozen else norm_s
-        for i, nu in enumerate(self._nu):
-            decay = math.exp(-nu * dt_s)
-            self.h[i] = decay * self.h[i] + (1.0 - decay) / nu * drive * regressor[i]
+        k0, k1, k2, k3, g0, g1, g2, g3 = self._held[dt_s]
+        self.h = (
+            k0 * h0 + g0 * drive * b0,
+            k1 * h1 + g1 * drive * b1,
+            k2 * h2 + g2 * drive * b2,
+            k3 * h3 + g3 * drive * b3,
+        )
+
+
+class AccelerationFilter:
+    """chi'' of the active rows: measured on the base, differenced on the joints, low-passed, exact for a held input."""
+
+    def __init__(self, cutoff_hz: float) -> None:
+        self._w = 2.0 * math.pi * cutoff_hz
+        self._arm_rate_rad_s: Vec2 | None = None
+        self._value: Rows | None = None
+
+    def step(self, dt_s: float, state: PlantState) -> Rows:
+        """m/s^2 and rad/s^2; starts at its first sample."""
+        w6, w7 = rate = state.arm_rate_rad_s
+        w6_before, w7_before = self._arm_rate_rad_s or rate
+        self._arm_rate_rad_s = rate
+        x, y, z = state.acceleration_world_m_s2
+        a6, a7 = (w6 - w6_before) / dt_s, (w7 - w7_before) / dt_s
+        if self._value is None:
+            value: Rows = (x, y, z, a6, a7)
+        else:
+            k = 1.0 - math.exp(-self._w * dt_s)
+            v0, v1, v2, v6, v7 = self._value
+            value = (v0 + k * (x - v0), v1 + k * (y - v1), v2 + k * (z - v2), v6 + k * (a6 - v6), v7 + k * (a7 - v7))
+        self._value = value
+        return value
 
 
 class AdaptiveController:
     """The whole law for vehicle and arm."""
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
-        self._c = config
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._impedance = Impedance(config)
         self._adaptation = Adaptation(config)
-        self._acceleration_filter = LowPass(config.acceleration_lowpass_hz)
+        weights = active(config.row_weights_s)
+        self._weights_squared: Rows = (
+            weights[0] ** 2,
+            weights[1] ** 2,
+            weights[2] ** 2,
+            weights[3] ** 2,
+            weights[4] ** 2,
+        )
+        self._inertia, self._lambda, self._phi, self._d = (
+            active(gain) for gain in (config.inertia_md, config.lambda_gain, config.phi, self._impedance.d)
+        )
+        self._varpi = config.boundary_layer
+        self._acceleration_cap = config.acceleration_cap
+        self._acceleration = AccelerationFilter(config.acceleration_lowpass_hz)
         self._force = ForceFilter(config.force_lowpass_hz)
         self._desired = DesiredForce(config.desired_force_time_s)
-        self._arm_acceleration_filter = LowPass(config.acceleration_lowpass_hz)
         self._actuation = Actuation(config, vehicle, hover_thrust)
-        self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
-        self._hover_thrust = hover_thrust
-        self._arm_rate_previous: Vec2 | None = None
+        mass_kg = vehicle.airframe.mass_kg
+        self._disturbance = DisturbanceObserver(
+            mass_kg, config.disturbance_time_xyz_s, config.disturbance_lag_s, config.disturbance_max_n
+        )
+        self._arm_inertia = ArmInertia(vehicle) if config.arm_inertia_nominal else None
+        self._friction_nm = config.arm_friction_share * vehicle.arm.joint_friction_nm
+        self._weight_n = mass_kg * GRAVITY_M_S2
+        self._force_share, self._compliance = config.force_feedforward_xyz, config.base_compliance_xyz
+        self._lead_s = config.feedforward_lead_s
+        shares = zip(self._force_share, self._compliance, strict=True)
+        x, y, z = (min(1.0, fed + yielding) for fed, yielding in shares)
+        self._accounted: Vec3 = (x, y, z)
+        self._known_n: Vec3 = (0.0, 0.0, 0.0)
+        """Of the last tick: rotors, weight, and the measured force as far as it is accounted for."""
+        self.hover_thrust = hover_thrust
+        """For the log; who estimates it sets it before every step."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """One tick of `dt_s`; see `companion.control.types.Controller`."""
-        c = self._c
-        acceleration = self._acceleration(dt_s, state)
+        adaptation, impedance, sent = self._adaptation, self._impedance, self._actuation
+        clipped_before = sent.any_clipped
+        acceleration = self._acceleration.step(dt_s, state)
         force = self._force.step(dt_s, state.force_ext_world_n)
-        error, error_rate = tracking_errors(state, reference)
-        e_tau, tau_d = self._torque_error(state, force)
-        s = self._impedance.sliding(error, error_rate)
-        weights = c.row_weights_s
-        norm_s = _weighted_norm(weights, s)
-        x = math.hypot(_weighted_norm(weights, error), _weighted_norm(weights, error_rate))
-        regressor: Vec4 = (1.0, x, x * x, min(_weighted_norm(weights, acceleration), c.acceleration_cap))
-        rho = self._adaptation.rho(regressor)
-        tau = self._tau(s, norm_s, rho, error_rate, tau_d, state, reference, force)
-        clipped_before = any(self._actuation.clipped)
-        sent = self._actuation.step(dt_s, (tau[0], tau[1], tau[2]), (tau[6], tau[7]), state, reference, vertical_scale)
-        self._adaptation.advance(dt_s, norm_s, regressor, clipped_before)
-        self._impedance.advance(dt_s, e_tau)
+        learn = vertical_scale >= 1.0 and not clipped_before
+        disturbance = self._disturbance.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
+        body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
+        error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
+        e_tau, tau_d, arm_gravity = self._torque_error(state.arm_rad, body_x, body_z, force)
+        s = impedance.sliding(error, error_rate)
+        norm_s, x, norm_a = self._norms(s, error, error_rate, acceleration)
+        cap = self._acceleration_cap
+        regressor: Vec4 = (1.0, x, x * x, cap if norm_a > cap else norm_a)
+        rho = adaptation.rho(regressor)
+        varpi = self._varpi
+        robust = rho / (varpi if varpi > norm_s else norm_s)
+        tau = self._tau(s, robust, error_rate, tau_d, reference)
+        wanted_n = self._base_force(tau, reference, force, disturbance)
+        wanted_nm = self._arm_torque(tau, arm_gravity, s, e_tau, error_rate, state, reference)
+        sent.step(dt_s, wanted_n, wanted_nm, body_z, reference.yaw_rad, vertical_scale)
+        (f0, f1, f2), (t6, t7) = sent.force_world_n, sent.arm_torque_nm
+        self._remember(sent.force_world_n, force)
+        adaptation.advance(dt_s, norm_s, regressor, clipped_before)
+        gamma = impedance.advance(dt_s, e_tau)
         self._desired.advance(dt_s, force)
         log = ControlLog(
-            error=vec8(error),
-            error_rate=vec8(error_rate),
-            sliding=vec8(s),
-            gamma=vec8(self._impedance.gamma),
-            tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
-            e_tau=vec8(e_tau),
-            h_hat=(self._adaptation.h[0], self._adaptation.h[1], self._adaptation.h[2], self._adaptation.h[3]),
-            zeta=self._adaptation.zeta,
-            rho=rho,
-            force_ext_world_n=force,
-            attitude_desired_rad=sent.roll_pitch_yaw_rad,
-            hover_thrust=self._hover_thrust,
-            saturated=sent.clipped,
+            error,
+            error_rate,
+            s,
+            gamma,
+            (f0, f1, f2, 0.0, 0.0, 0.0, t6, t7),
+            e_tau,
+            adaptation.h,
+            adaptation.zeta,
+            rho,
+            force,
+            sent.roll_pitch_yaw_rad,
+            self.hover_thrust,
+            sent.clipped,
         )
         return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
 
-    def _acceleration(self, dt_s: float, state: PlantState) -> list[float]:
-        """chi_dd, low-passed; attitude rows 0 (masked)."""
-        linear = self._acceleration_filter.step(dt_s, state.acceleration_world_m_s2)
-        before = self._arm_rate_previous or state.arm_rate_rad_s
-        rate = [(now - then) / dt_s for now, then in zip(state.arm_rate_rad_s, before, strict=True)]
-        self._arm_rate_previous = state.arm_rate_rad_s
-        arm = self._arm_acceleration_filter.step(dt_s, rate)
-        return [*linear, 0.0, 0.0, 0.0, *arm]
+    def _torque_error(self, arm_rad: Vec2, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Vec8, Vec2, Vec2]:
+        """e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that carry the arm."""
+        (xx, xy, xz), (zx, zy, zz) = body_x, body_z
+        jx6, jx7, jz6, jz7, g6, g7 = self._manipulator.joint_terms(arm_rad, GRAVITY_M_S2 * xz, GRAVITY_M_S2 * zz)
+        (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
+        f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
+        d_x, d_z = xx * d0 + xy * d1 + xz * d2, zx * d0 + zy * d1 + zz * d2
+        tau_d6, tau_d7 = jx6 * d_x + jz6 * d_z, jx7 * d_x + jz7 * d_z
+        return (
+            (
+                c0 * f0,
+                c1 * f1,
+                c2 * f2,
+                0.0,
+                0.0,
+                0.0,
+                jx6 * f_x + jz6 * f_z - tau_d6,
+                jx7 * f_x + jz7 * f_z - tau_d7,
+            ),
+            (tau_d6, tau_d7),
+            (g6, g7),
+        )
 
-    def _torque_error(self, state: PlantState, force: Vec3) -> tuple[list[float], list[float]]:
-        """e_tau = tau_ext - tau_d and tau_d, 8 rows."""
-        to_body = quat_conjugate(state.attitude_wxyz)
-        ext = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force))
-        desired = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, self._desired.world_n))
-        base = [share * f for share, f in zip(self._c.base_compliance_xyz, force, strict=True)]
-        e_tau = [*base, 0.0, 0.0, 0.0, ext[0] - desired[0], ext[1] - desired[1]]
-        return e_tau, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, desired[0], desired[1]]
+    def _norms(self, s: Vec8, error: Vec8, error_rate: Vec8, acceleration: Rows) -> Vec3:
+        """||S s||, ||S [e; e']||, ||S chi_dd||."""
+        s0, s1, s2, _, _, _, s6, s7 = s
+        e0, e1, e2, _, _, _, e6, e7 = error
+        v0, v1, v2, _, _, _, v6, v7 = error_rate
+        a0, a1, a2, a6, a7 = acceleration
+        w0, w1, w2, w6, w7 = self._weights_squared
+        return (
+            math.sqrt(w0 * s0 * s0 + w1 * s1 * s1 + w2 * s2 * s2 + w6 * s6 * s6 + w7 * s7 * s7),
+            math.sqrt(
+                w0 * (e0 * e0 + v0 * v0)
+                + w1 * (e1 * e1 + v1 * v1)
+                + w2 * (e2 * e2 + v2 * v2)
+                + w6 * (e6 * e6 + v6 * v6)
+                + w7 * (e7 * e7 + v7 * v7)
+            ),
+            math.sqrt(w0 * a0 * a0 + w1 * a1 * a1 + w2 * a2 * a2 + w6 * a6 * a6 + w7 * a7 * a7),
+        )
 
-    def _tau(
+    def _tau(self, s: Vec8, robust: float, error_rate: Vec8, tau_d: Vec2, reference: Reference) -> Rows:
+        """Eq. tau with - D gamma and dtau = -rho S^2 s / max(||S s||, varpi); `robust` is rho over that maximum. Row by row
+
+        tau = M_d (chi''_d - Phi e') - (Lambda + robust S^2) s - D gamma - tau_d.
+        """
+        s0, s1, s2, _, _, _, s6, s7 = s
+        v0, v1, v2, _, _, _, v6, v7 = error_rate
+        g0, g1, g2, _, _, _, g6, g7 = self._impedance.gamma
+        a0, a1, a2 = reference.acceleration_world_m_s2
+        a6, a7 = reference.arm_acceleration_rad_s2
+        m0, m1, m2, m6, m7 = self._inertia
+        p0, p1, p2, p6, p7 = self._phi
+        l0, l1, l2, l6, l7 = self._lambda
+        w0, w1, w2, w6, w7 = self._weights_squared
+        d0, d1, d2, d6, d7 = self._d
+        return (
+            m0 * (a0 - p0 * v0) - (l0 + robust * w0) * s0 - d0 * g0,
+            m1 * (a1 - p1 * v1) - (l1 + robust * w1) * s1 - d1 * g1,
+            m2 * (a2 - p2 * v2) - (l2 + robust * w2) * s2 - d2 * g2,
+            m6 * (a6 - p6 * v6) - (l6 + robust * w6) * s6 - d6 * g6 - tau_d[0],
+            m7 * (a7 - p7 * v7) - (l7 + robust * w7) * s7 - d7 * g7 - tau_d[1],
+        )
+
+    def _base_force(self, tau: Rows, reference: Reference, force: Vec3, disturbance: Vec3) -> Vec3:
+        """tau of the base and hover thrust; and, as far as the configuration asks for it: force sensor, disturbance, lead."""
+        (x, y, z, _, _), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = tau, force, disturbance, self._force_share
+        x -= c0 * f0 + d0
+        y -= c1 * f1 + d1
+        z -= c2 * f2 + d2
+        lead_s = self._lead_s
+        if lead_s > 0.0:
+            jerk, inertia = reference.jerk_world_m_s3, self._inertia
+            x += inertia[0] * lead_s * jerk[0]
+            y += inertia[1] * lead_s * jerk[1]
+        return (x, y, z + self._weight_n)
+
+    def _arm_torque(
         self,
-        s: Sequence[float],
-        norm_s: float,
-        rho: float,
-        error_rate: Sequence[float],
-        tau_d: Sequence[float],
+        tau: Rows,
+        gravity: Vec2,
+        s: Vec8,
+        e_tau: Vec8,
+        error_rate: Vec8,
         state: PlantState,
         reference: Reference,
-        force: Vec3,
-    ) -> list[float]:
-        """Eq. tau with - D gamma and dtau = -rho S^2 s / max(||S s||, varpi), plus hover thrust and arm gravity."""
-        c, impedance = self._c, self._impedance
-        robust = rho / max(norm_s, c.boundary_layer)
-        feed = (*reference.acceleration_world_m_s2, 0.0, 0.0, 0.0, *reference.arm_acceleration_rad_s2)
-        tau = [0.0] * 8
-        for i in _ACTIVE_ROWS:
-            tau[i] = (
-                -c.lambda_gain[i] * s[i]
-                - tau_d[i]
-                - robust * c.row_weights_s[i] ** 2 * s[i]
-                + c.inertia_md[i] * (feed[i] - c.phi[i] * error_rate[i])
-                - impedance.d[i] * impedance.gamma[i]
-            )
-        ff = c.force_feedforward_xyz
-        tau[0] -= ff[0] * force[0]
-        tau[1] -= ff[1] * force[1]
-        tau[2] += self._weight_n - ff[2] * force[2]
-        gravity = self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
-        tau[6] += gravity[0]
-        tau[7] += gravity[1]
-        return tau
+    ) -> Vec2:
+        """tau of the joints and arm gravity; and the options (M_arm - M_d) alpha''* + C alpha' and the friction at alpha'*.
 
+        Star: what the target asks for now, alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d - Phi e + gamma = alpha' - s.
+        """
+        t6, t7 = tau[3] + gravity[0], tau[4] + gravity[1]
+        rates = state.arm_rate_rad_s
+        if self._arm_inertia is not None:
+            _, _, _, m6, m7 = self._inertia
+            _, _, _, p6, p7 = self._phi
+            _, _, _, d6, d7 = self._d
+            gamma, feed = self._impedance.gamma, reference.arm_acceleration_rad_s2
+            a6 = feed[0] - p6 * error_rate[6] + (e_tau[6] - d6 * gamma[6]) / m6
+            a7 = feed[1] - p7 * error_rate[7] + (e_tau[7] - d7 * gamma[7]) / m7
+            first, second = self._arm_inertia.torque_nm(state.arm_rad, rates, (a6, a7))
+            t6 += first - m6 * a6
+            t7 += second - m7 * a7
+        if self._friction_nm > 0.0:
+            t6 += self._friction_nm * math.tanh((rates[0] - s[6]) / FRICTION_RATE_RAD_S)
+            t7 += self._friction_nm * math.tanh((rates[1] - s[7]) / FRICTION_RATE_RAD_S)
+        return (t6, t7)
 
-def _weighted_norm(weights: Sequence[float], vector: Sequence[float]) -> float:
-    return math.sqrt(sum((w * v) ** 2 for w, v in zip(weights, vector, strict=True)))
+    def _remember(self, sent_n: Vec3, force: Vec3) -> None:
+        """The measured force is none of the observer's business as far as it is fed forward or the base is to give way to it."""
+        (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
+        self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)

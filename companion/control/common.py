@@ -1,14 +1,14 @@
-"""What every law shares: errors, the filtered external force, the force that is taken for granted, and the way to the actuators."""
+"""What every law shares: errors, the filtered external force, the force that is taken for granted, and the way to the actuators.
+
+Plain floats, written out axis by axis: all of it runs in the control tick.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 from companion.config.vehicle import Vehicle
-from companion.control.impedance import LowPass
 from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.thrust import (
     ForceLimits,
@@ -19,51 +19,51 @@ from companion.control.thrust import (
     saturate_force,
 )
 from companion.control.types import PlantState
-from companion.frames import euler_zyx_from_quat, wrap_rad
-from companion.types import Quat, Reference, Vec2, Vec3, Vec8
+from companion.frames import wrap_rad
+from companion.types import IDENTITY_QUAT, Quat, Reference, Vec2, Vec3, Vec8
+
+ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def tracking_errors(state: PlantState, reference: Reference) -> tuple[list[float], list[float]]:
+def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Vec8, Vec8]:
     """e = chi - chi_d and e', 8 rows; rows 3 and 4 (roll, pitch) are 0: their reference is the law's own."""
-    p, v, r = state.position_world_m, state.velocity_world_m_s, reference
-    yaw = euler_zyx_from_quat(state.attitude_wxyz)[2]
-    yaw_rate = state.angular_rate_body_rad_s[2]
-    error = [
-        p[0] - r.position_world_m[0],
-        p[1] - r.position_world_m[1],
-        p[2] - r.position_world_m[2],
-        0.0,
-        0.0,
-        wrap_rad(yaw - r.yaw_rad),
-        state.arm_rad[0] - r.arm_rad[0],
-        state.arm_rad[1] - r.arm_rad[1],
-    ]
-    rate = [
-        v[0] - r.velocity_world_m_s[0],
-        v[1] - r.velocity_world_m_s[1],
-        v[2] - r.velocity_world_m_s[2],
-        0.0,
-        0.0,
-        yaw_rate - r.yaw_rate_rad_s,
-        state.arm_rate_rad_s[0] - r.arm_rate_rad_s[0],
-        state.arm_rate_rad_s[1] - r.arm_rate_rad_s[1],
-    ]
-    return error, rate
+    px, py, pz = state.position_world_m
+    vx, vy, vz = state.velocity_world_m_s
+    a1, a2 = state.arm_rad
+    w1, w2 = state.arm_rate_rad_s
+    px_d, py_d, pz_d = reference.position_world_m
+    vx_d, vy_d, vz_d = reference.velocity_world_m_s
+    a1_d, a2_d = reference.arm_rad
+    w1_d, w2_d = reference.arm_rate_rad_s
+    yaw_error = wrap_rad(yaw_rad - reference.yaw_rad)
+    yaw_error_rate = state.angular_rate_body_rad_s[2] - reference.yaw_rate_rad_s
+    return (
+        (px - px_d, py - py_d, pz - pz_d, 0.0, 0.0, yaw_error, a1 - a1_d, a2 - a2_d),
+        (vx - vx_d, vy - vy_d, vz - vz_d, 0.0, 0.0, yaw_error_rate, w1 - w1_d, w2 - w2_d),
+    )
 
 
 class ForceFilter:
-    """The external force, low-passed; zero while there is no sample to be trusted, and it starts again from there."""
+    """The external force, low-passed; zero while there is no sample to be trusted, and it starts again from there.
+
+    First order, exact for a held input; starts at its first sample.
+    """
 
     def __init__(self, cutoff_hz: float) -> None:
-        self._filter = LowPass(cutoff_hz)
+        self._w = 2.0 * math.pi * cutoff_hz
+        self._force_n: Vec3 | None = None
 
     def step(self, dt_s: float, sample_world_n: Vec3 | None) -> Vec3:
         """Filtered force, world, N."""
+        before = self._force_n
         if sample_world_n is None:
-            self._filter.reset((0.0, 0.0, 0.0))
-            return (0.0, 0.0, 0.0)
-        x, y, z = self._filter.step(dt_s, sample_world_n)
-        return (x, y, z)
+            sample_world_n = (0.0, 0.0, 0.0)
+        elif before is not None:
+            (x, y, z), (sx, sy, sz) = before, sample_world_n
+            k = 1.0 - math.exp(-self._w * dt_s)
+            sample_world_n = (x + k * (sx - x), y + k * (sy - y), z + k * (sz - z))
+        self._force_n = sample_world_n
+        return sample_world_n
 
 
 class DesiredForce:
@@ -81,9 +81,11 @@ class DesiredForce:
         """One step with the force held."""
         if self._time_s is None:
             return
-        k = min(1.0, dt_s / self._time_s)
-        d, f = self.world_n, force_world_n
-        self.world_n = (d[0] + k * (f[0] - d[0]), d[1] + k * (f[1] - d[1]), d[2] + k * (f[2] - d[2]))
+        k = dt_s / self._time_s
+        if k > 1.0:
+            k = 1.0
+        (x, y, z), (fx, fy, fz) = self.world_n, force_world_n
+        self.world_n = (x + k * (fx - x), y + k * (fy - y), z + k * (fz - z))
 
 
 class ActuationConfig(Protocol):
@@ -102,21 +104,11 @@ class ActuationConfig(Protocol):
         """Damping of the same filter."""
 
 
-@dataclass(frozen=True, slots=True)
-class Actuated:
-    """What may be asked of rotors and servos."""
-
-    attitude_wxyz: Quat
-    collective_n: float
-    arm_torque_nm: Vec2
-    force_world_n: Vec3
-    roll_pitch_yaw_rad: Vec3
-    clipped: tuple[bool, bool, bool]
-    """Vertical force, lateral force, joint torque."""
-
-
 class Actuation:
-    """From force and joint torques to what is sent: vertical first, then lateral within tilt; smooth roll and pitch; torque limits."""
+    """From force and joint torques to what is sent: vertical first, then lateral within tilt; smooth roll and pitch; torque limits.
+
+    What it says of the last tick are its attributes: a record more per tick would cost more than the arithmetic.
+    """
 
     def __init__(self, config: ActuationConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
@@ -124,50 +116,55 @@ class Actuation:
             vertical_min_n=0.3 * weight_n,
             vertical_max_n=min(0.9 * vehicle.airframe.thrust_max_n, 0.9 / hover_thrust * weight_n),
             lateral_max_n=config.lateral_force_max_n,
-            tilt_max_rad=math.radians(vehicle.airframe.tilt_max_deg),
+            tilt_max_tan=math.tan(math.radians(vehicle.airframe.tilt_max_deg)),
         )
         first, second = vehicle.arm.joints
         self._torque_max_nm = (first.torque_max_nm, second.torque_max_nm)
         self._tilt = TiltFilter(config.attitude_filter_rad_s, config.attitude_filter_damping)
-        self.roll_pitch_rad: Vec2 = (0.0, 0.0)
-        """As last asked for."""
+        self.attitude_wxyz: Quat = IDENTITY_QUAT
+        self.roll_pitch_yaw_rad: Vec3 = (0.0, 0.0, 0.0)
+        self.collective_n = 0.0
+        self.force_world_n: Vec3 = (0.0, 0.0, 0.0)
+        """After saturation."""
+        self.arm_torque_nm: Vec2 = (0.0, 0.0)
         self.clipped = (False, False, False)
-        """As in the last tick."""
+        """Vertical force, lateral force, joint torque."""
+        self.any_clipped = False
 
     def step(
         self,
         dt_s: float,
         force_world_n: Vec3,
         torque_nm: Vec2,
-        state: PlantState,
-        reference: Reference,
+        body_z_world: Vec3,
+        yaw_rad: float,
         vertical_scale: float,
-    ) -> Actuated:
-        """One tick; `vertical_scale` as in `companion.control.types.Controller`."""
+    ) -> None:
+        """One tick.
+
+        Args:
+            dt_s: since the last tick.
+            force_world_n: wanted on the base.
+            torque_nm: wanted on the joints.
+            body_z_world: the body's z axis as it is now.
+            yaw_rad: asked for.
+            vertical_scale: as in `companion.control.types.Controller`.
+        """
         force, clipped_z, clipped_xy = saturate_force(force_world_n, self._limits)
         if vertical_scale < 1.0:
             force = (0.0, 0.0, force[2] * vertical_scale)
-        roll, pitch = self._tilt.step(dt_s, *roll_pitch_from_force(force, reference.yaw_rad))
-        collective = max(0.0, collective_n(force, state.attitude_wxyz))
-        limit = self._torque_max_nm
-        torque: Vec2 = (
-            max(-limit[0], min(limit[0], torque_nm[0])),
-            max(-limit[1], min(limit[1], torque_nm[1])),
-        )
-        self.clipped = (clipped_z, clipped_xy, torque != torque_nm)
-        self.roll_pitch_rad = (roll, pitch)
-        attitude = attitude_from_roll_pitch_yaw(roll, pitch, reference.yaw_rad)
-        return Actuated(attitude, collective, torque, force, (roll, pitch, reference.yaw_rad), self.clipped)
-
-
-def vec8(values: Sequence[float]) -> Vec8:
-    """Eight values as a tuple.
-
-    Raises:
-        ValueError: another number of values.
-    """
-    a, b, c, d, e, f, g, h = values
-    return (a, b, c, d, e, f, g, h)
-
-
-ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.force_world_n = force
+        roll, pitch = roll_pitch_from_force(force, yaw_rad)
+        roll, pitch = self._tilt.step(dt_s, roll, pitch)
+        self.attitude_wxyz = attitude_from_roll_pitch_yaw(roll, pitch, yaw_rad)
+        self.roll_pitch_yaw_rad = (roll, pitch, yaw_rad)
+        collective = collective_n(force, body_z_world)
+        self.collective_n = collective if collective > 0.0 else 0.0
+        clipped_arm = False
+        (t1, t2), (most1, most2) = torque_nm, self._torque_max_nm
+        if not (-most1 <= t1 <= most1 and -most2 <= t2 <= most2):
+            torque_nm = (max(-most1, min(most1, t1)), max(-most2, min(most2, t2)))
+            clipped_arm = True
+        self.arm_torque_nm = torque_nm
+        self.clipped = (clipped_z, clipped_xy, clipped_arm)
+        self.any_clipped = clipped_z or clipped_xy or clipped_arm

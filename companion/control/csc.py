@@ -15,78 +15,52 @@ from __future__ import annotations
 
 from companion.config.controller import CscConfig
 from companion.config.vehicle import Vehicle
-from companion.control.common import ZERO8, Actuation, DesiredForce, ForceFilter, tracking_errors, vec8
-from companion.control.dynamics import Dynamics, chi_rate_from_body_rate, rotation_matrix
-from companion.control.manipulator import Manipulator
+from companion.control.common import tracking_errors
+from companion.control.dynamics import chi_rate_from_body_rate, rotation_matrix
+from companion.control.model_based import ModelBasedLaw
 from companion.control.types import PlantState, Wrench
-from companion.frames import euler_zyx_from_quat, quat_conjugate, quat_rotate
-from companion.types import ControlLog, Reference, Vec3, Vec8
+from companion.frames import body_x_z_axes_world, euler_zyx_from_quat, yaw_from_quat
+from companion.types import Reference, Vec3, Vec8
 
 
-class CscController:
+class CscController(ModelBasedLaw):
     """The whole law for vehicle and arm."""
 
     def __init__(self, config: CscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
+        super().__init__(config, vehicle, hover_thrust, config.model_mass_scale)
         self._c = config
-        self._dynamics = Dynamics(vehicle, config.model_mass_scale)
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
-        self._force = ForceFilter(config.force_lowpass_hz)
-        self._desired = DesiredForce(config.desired_force_time_s)
-        self._actuation = Actuation(config, vehicle, hover_thrust)
-        self._hover_thrust = hover_thrust
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """One tick of `dt_s`; see `companion.control.types.Controller`."""
         force = self._force.step(dt_s, state.force_ext_world_n)
-        error, error_rate = tracking_errors(state, reference)
+        error, error_rate = tracking_errors(state, reference, yaw_from_quat(state.attitude_wxyz))
         tau_ext, e_tau = self._external(state, force)
         tau = self._tau(state, reference, error, error_rate, e_tau)
-        sent = self._actuation.step(
+        self._actuation.step(
             dt_s,
             (tau[0] - tau_ext[0], tau[1] - tau_ext[1], tau[2] - tau_ext[2]),
             (tau[6] - tau_ext[6], tau[7] - tau_ext[7]),
-            state,
-            reference,
+            body_x_z_axes_world(state.attitude_wxyz)[1],
+            reference.yaw_rad,
             vertical_scale,
         )
-        self._desired.advance(dt_s, force)
-        log = ControlLog(
-            error=vec8(error),
-            error_rate=vec8(error_rate),
-            sliding=ZERO8,
-            gamma=ZERO8,
-            tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
-            e_tau=e_tau,
-            h_hat=(0.0, 0.0, 0.0, 0.0),
-            zeta=0.0,
-            rho=0.0,
-            force_ext_world_n=force,
-            attitude_desired_rad=sent.roll_pitch_yaw_rad,
-            hover_thrust=self._hover_thrust,
-            saturated=sent.clipped,
-        )
-        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
+        return self._end(dt_s, error, error_rate, e_tau, force)
 
     def _external(self, state: PlantState, force: Vec3) -> tuple[Vec8, Vec8]:
         """tau_ext and tau_ext - tau_d; the base's share as configured."""
-        to_body = quat_conjugate(state.attitude_wxyz)
-        ext = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force))
-        lasting = self._desired.world_n
-        desired = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, lasting))
+        ext, desired = self._joint_torques_nm(state, force)
         x, y, z = (share * f for share, f in zip(self._c.external_xyz, force, strict=True))
-        dx, dy, dz = (share * f for share, f in zip(self._c.desired_force_xyz, lasting, strict=True))
+        dx, dy, dz = (share * f for share, f in zip(self._c.desired_force_xyz, self._desired.world_n, strict=True))
         return (
             (x, y, z, 0.0, 0.0, 0.0, *ext),
             (x - dx, y - dy, z - dz, 0.0, 0.0, 0.0, ext[0] - desired[0], ext[1] - desired[1]),
         )
 
-    def _tau(
-        self, state: PlantState, reference: Reference, error: list[float], error_rate: list[float], e_tau: Vec8
-    ) -> list[float]:
+    def _tau(self, state: PlantState, reference: Reference, error: Vec8, error_rate: Vec8, e_tau: Vec8) -> list[float]:
         """M chi''_cmd + C chi' + g, 8 rows."""
         rpy = euler_zyx_from_quat(state.attitude_wxyz)
         q_rate = chi_rate_from_body_rate(rpy, state.angular_rate_body_rad_s)
-        roll_d, pitch_d = self._actuation.roll_pitch_rad
+        roll_d, pitch_d, _ = self._actuation.roll_pitch_yaw_rad
         e = [*error[0:3], rpy[0] - roll_d, rpy[1] - pitch_d, *error[5:8]]
         e_rate = [*error_rate[0:3], q_rate[0], q_rate[1], q_rate[2] - reference.yaw_rate_rad_s, *error_rate[6:8]]
         feed = (*reference.acceleration_world_m_s2, 0.0, 0.0, 0.0, *reference.arm_acceleration_rad_s2)

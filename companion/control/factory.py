@@ -7,10 +7,10 @@ from companion.config.vehicle import Vehicle
 from companion.control.adaptive import AdaptiveController
 from companion.control.csc import CscController
 from companion.control.psc import PscController
-from companion.control.types import Controller
+from companion.control.types import Law
 
 
-def build_controller(config: ControllerConfig, vehicle: Vehicle, hover_thrust: float) -> Controller:
+def build_controller(config: ControllerConfig, vehicle: Vehicle, hover_thrust: float) -> Law:
     """A fresh controller; `hover_thrust` is the normalised thrust that holds the vehicle's own mass."""
     match config:
         case AdaptiveConfig():

@@ -8,16 +8,11 @@ a caught payload pulls on the sensor and is no change of h. What is left in h is
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from companion.control.manipulator import GRAVITY_M_S2
-from companion.control.sensing import acceleration_world_m_s2
 from companion.control.types import PlantState
-from companion.frames import quat_conjugate, quat_rotate
-from companion.types import Inputs, LandedState, PhaseKind, Quat, Vec3
-
-if TYPE_CHECKING:
-    from companion.analysis.log import FlightLog
+from companion.frames import body_z_component
+from companion.types import Inputs, LandedState, Quat, Vec3
 
 SHARE_MAX = 0.25
 """The estimate stays within this share of its start value: a broken accelerometer must not take the vehicle down."""
@@ -32,7 +27,7 @@ _ACCELERATION_MAX_M_S2 = 1.5
 _ACCELERATION_LOWPASS_S = 0.05
 
 
-class _Balance:
+class Balance:
     """Thrust given and load carried, tick by tick, wherever the balance can be trusted."""
 
     def __init__(self, mass_kg: float) -> None:
@@ -50,16 +45,16 @@ class _Balance:
         before = thrust_sent if self._thrust is None else self._thrust
         self._thrust = before + (1.0 - math.exp(-dt_s / _LAG_S)) * (thrust_sent - before)
         ax, ay, az = acceleration_world_m_s2
-        self._acceleration_z_m_s2 += (1.0 - math.exp(-dt_s / _ACCELERATION_LOWPASS_S)) * (
-            az - self._acceleration_z_m_s2
-        )
+        jerked = self._acceleration_z_m_s2
+        jerked += (1.0 - math.exp(-dt_s / _ACCELERATION_LOWPASS_S)) * (az - jerked)
+        self._acceleration_z_m_s2 = jerked
         _, qx, qy, _ = attitude_wxyz
         leaning = 1.0 - 2.0 * (qx * qx + qy * qy) < _TILT_COS_MIN
-        if leaning or abs(self._acceleration_z_m_s2) > _ACCELERATION_MAX_M_S2 or not 0.0 < thrust_sent < 1.0:
+        if leaning or abs(jerked) > _ACCELERATION_MAX_M_S2 or not 0.0 < thrust_sent < 1.0:
             return None
         m, g = self._mass_kg, GRAVITY_M_S2
         fx, fy, fz = force_world_n
-        carried_m_s2 = quat_rotate(quat_conjugate(attitude_wxyz), (ax - fx / m, ay - fy / m, az + g - fz / m))[2]
+        carried_m_s2 = body_z_component(attitude_wxyz, (ax - fx / m, ay - fy / m, az + g - fz / m))
         return self._thrust, carried_m_s2 / g
 
 
@@ -72,7 +67,7 @@ class HoverThrust:
     """
 
     def __init__(self, start: float, mass_kg: float) -> None:
-        self._balance = _Balance(mass_kg)
+        self._balance = Balance(mass_kg)
         self._low, self._high = (1.0 - SHARE_MAX) * start, (1.0 + SHARE_MAX) * start
         self._learnt_s = 0.0
         self.value = start
@@ -96,10 +91,14 @@ class HoverThrust:
             return self.value
         thrust, load = balance
         self._learnt_s += dt_s
-        gain = dt_s / min(_TIME_MAX_S, max(_TIME_MIN_S, self._learnt_s))
+        time_s = self._learnt_s
+        time_s = _TIME_MIN_S if time_s < _TIME_MIN_S else time_s if time_s < _TIME_MAX_S else _TIME_MAX_S
         # Linear in the noisy load, so that its noise leaves no bias.
-        self.value = min(self._high, max(self._low, self.value + gain * (thrust - self.value * load)))
-        return self.value
+        value = self.value + dt_s / time_s * (thrust - self.value * load)
+        if not self._low <= value <= self._high:
+            value = min(self._high, max(self._low, value))
+        self.value = value
+        return value
 
 
 def off_the_ground(inputs: Inputs, ground_clearance_m: float) -> bool:
@@ -107,47 +106,3 @@ def off_the_ground(inputs: Inputs, ground_clearance_m: float) -> bool:
     if inputs.vehicle is None or inputs.status is None or inputs.status.landed is not LandedState.IN_AIR:
         return False
     return inputs.vehicle.position_world_m[2] > ground_clearance_m + AIRBORNE_M
-
-
-class HoverFitError(ValueError):
-    """The log does not show enough hovering: one line for the user."""
-
-
-FIT_MIN_S = 2.0
-
-
-def fit_hover_thrust(log: FlightLog) -> float:
-    """Hover thrust of the machine without payload, from the calm parts of a flight: least squares over the balance above.
-
-    Raises:
-        HoverFitError: less than `FIT_MIN_S` of calm flight under the law, or no mass in the log's configuration.
-    """
-    vehicle = log.config.get("vehicle") or {}
-    mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
-    force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)
-    if mass_kg is None:
-        raise HoverFitError(f"{log.path}: no vehicle.airframe.mass_kg in its configuration; expected a flight's log")
-    balance = _Balance(mass_kg)
-    sent: float | None = None
-    before_s: float | None = None
-    carrying = False
-    thrust_load = load_load = calm_s = 0.0
-    for i, o, _ in log.rows():
-        dt_s = 0.0 if before_s is None else i.t_s - before_s
-        before_s = i.t_s
-        carrying = carrying or any(event.id == "catch" for event in o.events)
-        if sent is not None and i.vehicle is not None and o.control is not None:
-            force = o.control.force_ext_world_n
-            now = balance.step(dt_s, sent, acceleration_world_m_s2(i.vehicle), force, i.vehicle.attitude_wxyz)
-            blind = i.force is None or i.t_s - i.force.stamp_s > force_timeout_s
-            if now is not None and o.phase_kind is PhaseKind.FLIGHT and not (carrying and blind):
-                thrust, load = now
-                thrust_load += thrust * load * dt_s
-                load_load += load * load * dt_s
-                calm_s += dt_s
-        sent = o.attitude.thrust if o.attitude is not None else None
-    if calm_s < FIT_MIN_S:
-        raise HoverFitError(
-            f"{log.path}: {calm_s:.1f} s of calm flight, expected {FIT_MIN_S:g} s or more; fly a hover of some seconds"
-        )
-    return thrust_load / load_load

@@ -75,6 +75,26 @@ class Manipulator:
         about_2 = self._moment_2 * (-math.sin(b) * up_x - math.cos(b) * up_z)
         return (about_1 + about_2, -about_2)
 
+    def joint_terms(
+        self, angle_rad: Vec2, up_x_m_s2: float, up_z_m_s2: float
+    ) -> tuple[float, float, float, float, float, float]:
+        """Rows x and z of the Jacobian (m/rad), then the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in one.
+
+        Args:
+            angle_rad: both joints.
+            up_x_m_s2: body x component of what the arm must push against, 9.81 m/s^2 upwards.
+            up_z_m_s2: body z component.
+        """
+        a1, a2 = angle_rad
+        b = a1 - a2
+        s1, c1, s2, c2 = math.sin(a1), math.cos(a1), math.sin(b), math.cos(b)
+        about_1 = self._moment_1 * (-s1 * up_x_m_s2 - c1 * up_z_m_s2)
+        about_2 = self._moment_2 * (-s2 * up_x_m_s2 - c2 * up_z_m_s2)
+        l1, l2 = self._l1, self._l2
+        s2 *= l2
+        c2 *= l2
+        return -l1 * s1 - s2, s2, -l1 * c1 - c2, c2, about_1 + about_2, -about_2
+
     def sensor_attitude_body(self, angle_rad: Vec2) -> Quat:
         """Rotation from the force-torque sensor's frame to the body frame."""
         half = 0.5 * (angle_rad[0] - angle_rad[1])

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
 from companion.config.loader import FlightConfig
 from companion.control.arm_hold import hold_torque_nm
+from companion.control.disturbance import DisturbanceObserver
 from companion.control.factory import build_controller
 from companion.control.hover import HoverThrust, off_the_ground
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, acceleration_world_m_s2
 from companion.control.types import Controller, PlantState
-from companion.frames import euler_zyx_from_quat, quat_from_euler_zyx
-from companion.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2
+from companion.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
+from companion.frozen import quick
+from companion.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2, Vec3
 
 FOLD_RATE_RAD_S = 1.2
+PULL_TIME_S, PULL_LAG_S, PULL_MAX_N = 0.1, 0.05, 100.0
+"""Of the force that acts on the machine, for the safety monitors."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class Command:
     """What one tick wants to send; the gate has the last word."""
@@ -44,18 +48,26 @@ class Pilot:
         if hover_thrust is None:
             raise ValueError("hover_thrust must be in the effective configuration before the core starts")
         self._hover = HoverThrust(hover_thrust, vehicle.airframe.mass_kg)
-        self._airframe = vehicle.airframe
+        self._hover_adapts = vehicle.airframe.hover_thrust_adapt
+        self._ground_clearance_m = vehicle.airframe.ground_clearance_m
+        self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self._thrust_sent = 0.0
         self._force_timeout_s = vehicle.safety.force_timeout_s
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._sensing = ForceSensing(vehicle.tool, self._manipulator)
         self._catch = CatchDetector()
-        self._controller: Controller = build_controller(config.controller, vehicle, hover_thrust)
+        self._law = build_controller(config.controller, vehicle, hover_thrust)
+        self._controller: Controller = self._law
         fold = vehicle.safety.fold_arm_deg
         self.fold_rad: Vec2 = (math.radians(fold[0]), math.radians(fold[1]))
         self._arm_target_rad: Vec2 | None = None
         self.tracking_error_m: float | None = None
         """Distance from the reference in the last tick that the law flew."""
+        self._pull = DisturbanceObserver(
+            vehicle.airframe.mass_kg, (PULL_TIME_S, PULL_TIME_S, PULL_TIME_S), PULL_LAG_S, PULL_MAX_N
+        )
+        self.disturbance_world_n: Vec3 | None = None
+        """What acts on the machine beside rotors and weight, payload included, N; None on the ground."""
 
     def collect_tare(self, i: Inputs) -> None:
         """Add this tick's force sample, at rest, to the tare; the arm is to be held where it is."""
@@ -106,25 +118,38 @@ class Pilot:
         if i.force is not None and i.t_s - i.force.stamp_s <= self._force_timeout_s:
             force = self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
         state = PlantState(
-            position_world_m=vehicle.position_world_m,
-            velocity_world_m_s=vehicle.velocity_world_m_s,
-            acceleration_world_m_s2=acceleration_world_m_s2(vehicle),
-            attitude_wxyz=vehicle.attitude_wxyz,
-            angular_rate_body_rad_s=vehicle.angular_rate_body_rad_s,
-            arm_rad=arm_rad,
-            arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
-            force_ext_world_n=force,
+            vehicle.position_world_m,
+            vehicle.velocity_world_m_s,
+            acceleration_world_m_s2(vehicle),
+            vehicle.attitude_wxyz,
+            vehicle.angular_rate_body_rad_s,
+            arm_rad,
+            arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
+            force,
         )
-        if self._airframe.hover_thrust_adapt:
-            airborne = off_the_ground(i, self._airframe.ground_clearance_m)
+        if self._hover_adapts:
+            airborne = off_the_ground(i, self._ground_clearance_m)
             self._hover.step(dt_s, self._thrust_sent, state, airborne, self._catch.caught_s is not None)
+        self._watch_disturbance(dt_s, state, vertical_scale)
+        self._law.hover_thrust = hover = self._hover.value
         wrench = self._controller.step(dt_s, state, reference, vertical_scale)
-        self.tracking_error_m = math.hypot(*wrench.log.error[0:3])
-        hover = self._hover.value
-        self._thrust_sent = min(1.0, wrench.collective_n * hover / (self._airframe.mass_kg * GRAVITY_M_S2))
+        ex, ey, ez, *_ = wrench.log.error
+        self.tracking_error_m = math.hypot(ex, ey, ez)
+        thrust = wrench.collective_n * hover / self._weight_n
+        self._thrust_sent = thrust if thrust < 1.0 else 1.0
         torque = wrench.arm_torque_nm if arm is not None else None
-        log = dataclasses.replace(wrench.log, hover_thrust=hover)
-        return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, log)
+        return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, wrench.log)
+
+    def _watch_disturbance(self, dt_s: float, state: PlantState, vertical_scale: float) -> None:
+        """By the attitude that the body has, not the one asked for: a vehicle slow to lean is not being pulled at."""
+        if vertical_scale < 1.0:
+            self._pull.reset()
+            self.disturbance_world_n = None
+            return
+        weight_n = self._weight_n
+        x, y, z = quat_rotate(state.attitude_wxyz, (0.0, 0.0, self._thrust_sent / self._hover.value * weight_n))
+        known: Vec3 = (x, y, z - weight_n)
+        self.disturbance_world_n = self._pull.step(dt_s, known, state.acceleration_world_m_s2, learn=True)
 
     def catch_s(self, t_s: float, log: ControlLog) -> float | None:
         """Time of the blow, in the one tick in which a catch becomes certain."""

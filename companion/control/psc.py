@@ -15,13 +15,13 @@ import math
 
 from companion.config.controller import PscConfig
 from companion.config.vehicle import Vehicle
-from companion.control.common import ZERO8, Actuation, DesiredForce, ForceFilter, tracking_errors, vec8
-from companion.control.dynamics import Dynamics
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.common import tracking_errors
+from companion.control.manipulator import GRAVITY_M_S2
+from companion.control.model_based import ModelBasedLaw
 from companion.control.thrust import collective_n
 from companion.control.types import PlantState, Wrench
-from companion.frames import quat_conjugate, quat_rotate
-from companion.types import ControlLog, Reference, Vec2, Vec3
+from companion.frames import body_x_z_axes_world
+from companion.types import Reference, Vec2, Vec3, Vec8
 
 
 class PayloadEstimator:
@@ -56,60 +56,37 @@ class PayloadEstimator:
         return self.payload_kg
 
 
-class PscController:
+class PscController(ModelBasedLaw):
     """Both laws, side by side."""
 
     def __init__(self, config: PscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
+        super().__init__(config, vehicle, hover_thrust)
         self._c = config
         self._mass_kg = vehicle.airframe.mass_kg
-        self._dynamics = Dynamics(vehicle)
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
-        self._force = ForceFilter(config.force_lowpass_hz)
-        self._desired = DesiredForce(config.desired_force_time_s)
-        self._actuation = Actuation(config, vehicle, hover_thrust)
-        self._hover_thrust = hover_thrust
         self._estimator = PayloadEstimator(config, self._mass_kg)
         self._integral_m_s2 = [0.0, 0.0, 0.0]
         self._commanded_n = 0.0
-
-    @property
-    def payload_kg(self) -> float:
-        """Estimated mass of the payload."""
-        return self._estimator.payload_kg
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """One tick of `dt_s`; see `companion.control.types.Controller`."""
         flying = vertical_scale >= 1.0
         felt = state.acceleration_world_m_s2
-        specific_z = collective_n((felt[0], felt[1], felt[2] + GRAVITY_M_S2), state.attitude_wxyz)
+        body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
+        specific_z = collective_n((felt[0], felt[1], felt[2] + GRAVITY_M_S2), body_z)
         payload_kg = self._estimator.step(dt_s, self._commanded_n, specific_z, flying)
 
         force = self._force.step(dt_s, state.force_ext_world_n)
-        error, error_rate = tracking_errors(state, reference)
+        error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
         e_tau, torque = self._arm(state, reference, error, error_rate, force)
         wanted = self._vehicle(reference, error, error_rate, self._mass_kg + payload_kg)
-        sent = self._actuation.step(dt_s, wanted, torque, state, reference, vertical_scale)
+        sent = self._actuation
+        sent.step(dt_s, wanted, torque, body_z, reference.yaw_rad, vertical_scale)
         self._commanded_n = sent.collective_n
         self._integrate(dt_s, error, flying, sent.clipped)
-        self._desired.advance(dt_s, force)
-        log = ControlLog(
-            error=vec8(error),
-            error_rate=vec8(error_rate),
-            sliding=ZERO8,
-            gamma=ZERO8,
-            tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
-            e_tau=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau),
-            h_hat=(0.0, 0.0, 0.0, 0.0),
-            zeta=0.0,
-            rho=0.0,
-            force_ext_world_n=force,
-            attitude_desired_rad=sent.roll_pitch_yaw_rad,
-            hover_thrust=self._hover_thrust,
-            saturated=sent.clipped,
-        )
-        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
+        rows = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau)
+        return self._end(dt_s, error, error_rate, rows, force, payload_kg)
 
-    def _vehicle(self, reference: Reference, error: list[float], error_rate: list[float], mass_kg: float) -> Vec3:
+    def _vehicle(self, reference: Reference, error: Vec8, error_rate: Vec8, mass_kg: float) -> Vec3:
         """Force on the vehicle, world, N."""
         c = self._c
         x, y, z = (
@@ -120,7 +97,7 @@ class PscController:
         )
         return (x, y, z + mass_kg * GRAVITY_M_S2)
 
-    def _integrate(self, dt_s: float, error: list[float], flying: bool, clipped: tuple[bool, bool, bool]) -> None:
+    def _integrate(self, dt_s: float, error: Vec8, flying: bool, clipped: tuple[bool, bool, bool]) -> None:
         """The integral part stands still on the ground and where the actuators clip."""
         limit = self._c.integral_max_m_s2
         for i, held in enumerate((clipped[1], clipped[1], clipped[0])):
@@ -129,13 +106,11 @@ class PscController:
                 self._integral_m_s2[i] = max(-limit, min(limit, grown))
 
     def _arm(
-        self, state: PlantState, reference: Reference, error: list[float], error_rate: list[float], force: Vec3
+        self, state: PlantState, reference: Reference, error: Vec8, error_rate: Vec8, force: Vec3
     ) -> tuple[Vec2, Vec2]:
         """tau_ext - tau_d and the motors' torques, N m."""
-        c, manipulator = self._c, self._manipulator
-        to_body = quat_conjugate(state.attitude_wxyz)
-        ext = manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force))
-        desired = manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, self._desired.world_n))
+        c = self._c
+        ext, desired = self._joint_torques_nm(state, force)
         e_tau: Vec2 = (ext[0] - desired[0], ext[1] - desired[1])
         a1, a2 = (
             reference.arm_acceleration_rad_s2[i]
@@ -144,7 +119,7 @@ class PscController:
             for i in range(2)
         )
         terms = self._dynamics.arm_terms(state.arm_rad, state.arm_rate_rad_s)
-        gravity = manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
+        gravity = self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
         (m11, m12), (m21, m22) = terms.mass
         return e_tau, (
             m11 * a1 + m12 * a2 + terms.coriolis[0] + gravity[0] - ext[0],

@@ -61,8 +61,8 @@ class ForceSensing:
 class CatchDetector:
     """A caught payload: a blow on the sensor, followed by a lasting pull downwards."""
 
-    BLOW_N = 3.0
-    PULL_N = 0.5
+    BLOW_N = 1.5
+    PULL_N = 0.3
     PULL_TIME_S = 0.25
 
     def __init__(self) -> None:

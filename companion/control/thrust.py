@@ -16,7 +16,8 @@ class ForceLimits:
     vertical_min_n: float
     vertical_max_n: float
     lateral_max_n: float
-    tilt_max_rad: float
+    tilt_max_tan: float
+    """Lateral over vertical force at the steepest tilt."""
 
 
 def saturate_force(force_world_n: Vec3, limits: ForceLimits) -> tuple[Vec3, bool, bool]:
@@ -26,9 +27,11 @@ def saturate_force(force_world_n: Vec3, limits: ForceLimits) -> tuple[Vec3, bool
         The force that may be asked for, whether the vertical was clipped, whether the lateral was clipped.
     """
     fx, fy, fz = force_world_n
-    z = min(limits.vertical_max_n, max(limits.vertical_min_n, fz))
-    lateral = math.hypot(fx, fy)
-    allowed = min(limits.lateral_max_n, z * math.tan(limits.tilt_max_rad))
+    low, high, allowed = limits.vertical_min_n, limits.vertical_max_n, limits.lateral_max_n
+    z = low if fz < low else high if fz > high else fz
+    lateral, within_tilt = math.hypot(fx, fy), z * limits.tilt_max_tan
+    if within_tilt < allowed:
+        allowed = within_tilt
     if lateral > allowed:
         scale = allowed / lateral
         return (fx * scale, fy * scale, z), z != fz, True
@@ -41,17 +44,20 @@ class TiltFilter:
     def __init__(self, bandwidth_rad_s: float, damping: float) -> None:
         self._w = bandwidth_rad_s
         self._d = damping
-        self._angle = [0.0, 0.0]
-        self._rate = [0.0, 0.0]
+        self._roll_rad = self._pitch_rad = 0.0
+        self._roll_rate_rad_s = self._pitch_rate_rad_s = 0.0
 
     def step(self, dt_s: float, roll_rad: float, pitch_rad: float) -> tuple[float, float]:
         """Filtered roll and pitch, rad."""
-        w, d = self._w, self._d
-        denominator = 1.0 + 2.0 * d * w * dt_s + w * w * dt_s * dt_s
-        for i, target in enumerate((roll_rad, pitch_rad)):
-            self._rate[i] = (self._rate[i] + w * w * dt_s * (target - self._angle[i])) / denominator
-            self._angle[i] += dt_s * self._rate[i]
-        return self._angle[0], self._angle[1]
+        w = self._w
+        pull = w * w * dt_s
+        denominator = 1.0 + 2.0 * self._d * w * dt_s + pull * dt_s
+        roll, pitch = self._roll_rad, self._pitch_rad
+        self._roll_rate_rad_s = rate = (self._roll_rate_rad_s + pull * (roll_rad - roll)) / denominator
+        self._roll_rad = roll = roll + dt_s * rate
+        self._pitch_rate_rad_s = rate = (self._pitch_rate_rad_s + pull * (pitch_rad - pitch)) / denominator
+        self._pitch_rad = pitch = pitch + dt_s * rate
+        return roll, pitch
 
 
 def roll_pitch_from_force(force_world_n: Vec3, yaw_rad: float) -> tuple[float, float]:
@@ -64,11 +70,10 @@ def roll_pitch_from_force(force_world_n: Vec3, yaw_rad: float) -> tuple[float, f
     return roll, pitch
 
 
-def collective_n(force_world_n: Vec3, attitude_wxyz: Quat) -> float:
+def collective_n(force_world_n: Vec3, body_z_world: Vec3) -> float:
     """u = F . z_body, N: what the rotors must give in the attitude that the body really has."""
-    w, x, y, z = attitude_wxyz
-    zx, zy, zz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
-    return force_world_n[0] * zx + force_world_n[1] * zy + force_world_n[2] * zz
+    (fx, fy, fz), (zx, zy, zz) = force_world_n, body_z_world
+    return fx * zx + fy * zy + fz * zz
 
 
 def attitude_from_roll_pitch_yaw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:

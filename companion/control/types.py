@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from companion.frozen import quick
 from companion.types import ControlLog, Quat, Reference, Vec2, Vec3
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class PlantState:
     """What a controller may know of the machine at one tick; world ENU, body FLU."""
@@ -24,6 +26,7 @@ class PlantState:
     """On the net, tared, net's weight removed, not filtered; None: no sensor to be trusted."""
 
 
+@quick
 @dataclass(frozen=True, slots=True)
 class Wrench:
     """What a controller asks of vehicle and arm."""
@@ -39,3 +42,10 @@ class Controller(Protocol):
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """One tick of `dt_s`. `vertical_scale` (0 to 1) scales the vertical force while rotors spool up or down on the ground."""
+
+
+class Law(Controller, Protocol):
+    """A controller as the pilot owns it."""
+
+    hover_thrust: float
+    """For the log: the normalised thrust that is taken to carry the machine without payload; set before every step."""

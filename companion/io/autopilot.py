@@ -12,6 +12,7 @@ import re
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -25,7 +26,14 @@ from mavsdk.plugins.telemetry.telemetry import Telemetry
 from companion.clock import Clock
 from companion.config.vehicle import AutopilotDevice
 from companion.io import autopilot_messages as messages
-from companion.io.autopilot_link import add_connection, check_address, device_error, first_autopilot, quiet_native_log
+from companion.io.autopilot_link import (
+    add_connection,
+    check_address,
+    device_error,
+    first_autopilot,
+    quiet_native_log,
+    udp_ports,
+)
 from companion.io.autopilot_requests import RequestDesk
 from companion.io.edges import DeviceError
 from companion.types import (
@@ -59,6 +67,17 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 
+@dataclass(frozen=True, slots=True)
+class LinkIdentity:
+    """What another process must know to go on speaking on this link."""
+
+    autopilot_system: int
+    own_system: int
+    own_component: int
+    local_port: int
+    """UDP port that MAVSDK speaks from; 0: not UDP, or not known."""
+
+
 class MavsdkAutopilot:
     """The `Autopilot` edge.
 
@@ -84,10 +103,12 @@ class MavsdkAutopilot:
         self._info: Any = None
         self._open = False
         self._system_id = 0
+        self._own_ids = (0, 0)
+        self._local_port = 0
 
         # Written by MAVSDK's threads, one assignment each; a tuple is replaced as a whole, so a reader never sees half of it.
         self._position: tuple[float, Vec3, Vec3] | None = None
-        self._attitude: tuple[float, Quat] | None = None
+        self._attitude: tuple[float, Quat, int] | None = None
         self._rates: Vec3 | None = None
         self._imu: tuple[float, Vec3] | None = None
         self._heartbeat: tuple[float, str] | None = None
@@ -110,12 +131,16 @@ class MavsdkAutopilot:
         self._restore_log = quiet_native_log()
         try:
             configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
+            self._own_ids = (int(configuration.system_id), int(configuration.component_id))
+            ports = udp_ports()
             self._mavsdk = Mavsdk(configuration)
             self._connection = await self._call(
                 "the connection to open", _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address
             )
             system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
+            new = udp_ports() - ports
+            self._local_port = new.pop() if len(new) == 1 else 0
             self._direct = MavlinkDirect(system)
             self._mocap = Mocap(system)
             self._telemetry = Telemetry(system)
@@ -135,6 +160,10 @@ class MavsdkAutopilot:
         """Cut the wire at once, then let MAVSDK's threads end. No packet leaves after this; PX4 keeps its mode."""
         await self._close()
 
+    def identity(self) -> LinkIdentity:
+        """Who speaks to whom on the open link."""
+        return LinkIdentity(self._system_id, *self._own_ids, self._local_port)
+
     def vehicle(self) -> VehicleState | None:
         """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
         position, attitude, rates, imu = self._position, self._attitude, self._rates, self._imu
@@ -146,6 +175,8 @@ class MavsdkAutopilot:
             state = messages.vehicle_state(
                 position[0], position[1], position[2], attitude[0], attitude[1], rates, imu[0], imu[1]
             )
+            if state is not None and attitude[2]:
+                state = replace(state, boot_s=attitude[2] * 1e-6)
             # Values that are not finite are as good as not arrived: the last good state stays, and its stamps grow old.
             self._vehicle = state or self._vehicle
         return self._vehicle
@@ -354,7 +385,7 @@ class MavsdkAutopilot:
         )
 
     def _on_attitude(self, value: Any, _: Any) -> None:
-        self._attitude = (self._clock(), (value.w, value.x, value.y, value.z))
+        self._attitude = (self._clock(), (value.w, value.x, value.y, value.z), value.timestamp_us)
 
     def _on_rates(self, value: Any, _: Any) -> None:
         self._rates = (value.roll_rad_s, value.pitch_rad_s, value.yaw_rad_s)

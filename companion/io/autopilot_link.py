@@ -11,6 +11,7 @@ import socket
 import stat
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from mavsdk import Autopilot as AutopilotKind
@@ -125,6 +126,24 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
     if kind != AutopilotKind.PX4:
         raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion speaks no other's modes")
     return system
+
+
+def udp_ports() -> set[int]:
+    """Local ports of the UDP sockets that this process holds; empty where /proc does not tell."""
+    try:
+        own = {link for name in os.listdir("/proc/self/fd") if (link := _link_of(name)) is not None}
+        table = Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return set()
+    rows = (line.split() for line in table)
+    return {int(row[1].rpartition(":")[2], 16) for row in rows if f"socket:[{row[9]}]" in own}
+
+
+def _link_of(descriptor: str) -> str | None:
+    try:
+        return os.readlink(f"/proc/self/fd/{descriptor}")
+    except OSError:  # closed while we looked
+        return None
 
 
 def _log_native(level: Any, message: str, file: str | None, line: int) -> bool:

@@ -30,7 +30,7 @@ from companion.types import (
 
 MAV_COMP_ID_AUTOPILOT1 = 1
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1
-_MAV_MODE_FLAG_SAFETY_ARMED = 128
+MAV_MODE_FLAG_SAFETY_ARMED = 128
 _PX4_MAIN_MODE_AUTO = 4
 _PX4_MAIN_MODE_OFFBOARD = 6
 # Body rates are not commanded: ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE | PITCH | YAW.
@@ -62,7 +62,6 @@ _MAV_RESULTS = {
     5: "in progress",
     6: "cancelled",
 }
-# MAV_CMD and its first two parameters.
 _COMMANDS: dict[AutopilotRequest, tuple[int, float, float]] = {
     AutopilotRequest.OFFBOARD: (176, float(_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(_PX4_MAIN_MODE_OFFBOARD)),
     AutopilotRequest.ARM: (400, 1.0, 0.0),
@@ -75,7 +74,7 @@ def armed_and_mode(heartbeat_json: str) -> tuple[bool, FlightMode]:
     """Armed flag and flight mode of a HEARTBEAT's fields (`base_mode`, `custom_mode`)."""
     fields = json.loads(heartbeat_json)
     base_mode = int(fields["base_mode"])
-    return bool(base_mode & _MAV_MODE_FLAG_SAFETY_ARMED), flight_mode(base_mode, int(fields["custom_mode"]))
+    return bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED), flight_mode(base_mode, int(fields["custom_mode"]))
 
 
 def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
@@ -112,9 +111,15 @@ def vehicle_state(
     imu_stamp_s: float,
     specific_force_frd_m_s2: Vec3,
 ) -> VehicleState | None:
-    """LOCAL_POSITION_NED, ATTITUDE_QUATERNION and HIGHRES_IMU in the companion's frames; None if anything is not finite."""
+    """LOCAL_POSITION_NED, ATTITUDE_QUATERNION and HIGHRES_IMU in the companion's frames; None if anything is not finite or the
+    quaternion has no direction.
+    """
     values = (*position_ned_m, *velocity_ned_m_s, *attitude_ned_frd, *rates_frd_rad_s, *specific_force_frd_m_s2)
-    if not all(map(math.isfinite, values)) or not any(attitude_ned_frd):
+    if not all(map(math.isfinite, values)):
+        return None
+    try:
+        attitude_ned_frd = quat_normalize(attitude_ned_frd)
+    except ValueError:
         return None
     return VehicleState(
         position_stamp_s=position_stamp_s,
@@ -122,7 +127,7 @@ def vehicle_state(
         imu_stamp_s=imu_stamp_s,
         position_world_m=enu_from_ned(position_ned_m),
         velocity_world_m_s=enu_from_ned(velocity_ned_m_s),
-        attitude_wxyz=attitude_enu_flu_from_ned_frd(quat_normalize(attitude_ned_frd)),
+        attitude_wxyz=attitude_enu_flu_from_ned_frd(attitude_ned_frd),
         angular_rate_body_rad_s=flu_from_frd(rates_frd_rad_s),
         specific_force_body_m_s2=flu_from_frd(specific_force_frd_m_s2),
     )
@@ -162,17 +167,22 @@ def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
     return ned_from_enu(pose.position_world_m), euler_zyx_from_quat(attitude)
 
 
-def command_json(request: AutopilotRequest, target_system: int) -> str:
-    """COMMAND_LONG for a request: DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND (21).
+def command(request: AutopilotRequest) -> tuple[int, float, float]:
+    """MAV_CMD and its first two parameters, the others are 0: DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND (21).
 
     Raises:
         KeyError: for `AutopilotRequest.NONE`, which is no command.
     """
-    command, param1, param2 = _COMMANDS[request]
+    return _COMMANDS[request]
+
+
+def command_json(request: AutopilotRequest, target_system: int) -> str:
+    """COMMAND_LONG for a request, fields as `command` gives them; raises as `command` does."""
+    number, param1, param2 = command(request)
     fields: dict[str, float | int] = {
         "target_system": target_system,
         "target_component": MAV_COMP_ID_AUTOPILOT1,
-        "command": command,
+        "command": number,
         "confirmation": 0,
         "param1": param1,
         "param2": param2,
@@ -184,4 +194,9 @@ def command_json(request: AutopilotRequest, target_system: int) -> str:
 def refusal(ack_json: str) -> str | None:
     """Why a COMMAND_ACK is not an acceptance, in words; None when it is one."""
     result = int(json.loads(ack_json)["result"])
-    return None if result == 0 else f"{_MAV_RESULTS.get(result, 'unknown result')} (MAV_RESULT {result})"
+    return None if result == 0 else result_text(result)
+
+
+def result_text(result: int) -> str:
+    """A MAV_RESULT in words."""
+    return f"{_MAV_RESULTS.get(result, 'unknown result')} (MAV_RESULT {result})"

@@ -65,9 +65,10 @@ class RequestDesk:
                 self._messages.append(f"{request.name} refused: {refusal}")
 
     def note(self, text: str) -> None:
-        """Keep a line that the autopilot said by itself (STATUSTEXT)."""
+        """Keep a line that the autopilot said by itself (STATUSTEXT); whatever is in it, it stays one line."""
+        line = "".join(character if character.isprintable() else "?" for character in text)
         with self._lock:
-            self._messages.append(text)
+            self._messages.append(line)
 
     def pending(self) -> int:
         """How many commands still wait for their answer."""

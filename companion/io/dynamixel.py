@@ -69,6 +69,8 @@ _BLOCK = struct.Struct("<iBiBhB")
 
 _POLL_MS = 1.0
 _NOISE_PATIENCE = 20.0
+_NOISE_BYTES = 4096
+"""More than all answers to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
 
 HARDWARE_ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 WATCHDOG_ERROR = 0x80
@@ -175,6 +177,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
 
     is_open: bool
     _waited_ms = 0.0
+    _taken_bytes = 0
     reply_timeout_ms = 100.0
     """Longest wait for an answer, beside the time of its bytes."""
 
@@ -221,6 +224,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         self.packet_start_time = self.getCurrentTime()
         self.packet_timeout = msec
         self._waited_ms = 0.0
+        self._taken_bytes = 0
 
     def readPort(self, length: int) -> bytes:
         """Up to `length` bytes, after at most 1 ms.
@@ -228,15 +232,19 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         Raises:
             OSError: the port is gone.
         """
+        if self._taken_bytes > _NOISE_BYTES:
+            return b""  # the SDK looks at the time only when it lacks bytes: noise without end would keep it for ever
         data: bytes = self.ser.read(length)
-        if not data:
+        if data:
+            self._taken_bytes += len(data)
+        else:
             self._waited_ms += _POLL_MS
         return data
 
     def isPacketTimeout(self) -> bool:
         """The answer is overdue."""
         elapsed_ms = self.getTimeSinceStart()
-        if elapsed_ms > _NOISE_PATIENCE * self.packet_timeout:
+        if elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > _NOISE_BYTES:
             return True  # a line that never falls silent
         return elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
 

@@ -16,12 +16,12 @@ from companion.clock import Clock
 from companion.config.vehicle import MocapDevice
 from companion.io import natnet
 from companion.io.edges import DeviceError
+from companion.io.mocap_pose import VERSIONS, mocap_pose
 from companion.io.natnet import Frame, Malformed, Message, NatNetVersion, ServerInfo
 from companion.types import MocapPose
 
 _LOG = logging.getLogger(__name__)
 
-_VERSIONS: Final[dict[str, NatNetVersion]] = {"3.0": "3.0", "4.1": "4.1"}
 _CONNECT_PERIOD_S: Final = 0.25
 _KEEP_ALIVE_PERIOD_S: Final = 0.5
 _SILENCE_RECONNECT_S: Final = 1.0
@@ -83,6 +83,7 @@ class NatNetMocap:
         self._body_tracked = asyncio.Event()
         self._info: ServerInfo | None = None
         self._version: NatNetVersion | None = None
+        self._version_told = False
         self._latest: MocapPose | None = None
         self._last_number: int | None = None
         self._last_frame_s = 0.0
@@ -223,10 +224,10 @@ class NatNetMocap:
 
     def _check_server(self, info: ServerInfo) -> NatNetVersion:
         device = self._device
-        version = _VERSIONS.get(info.version)
+        version = VERSIONS.get(info.version)
         wanted = device.natnet_version
         if version is None or (wanted is not None and version != wanted):
-            expected = wanted or " or ".join(_VERSIONS)
+            expected = wanted or " or ".join(VERSIONS)
             raise DeviceError(
                 f"{self._where}: {info.application or 'the server'} speaks NatNet {info.version}, expected {expected}; "
                 "set the bitstream version in Motive's streaming pane or devices.mocap.natnet_version"
@@ -336,10 +337,16 @@ class NatNetMocap:
             self._count_malformed(info)
             return
         if self._version is not None and info.version != self._version:
-            _LOG.error(
-                "%s: the server was restarted with NatNet %s instead of %s", self._where, info.version, self._version
-            )
+            if not self._version_told:
+                self._version_told = True
+                _LOG.error(
+                    "%s: the server was restarted with NatNet %s instead of %s",
+                    self._where,
+                    info.version,
+                    self._version,
+                )
             return
+        self._version_told = False
         self._info = info
         self._info_changed.set()
 
@@ -363,24 +370,12 @@ class NatNetMocap:
         self._last_malformed = bad.reason
 
     def _deliver(self, frame: Frame, arrived_s: float) -> None:
-        body = frame.body
-        if body is None:
+        pose = mocap_pose(frame, arrived_s, self._device.up_axis)
+        if pose is None:
             return
-        position_m, quat_wxyz = body.position_m, body.quat_wxyz
-        if self._device.up_axis == "y":
-            position_m, quat_wxyz = natnet.z_up_from_y_up(position_m, quat_wxyz)
-        pose = MocapPose(
-            stamp_s=arrived_s,
-            latency_s=frame.latency_s,
-            frame_number=frame.number,
-            position_world_m=position_m,
-            attitude_wxyz=quat_wxyz,
-            tracking_valid=body.tracking_valid,
-            marker_error_m=body.error_m,
-        )
         self._latest = pose
         self._frames += 1
-        if body.tracking_valid:
+        if pose.tracking_valid:
             self._body_tracked.set()
         try:
             self._on_pose(pose)

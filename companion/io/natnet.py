@@ -195,7 +195,7 @@ def parse_server_info(datagram: Buffer) -> ServerInfo | Malformed:
         frequency_hz = ticks or None
         group = ".".join(str(byte) for byte in address)
     return ServerInfo(
-        application=name.partition(b"\0")[0].decode("utf-8", "replace"),
+        application=_text(name.partition(b"\0")[0]),
         application_version=tuple(application_version),
         natnet_version=tuple(natnet_version),
         clock_frequency_hz=frequency_hz,
@@ -379,7 +379,13 @@ def _model_definitions(data: bytes, sized: bool) -> tuple[BodyDefinition, ...]:
 
 def _body_definition(data: bytes, offset: int) -> BodyDefinition:
     end = _skip_string(data, offset)
-    return BodyDefinition(_U32.unpack_from(data, end)[0], data[offset : end - 1].decode("utf-8", "replace"))
+    return BodyDefinition(_U32.unpack_from(data, end)[0], _text(data[offset : end - 1]))
+
+
+def _text(name: bytes) -> str:
+    """A name for messages to people: whatever is in it, it stays one line and steers no terminal."""
+    text = name.decode("utf-8", "replace")
+    return "".join(character if character.isprintable() else "?" for character in text)
 
 
 def _skip_body(data: bytes, offset: int) -> int:

@@ -21,14 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from companion.io.edges import DeviceError
+from companion.io.packets import CLOSE, METADATA, TEXT, TICK
 from companion.record import pack_plain, plain
 from companion.types import Inputs, Outputs, Sent, Severity
-
-# First element of a packet; the second is its number.
-TICK = 0  # inputs, outputs, sent (plain)
-TEXT = 1  # t_s, severity value, source, text
-METADATA = 2  # name, dict of strings
-CLOSE = 3  # nothing more: the number is that of packets offered before
 
 _BUFFER_BYTES = 8 * 2**20
 # The recorder tells of a full disk on the same socket; half a second at 200 Hz is soon enough to look.
@@ -102,7 +97,7 @@ class RecorderClient:
     def _listen(self) -> None:
         if self._dead:
             return
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
             message = self._socket.recv(4096)
             if message:
                 self.error = str(json.loads(message)["error"])

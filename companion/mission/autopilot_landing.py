@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.mission.sequencer import TouchdownDetector, in_offboard, is_armed, on_ground
+from companion.mission.sequencer import PEOPLE_CHOOSE, TouchdownDetector, in_offboard, is_armed, on_ground
 from companion.types import AutopilotRequest, FlightMode, Inputs
 
 TRUST_ESTIMATE_S = 4.2
@@ -43,22 +43,31 @@ class AutopilotLanding:
     Args:
         start_s: flight time at its start.
         clearance_m: height of the body's origin when the vehicle stands.
-        pilot: a pilot took over: watch only, ask for nothing.
+        pilot: a pilot took over: watch only, ask for nothing. One who takes over later is seen by PX4's mode.
     """
 
     def __init__(self, start_s: float, clearance_m: float, pilot: bool) -> None:
         self._start_s = start_s
         self._clearance_m = clearance_m
         self._pilot = pilot
+        self._was_landing = False
         self._touchdown = TouchdownDetector(clearance_m)
         self._standing_since_s: float | None = None
         self._touched_s: float | None = None
         self._pose_s = start_s
 
+    @property
+    def pilot(self) -> bool:
+        """Somebody else flies."""
+        return self._pilot
+
     def step(self, i: Inputs) -> LandingStep:
         """One tick."""
         elapsed = i.t_s - self._start_s
         heard = i.status is not None and i.t_s - i.status.heartbeat_stamp_s < _HEARTBEAT_FRESH_S
+        if not self._pilot and heard and self._pilot_takes_over(i):
+            self._pilot = True
+            return LandingStep(AutopilotRequest.NONE, False, False, False, "a pilot took over")
         if heard and not is_armed(i.status) and elapsed > 0.5:
             return LandingStep(AutopilotRequest.NONE, False, True, True)
         if elapsed > TIMEOUT_S and not (self._pilot and heard):  # a pilot may fly on for as long as they like
@@ -78,6 +87,12 @@ class AutopilotLanding:
             return LandingStep(AutopilotRequest.DISARM, True, False, False)
         wait = i.t_s - self._touched_s < ZERO_THRUST_STREAM_S or in_offboard(i.status)
         return LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
+
+    def _pilot_takes_over(self, i: Inputs) -> bool:
+        """A mode in which somebody steers; or, once PX4 was landing, any that only people choose."""
+        mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
+        self._was_landing = self._was_landing or mode is FlightMode.LAND
+        return mode is FlightMode.MANUAL or (self._was_landing and mode in PEOPLE_CHOOSE)
 
     def _touches(self, i: Inputs) -> bool:
         """PX4 is landing, and the height that it believes in says that the vehicle stands."""

@@ -7,39 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
-from companion.frames import quat_from_euler_zyx, wrap_rad
+from companion.frames import wrap_rad
+from companion.mission.check_judge import CATCH_NEAR_M, STOP, Judge, Violation
 from companion.mission.minsnap import Progress
 from companion.mission.plan import Plan, Segment
-from companion.safety.tether import allowed_m, distance_m
+from companion.safety.governor import SafeSet
 from companion.types import PhaseKind, Reference, Vec2, Vec3
 
 SAMPLE_S = 0.02
 SAMPLES_PER_SEGMENT_MAX = 3000
-BODY_TOP_M = 0.15
-"""Rotors and markers above the body's origin."""
-ARM_RADIUS_M = 0.03
-"""Half the thickness of servos and links."""
-FLOOR_GAP_M = 0.01
 TAKEOFF_RISE_MIN_M = 0.2
-CATCH_NEAR_M = 0.05
-TOLERANCE = 1e-6
-"""Relative; so that a mission may use its limits to the full."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Violation:
-    """One limit exceeded in one sample. `excess` orders violations of the same limit."""
-
-    limit: str
-    excess: float
-    what: str
-    detail: str
-    advice: str
 
 
 def check_mission(
@@ -68,21 +48,26 @@ def check_mission(
     start = mission.start
     position = start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m)
     yaw_rad = math.radians(start.yaw_deg) if start_yaw_rad is None else start_yaw_rad
+    problems = check_vehicle(vehicle)
+    if problems:
+        return problems
     plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad, progress)
     problems = check_start(mission, vehicle, position, yaw_rad, start_arm_rad)
     problems += _whole(mission, vehicle, plan, phase_origins)
-    judge = _Judge(mission, vehicle)
+    judge = Judge(mission, vehicle)
     told: dict[str, str] = {}
     also: dict[str, list[str]] = {}
     for segment in plan.segments:
-        worst: dict[str, tuple[_Violation, float, Reference]] = {}
+        worst: dict[str, tuple[Violation, float, Reference]] = {}
         for t_s in _samples(segment):
             reference = plan.reference(t_s)
-            for violation in judge.violations(reference, plan.jerks(t_s), segment.kind):
+            for violation in judge.violations(t_s, reference, plan.jerks(t_s), segment.kind):
                 known = worst.get(violation.limit)
                 if known is None or violation.excess > known[0].excess:
                     worst[violation.limit] = (violation, t_s, reference)
         for limit, (violation, t_s, reference) in worst.items():
+            if limit.startswith(STOP) and any(other.startswith(limit.removeprefix(STOP)) for other in worst):
+                continue  # the way itself leads out
             if limit in told:
                 also[limit].append(f"'{segment.name}'")
                 continue
@@ -94,6 +79,22 @@ def check_mission(
             )
     for limit, text in told.items():
         problems.append(text + (f" (also in {', '.join(also[limit])})" if also[limit] else ""))
+    return problems
+
+
+def check_vehicle(vehicle: Vehicle) -> list[str]:
+    """Why nothing can be flown with this machine, tether and room, whatever the mission; one line each."""
+    problems = []
+    rating_n, thrust_n = vehicle.tether.load_rating_n, vehicle.airframe.thrust_max_n
+    if rating_n < thrust_n:
+        problems.append(
+            f"vehicle '{vehicle.name}': tether.load_rating_n is {rating_n:g} N, but the rotors pull with {thrust_n:g} N "
+            "(airframe.thrust_max_n); a tether must hold them: take a stronger one"
+        )
+    try:
+        SafeSet(vehicle)
+    except ValueError as error:
+        problems.append(str(error))
     return problems
 
 
@@ -178,138 +179,3 @@ def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequen
                 "change catch.expected_at_m or the lines"
             )
     return problems
-
-
-class _Judge:
-    """Holds one instant of the plan against every limit."""
-
-    def __init__(self, mission: Mission, vehicle: Vehicle) -> None:
-        self._limits = mission.limits
-        self._vehicle = vehicle
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
-        payload_kg = mission.catch.payload_max_kg if mission.catch is not None else 0.0
-        self._mass_kg = vehicle.airframe.mass_kg + payload_kg
-
-    def violations(self, reference: Reference, jerks: tuple[Vec3, Vec2], kind: PhaseKind) -> Iterator[_Violation]:
-        clearance_m = self._vehicle.airframe.ground_clearance_m
-        x_m, y_m, z_m = reference.position_world_m
-        if kind is PhaseKind.LANDING and z_m < clearance_m:
-            return  # the reference goes on below the floor until touchdown is detected
-        if kind is PhaseKind.FLIGHT and z_m < clearance_m - TOLERANCE:
-            yield _Violation(
-                "floor",
-                clearance_m - z_m,
-                "flies into the floor",
-                f"the body's origin at {z_m:.2f} m, {clearance_m:.2f} m is the lowest",
-                "raise the waypoint",
-            )
-        position = (x_m, y_m, max(z_m, clearance_m)) if kind is PhaseKind.TAKEOFF else reference.position_world_m
-        yield from self._space(position, reference)
-        yield from self._arm(position, reference)
-        yield from self._motion(reference, jerks)
-
-    def _space(self, position: Vec3, reference: Reference) -> Iterator[_Violation]:
-        vehicle = self._vehicle
-        net_m = _world(position, reference.yaw_rad, self._manipulator.net_body_m(reference.arm_rad))
-        net_radius_m = vehicle.tool.net_radius_m
-        radius_m = vehicle.airframe.radius_m
-        room = vehicle.room
-        for axis, name, span in ((0, "x", room.x_m), (1, "y", room.y_m), (2, "z", room.z_m)):
-            if axis == 2 and position[2] < vehicle.airframe.ground_clearance_m:
-                continue  # told as flying into the floor
-            low = min(position[axis] - radius_m, net_m[axis] - net_radius_m) if axis < 2 else position[2]
-            high = max(position[axis] + (radius_m if axis < 2 else BODY_TOP_M), net_m[axis] + net_radius_m)
-            for edge, excess, reach in (("low", span[0] - low, low), ("high", high - span[1], high)):
-                if excess > TOLERANCE:
-                    yield _Violation(
-                        f"room {name} {edge}",
-                        excess,
-                        "leaves the room",
-                        f"rotors, arm and net reach {name} = {reach:.2f} m, the room is {span[0]:g} to {span[1]:g} m",
-                        "move the waypoint inwards",
-                    )
-        attitude = quat_from_euler_zyx(0.0, 0.0, reference.yaw_rad)
-        away_m = distance_m(vehicle.tether, position, attitude)
-        limit_m = allowed_m(vehicle.tether)
-        if away_m > limit_m + TOLERANCE:
-            yield _Violation(
-                "tether",
-                away_m - limit_m,
-                "leaves the tether sphere",
-                f"{away_m:.2f} m from the anchor, {limit_m:.2f} m allowed",
-                "shorten the line or move the anchor",
-            )
-
-    def _arm(self, position: Vec3, reference: Reference) -> Iterator[_Violation]:
-        arm = self._vehicle.arm
-        for number, (angle_rad, joint) in enumerate(zip(reference.arm_rad, arm.joints, strict=True), start=1):
-            angle_deg = math.degrees(angle_rad)
-            low_deg, high_deg = joint.angle_deg
-            excess = max(low_deg - angle_deg, angle_deg - high_deg)
-            if excess > TOLERANCE:
-                what = f"drives joint {number} through its wall"
-                detail = f"{angle_deg:.1f} deg, {low_deg:g} to {high_deg:g} deg allowed"
-                yield _Violation(f"joint {number}", excess, what, detail, "change arm_deg")
-        net_z_m = position[2] + self._manipulator.net_body_m(reference.arm_rad)[2] - self._vehicle.tool.net_radius_m
-        elbow_z_m = position[2] + self._manipulator.elbow_body_m(reference.arm_rad)[2] - ARM_RADIUS_M
-        for part, lowest_m in (("net", net_z_m), ("elbow", elbow_z_m)):
-            if lowest_m < FLOOR_GAP_M:
-                what = f"drags the {part} over the floor"
-                detail = f"its lowest point is {lowest_m:.2f} m high, {FLOOR_GAP_M:g} m is the least"
-                yield _Violation(
-                    f"floor {part}", FLOOR_GAP_M - lowest_m, what, detail, "fly higher or fold the arm first"
-                )
-
-    def _motion(self, reference: Reference, jerks: tuple[Vec3, Vec2]) -> Iterator[_Violation]:
-        limits = self._limits
-        speed = math.hypot(*reference.velocity_world_m_s)
-        acceleration = math.hypot(*reference.acceleration_world_m_s2)
-        arm_speed = math.degrees(max(map(abs, reference.arm_rate_rad_s)))
-        arm_acceleration = math.degrees(max(map(abs, reference.arm_acceleration_rad_s2)))
-        jerk = math.hypot(*jerks[0])
-        arm_jerk = math.degrees(max(map(abs, jerks[1])))
-        checked = (
-            ("speed_max_m_s", speed, limits.speed_max_m_s, "m/s", "flies too fast"),
-            ("acceleration_max_m_s2", acceleration, limits.acceleration_max_m_s2, "m/s^2", "accelerates too hard"),
-            ("jerk_max_m_s3", jerk, limits.jerk_max_m_s3, "m/s^3", "starts or stops too abruptly"),
-            ("arm_speed_max_deg_s", arm_speed, limits.arm_speed_max_deg_s, "deg/s", "turns a joint too fast"),
-            (
-                "arm_acceleration_max_deg_s2",
-                arm_acceleration,
-                limits.arm_acceleration_max_deg_s2,
-                "deg/s^2",
-                "accelerates a joint too hard",
-            ),
-            ("arm_jerk_max_deg_s3", arm_jerk, limits.arm_jerk_max_deg_s3, "deg/s^3", "jerks a joint"),
-        )
-        for key, value, limit, unit, what in checked:
-            if value > limit * (1.0 + TOLERANCE):
-                detail = f"{value:.3g} {unit}, limits.{key} is {limit:g}"
-                yield _Violation(key, value / limit, what, detail, "take longer or go less far")
-        for number, joint in enumerate(self._vehicle.arm.joints, start=1):
-            rate = abs(math.degrees(reference.arm_rate_rad_s[number - 1]))
-            if rate > joint.velocity_max_deg_s * (1.0 + TOLERANCE):
-                what = f"turns joint {number} faster than it can"
-                detail = f"{rate:.3g} deg/s, the joint's velocity_max_deg_s is {joint.velocity_max_deg_s:g}"
-                yield _Violation(f"velocity {number}", rate, what, detail, "take longer or go less far")
-        ax, ay, az = reference.acceleration_world_m_s2
-        airframe = self._vehicle.airframe
-        thrust_n = self._mass_kg * math.hypot(ax, ay, az + GRAVITY_M_S2)
-        allowed_n = limits.thrust_share_max * airframe.thrust_max_n
-        if thrust_n > allowed_n * (1.0 + TOLERANCE):
-            detail = (
-                f"{thrust_n:.1f} N with the largest payload, {allowed_n:.1f} N allowed "
-                f"({limits.thrust_share_max:g} of {airframe.thrust_max_n:g} N)"
-            )
-            yield _Violation("thrust", thrust_n, "needs too much thrust", detail, "take longer or carry less")
-        tilt_deg = math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2))
-        if tilt_deg > airframe.tilt_max_deg * (1.0 + TOLERANCE):
-            detail = f"{tilt_deg:.1f} deg, airframe.tilt_max_deg is {airframe.tilt_max_deg:g}"
-            yield _Violation("tilt", tilt_deg, "leans too far", detail, "take longer or go less far")
-
-
-def _world(position: Vec3, yaw_rad: float, body_m: Vec3) -> Vec3:
-    """A point of the level vehicle, world frame."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    x_m, y_m, z_m = body_m
-    return (position[0] + c * x_m - s * y_m, position[1] + s * x_m + c * y_m, position[2] + z_m)

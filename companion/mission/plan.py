@@ -99,7 +99,7 @@ class Plan:
         start = mission.start
         arm_start = _radians(start.arm_deg)
         yaw_start = math.radians(start.yaw_deg)
-        builder = _Builder(
+        builder = PlanBuilder(
             start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m),
             yaw_start if start_yaw_rad is None else start_yaw_rad,
             start_arm_rad or arm_start,
@@ -145,11 +145,13 @@ class Plan:
 
     def segment(self, t_s: float) -> Segment:
         """The segment at a time: the first before 0, the last after the end."""
-        return self.segments[max(0, bisect_right(self._starts_s, t_s) - 1)]
+        index = bisect_right(self._starts_s, t_s)
+        return self.segments[index - 1 if index else 0]
 
     def progress(self, t_s: float) -> float:
         """Share of the whole duration, 0 to 1."""
-        return min(1.0, max(0.0, t_s / self.duration_s))
+        share = t_s / self.duration_s
+        return 0.0 if share <= 0.0 else share if share < 1.0 else 1.0
 
 
 def landing_from(
@@ -174,7 +176,7 @@ def landing_from(
         speed_m_s: of the descent.
         vehicle: for the height of the floor and the reach of the arm.
     """
-    builder = _Builder(position_world_m, yaw_rad, arm_rad)
+    builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
     fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
     fold_s = max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * fold_rad / FOLD_SPEED_RAD_S)
     builder.fold_arm(arm_fold_rad, fold_s)
@@ -191,7 +193,16 @@ def landing_from(
     return builder.plan("landing")
 
 
-class _Builder:
+def stopping(velocity_world_m_s: Vec3) -> tuple[Vec3, float]:
+    """The velocity that a stop begins with, cut to `STOP_SPEED_MAX_M_S`, and how long it takes, s."""
+    speed_m_s = math.hypot(*velocity_world_m_s)
+    share = min(1.0, STOP_SPEED_MAX_M_S / speed_m_s) if speed_m_s > 0.0 else 0.0
+    vx, vy, vz = velocity_world_m_s
+    duration_s = max(STOP_MIN_S, REST_TO_REST_PEAK_SPEED * share * speed_m_s / STOP_ACCELERATION_M_S2)
+    return (share * vx, share * vy, share * vz), duration_s
+
+
+class PlanBuilder:
     """Appends moves to the three tracks; `t_s` is where the next phase begins."""
 
     def __init__(self, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2) -> None:
@@ -203,14 +214,26 @@ class _Builder:
 
     @property
     def height_m(self) -> float:
+        """Of the body's origin where the vehicle is."""
         return self._at[0][2]
+
+    @property
+    def position_m(self) -> Vec3:
+        """Where the vehicle is, world frame."""
+        x_m, y_m, z_m = self._at[0]
+        return (x_m, y_m, z_m)
 
     def line_m(self, to_world_m: Vec3) -> float:
         """How far a point is from where the vehicle is."""
         return math.dist(self._at[0], to_world_m)
 
     def move_vehicle(self, to_world_m: Vec3, duration_s: float) -> None:
+        """Straight, by minimum snap."""
         self._go(0, to_world_m, self.t_s, duration_s, minimum_snap)
+
+    def go(self, to_world_m: Vec3, duration_s: float) -> None:
+        """Straight from rest to rest, with less of a peak speed than minimum snap."""
+        self._go(0, to_world_m, self.t_s, duration_s, rest_to_rest)
 
     def follow(
         self, points_m: tuple[Vec3, ...], duration_s: float | None, limits: VehicleLimits, progress: Progress | None
@@ -238,6 +261,7 @@ class _Builder:
         return plan_arm(delta_rad, limits).duration_s if any(delta_rad) else ARM_LEAST_S
 
     def move_arm(self, to_rad: Vec2, delay_s: float, duration_s: float, limits: ArmLimits) -> None:
+        """By ruckig, in a duration that it is given."""
         delta_rad = self._arm_delta(to_rad)
         if any(delta_rad):
             profile = plan_arm(delta_rad, limits, duration_s).profile
@@ -249,11 +273,12 @@ class _Builder:
 
     def stop(self, velocity_world_m_s: Vec3) -> float:
         """Come to rest from a velocity; returns the end, s."""
-        speed_m_s = math.hypot(*velocity_world_m_s)
-        share = min(1.0, STOP_SPEED_MAX_M_S / speed_m_s) if speed_m_s > 0.0 else 0.0
-        duration_s = max(STOP_MIN_S, REST_TO_REST_PEAK_SPEED * share * speed_m_s / STOP_ACCELERATION_M_S2)
+        return self.stop_within(*stopping(velocity_world_m_s))
+
+    def stop_within(self, velocity_world_m_s: Vec3, duration_s: float) -> float:
+        """The same, in a given time."""
         vx, vy, vz = velocity_world_m_s
-        reach = share * duration_s
+        reach = duration_s
         self._append(0, Move(self.t_s, duration_s, self._at[0], (vx * reach, vy * reach, vz * reach), slow_down))
         return self.t_s + duration_s
 
@@ -275,6 +300,7 @@ class _Builder:
         return t_s
 
     def plan(self, name: str) -> Plan:
+        """What was appended."""
         position, yaw, arm = (
             Track(initial, tuple(moves)) for initial, moves in zip(self._initial, self._moves, strict=True)
         )
@@ -296,7 +322,7 @@ class _Builder:
         self._at[track] = move.end
 
 
-def _line(builder: _Builder, phase: Line, limits: VehicleLimits, arm_limits: ArmLimits) -> float:
+def _line(builder: PlanBuilder, phase: Line, limits: VehicleLimits, arm_limits: ArmLimits) -> float:
     """Append a line and what the arm does meanwhile; returns how long it takes, s."""
     arm_rad = None if phase.arm_deg is None else _radians(phase.arm_deg)
     delay_s = phase.arm_delay_s or 0.0

@@ -43,6 +43,8 @@ BEFORE_LIFT = frozenset({Stage.WAIT, Stage.OFFBOARD, Stage.ARM})
 LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
 """Stages in which PX4 must be in OFFBOARD, by the companion's belief."""
+PEOPLE_CHOOSE = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
+"""Modes that only people choose: theirs is the machine, nothing is sent against them."""
 
 
 class TouchdownDetector:

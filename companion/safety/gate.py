@@ -1,4 +1,8 @@
-"""The last look at everything that leaves: finite, in range, fresh. A bad command never leaves."""
+"""The last look at everything that leaves: finite, in range, fresh, not jumping. A bad command never leaves.
+
+What is held back is replaced by nothing: then PX4's offboard-loss failsafe and the servos' bus watchdog decide. What is only too much
+is cut: thrust that changes too fast, torque beyond a limit, torque that drives a joint on that is past its wall or too fast already.
+"""
 
 from __future__ import annotations
 
@@ -7,29 +11,60 @@ from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
 from companion.frames import tilt_rad
+from companion.frozen import quick
 from companion.types import AttitudeSetpoint, Vec2
 
+SLEW_MEMORY_S = 0.1
+"""After so long without a setpoint, which is what PX4 forgets the last one after, the next may be any."""
+ARM_FRESH_S = 0.05
+"""Oldest joint state that a torque may answer."""
 
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """One reason for which a command did not leave as it was."""
+
+    kind: str
+    """The same for the same reason, whatever the numbers."""
+    text: str
+
+
+@quick
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """What may leave, and why the rest may not."""
 
     attitude: AttitudeSetpoint | None
     arm_torque_nm: Vec2 | None
-    refused: tuple[str, ...]
+    refused: tuple[Refusal, ...]
 
 
 class Gate:
-    """Pure check of one tick's commands against the vehicle file."""
+    """Check of each tick's commands against the vehicle file; remembers the last thrust that left."""
 
     def __init__(self, vehicle: Vehicle) -> None:
+        safety, joints = vehicle.safety, vehicle.arm.joints
         self._tilt_max_rad = math.radians(vehicle.airframe.tilt_max_deg) + 1e-6
-        self._torque_max_nm = (vehicle.arm.joints[0].torque_max_nm, vehicle.arm.joints[1].torque_max_nm)
-        walls = [joint.angle_deg for joint in vehicle.arm.joints]
-        self._walls_rad = [(math.radians(low), math.radians(high)) for low, high in walls]
+        self._lean_max = math.sin(0.5 * self._tilt_max_rad) ** 2
+        by_current_nm = safety.servo_current_max_a * vehicle.arm.torque_per_amp_nm_a
+        self._torque_max_nm = (min(joints[0].torque_max_nm, by_current_nm), min(joints[1].torque_max_nm, by_current_nm))
+        self._walls_rad = [(math.radians(joint.angle_deg[0]), math.radians(joint.angle_deg[1])) for joint in joints]
+        self._speed_max_rad_s = [math.radians(joint.velocity_max_deg_s) for joint in joints]
+        self._state_age_max_s = safety.command_state_age_max_s
+        self._slew_max_per_s = safety.thrust_slew_max_per_s
+        self._last: tuple[float, float] | None = None
+        """When, and which thrust."""
 
     def check(
-        self, attitude: AttitudeSetpoint | None, arm_torque_nm: Vec2 | None, arm_rad: Vec2 | None, arm_fresh: bool
+        self,
+        attitude: AttitudeSetpoint | None,
+        arm_torque_nm: Vec2 | None,
+        arm_rad: Vec2 | None,
+        arm_fresh: bool,
+        *,
+        t_s: float = 0.0,
+        state_age_s: float = 0.0,
+        arm_rate_rad_s: Vec2 = (0.0, 0.0),
     ) -> Verdict:
         """The commands that may leave.
 
@@ -38,46 +73,82 @@ class Gate:
             arm_torque_nm: wanted joint torques.
             arm_rad: joint angles now; None if unknown.
             arm_fresh: the joint state is fresh enough to close a loop on.
+            t_s: flight clock.
+            state_age_s: of the attitude that the setpoint was computed from.
+            arm_rate_rad_s: joint speeds now.
         """
-        refused = []
+        refused: list[Refusal] = []
         if attitude is not None:
-            reason = self._attitude_fault(attitude)
-            if reason:
-                refused.append(reason)
+            fault = self._attitude_fault(attitude, state_age_s)
+            if fault is not None:
+                refused.append(fault)
                 attitude = None
+            else:
+                attitude = self._slewed(attitude, t_s, refused)
         if arm_torque_nm is not None:
-            if not all(math.isfinite(t) for t in arm_torque_nm):
-                refused.append(f"joint torque {arm_torque_nm} is not finite")
+            first, second = arm_torque_nm
+            if not (math.isfinite(first) and math.isfinite(second)):
+                refused.append(Refusal("torque not finite", f"joint torque {arm_torque_nm} is not finite"))
                 arm_torque_nm = None
             elif arm_rad is None or not arm_fresh:
-                refused.append("joint torque without a fresh joint state")
+                refused.append(Refusal("torque without state", "joint torque without a fresh joint state"))
                 arm_torque_nm = None
-            else:
-                arm_torque_nm = self._within_walls(arm_torque_nm, arm_rad)
-        return Verdict(attitude, arm_torque_nm, tuple(refused))
+            elif not self._is_free(first, second, arm_rad, arm_rate_rad_s):
+                arm_torque_nm = (
+                    self._limited(0, first, arm_rad[0], arm_rate_rad_s[0]),
+                    self._limited(1, second, arm_rad[1], arm_rate_rad_s[1]),
+                )
+        return Verdict(attitude, arm_torque_nm, tuple(refused) if refused else ())
 
-    def _attitude_fault(self, setpoint: AttitudeSetpoint) -> str | None:
-        q = setpoint.attitude_wxyz
-        if not all(math.isfinite(value) for value in (*q, setpoint.thrust)):
-            return "attitude setpoint is not finite"
-        if abs(math.sqrt(sum(value * value for value in q)) - 1.0) > 1e-3:
-            return "attitude setpoint is no unit quaternion"
-        if not 0.0 <= setpoint.thrust <= 1.0:
-            return f"thrust {setpoint.thrust:.3f} is outside 0 to 1"
-        if tilt_rad(q) > self._tilt_max_rad:
-            return f"tilt setpoint {math.degrees(tilt_rad(q)):.1f} deg is above the limit"
-        return None
+    def _attitude_fault(self, setpoint: AttitudeSetpoint, state_age_s: float) -> Refusal | None:
+        w, x, y, z = setpoint.attitude_wxyz
+        norm2, lean, thrust = w * w + x * x + y * y + z * z, x * x + y * y, setpoint.thrust
+        # Written so that NaN fails all of it.
+        if 0.998 < norm2 < 1.002 and lean <= self._lean_max and 0.0 <= thrust <= 1.0:
+            if state_age_s <= self._state_age_max_s:
+                return None
+            return Refusal("stale state", f"attitude setpoint from a state {state_age_s * 1e3:.0f} ms old")
+        if not (math.isfinite(norm2) and math.isfinite(thrust)):
+            return Refusal("setpoint not finite", "attitude setpoint is not finite")
+        if not 0.998 < norm2 < 1.002:
+            return Refusal("no rotation", "attitude setpoint is no unit quaternion")
+        if not 0.0 <= thrust <= 1.0:
+            return Refusal("thrust", f"thrust {thrust:.3f} is outside 0 to 1")
+        tilt_deg = math.degrees(tilt_rad(setpoint.attitude_wxyz))
+        return Refusal("tilt", f"tilt setpoint {tilt_deg:.1f} deg is above the limit")
 
-    def _within_walls(self, torque_nm: Vec2, arm_rad: Vec2) -> Vec2:
-        """Clip to the joint's limit; past a wall only torque that leads back."""
-        out = []
-        for torque, limit, angle, (low, high) in zip(
-            torque_nm, self._torque_max_nm, arm_rad, self._walls_rad, strict=True
-        ):
-            clipped = max(-limit, min(limit, torque))
-            if angle > high:
-                clipped = min(clipped, 0.0)
-            elif angle < low:
-                clipped = max(clipped, 0.0)
-            out.append(clipped)
-        return (out[0], out[1])
+    def _slewed(self, setpoint: AttitudeSetpoint, t_s: float, refused: list[Refusal]) -> AttitudeSetpoint:
+        """Thrust that changes no faster than it may."""
+        thrust, last = setpoint.thrust, self._last
+        if last is not None and t_s - last[0] <= SLEW_MEMORY_S:
+            most = self._slew_max_per_s * max(0.0, t_s - last[0])
+            if not last[1] - most <= thrust <= last[1] + most:
+                slow = max(last[1] - most, min(last[1] + most, thrust))
+                text = f"thrust {last[1]:.2f} to {thrust:.2f} in one step is cut to {slow:.2f}"
+                refused.append(Refusal("thrust slew", text))
+                setpoint, thrust = AttitudeSetpoint(setpoint.attitude_wxyz, slow), slow
+        self._last = (t_s, thrust)
+        return setpoint
+
+    def _is_free(self, first_nm: float, second_nm: float, arm_rad: Vec2, arm_rate_rad_s: Vec2) -> bool:
+        """Torques within limits, joints within walls and slow: `_limited` would change nothing. Nearly every tick is so."""
+        (a1, a2), (w1, w2), (most1, most2) = arm_rad, arm_rate_rad_s, self._torque_max_nm
+        ((low1, high1), (low2, high2)), (fast1, fast2) = self._walls_rad, self._speed_max_rad_s
+        return (
+            (-most1 <= first_nm <= most1 and -most2 <= second_nm <= most2)
+            and (low1 <= a1 <= high1 and low2 <= a2 <= high2)
+            and (-fast1 <= w1 <= fast1 and -fast2 <= w2 <= fast2)
+        )
+
+    def _limited(self, index: int, torque_nm: float, angle_rad: float, rate_rad_s: float) -> float:
+        """Clipped to the joint's limit; past a wall, or too fast, only torque that leads back."""
+        limit, (low, high), fast = self._torque_max_nm[index], self._walls_rad[index], self._speed_max_rad_s[index]
+        if torque_nm > limit:
+            torque_nm = limit
+        elif torque_nm < -limit:
+            torque_nm = -limit
+        if torque_nm > 0.0 and (angle_rad > high or rate_rad_s > fast):
+            return 0.0
+        if torque_nm < 0.0 and (angle_rad < low or rate_rad_s < -fast):
+            return 0.0
+        return torque_nm

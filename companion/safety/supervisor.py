@@ -1,7 +1,8 @@
 """The safety ladder: one pure update, latched.
 
 NOMINAL -> WARN -> HOLD -> RETRACT -> LAND -> AUTOPILOT_LAND -> TERMINATE. An event carries the rung it asks for; the ladder goes to the
-highest rung asked for and never back by itself.
+highest rung asked for. Of itself it only goes on upwards: a HOLD that lasts too long becomes a LAND, and so does a RETRACT. The one way
+down is people's: `operator_resume` ends a HOLD, and nothing else.
 """
 
 from __future__ import annotations
@@ -9,7 +10,27 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from companion.config.vehicle import Safety
 from companion.types import Event, SafetyAction
+
+RESUME = "operator_resume"
+HOLD_EXPIRED, RETRACT_EXPIRED = "hold_expired", "retract_expired"
+"""Causes of a LAND that no event asked for."""
+RETRACT_DONE = "retract_done"
+"""The event by which the core says that a RETRACT has arrived."""
+
+
+@dataclass(frozen=True, slots=True)
+class LadderTimes:
+    """How long the rungs may last that are no end in themselves."""
+
+    hold_max_s: float
+    retract_max_s: float
+
+    @classmethod
+    def of(cls, safety: Safety) -> LadderTimes:
+        """As the vehicle file says."""
+        return cls(safety.hold_max_s, safety.retract_max_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +43,15 @@ class SupervisorState:
     since_s: float = 0.0
 
 
-def update(state: SupervisorState, events: Iterable[Event]) -> SupervisorState:
-    """The ladder after these events."""
+def update(state: SupervisorState, events: Iterable[Event], t_s: float, times: LadderTimes) -> SupervisorState:
+    """The ladder after these events, at this time. The same object if nothing changes."""
     for event in events:
         if event.action.rank > state.action.rank:
             state = SupervisorState(event.action, event.id, event.t_s)
+        elif event.id == RESUME and state.action is SafetyAction.HOLD:
+            state = SupervisorState(SafetyAction.NOMINAL, event.id, event.t_s)
+    if state.action is SafetyAction.HOLD and t_s - state.since_s > times.hold_max_s:
+        return SupervisorState(SafetyAction.LAND, HOLD_EXPIRED, t_s)
+    if state.action is SafetyAction.RETRACT and t_s - state.since_s > times.retract_max_s:
+        return SupervisorState(SafetyAction.LAND, RETRACT_EXPIRED, t_s)
     return state

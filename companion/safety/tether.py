@@ -1,12 +1,25 @@
-"""Static geometry of the safety tether: a sphere around its anchor that the attachment point cannot leave."""
+"""The safety tether: slack now and at the predicted stop, sag against rotors and arm, winding, pull, separation. Pure.
+
+The tether is a line between its anchor and an attachment point on the vehicle that can be no longer than `tether.length_m`.
+What cannot be measured is bounded: how the line hangs (`companion.safety.tether_shape`), how hard it pulls
+(`companion.safety.tether_pull`). Plain floats: the watch runs in the control tick.
+"""
 
 from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Tether
+from companion.config.vehicle import Tether, Vehicle
 from companion.frames import quat_rotate
-from companion.types import Quat, Vec3
+from companion.safety.tether_pull import PullEstimate
+from companion.safety.tether_shape import Clearance, steepest_slope
+from companion.types import Quat, TetherState, Vec2, Vec3
+
+_TWO_PI = 2.0 * math.pi
+_ABOVE_M = 0.05
+"""So near to a vertical the direction to it says nothing: winding is held."""
+_DT_MAX_S = 0.05
+"""A longer gap between two updates counts as this in filters."""
 
 
 def attachment_world_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> Vec3:
@@ -28,3 +41,139 @@ def slack_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> floa
 def allowed_m(tether: Tether) -> float:
     """Largest distance from the anchor that a plan may use."""
     return tether.length_m - tether.margin_m
+
+
+def stop_distance_m(tether: Tether, outward_m_s: float) -> float:
+    """How far the machine goes on outwards before it can stand: v t_react + v^2 / (2 a); 0 when it does not move outwards."""
+    if outward_m_s <= 0.0:
+        return 0.0
+    return outward_m_s * (tether.react_time_s + 0.5 * outward_m_s / tether.stop_deceleration_m_s2)
+
+
+class Winding:
+    """Turns of a direction, counted from where it was first seen."""
+
+    __slots__ = ("_last_rad", "turns")
+
+    def __init__(self) -> None:
+        self._last_rad: float | None = None
+        self.turns = 0.0
+
+    def update(self, x: float, y: float) -> float:
+        """The direction as it is now; returns the turns. Too short a vector has no direction and changes nothing."""
+        if x * x + y * y < _ABOVE_M * _ABOVE_M:
+            return self.turns
+        angle = math.atan2(y, x)
+        if self._last_rad is not None:
+            step = angle - self._last_rad
+            if step > math.pi:
+                step -= _TWO_PI
+            elif step < -math.pi:
+                step += _TWO_PI
+            self.turns += step / _TWO_PI
+        self._last_rad = angle
+        return self.turns
+
+
+class TetherWatch:
+    """Follows the tether through a flight. State: winding, and the low-passed force.
+
+    `TetherState.turns` is the winding about the anchor's vertical (flying round it) or of the line about the vehicle (turning on the
+    spot), whichever is more: counter-clockwise from above positive, from where the watch began, whole turns come and go.
+    `clearance_m` counts the arm only if the line is not tied in the arm's own plane (`Clearance.judges_arm`).
+
+    Args:
+        vehicle: its tether, airframe, arm and tool.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        tether = vehicle.tether
+        self._anchor = tether.anchor_world_m
+        self._attachment = tether.attachment_body_m
+        self._length_m = tether.length_m
+        self._react_s = tether.react_time_s
+        self._half_per_a = 0.5 / tether.stop_deceleration_m_s2
+        self._taut_slack_m = tether.taut_slack_m
+        self._separation_m = tether.separation_m
+        self._clearance = Clearance(vehicle)
+        self._pull = PullEstimate(tether)
+        self._about_anchor = Winding()
+        self._about_vehicle = Winding()
+        self._last_t_s: float | None = None
+
+    def update(
+        self,
+        t_s: float,
+        position_world_m: Vec3,
+        velocity_world_m_s: Vec3,
+        attitude_wxyz: Quat,
+        arm_rad: Vec2 | None,
+        disturbance_world_n: Vec3 | None,
+        tool_force_world_n: Vec3 | None,
+    ) -> TetherState:
+        """One tick.
+
+        Args:
+            t_s: flight clock.
+            position_world_m: of the body's origin.
+            velocity_world_m_s: of the body's origin.
+            attitude_wxyz: body to world.
+            arm_rad: the paper's angles; None: unknown, the arm may be anywhere within its reach.
+            disturbance_world_n: everything that acts on the machine beside rotors and gravity; None: unknown, or on the ground.
+            tool_force_world_n: the part of it that acts on the net, tared; None: unknown.
+        """
+        dt_s = 0.0
+        if self._last_t_s is not None:
+            dt_s = t_s - self._last_t_s
+            if not 0.0 <= dt_s <= _DT_MAX_S:
+                dt_s = min(_DT_MAX_S, max(0.0, dt_s))
+        self._last_t_s = t_s
+        w, i, j, k = attitude_wxyz
+        # Rows of the rotation body -> world.
+        xx, xy, xz = 1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j - w * k), 2.0 * (i * k + w * j)
+        yx, yy, yz = 2.0 * (i * j + w * k), 1.0 - 2.0 * (i * i + k * k), 2.0 * (j * k - w * i)
+        zx, zy, zz = 2.0 * (i * k - w * j), 2.0 * (j * k + w * i), 1.0 - 2.0 * (i * i + j * j)
+        bx, by, bz = self._attachment
+        ax, ay, az = self._anchor
+        px, py, pz = position_world_m
+        # From the attachment to the anchor.
+        lx = ax - px - (xx * bx + xy * by + xz * bz)
+        ly = ay - py - (yx * bx + yy * by + yz * bz)
+        lz = az - pz - (zx * bx + zy * by + zz * bz)
+        level_2 = lx * lx + ly * ly
+        range_m = math.sqrt(level_2 + lz * lz)
+        level_m = math.sqrt(level_2)
+        slack = self._length_m - range_m
+        scale = 1.0 / range_m if range_m > 1e-6 else 0.0
+        ux, uy, uz = lx * scale, ly * scale, lz * scale
+        vx, vy, vz = velocity_world_m_s
+        outward = -(vx * ux + vy * uy + vz * uz)
+        stop_slack = slack
+        if outward > 0.0:
+            stop_slack -= outward * (self._react_s + outward * self._half_per_a)
+
+        # The line in the body's frame, straight and hanging as deep as its length lets it.
+        straight = (xx * ux + yx * uy + zx * uz, xy * ux + yy * uy + zy * uz, xz * ux + yz * uy + zz * uz)
+        hanging = None
+        if self._clearance.needs_hanging and slack > 0.0:
+            along, down = steepest_slope(level_m, lz, range_m, slack)
+            hx, hy = (lx / level_m * along, ly / level_m * along) if level_m > 1e-6 else (0.0, 0.0)
+            hanging = (xx * hx + yx * hy + zx * down, xy * hx + yy * hy + zy * down, xz * hx + yz * hy + zz * down)
+
+        pull = self._pull
+        pull.update(dt_s, (ux, uy, uz), range_m, disturbance_world_n, tool_force_world_n)
+        used_up = slack <= self._taut_slack_m
+        about_anchor = self._about_anchor.update(-lx, -ly)
+        about_vehicle = self._about_vehicle.update(straight[0] * range_m, straight[1] * range_m)
+        return TetherState(
+            range_m,
+            slack,
+            stop_slack,
+            math.atan2(-lz, level_m),
+            self._clearance.least_m(straight, hanging, arm_rad),
+            about_anchor if abs(about_anchor) >= abs(about_vehicle) else about_vehicle,
+            max(0.0, pull.pull_n),
+            used_up or (pull.pulling and pull.growing),
+            (pull.pulling or pull.sideways) and not used_up,
+            slack < -self._separation_m and not pull.pulling,
+        )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from companion.frames import quat_multiply
 from companion.types import Quat, Vec3
 from sitl.autopilot.cascade import Cascade, CascadeGains
-from sitl.autopilot.commander import Command, Commander, Notice, Result
+from sitl.autopilot.commander import Command, Commander, Notice, Result, Severity
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.land_detector import LandDetector
 from sitl.autopilot.modes import Health, NavState, OffboardKind
@@ -32,6 +32,8 @@ _EARTH_RADIUS_M = 6371000.0
 _EV_POSITION_AND_YAW = 1 | 2 | 8
 """EKF2_EV_CTRL: horizontal position, vertical position, yaw. Without magnetometer, barometer and GPS PX4 needs all of them."""
 _TIME_EPSILON_S = 1e-9
+# A member asked of its Enum takes as long as ten comparisons; these are asked for at 250 Hz.
+_OFFBOARD, _TERMINATION = NavState.OFFBOARD, NavState.TERMINATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,9 @@ class Origin:
 
     def _shrink(self) -> float:
         return max(math.cos(math.radians(self.latitude_deg)), 1e-6)
+
+
+_SOMEWHERE = Origin(47.4, 8.5, 480.0)
 
 
 def gains_from_params(params: Params) -> CascadeGains:
@@ -123,6 +128,12 @@ class Px4Stub:
         self._estimator = estimator
         self._cascade = cascade
         self._setpoint_delay_s = setpoint_delay_s
+        self.refuses_offboard = False
+        """Fault: the mode is not to be had, and is left."""
+        self.refuses_arming = False
+        """Fault."""
+        self.booted_at_s = 0.0
+        """World time at zero of PX4's own clock; before it nothing runs."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
         self._offboard: OffboardTarget | None = None
         self._setpoint_at_s: float | None = None
@@ -143,6 +154,11 @@ class Px4Stub:
         return self.commander.nav_state
 
     @property
+    def setpoint_at_s(self) -> float | None:
+        """World time at which the last offboard setpoint arrived; None: none ever did."""
+        return self._setpoint_at_s
+
+    @property
     def landed(self) -> bool:
         """Land detector."""
         return self.land.landed
@@ -159,17 +175,22 @@ class Px4Stub:
 
     def step(self, imu: ImuSample) -> RotorCommands:
         """Advance to the sample's world time; returns normalised rotor commands, all zero while disarmed."""
-        dt_s = imu.t_s - self.imu.t_s if self.imu is not None else 0.0
+        t_s = imu.t_s
+        dt_s = t_s - self.imu.t_s if self.imu is not None else 0.0
         self.imu = imu
-        self.t_s = t_s = imu.t_s
+        self.t_s = t_s
+        if t_s < self.booted_at_s:
+            return _STOPPED
         self._estimator.predict(imu)
         self.estimate = estimate = self._estimator.estimate()
-        while self._queue and self._queue[0][0] <= t_s + _TIME_EPSILON_S:
-            self._offboard = self._queue.popleft()[1]
+        queue = self._queue
+        while queue and queue[0][0] <= t_s + _TIME_EPSILON_S:
+            self._offboard = queue.popleft()[1]
         if t_s >= self._next_commander_s:
             self._next_commander_s = t_s + _COMMANDER_PERIOD_S - _TIME_EPSILON_S
             self._command_cycle(t_s, estimate)
-        if not self.commander.armed or self.commander.nav_state is NavState.TERMINATION:
+        commander = self.commander
+        if not commander.armed or commander.nav_state is _TERMINATION:
             self.target = AttitudeTarget(estimate.attitude_ned_frd, 0.0)
             self.rotors = _STOPPED
             return _STOPPED
@@ -199,6 +220,10 @@ class Px4Stub:
 
     def on_command(self, t_s: float, command: int, params: Command7) -> Result:
         """A MAV_CMD with param1 to param7 arrived at world time `t_s`; positions in degrees and m."""
+        refusal = self._refusal(command, params)
+        if refusal is not None:
+            self.notices.append(Notice(Severity.CRITICAL, refusal))
+            return Result.TEMPORARILY_REJECTED
         was_armed = self.commander.armed
         result = self.commander.command(t_s, command, params, self._health(t_s))
         if self.commander.armed and not was_armed:
@@ -208,6 +233,37 @@ class Px4Stub:
             self._reposition(params)
         self._collect_notices()
         return result
+
+    def _refusal(self, command: int, params: Command7) -> str | None:
+        """What a fault makes PX4 say to a command; None: nothing."""
+        if self.refuses_offboard and command == Command.DO_SET_MODE and params[1] == NavState.OFFBOARD.value[0]:
+            return "Switching to mode 'Offboard' is currently not possible"
+        if self.refuses_arming and command == Command.COMPONENT_ARM_DISARM and params[0] == 1.0:
+            return "Arming denied: Resolve system health failures first"
+        return None
+
+    def reboot(self, for_s: float) -> None:
+        """Everything but the parameters is forgotten; `for_s` from now PX4 runs again."""
+        self.booted_at_s = self.t_s + for_s
+        self.commander, self.navigator = Commander(self.params), Navigator(self.params)
+        self.land, self._estimator = LandDetector(self.params), Estimator()
+        self.estimate = self.origin = self.home_ned_m = self._offboard = self._setpoint_at_s = self._flying = None
+        self.target, self.rotors = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0), _STOPPED
+        self._queue.clear()
+        self._cascade.reset()
+        self._next_commander_s = self._position_at_s = -math.inf
+        self._climb_rate_controlled = False
+
+    def pilot_chooses(self, state: NavState) -> None:
+        """A mode by the switch of a pilot's radio; where home is, somebody has told PX4 before."""
+        estimate = self.estimate
+        if estimate is None:
+            return
+        if self.origin is None:
+            self.set_origin(_SOMEWHERE)
+        if self.home_ned_m is None:
+            self.home_ned_m = estimate.position_ned_m
+        self.commander.change_mode(state, self._health(self.t_s))
 
     def set_origin(self, origin: Origin) -> None:
         """SET_GPS_GLOBAL_ORIGIN: from now on the local position is a global one too."""
@@ -248,14 +304,16 @@ class Px4Stub:
             self.navigator.enter(state, estimate, self.home_ned_m, self.land.landed)
 
     def _choose_target(self, t_s: float, estimate: Estimate) -> None:
-        offboard = self._offboard if self.commander.nav_state is NavState.OFFBOARD else None
-        if isinstance(offboard, AttitudeTarget | RateTarget):
+        offboard = self._offboard if self.commander.nav_state is _OFFBOARD else None
+        if isinstance(offboard, AttitudeTarget):
             self._climb_rate_controlled = False
             self.navigator.settle(self.land.landed)
-            if isinstance(offboard, RateTarget):
-                self.target = self._attitude_for_rates(estimate, offboard)
-            else:
-                self.target = offboard
+            self.target = offboard
+            return
+        if isinstance(offboard, RateTarget):
+            self._climb_rate_controlled = False
+            self.navigator.settle(self.land.landed)
+            self.target = self._attitude_for_rates(estimate, offboard)
             return
         self._climb_rate_controlled = True
         since_s = t_s - self._position_at_s
@@ -300,15 +358,16 @@ class Px4Stub:
 
     def _health(self, t_s: float) -> Health:
         estimate = self.estimate
+        origin_set = self.origin is not None
         return Health(
-            attitude_valid=estimate is not None and estimate.attitude_valid,
-            position_valid=estimate is not None and estimate.position_valid,
-            origin_set=self.origin is not None,
-            home_set=self.home_set,
-            landed=self.land.landed,
-            maybe_landed=self.land.maybe_landed,
-            setpoint_age_s=None if self._setpoint_at_s is None else t_s - self._setpoint_at_s,
-            setpoint_kind=self._setpoint_kind,
+            estimate is not None and estimate.attitude_valid,
+            estimate is not None and estimate.position_valid,
+            origin_set,
+            origin_set and self.home_ned_m is not None,
+            self.land.landed,
+            self.land.maybe_landed,
+            None if self._setpoint_at_s is None or self.refuses_offboard else t_s - self._setpoint_at_s,
+            self._setpoint_kind,
         )
 
     def _collect_notices(self) -> None:

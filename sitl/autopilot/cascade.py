@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.frames import quat_conjugate, quat_multiply
-from companion.types import Vec3
+from companion.types import Quat, Vec3
 from sitl.autopilot.types import AttitudeTarget, Estimate, RotorCommands
 
 # Sign of each rotor's contribution to roll, pitch and yaw (FRD), in PX4's order.
@@ -32,7 +31,10 @@ class CascadeGains:
 
 
 class Cascade:
-    """PX4's multicopter attitude P loop, rate PID loop and quad-x mixer."""
+    """PX4's multicopter attitude P loop, rate PID loop and quad-x mixer.
+
+    Products of quaternions and sums over axes are written out: this runs at 250 Hz.
+    """
 
     def __init__(self, gains: CascadeGains | None = None) -> None:
         self._gains = gains or CascadeGains()
@@ -40,86 +42,101 @@ class Cascade:
 
     def reset(self) -> None:
         """Forget integrators (on arming)."""
-        self._integral = [0.0, 0.0, 0.0]
+        self._integral: Vec3 = (0.0, 0.0, 0.0)
         self._rate_previous: Vec3 | None = None
-        self._d_filtered = [0.0, 0.0, 0.0]
+        self._d_filtered: Vec3 = (0.0, 0.0, 0.0)
         self._unsaturated = True
 
     def step(self, dt_s: float, estimate: Estimate, target: AttitudeTarget) -> RotorCommands:
         """One control period."""
-        rate_sp = self._rate_setpoint(estimate, target)
+        rate_sp = self._rate_setpoint(estimate.attitude_ned_frd, target)
         torque = self._rate_loop(dt_s, estimate.rates_frd_rad_s, rate_sp, target.thrust)
         return self._mix(torque, target.thrust)
 
-    def _rate_setpoint(self, estimate: Estimate, target: AttitudeTarget) -> Vec3:
+    def _rate_setpoint(self, q: Quat, target: AttitudeTarget) -> Vec3:
         """Quaternion P control with reduced yaw priority (Brescianini et al., as in mc_att_control)."""
-        gains = self._gains
-        q, q_d = estimate.attitude_ned_frd, target.attitude_ned_frd
         w, x, y, z = q
-        wd, xd, yd, zd = q_d
+        wd, xd, yd, zd = target.attitude_ned_frd
         # z axes of both attitudes and the shortest rotation between them.
-        ez = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-        ezd = (2 * (xd * zd + wd * yd), 2 * (yd * zd - wd * xd), 1 - 2 * (xd * xd + yd * yd))
-        dot = ez[0] * ezd[0] + ez[1] * ezd[1] + ez[2] * ezd[2]
+        ex, ey, ez = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+        fx, fy, fz = 2 * (xd * zd + wd * yd), 2 * (yd * zd - wd * xd), 1 - 2 * (xd * xd + yd * yd)
+        dot = ex * fx + ey * fy + ez * fz
         if dot < -0.9999:
-            q_red = q_d
+            aw, ax, ay, az = wd, xd, yd, zd
         else:
             rw = 1.0 + dot
-            rx = ez[1] * ezd[2] - ez[2] * ezd[1]
-            ry = ez[2] * ezd[0] - ez[0] * ezd[2]
-            rz = ez[0] * ezd[1] - ez[1] * ezd[0]
+            rx, ry, rz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
             n = math.sqrt(rw * rw + rx * rx + ry * ry + rz * rz)
-            q_red = quat_multiply((rw / n, rx / n, ry / n, rz / n), q)
-        mix = quat_multiply(quat_conjugate(q_red), q_d)
-        sign = 1.0 if mix[0] >= 0 else -1.0
-        yaw_weight = gains.attitude_p[2] / gains.attitude_p[0]
-        half = math.asin(max(-1.0, min(1.0, sign * mix[3]))) * yaw_weight
-        q_sp = quat_multiply(q_red, (math.cos(half), 0.0, 0.0, math.sin(half)))
-        err = quat_multiply(quat_conjugate(q), q_sp)
-        sign = 2.0 if err[0] >= 0 else -2.0
-        p, limit = gains.attitude_p, gains.rate_max_rad_s
+            rw, rx, ry, rz = rw / n, rx / n, ry / n, rz / n
+            aw = rw * w - rx * x - ry * y - rz * z
+            ax = rw * x + rx * w + ry * z - rz * y
+            ay = rw * y - rx * z + ry * w + rz * x
+            az = rw * z + rx * y - ry * x + rz * w
+        # What is left is a turn about the body's z axis, of which a share is asked for: a* (.) = target.
+        left_w = aw * wd + ax * xd + ay * yd + az * zd
+        left_z = aw * zd - ax * yd + ay * xd - az * wd
+        (p_roll, p_pitch, p_yaw), (most_roll, most_pitch, most_yaw) = self._gains.attitude_p, self._gains.rate_max_rad_s
+        sine = left_z if left_w >= 0 else -left_z
+        half = math.asin(1.0 if sine > 1.0 else -1.0 if sine < -1.0 else sine) * (p_yaw / p_roll)
+        c, s = math.cos(half), math.sin(half)
+        sw, sx, sy, sz = aw * c - az * s, ax * c + ay * s, ay * c - ax * s, aw * s + az * c
+        # The error q* (.) = setpoint; its vector part is half the angle.
+        gain = 2.0 if w * sw + x * sx + y * sy + z * sz >= 0 else -2.0
         # PX4 divides the yaw weight out of the yaw gain again, so one gain serves all axes here.
-        r = [
-            max(-limit[0], min(limit[0], p[0] * sign * err[1])),
-            max(-limit[1], min(limit[1], p[1] * sign * err[2])),
-            max(-limit[2], min(limit[2], p[0] * sign * err[3])),
-        ]
+        roll = p_roll * gain * (w * sx - x * sw - y * sz + z * sy)
+        pitch = p_pitch * gain * (w * sy + x * sz - y * sw - z * sx)
+        yaw = p_roll * gain * (w * sz - x * sy + y * sx - z * sw)
+        roll = most_roll if roll > most_roll else -most_roll if roll < -most_roll else roll
+        pitch = most_pitch if pitch > most_pitch else -most_pitch if pitch < -most_pitch else pitch
+        yaw = most_yaw if yaw > most_yaw else -most_yaw if yaw < -most_yaw else yaw
         if target.yaw_rate_rad_s:
             # Feed-forward about the world's vertical.
-            r[0] += target.yaw_rate_rad_s * 2 * (x * z - w * y)
-            r[1] += target.yaw_rate_rad_s * 2 * (y * z + w * x)
-            r[2] += target.yaw_rate_rad_s * ez[2]
-        return (r[0], r[1], r[2])
+            roll += target.yaw_rate_rad_s * 2 * (x * z - w * y)
+            pitch += target.yaw_rate_rad_s * 2 * (y * z + w * x)
+            yaw += target.yaw_rate_rad_s * ez
+        return (roll, pitch, yaw)
 
     def _rate_loop(self, dt_s: float, rate: Vec3, rate_sp: Vec3, thrust: float) -> Vec3:
         gains = self._gains
-        previous = self._rate_previous or rate
-        blend = 1.0 - math.exp(-2 * math.pi * gains.d_cutoff_hz * dt_s)
-        out = [0.0, 0.0, 0.0]
-        for i in range(3):
-            error = rate_sp[i] - rate[i]
-            self._d_filtered[i] += blend * ((rate[i] - previous[i]) / dt_s - self._d_filtered[i])
-            if (
-                thrust > 0.1 and self._unsaturated
-            ):  # on the ground the integrator would wind up against the landing gear
-                limit = gains.integrator_max
-                self._integral[i] = max(-limit, min(limit, self._integral[i] + gains.rate_i[i] * error * dt_s))
-            elif thrust <= 0.1:
-                self._integral[i] = 0.0
-            out[i] = gains.rate_p[i] * error + self._integral[i] - gains.rate_d[i] * self._d_filtered[i]
+        (x, y, z), (to_x, to_y, to_z), (px, py, pz) = rate, rate_sp, self._rate_previous or rate
         self._rate_previous = rate
-        return (out[0], out[1], out[2])
+        error_x, error_y, error_z = to_x - x, to_y - y, to_z - z
+        blend = 1.0 - math.exp(-2 * math.pi * gains.d_cutoff_hz * dt_s)
+        dx, dy, dz = self._d_filtered
+        dx += blend * ((x - px) / dt_s - dx)
+        dy += blend * ((y - py) / dt_s - dy)
+        dz += blend * ((z - pz) / dt_s - dz)
+        self._d_filtered = (dx, dy, dz)
+        if thrust <= 0.1:  # on the ground the integrator would wind up against the landing gear
+            self._integral = (0.0, 0.0, 0.0)
+        elif self._unsaturated:
+            most = gains.integrator_max
+            (kx, ky, kz), (ix, iy, iz) = gains.rate_i, self._integral
+            self._integral = (
+                max(-most, min(most, ix + kx * error_x * dt_s)),
+                max(-most, min(most, iy + ky * error_y * dt_s)),
+                max(-most, min(most, iz + kz * error_z * dt_s)),
+            )
+        (ix, iy, iz), (kx, ky, kz), (lx, ly, lz) = self._integral, gains.rate_p, gains.rate_d
+        return (kx * error_x + ix - lx * dx, ky * error_y + iy - ly * dy, kz * error_z + iz - lz * dz)
 
     def _mix(self, torque: Vec3, thrust: float) -> RotorCommands:
         """Collective + torques to rotor commands; yaw gives way first, then the collective (airmode off for yaw)."""
         roll, pitch, yaw = torque
-        lean = [MIX_ROLL[i] * roll + MIX_PITCH[i] * pitch for i in range(4)]
-        span = max(lean) - min(lean)
+        # MIX_ROLL and MIX_PITCH: the rotors get -across, +across, +along, -along.
+        across, along = roll - pitch, roll + pitch
+        most = max(abs(across), abs(along))
+        span = 2.0 * most
         if span > 1.0:
-            lean = [value / span for value in lean]
-        base = max(-min(lean), min(1.0 - max(lean), thrust)) if thrust > 0.0 else 0.0
-        room = min(min(base + value, 1.0 - base - value) for value in lean)
-        yaw_used = max(-room, min(room, yaw)) if room > 0 else 0.0
+            across, along, most = across / span, along / span, most / span
+        base = max(most, min(1.0 - most, thrust)) if thrust > 0.0 else 0.0
+        room = min(base - most, 1.0 - base - most)
+        turn = max(-room, min(room, yaw)) if room > 0 else 0.0
         self._unsaturated = span <= 1.0 and abs(base - thrust) < 0.05
-        a, b, c, d = (min(1.0, max(0.0, base + lean[i] + MIX_YAW[i] * yaw_used)) for i in range(4))
-        return (a, b, c, d)
+        a, b, c, d = base - across + turn, base + across + turn, base + along - turn, base - along - turn
+        return (
+            0.0 if a < 0.0 else 1.0 if a > 1.0 else a,
+            0.0 if b < 0.0 else 1.0 if b > 1.0 else b,
+            0.0 if c < 0.0 else 1.0 if c > 1.0 else c,
+            0.0 if d < 0.0 else 1.0 if d > 1.0 else d,
+        )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from companion.frames import euler_zyx_from_quat, quat_multiply, quat_normalize, quat_rotate, wrap_rad
+from companion.frames import quat_multiply, quat_normalize, wrap_rad, yaw_from_quat
 from companion.types import IDENTITY_QUAT, Quat, Vec3
 from sitl.autopilot.types import Estimate, ImuSample
 
@@ -49,28 +49,43 @@ class Estimator:
         if self._t_s is None or not self._tilt_aligned:
             self._align_tilt(imu)
             return
-        dt = imu.t_s - self._t_s
-        self._t_s = imu.t_s
+        t_s, rates, accel = imu
+        dt = t_s - self._t_s
+        self._t_s = t_s
         if dt <= 0.0:
             return
-        gx, gy, gz = imu.gyro_frd_rad_s
+        w, x, y, z = self._q
+        gx, gy, gz = rates
         angle = math.sqrt(gx * gx + gy * gy + gz * gz) * dt
         if angle > 1e-9:
+            # Products of quaternions are written out here: this runs at 250 Hz.
             k = math.sin(0.5 * angle) / angle * dt
-            self._q = quat_normalize(quat_multiply(self._q, (math.cos(0.5 * angle), gx * k, gy * k, gz * k)))
-        fx, fy, fz = imu.accel_frd_m_s2
-        ax, ay, az = quat_rotate(self._q, (fx, fy, fz - self._bias_z))
-        az += GRAVITY_M_S2
+            rw, rx, ry, rz = math.cos(0.5 * angle), gx * k, gy * k, gz * k
+            self._q = w, x, y, z = quat_normalize(
+                (
+                    w * rw - x * rx - y * ry - z * rz,
+                    w * rx + x * rw + y * rz - z * ry,
+                    w * ry - x * rz + y * rw + z * rx,
+                    w * rz + x * ry - y * rx + z * rw,
+                )
+            )
+        fx, fy, fz = accel
+        fz -= self._bias_z
+        tx, ty, tz = 2.0 * (y * fz - z * fy), 2.0 * (z * fx - x * fz), 2.0 * (x * fy - y * fx)
+        ax = fx + w * tx + y * tz - z * ty
+        ay = fy + w * ty + z * tx - x * tz
+        az = fz + w * tz + x * ty - y * tx + GRAVITY_M_S2
         px, py, pz = self._p
         vx, vy, vz = self._v
         half = 0.5 * dt * dt
-        self._p = (px + vx * dt + ax * half, py + vy * dt + ay * half, pz + vz * dt + az * half)
+        self._p = p = (px + vx * dt + ax * half, py + vy * dt + ay * half, pz + vz * dt + az * half)
         self._v = (vx + ax * dt, vy + ay * dt, vz + az * dt)
-        self._rates = imu.gyro_frd_rad_s
-        self._accel = imu.accel_frd_m_s2
-        self._history.append((imu.t_s, self._p, self._q))
-        while self._history[0][0] < imu.t_s - _HISTORY_S:
-            self._history.popleft()
+        self._rates = rates
+        self._accel = accel
+        history = self._history
+        history.append((t_s, p, self._q))
+        while history[0][0] < t_s - _HISTORY_S:
+            history.popleft()
 
     def _align_tilt(self, imu: ImuSample) -> None:
         """Roll and pitch from the accelerometer at rest, yaw 0 until vision says more."""
@@ -86,13 +101,15 @@ class Estimator:
 
     def fuse_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> None:
         """Fuse a vision pose that was taken at world time `t_s` (arrival minus EKF2_EV_DELAY)."""
-        if self._t_s is None or not all(math.isfinite(value) for value in (*position_ned_m, *attitude_ned_frd)):
+        # A sum is finite only if everything in it is.
+        if self._t_s is None or not math.isfinite(sum(position_ned_m) + sum(attitude_ned_frd)):
             return
         gap = self._t_s - self._arrived_t_s if self._arrived_t_s is not None else 1.0
         self._arrived_t_s = self._t_s
         then_p, then_q = self._at(t_s)
-        rx, ry, rz = (z - p for z, p in zip(position_ned_m, then_p, strict=True))
-        yaw_error = wrap_rad(euler_zyx_from_quat(attitude_ned_frd)[2] - euler_zyx_from_quat(then_q)[2])
+        zx, zy, zz = position_ned_m
+        rx, ry, rz = zx - then_p[0], zy - then_p[1], zz - then_p[2]
+        yaw_error = wrap_rad(yaw_from_quat(attitude_ned_frd) - yaw_from_quat(then_q))
         starved = self._fused_t_s is None or self._t_s - self._fused_t_s > _GATE_RESET_S
         if starved:
             self._reset_to((rx, ry, rz), yaw_error)
@@ -101,16 +118,14 @@ class Estimator:
             return
         self._fused_t_s = self._t_s
         dt = min(gap, 0.05)
-        kp, kv, ka = _L_POSITION * dt, _L_VELOCITY * dt, _L_ACCELERATION * dt
-        kp, kv, ka = min(kp, 0.6), min(kv, 2.0), min(ka, 1.0)
+        kp, kv, ka = min(_L_POSITION * dt, 0.6), min(_L_VELOCITY * dt, 2.0), min(_L_ACCELERATION * dt, 1.0)
         px, py, pz = self._p
         vx, vy, vz = self._v
         self._p = (px + kp * rx, py + kp * ry, pz + kp * rz)
         self._v = (vx + kv * rx, vy + kv * ry, vz + kv * rz)
         # A tilt error shows as a horizontal acceleration error of g x theta.
-        self._rotate_world((ka / GRAVITY_M_S2 * ry, -ka / GRAVITY_M_S2 * rx, _L_YAW * dt * yaw_error))
-        self._bias_z -= ka * rz * 0.3
-        self._bias_z = max(-1.0, min(1.0, self._bias_z))
+        self._rotate_world(ka / GRAVITY_M_S2 * ry, -ka / GRAVITY_M_S2 * rx, _L_YAW * dt * yaw_error)
+        self._bias_z = max(-1.0, min(1.0, self._bias_z - ka * rz * 0.3))
 
     def _at(self, t_s: float) -> tuple[Vec3, Quat]:
         for stamp, position, attitude in reversed(self._history):
@@ -121,28 +136,28 @@ class Estimator:
     def _reset_to(self, innovation: Vec3, yaw_error: float) -> None:
         self._p = (self._p[0] + innovation[0], self._p[1] + innovation[1], self._p[2] + innovation[2])
         self._v = (0.0, 0.0, 0.0)
-        self._rotate_world((0.0, 0.0, yaw_error))
+        self._rotate_world(0.0, 0.0, yaw_error)
         self._history.clear()
         self._fused_t_s = self._t_s
 
-    def _rotate_world(self, theta: Vec3) -> None:
-        half = (0.5 * theta[0], 0.5 * theta[1], 0.5 * theta[2])
-        norm = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
+    def _rotate_world(self, theta_x: float, theta_y: float, theta_z: float) -> None:
+        x, y, z = 0.5 * theta_x, 0.5 * theta_y, 0.5 * theta_z
+        norm = math.sqrt(x**2 + y**2 + z**2)
         k = math.sin(norm) / norm if norm > 1e-12 else 1.0
-        self._q = quat_normalize(quat_multiply((math.cos(norm), k * half[0], k * half[1], k * half[2]), self._q))
+        self._q = quat_normalize(quat_multiply((math.cos(norm), k * x, k * y, k * z), self._q))
 
     def estimate(self) -> Estimate:
         """Newest output."""
         t_s = self._t_s or 0.0
         since = t_s - self._fused_t_s if self._fused_t_s is not None else math.inf
         return Estimate(
-            t_s=t_s,
-            position_ned_m=self._p,
-            velocity_ned_m_s=self._v,
-            attitude_ned_frd=self._q,
-            rates_frd_rad_s=self._rates,
-            accel_frd_m_s2=self._accel,
-            vision_fused=since <= VISION_FUSED_TIMEOUT_S,
-            position_valid=since <= POSITION_VALID_TIMEOUT_S,
-            attitude_valid=self._tilt_aligned,
+            t_s,
+            self._p,
+            self._v,
+            self._q,
+            self._rates,
+            self._accel,
+            since <= VISION_FUSED_TIMEOUT_S,
+            since <= POSITION_VALID_TIMEOUT_S,
+            self._tilt_aligned,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from sitl.autopilot.params import Params
 from sitl.autopilot.types import Estimate
@@ -12,11 +13,24 @@ _BLIND_S = 8.0
 """Without vertical velocity: this long at minimum thrust and without rotation counts as landed."""
 
 
+class _Settings(NamedTuple):
+    hold_s: float
+    thrust_min: float
+    thrust_hover: float
+    thrust_manual_min: float
+    hover_estimated: bool
+    still_z_m_s: float
+    still_xy_m_s: float
+    still_rad_s: float
+
+
 class LandDetector:
     """Three conditions in a row, each held for a third of LNDMC_TRIG_TIME; each is lost at once."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
+        self._revision = params.revision
+        self._settings = self._read()
         self._contact_since_s: float | None = None
         self._maybe_since_s: float | None = None
         self._landed_since_s: float | None = None
@@ -40,7 +54,10 @@ class LandDetector:
             self._contact_since_s = self._maybe_since_s = self._landed_since_s = -math.inf
             self._low_since_s = None
             return
-        hold_s = self._params.real("LNDMC_TRIG_TIME") / 3.0
+        if self._revision != self._params.revision:
+            self._revision = self._params.revision
+            self._settings = self._read()
+        hold_s = self._settings.hold_s
         contact = self._contact_now(estimate, thrust, climb_rate_controlled, descend_m_s)
         self._contact_since_s, self.ground_contact = _held(t_s, contact, self._contact_since_s, hold_s)
         maybe = self._maybe_now(t_s, estimate, thrust, climb_rate_controlled)
@@ -50,34 +67,47 @@ class LandDetector:
     def _contact_now(self, estimate: Estimate, thrust: float, climb_rate_controlled: bool, descend_m_s: float) -> bool:
         if not estimate.position_valid:
             return False
-        params = self._params
-        thr_min, thr_hover = params.real("MPC_THR_MIN"), params.real("MPC_THR_HOVER")
+        settings = self._settings
         # The hover thrust estimator runs in climb-rate-controlled modes only; where it does, PX4 trusts the hover thrust more.
-        share = 0.6 if climb_rate_controlled and params.integer("MPC_USE_HTE") else 0.3
-        if thrust > thr_min + share * (thr_hover - thr_min):
+        share = 0.6 if climb_rate_controlled and settings.hover_estimated else 0.3
+        if thrust > settings.thrust_min + share * (settings.thrust_hover - settings.thrust_min):
             return False
         if climb_rate_controlled and not self.maybe_landed and not self.landed and descend_m_s < _DESCENT_THRESHOLD_M_S:
             return False
         vx, vy, vz = estimate.velocity_ned_m_s
-        still_m_s = params.real("LNDMC_Z_VEL_MAX") * (2.5 if self.maybe_landed else 1.0)
-        return abs(vz) <= still_m_s and math.hypot(vx, vy) <= params.real("LNDMC_XY_VEL_MAX")
+        still_m_s = settings.still_z_m_s * (2.5 if self.maybe_landed else 1.0)
+        return abs(vz) <= still_m_s and math.hypot(vx, vy) <= settings.still_xy_m_s
 
     def _maybe_now(self, t_s: float, estimate: Estimate, thrust: float, climb_rate_controlled: bool) -> bool:
-        params = self._params
-        thr_min, thr_hover = params.real("MPC_THR_MIN"), params.real("MPC_THR_HOVER")
-        least = thr_min + 0.1 * (thr_hover - thr_min) if climb_rate_controlled else params.real("MPC_MANTHR_MIN") + 0.01
+        settings = self._settings
+        least = settings.thrust_manual_min + 0.01
+        if climb_rate_controlled:
+            least = settings.thrust_min + 0.1 * (settings.thrust_hover - settings.thrust_min)
         if thrust > least:
             self._low_since_s = None
             return False
         if self._low_since_s is None:
             self._low_since_s = t_s
-        turning_rad_s = math.radians(params.real("LNDMC_ROT_MAX")) * (2.5 if self.maybe_landed else 1.0)
+        turning_rad_s = settings.still_rad_s * (2.5 if self.maybe_landed else 1.0)
         p, q, _ = estimate.rates_frd_rad_s
         if math.hypot(p, q) > turning_rad_s:
             return False
         if estimate.position_valid:
             return self.ground_contact
         return t_s - self._low_since_s > _BLIND_S
+
+    def _read(self) -> _Settings:
+        real = self._params.real
+        return _Settings(
+            hold_s=real("LNDMC_TRIG_TIME") / 3.0,
+            thrust_min=real("MPC_THR_MIN"),
+            thrust_hover=real("MPC_THR_HOVER"),
+            thrust_manual_min=real("MPC_MANTHR_MIN"),
+            hover_estimated=bool(self._params.integer("MPC_USE_HTE")),
+            still_z_m_s=real("LNDMC_Z_VEL_MAX"),
+            still_xy_m_s=real("LNDMC_XY_VEL_MAX"),
+            still_rad_s=math.radians(real("LNDMC_ROT_MAX")),
+        )
 
 
 def _held(t_s: float, now: bool, since_s: float | None, hold_s: float) -> tuple[float | None, bool]:

@@ -51,6 +51,8 @@ class Link(asyncio.DatagramProtocol):
     def __init__(self, stub: Px4Stub, receiver: Receiver, partner: tuple[str, int] | None, ground: bool) -> None:
         self.schedule = Schedule(ground)
         self.down = False
+        self.delay_s = 0.0
+        """Fault: everything takes so long, each way."""
         self.port = 0
         self.messages_in = 0
         self.messages_out = 0
@@ -82,7 +84,13 @@ class Link(asyncio.DatagramProtocol):
         """Nobody listens at the partner's port: UDP does not care, and neither does PX4."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        """Decode and handle at once."""
+        """Decode and handle at once, or as late as the link is slow."""
+        if self.delay_s:
+            asyncio.get_running_loop().call_later(self.delay_s, self._take, data, addr)
+        else:
+            self._take(data, addr)
+
+    def _take(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         if self.down:
             return
         messages = self._decoder.parse_buffer(data)
@@ -107,7 +115,14 @@ class Link(asyncio.DatagramProtocol):
         data = message.pack(self._encoder)
         self._encoder.seq = (self._encoder.seq + 1) % 256
         self.messages_out += 1
-        self._transport.sendto(data, self._partner)
+        if self.delay_s:
+            asyncio.get_running_loop().call_later(self.delay_s, self._let_out, data, self._partner)
+        else:
+            self._transport.sendto(data, self._partner)
+
+    def _let_out(self, data: bytes, partner: tuple[str, int]) -> None:
+        if self._transport is not None and not self.down:
+            self._transport.sendto(data, partner)
 
     def send_all_params(self) -> None:
         """Queue _HASH_CHECK and every parameter; `pump` sends them in portions."""
@@ -185,6 +200,16 @@ class MavlinkServer:
         self._down = down
         for link in self._links:
             link.down = down
+
+    @property
+    def delay_s(self) -> float:
+        """Fault: everything on every link takes so long, each way."""
+        return self._links[0].delay_s if self._links else 0.0
+
+    @delay_s.setter
+    def delay_s(self, delay_s: float) -> None:
+        for link in self._links:
+            link.delay_s = delay_s
 
     @property
     def messages_in(self) -> int:

@@ -25,11 +25,11 @@ _VERSION = 1 << 24 | 16 << 16 | 1 << 8 | 255
 
 
 def _ms(stub: Px4Stub) -> int:
-    return int(stub.t_s * 1e3) & 0xFFFFFFFF
+    return int((stub.t_s - stub.booted_at_s) * 1e3) & 0xFFFFFFFF
 
 
 def _us(stub: Px4Stub) -> int:
-    return int(stub.t_s * 1e6)
+    return int((stub.t_s - stub.booted_at_s) * 1e6)
 
 
 def heartbeat(stub: Px4Stub) -> Message:

@@ -1,14 +1,16 @@
-"""Records inside the PX4 stub; frames are PX4's own: local NED, body FRD."""
+"""Records inside the PX4 stub; frames are PX4's own: local NED, body FRD.
+
+Named tuples: they are made at 250 Hz, and one costs a quarter of a frozen dataclass.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from companion.types import Quat, Vec3, Vec4
 
 
-@dataclass(frozen=True, slots=True)
-class ImuSample:
+class ImuSample(NamedTuple):
     """One IMU sample, noise and bias included."""
 
     t_s: float
@@ -17,8 +19,7 @@ class ImuSample:
     """Specific force: (0, 0, -9.81) at rest, level."""
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(NamedTuple):
     """Output of the EKF-like estimator."""
 
     t_s: float
@@ -34,8 +35,7 @@ class Estimate:
     attitude_valid: bool
 
 
-@dataclass(frozen=True, slots=True)
-class AttitudeTarget:
+class AttitudeTarget(NamedTuple):
     """What the attitude loop follows."""
 
     attitude_ned_frd: Quat

@@ -11,8 +11,10 @@ from typing import Any
 import foxglove
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
-from companion.analysis import metrics
+from companion.analysis import metrics, plots
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.replay import replay
 from companion.analysis.report import write_report
@@ -278,6 +280,85 @@ def test_the_report_is_one_file_with_plots_results_and_events(flight: FlightLog,
     assert "payload in the net" in page
     assert "version_" not in page
     assert "numpy" in page
+
+
+def force_legend(log: FlightLog) -> list[str]:
+    figure = plots._force(log)
+    assert figure is not None
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_a_payload_estimate_is_drawn_as_its_weight_and_only_if_there_is_one() -> None:
+    def estimate(i: Inputs, o: Outputs, s: Sent) -> Row:
+        if o.control is None:
+            return i, o, s
+        return i, replace(o, control=replace(o.control, payload_estimate_kg=0.2 if o.mission_t_s > 7.0 else 0.0)), s
+
+    log = changed(estimate)
+    assert force_legend(log)[3:] == ["weight of the estimated payload"]
+    figure = plots._force(log)
+    assert figure is not None
+    line = next(line for line in figure.axes[0].get_lines() if line.get_label() == "weight of the estimated payload")
+    drawn = np.asarray(line.get_ydata())
+    assert np.nanmin(drawn) == pytest.approx(-0.2 * 9.81, rel=1e-3)
+    assert np.nanmax(drawn) == pytest.approx(0.0)
+    assert len(force_legend(changed(lambda i, o, s: (i, o, s)))) == 3
+
+
+def rewritten(source: Path, target: Path, message: Callable[[str, dict[str, Any]], None], records: str) -> Path:
+    """A log as a version with other records would have written it: each tick's data changed, and another fingerprint."""
+    with source.open("rb") as file, target.open("wb") as out:
+        reader, writer = make_reader(file), Writer(out)
+        writer.start()
+        for record in reader.iter_metadata():
+            known = dict(record.metadata)
+            writer.add_metadata(record.name, {**known, "records": records} if record.name == "companion" else known)
+        channels: dict[str, int] = {}
+        for schema, channel, row in reader.iter_messages(topics=["/inputs", "/outputs", "/sent"]):
+            assert schema is not None
+            if channel.topic not in channels:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "json", schema_id)
+            data = json.loads(row.data)
+            message(channel.topic, data)
+            writer.add_message(channels[channel.topic], row.log_time, json.dumps(data).encode(), row.publish_time)
+        writer.finish()
+    return target
+
+
+def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(
+    flight: FlightLog, tmp_path: Path
+) -> None:
+    """`None` is left out of a log, so the ticks of such a log are those of today; what the core makes of them is not."""
+
+    def same(topic: str, data: dict[str, Any]) -> None:
+        assert "payload_estimate_kg" not in data.get("control", {})
+
+    log = FlightLog.read(rewritten(flight.path, tmp_path / "older.mcap", same, "0" * 16))
+    assert log.outputs == flight.outputs
+    with pytest.raises(LogError, match=r"^[^\n]*records are not those of today[^\n]*replay it with that version$"):
+        replay(log, lambda _: Recited(log.outputs))
+
+
+@pytest.mark.parametrize(("field", "reason"), [("zeta", "'zeta' is missing"), ("news", "unknown field 'news'")])
+def test_a_log_with_records_of_another_shape_is_refused_in_one_line(
+    flight: FlightLog, tmp_path: Path, field: str, reason: str
+) -> None:
+    def change(topic: str, data: dict[str, Any]) -> None:
+        if "control" in data:
+            data["control"].pop(field, None)
+            if field == "news":
+                data["control"]["news"] = 1.0
+
+    path = rewritten(flight.path, tmp_path / "other.mcap", change, "0" * 16)
+    with pytest.raises(LogError) as refusal:
+        FlightLog.read(path)
+    assert str(refusal.value).startswith(f"{path}: records of another shape (ControlLog: ")
+    assert reason in str(refusal.value)
+    assert "written by companion " in str(refusal.value)
+    assert "\n" not in str(refusal.value)
 
 
 def test_the_report_of_a_flight_that_hardly_began_is_written_all_the_same(tmp_path: Path) -> None:

@@ -103,7 +103,15 @@ class Machine:
         self.rate += DT_S * acceleration
 
 
-TARGET = Reference((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0), 0.0, 0.0, POSE, (0.0, 0.0), (0.2, -0.1))
+TARGET = Reference(
+    (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0), 0.0, 0.0, POSE, (0.0, 0.0), (0.2, -0.1), (0.3, -0.2, 0.0)
+)
+OPTIONS_OFF = {
+    "disturbance_time_xyz_s": (0.0, 0.0, 0.0),
+    "feedforward_lead_s": 0.0,
+    "arm_inertia_nominal": False,
+    "arm_friction_share": 0.0,
+}
 
 
 def wide(five: Array) -> list[float]:
@@ -138,12 +146,16 @@ class Instant:
     big_e: Array
     """The overall uncertainty E, as the machine has it."""
     dtau: Array
+    added: Array
+    """What the options beyond the paper add to tau."""
 
 
 def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
     """Closed loop from an initial error under a steady pull."""
     law = adaptive(config)
     controller = AdaptiveController(law, config.vehicle, HOVER)
+    # The same law with the options beyond the paper off: what they add to tau is the difference, and belongs to E.
+    plain = AdaptiveController(law.model_copy(update=OPTIONS_OFF), config.vehicle, HOVER)
     machine = Machine(config)
     m_d, weight = (np.array(gain)[ROWS] for gain in (law.inertia_md, law.row_weights_s))
     share = np.array([*law.base_compliance_xyz, 1.0, 1.0])
@@ -153,7 +165,10 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
     out = []
     for _ in range(ticks):
         log = controller.step(DT_S, machine.state(), TARGET, 1.0).log
+        without = plain.step(DT_S, machine.state(), TARGET, 1.0).log
         assert not any(log.saturated)
+        assert not any(without.saturated)
+        added = (np.array(log.tau) - np.array(without.tau))[ROWS]
         acceleration = machine.acceleration(np.array(log.tau)[ROWS])
         e, e_rate = np.array(log.error)[ROWS], np.array(log.error_rate)[ROWS]
         e_acceleration = acceleration - wanted_acceleration
@@ -176,7 +191,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
         norm = max(float(np.linalg.norm(weight * s)), law.boundary_layer)
         # E holds what the machine has and the law does not know; a force that the law neither complies with nor feeds forward too.
         unanswered = machine.tau_ext() * (1.0 - share - fed)
-        big_e = INERTIA @ acceleration - m_d * acceleration + machine.unknown() - unanswered
+        big_e = INERTIA @ acceleration - m_d * acceleration + machine.unknown() - unanswered - added
         out.append(
             Instant(
                 e,
@@ -189,6 +204,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
                 np.array(e_tau)[ROWS],
                 big_e,
                 -log.rho * weight**2 * s / norm,
+                added,
             )
         )
         gamma_before = list(log.gamma)
@@ -212,6 +228,7 @@ def test_step4_closed_loop_is_md_sdot_equals_minus_lambda_s_minus_e_plus_dtau(
         np.testing.assert_allclose(m_d * now.s_rate, -lam * now.s - now.big_e + now.dtau, atol=1e-6)
     assert max(np.abs(now.s_rate).max() for now in seen) > 0.5, "nothing moved"
     assert max(np.abs(now.gamma).max() for now in seen) > 0.1, "gamma was not exercised"
+    assert max(np.abs(now.added).max() for now in seen) > 0.01 or law.preset == "paper", "no option was exercised"
 
 
 def test_I_cl_impedance_error_is_md_sdot_plus_d_s(config: FlightConfig, law: AdaptiveConfig) -> None:

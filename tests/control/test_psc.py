@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from companion.analysis.log import FlightLog
+from companion.analysis.replay import flight_core, replay
 from companion.config.controller import PscConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.dynamics import Dynamics
@@ -15,14 +17,15 @@ from companion.control.manipulator import Manipulator
 from companion.control.psc import PayloadEstimator, PscController
 from companion.control.types import PlantState, Wrench
 from companion.core import FlightCore
-from companion.types import IDENTITY_QUAT, Inputs, Outcome, Outputs, PhaseKind, Reference, Vec2, Vec3
+from companion.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference
+from sitl.campaign import log_of
 from sitl.fast import FastFlight, FastResult
+from tests.analysis.recorded import record
+from tests.control.states import POSE, ZERO, at
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 
 MISSION = "configs/missions/catch.yaml"
-POSE: Vec2 = (math.radians(100), math.radians(60))
 MASS_KG, G = 3.0, 9.81
-ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 def configured(*overrides: str) -> FlightConfig:
@@ -41,16 +44,6 @@ def controller(config: FlightConfig) -> PscController:
 @cache
 def flown(*overrides: str) -> FastResult:
     return FastFlight(configured(*overrides)).run()
-
-
-def at(
-    position: Vec3 = (0.0, 0.0, 1.0),
-    velocity: Vec3 = ZERO,
-    arm: Vec2 = POSE,
-    arm_rate: Vec2 = (0.0, 0.0),
-    force: Vec3 | None = ZERO,
-) -> PlantState:
-    return PlantState(position, velocity, ZERO, IDENTITY_QUAT, ZERO, arm, arm_rate, force)
 
 
 REFERENCE = Reference((0.0, 0.0, 1.0), ZERO, (0.2, 0.0, 0.1), 0.0, 0.0, POSE, (0.0, 0.0), (0.3, -0.2))
@@ -141,42 +134,27 @@ def test_no_estimate_without_its_switch() -> None:
     assert estimator.step(0.005, 40.0, G, True) == 0.0
 
 
-class WatchedCore(FlightCore):
-    """The core, and its law's estimate in every tick."""
-
-    def __init__(self, config: FlightConfig) -> None:
-        super().__init__(config)
-        self.payload_kg: list[float] = []
-
-    def step(self, inputs: Inputs) -> Outputs:
-        outputs = super().step(inputs)
-        one = self._pilot._controller
-        assert isinstance(one, PscController)
-        self.payload_kg.append(one.payload_kg)
-        return outputs
-
-
 @pytest.mark.parametrize("payload_kg", [0.1, 0.2, 0.3])
 def test_the_mass_estimate_converges_after_the_catch(payload_kg: float) -> None:
     """Within 20 %, from thrust and IMU alone, with their noise; from 2 s after the catch to the landing."""
-    overrides = f"world.payload_kg={payload_kg}"
-    core = WatchedCore(FastFlight(configured(overrides)).config)
-    result = flown(overrides)
-    for inputs in result.inputs:
-        core.step(inputs)
+    result = flown(f"world.payload_kg={payload_kg}")
     catch_s = next(event.t_s for outputs in result.outputs for event in outputs.events if event.id == "catch")
-    carried = [
-        estimate
-        for outputs, estimate in zip(result.outputs, core.payload_kg, strict=True)
-        if outputs.phase_kind is PhaseKind.FLIGHT and outputs.t_s > catch_s + 2.0
-    ]
-    before = [
-        estimate
-        for outputs, estimate in zip(result.outputs, core.payload_kg, strict=True)
-        if outputs.phase_kind is PhaseKind.FLIGHT and outputs.t_s < catch_s
-    ]
+    flight = [o for o in result.outputs if o.phase_kind is PhaseKind.FLIGHT]
+    estimates = [(o.t_s, o.control.payload_estimate_kg) for o in flight if o.control is not None]
+    assert len(estimates) == len(flight)
+    carried = [kg for t_s, kg in estimates if kg is not None and t_s > catch_s + 2.0]
+    before = [kg for t_s, kg in estimates if kg is not None and t_s < catch_s]
     assert np.mean(carried) == pytest.approx(payload_kg, rel=0.2)
     assert np.mean(before) < 0.05
+
+
+def test_the_estimate_is_in_the_log_and_comes_out_of_a_replay_bit_for_bit(tmp_path: Path) -> None:
+    flight = FastFlight(configured("world.payload_kg=0.2"))
+    log = FlightLog.read(record(log_of(flight.config, flight.run(), None), tmp_path / "flight.mcap"))
+    estimates = [o.control.payload_estimate_kg for o in log.outputs if o.control is not None]
+    assert None not in estimates
+    assert len(set(estimates)) > 1000
+    assert replay(log, flight_core).first_difference is None
 
 
 @pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.1, 0.02), (0.2, 0.025), (0.3, 0.03)])

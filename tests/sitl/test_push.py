@@ -97,14 +97,16 @@ def test_the_world_pushes_with_what_was_asked_and_only_then() -> None:
 @pytest.mark.parametrize("force", [DOWN, BACK], ids=["down", "back"])
 @pytest.mark.parametrize("base_rows", [False, True], ids=["base off", "base on"])
 def test_the_arm_gives_way_as_its_impedance_says(preset: str, force: Vec3, base_rows: bool) -> None:
-    """Joint friction of 0.04 N m takes up to 16 % of the deflection of a 2 N push; without it 4 % are missing."""
+    """Joint friction of 0.04 N m takes up to 16 % of the deflection of a 2 N push from the paper's law, 7 % from ours."""
     arm = pushed(preset, force, base_rows).arm_rad
-    assert arm.peak_ratio == pytest.approx(1.0, abs=0.18)
+    assert arm.peak_ratio == pytest.approx(1.0, abs=0.15 if preset == "recommended" else 0.18)
     assert arm.rms_difference < 0.2 * arm.peak_ideal
 
 
 def test_without_friction_the_arm_is_within_five_percent() -> None:
-    arm = push_test(push_config(catch("recommended", "world.joint_friction_nm=0"), DOWN)).arm_rad
+    arm = push_test(
+        push_config(catch("recommended", "world.joint_friction_nm=0", "controller.arm_friction_share=0"), DOWN)
+    ).arm_rad
     assert arm.peak_ratio == pytest.approx(1.0, abs=0.05)
 
 

@@ -1,0 +1,184 @@
+"""Runs inputs through a target and watches: exceptions, endless calls, memory, open files."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import time
+import traceback
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from random import Random
+from types import FrameType, TracebackType
+from typing import ClassVar, Self
+
+CPU_LIMIT_S = 5.0
+"""Of one input, CPU time of this process: a loaded machine does not make a call endless."""
+FINDINGS_MAX = 5
+"""Of one process; then it stops."""
+MEMORY_SHARE, MEMORY_BYTES = 0.05, 5 * 2**20
+"""The resident set may grow by the larger of the two from 10 % of the inputs to the end."""
+_WARM_UP_SHARE = 0.1
+_TELL_EVERY = 64
+
+
+class Wrong(AssertionError):
+    """A call returned, but not what it promises."""
+
+
+class Endless(BaseException):
+    """A call does not return. Not an Exception: the code under test may catch those."""
+
+
+class Target(ABC):
+    """One wire of the companion. An input is bytes that hold everything: fed alone it does the same as among a million others."""
+
+    name: ClassVar[str]
+    share: ClassVar[float] = 1.0
+    """Of the inputs asked for; less than 1 where every input passes a real device driver."""
+
+    @abstractmethod
+    def make(self, rng: Random) -> bytes:
+        """The next input."""
+
+    @abstractmethod
+    def feed(self, data: bytes) -> None:
+        """Let the companion read it, then something valid. Whatever is raised is a finding."""
+
+    @abstractmethod
+    def __enter__(self) -> Self: ...
+
+    @abstractmethod
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """An input that the companion did not bear."""
+
+    target: str
+    seed: int
+    index: int | None
+    """None: not one input, the run as a whole."""
+    text: str
+    data: bytes = b""
+
+    def __str__(self) -> str:
+        where = "the whole run" if self.index is None else f"--seed {self.seed}, index {self.index}"
+        return f"{self.target}, {where}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """What one process saw of a range of inputs."""
+
+    inputs: int
+    duration_s: float
+    slowest_s: float
+    """CPU and waiting of the slowest input, wall clock."""
+    slowest_index: int
+    memory_bytes: tuple[int, int]
+    """Resident set after 10 % of the inputs and at the end."""
+    findings: tuple[Finding, ...]
+
+
+def generator(target: str, seed: int, index: int) -> Random:
+    """The generator of one input."""
+    return Random(zlib.crc32(target.encode()) << 96 | (seed & 0xFFFFFFFF) << 64 | index)
+
+
+def run(target: Target, seed: int, first: int, last: int, tell: Callable[[int], None] = lambda index: None) -> Stretch:
+    """Feed inputs `first` to `last` - 1.
+
+    Args:
+        target: entered.
+        seed: with the index it makes the input.
+        first: index.
+        last: index, exclusive.
+        tell: called with the index before it is fed, now and then.
+    """
+    findings: list[Finding] = []
+    start_s = time.monotonic()
+    warm_index = first + int(_WARM_UP_SHARE * (last - first))
+    memory, files = _resident_bytes(), _open_files()
+    slowest_s, slowest_index = 0.0, first
+    index = first
+    for index in range(first, last):
+        if index == warm_index:
+            memory, files = _resident_bytes(), _open_files()
+        if index % _TELL_EVERY == 0:
+            tell(index)
+        data = target.make(generator(target.name, seed, index))
+        begun_s = time.monotonic()
+        text = feed_watched(target, data)
+        took_s = time.monotonic() - begun_s
+        if took_s > slowest_s:
+            slowest_s, slowest_index = took_s, index
+        if text is not None:
+            findings.append(Finding(target.name, seed, index, text, data))
+            if len(findings) == FINDINGS_MAX:
+                break
+    end, end_files = _resident_bytes(), _open_files()
+    if end - memory > max(MEMORY_SHARE * memory, MEMORY_BYTES):
+        text = f"memory grew from {memory / 2**20:.1f} to {end / 2**20:.1f} MiB"
+        findings.append(Finding(target.name, seed, None, text))
+    if end_files > files:
+        findings.append(Finding(target.name, seed, None, f"open files grew from {files} to {end_files}"))
+    done = index + 1 - first if last > first else 0
+    return Stretch(done, time.monotonic() - start_s, slowest_s, slowest_index, (memory, end), tuple(findings))
+
+
+def feed_watched(target: Target, data: bytes, cpu_limit_s: float = CPU_LIMIT_S) -> str | None:
+    """Feed one input; what was wrong, None if nothing was."""
+    try:
+        with _cpu_limit(cpu_limit_s):
+            target.feed(data)
+    except Wrong as error:
+        return str(error)
+    except Endless as error:
+        return f"does not return: {error}"
+    except Exception as error:  # this is what fuzzing looks for
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}:{place.lineno})"
+    return None
+
+
+@contextmanager
+def _cpu_limit(limit_s: float) -> Iterator[None]:
+    def expired(number: int, frame: FrameType | None) -> None:
+        place = "?" if frame is None else f"{os.path.basename(frame.f_code.co_filename)}:{frame.f_lineno}"
+        raise Endless(f"busy for {limit_s:g} s of CPU time, at {place}")
+
+    before = signal.signal(signal.SIGPROF, expired)
+    signal.setitimer(signal.ITIMER_PROF, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
+
+
+def _resident_bytes() -> int:
+    gc.collect()
+    with open("/proc/self/statm", encoding="ascii") as statm:
+        return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def one_line(text: str, what: str) -> None:
+    """Check a text that people are shown.
+
+    Raises:
+        Wrong: it is empty, more than one line, or holds what a terminal would obey.
+    """
+    if not text or not text.isprintable():
+        raise Wrong(f"{what} is no printable line: {text!r:.200}")

@@ -1,0 +1,66 @@
+"""Channels between the companion's own processes: the guardian's heartbeat, and what the recorder tells the flight process."""
+
+from __future__ import annotations
+
+import math
+import socket
+from random import Random
+from types import TracebackType
+from typing import ClassVar, Self
+
+from benchmarks.fuzzing.campaign import Target, Wrong, one_line
+from benchmarks.fuzzing.mutate import mutated
+from companion.guardian import beat as words
+from companion.guardian.beat import Beat
+from companion.io.recorder import RecorderClient
+
+_SIZE_MAX_BYTES = 4000
+_BEAT = Beat(
+    tick=7, t_s=1.5, origin_s=100.0, mission_t_s=0.5, lifting=True, pilot=False, goodbye=False, autopilot_system=1,
+    own_system=1, own_component=191, local_port=14540, pose_stamp_s=1.49, position_world_m=(1.0, 2.0, 3.0),
+)  # fmt: skip
+
+
+class ChannelsTarget(Target):
+    """First byte of an input: 0 for a beat, 1 for a word of the recorder; the rest is the datagram."""
+
+    name: ClassVar[str] = "channels"
+
+    def __init__(self) -> None:
+        self._beats = [words.pack(_BEAT), words.READY, words.PROBLEM + b"no mocap", words.ADOPT]
+        self._tidings = [
+            b'{"error": "recorder: log.mcap: No space left on device"}',
+            b'{"samples": 1}',
+            b"[1]",
+            b"null",
+        ]
+
+    def __enter__(self) -> Self:
+        ours, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._client = RecorderClient(ours)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.close()
+        self._theirs.close()
+
+    def make(self, rng: Random) -> bytes:
+        kind = rng.randrange(2)
+        return bytes((kind,)) + mutated(rng, (self._beats, self._tidings)[kind], _SIZE_MAX_BYTES)
+
+    def feed(self, data: bytes) -> None:
+        if data[:1] == b"\0":
+            beat = words.unpack(data[1:])
+            if beat is not None and not all(map(math.isfinite, (beat.t_s, beat.origin_s, *beat.position_world_m))):
+                raise Wrong(f"a beat that is not finite: {beat}")
+            if words.unpack(words.pack(_BEAT)) != _BEAT:
+                raise Wrong("a valid beat behind it is not understood")
+        elif len(data) > 1:
+            self._theirs.send(data[1:])
+            self._client._listen()
+            self._client.error = None
+            self._theirs.send(b'{"error": "disk full"}')
+            self._client._listen()
+            one_line(self._client.error or "", "the recorder's word")

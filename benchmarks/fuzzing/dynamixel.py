@@ -1,0 +1,336 @@
+"""Servo bus: the real dynamixel-sdk and the arm edge's own bus code, behind a serial port in memory or a real pty.
+
+In memory the port answers what the input says and time is simulated, so that a read that waits for ever is seen at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import time
+from collections.abc import Callable
+from random import Random
+from types import TracebackType
+from typing import ClassVar, Self
+
+from benchmarks.fuzzing.campaign import Endless, Target, Wrong, one_line
+from benchmarks.fuzzing.mutate import mutated
+from companion.config.vehicle import Arm, ArmDevice, Joint
+from companion.io import dynamixel as dxl
+from companion.io.arm import DynamixelArm
+from companion.io.dynamixel_bus import ArmBus
+from sitl.servo_bus import ServoBus, ServoLine
+from sitl.servo_model import ServoModel
+from sitl.servo_protocol import ALERT, Instruction, fast_status, packet, status
+
+IDS = (11, 12)
+_WATCHDOG_MS = 100
+_WATCHDOG = _WATCHDOG_MS // dxl.WATCHDOG_UNIT_MS
+_SIZE_MAX_BYTES = 2500
+_READ_LIMIT_S = 1.0
+"""Of simulated time, for one cycle: both servos' answers, or noise that never ends."""
+_OPEN_LIMIT_S = 30.0
+_LATE_WRITE = "SerialTimeoutException: Write timeout"
+"""pyserial says so too when the process was not scheduled between writing and looking at the time."""
+_REPLACE, _BEFORE, _BEHIND, _SILENCE = range(4)
+_READ, _OPEN, _BABBLE = range(3)
+"""First byte of an input: answers to a flight's read; damage to the answers while the bus is opened; a line that never falls silent."""
+
+
+def arm_config() -> Arm:
+    return Arm(
+        shoulder_body_m=(0.0, 0.0, -0.05),
+        link_lengths_m=(0.2, 0.2),
+        link_masses_kg=(0.15, 0.05),
+        link_com_m=(0.1, 0.1),
+        torque_per_amp_nm_a=1.3,
+        joints=(
+            Joint(servo_id=IDS[0], sign=-1, zero_count=3072, angle_deg=(-180, 180), torque_max_nm=2.5),
+            Joint(servo_id=IDS[1], sign=1, zero_count=1024, angle_deg=(-180, 180), torque_max_nm=1.5),
+        ),
+    )
+
+
+class MemorySerial:
+    """What `ServoPort` uses of a pyserial port. A reader that waits lets time pass; bytes take the time of the wire."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.limit_s = math.inf
+        self.answer: Callable[[bytes], bytes] = lambda sent: b""
+        self.babble = b""
+        """Said again and again once the answers are read."""
+        self._waiting = bytearray()
+
+    def write(self, sent: list[int]) -> int:
+        self._waiting += self.answer(bytes(sent))
+        return len(sent)
+
+    def read(self, size: int) -> bytes:
+        if self.now_s > self.limit_s:
+            raise Endless("the bus code still waits for an answer")
+        if self.babble and len(self._waiting) < size:
+            self._waiting += self.babble * (size // len(self.babble) + 1)
+        data = bytes(self._waiting[: max(0, size)])
+        del self._waiting[: max(0, size)]
+        self.now_s += len(data) * 10.0 / 3e6 + 2e-6 if data or size <= 0 else 1e-3
+        return data
+
+    def reset_input_buffer(self) -> None:
+        self._waiting.clear()
+
+    def set_low_latency_mode(self, on: bool) -> None:
+        """There is no latency timer, as on a pty."""
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
+class MemoryPort(dxl.ServoPort):
+    """The companion's port on a `MemorySerial`."""
+
+    def __init__(self, line: MemorySerial) -> None:
+        super().__init__("memory")
+        self.ser = line
+
+    def setupPort(self, cflag_baud: int) -> bool:
+        self.is_open = True
+        self.tx_time_per_byte = 10_000.0 / cflag_baud
+        return True
+
+    def getCurrentTime(self) -> float:
+        now_ms: float = self.ser.now_s * 1e3
+        return now_ms
+
+
+class DynamixelTarget(Target):
+    """See `_READ`, `_OPEN` and `_BABBLE` for the first byte."""
+
+    name: ClassVar[str] = "dynamixel"
+
+    def __init__(self) -> None:
+        self._line = MemorySerial()
+        self._count = 0
+        self._corpus = _corpus()
+
+    def __enter__(self) -> Self:
+        self._arm, self._bus = self._new()
+        self._line.answer = _servos().feed
+        failure = self._arm._open(self._bus)
+        if failure is not None:
+            raise failure
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._line.answer, self._line.limit_s = (lambda sent: b""), math.inf
+        self._bus.close()
+
+    def make(self, rng: Random) -> bytes:
+        kind = rng.random()
+        if kind < 0.004:
+            return bytes((_BABBLE, rng.randrange(2))) + self._answers(rng)[:200]
+        if kind < 0.012:
+            return bytes((_OPEN,)) + b"".join(self._damage(rng) for _ in range(rng.choice((1, 1, 2, 5))))
+        return bytes((_READ,)) + self._answers(rng)
+
+    def _answers(self, rng: Random) -> bytes:
+        """Damaged answers; every third is damage within packets whose CRC fits."""
+        if rng.random() < 0.67:
+            return mutated(rng, self._corpus, _SIZE_MAX_BYTES)
+        sealed = b""
+        for servo_id in rng.choice((IDS, IDS, IDS, IDS[:1], (IDS[1], IDS[0]), (IDS[0], 7, IDS[1]), (0, 253, 254))):
+            block = mutated(rng, [_block(1000, 3), _block(-5, 0xFF), b"\xff\xff\xfd" * 5, b"", bytes(15)], 1100)
+            sealed += packet(servo_id, bytes((Instruction.STATUS, rng.choice((0, 0, 0, 1, 0x80, 0x83)))) + block)
+        return sealed
+
+    def _damage(self, rng: Random) -> bytes:
+        """Which exchange (of about 70), what is done to the answer, and with what."""
+        data = self._answers(rng)[: rng.choice((20, 255))]
+        return bytes((rng.randrange(70), rng.randrange(4), len(data))) + data
+
+    def feed(self, data: bytes) -> None:
+        if not data:
+            return
+        if data[0] == _OPEN:
+            self._feed_opening(data[1:])
+            return
+        line = self._line
+        opening = data[0] == _BABBLE and len(data) > 2 and data[1] == 1
+        line.babble = data[2:] if data[0] == _BABBLE else b""
+        line.answer = lambda sent: data[1:]
+        try:
+            if opening:
+                line.answer = _servos().feed
+                self._open_another()
+            else:
+                self._read()
+        finally:
+            line.babble = b""
+            line.reset_input_buffer()
+        self._check_that_it_goes_on()
+
+    def _read(self) -> None:
+        """A cycle of the bus thread."""
+        arm, line = self._arm, self._line
+        failures = arm._failures
+        line.limit_s = line.now_s + _READ_LIMIT_S
+        tripped = arm._read_once(self._bus)
+        state = arm.latest()
+        if state is None or not all(map(math.isfinite, (*state.angle_rad, *state.velocity_rad_s, *state.torque_nm))):
+            raise Wrong(f"a joint state that is not finite: {state}")
+        if arm._failures not in (0, failures + 1):
+            raise Wrong(f"{arm._failures} failures after {failures}")
+        if tripped:
+            line.limit_s = line.now_s + _READ_LIMIT_S
+            arm._try(self._bus.restart_watchdogs)
+        self._no_problem(arm)
+
+    def _check_that_it_goes_on(self) -> None:
+        self._count = (self._count + 1) % 4096
+        line, counts = self._line, (self._count, 4095 - self._count)
+        line.answer = lambda sent: b"".join(
+            status(servo_id, 0, _block(count, _WATCHDOG)) for servo_id, count in zip(IDS, counts, strict=True)
+        )
+        self._read()
+        state, scales = self._arm.latest(), self._arm._scales
+        assert state is not None and scales is not None
+        expected = tuple(scale.angle_rad(count) for scale, count in zip(scales, counts, strict=True))
+        if self._arm._failures or state.angle_rad != expected:
+            raise Wrong(f"a valid answer behind it is not understood: {state}")
+
+    def _feed_opening(self, program: bytes) -> None:
+        damage = _parse_program(program)
+        servos, exchange = _servos(), -1
+
+        def answer(sent: bytes) -> bytes:
+            nonlocal exchange
+            exchange += 1
+            whole = servos.feed(sent)
+            for kind, noise in damage.get(exchange, ()):
+                whole = {_REPLACE: noise, _BEFORE: noise + whole, _BEHIND: whole + noise, _SILENCE: b""}[kind]
+            return whole
+
+        self._line.answer = answer
+        self._open_another()
+
+    def _open_another(self) -> None:
+        arm, bus = self._new()
+        self._line.limit_s = self._line.now_s + _OPEN_LIMIT_S
+        failure = arm._open(bus)
+        if failure is not None:
+            one_line(str(failure), "the refusal of the bus")
+            if "Error: " in str(failure):
+                raise Wrong(f"an exception became the refusal of the bus: {failure}")
+        bus.close()
+
+    def _no_problem(self, arm: DynamixelArm) -> None:
+        if arm.problem:
+            problem, arm._problem = arm.problem, ""
+            raise Wrong(f"an exception inside the bus code: {problem}")
+
+    def _new(self) -> tuple[DynamixelArm, ArmBus]:
+        device = ArmDevice(port="memory", watchdog_ms=_WATCHDOG_MS)
+        bus = ArmBus(device, arm_config())
+        bus._port = MemoryPort(self._line)
+        self._line.reset_input_buffer()
+        return DynamixelArm(device, arm_config(), lambda: self._line.now_s), bus
+
+
+class DynamixelWireTarget(Target):
+    """An input is noise on the line, before a read of the whole edge on a real pty and in the middle of one."""
+
+    name: ClassVar[str] = "dynamixel-wire"
+    share: ClassVar[float] = 0.01
+
+    def __init__(self) -> None:
+        self._corpus = _corpus()
+
+    def __enter__(self) -> Self:
+        self._loop = asyncio.new_event_loop()
+        self._loop.run_until_complete(self._open())
+        return self
+
+    async def _open(self) -> None:
+        self._bus = ServoBus([ServoModel(servo_id, baud_bps=3_000_000, shaft_angle_rad=3.1) for servo_id in IDS])
+        await self._bus.__aenter__()
+        self._arm = DynamixelArm(ArmDevice(port=self._bus.path), arm_config(), time.monotonic)
+        await self._arm.__aenter__()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._loop.run_until_complete(self._arm.__aexit__(None, None, None))
+        self._loop.run_until_complete(self._bus.__aexit__(None, None, None))
+        self._loop.close()
+
+    def make(self, rng: Random) -> bytes:
+        return bytes((rng.randrange(2),)) + mutated(rng, self._corpus, _SIZE_MAX_BYTES)
+
+    def feed(self, data: bytes) -> None:
+        if data:
+            self._loop.run_until_complete(self._feed(data[0] == 1, data[1:]))
+
+    async def _feed(self, during: bool, noise: bytes) -> None:
+        arm = self._arm
+        if not during:
+            os.write(self._bus._master_fd, noise)
+            await arm.read(1.0)
+        else:
+            reading = asyncio.ensure_future(arm.read(1.0))
+            await asyncio.sleep(0)  # the request is on its way now, its answer is not
+            os.write(self._bus._master_fd, noise)
+            await reading
+        async with asyncio.timeout(30.0):
+            while (state := await arm.read(1.0)) is None or state.read_failures:
+                pass
+        if arm.problem not in ("", _LATE_WRITE):
+            raise Wrong(f"an exception inside the bus code: {arm.problem}")
+        if state.hardware_error != (0, 0):
+            raise Wrong(f"hardware errors that no servo has: {state}")
+
+
+def _servos() -> ServoLine:
+    return ServoLine(
+        [ServoModel(servo_id, baud_bps=3_000_000, shaft_angle_rad=3.1) for servo_id in IDS]
+    )  # fmt: skip
+
+
+def _parse_program(program: bytes) -> dict[int, list[tuple[int, bytes]]]:
+    """Damage per exchange; what is cut off counts as far as it goes."""
+    damage: dict[int, list[tuple[int, bytes]]] = {}
+    at = 0
+    while at + 3 <= len(program):
+        exchange, kind, size = program[at : at + 3]
+        damage.setdefault(exchange, []).append((kind % 4, program[at + 3 : at + 3 + size]))
+        at += 3 + size
+    return damage
+
+
+def _block(position_count: int, watchdog: int) -> bytes:
+    """Indirect data of one servo, as `companion.io.dynamixel.BLOCK` lays it out."""
+    return dxl._BLOCK.pack(position_count, 0, -7, 35, 12, watchdog)
+
+
+def _corpus() -> list[bytes]:
+    """Answers to a cycle's read, and everything else that a servo may say."""
+    pairs = [
+        b"".join(status(servo_id, error, _block(1000 * k, watchdog)) for k, servo_id in enumerate(IDS))
+        for error, watchdog in ((0, _WATCHDOG), (0, 0xFF), (ALERT, _WATCHDOG), (4, _WATCHDOG), (0, 0))
+    ]
+    return [
+        *pairs * 2,
+        status(IDS[0], 0, _block(2048, _WATCHDOG)),
+        status(IDS[1], 0, _block(2048, _WATCHDOG)),
+        status(IDS[0], 0, b"\xff\xff\xfd" * 5),
+        status(IDS[0], 0, bytes((6, 4, 45))),
+        status(IDS[0], 0),
+        status(IDS[0], 0, b"\xff\xff\xfd" * 300),
+        fast_status([(servo_id, 0, _block(5, _WATCHDOG)) for servo_id in IDS], 2 * (dxl.BLOCK_SIZE + 4)),
+        packet(IDS[0], bytes((Instruction.READ, 132, 0, 4, 0))),
+        b"\xff\xff\xfd\x00",
+        b"\xff\xff\xfd\x00\x0b\x00\x04\x55\x00" * 3,
+        b"\xff" * 40,
+    ]

@@ -1,0 +1,229 @@
+"""MAVLink: what MAVSDK hands over becomes the companion's records; and damaged datagrams at the port of a live edge."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import struct
+import sys
+import time
+from random import Random
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.generator.mavcrc import x25crc
+
+from benchmarks.fuzzing.campaign import Target, Wrong, one_line
+from benchmarks.fuzzing.mutate import mutated
+from companion.config.vehicle import AutopilotDevice
+from companion.guardian.link import Link, UdpWire
+from companion.guardian.px4 import Px4State
+from companion.io import autopilot_messages as messages
+from companion.io.autopilot import MavsdkAutopilot
+from companion.types import FlightMode, VehicleState
+from tests.io.autopilot_peer import Px4Peer, free_udp_port
+
+_SIZE_MAX_BYTES = 1500
+_HEADER_BYTES, _CRC_BYTES, _STX = 10, 2, 0xFD
+_DEADLINE_S = 30.0
+
+
+class MemoryWire(UdpWire):
+    """What waits in the guardian's socket, without the socket."""
+
+    def __init__(self) -> None:
+        self.waiting: list[bytes] = []
+
+    def receive(self) -> list[bytes]:
+        waiting, self.waiting = self.waiting, []
+        return waiting
+
+
+class MavlinkTarget(Target):
+    """An input is a datagram. It passes the guardian's parser and records, and the converters behind MAVSDK's MavlinkDirect."""
+
+    name: ClassVar[str] = "mavlink"
+
+    def __init__(self) -> None:
+        self._corpus = corpus()
+        self._wire = MemoryWire()
+        self._link = Link(self._wire, (1, 191), 1)
+        self._usual = [self._received(data)[0] for data in self._corpus[:6]]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """There is nothing to close."""
+
+    def make(self, rng: Random) -> bytes:
+        return damaged_datagram(rng, self._corpus)
+
+    def feed(self, data: bytes) -> None:
+        state = Px4State()
+        for message in self._usual:
+            state.take(1.0, message)
+        for message in self._received(data):
+            state.take(2.0, message)
+            self._convert(message)
+        state.status()
+        self._check(state.vehicle(), state.yaw_rad())
+        for message in self._received(self._corpus[0]):
+            state.take(3.0, message)
+            armed_and_mode = messages.armed_and_mode(_fields_json(message))
+            status = state.status()
+            if armed_and_mode == (True, FlightMode.OFFBOARD) and status is not None and status.heartbeat_stamp_s == 3.0:
+                return
+        raise Wrong("a valid heartbeat behind it is not understood")
+
+    def _received(self, data: bytes) -> list[Any]:
+        self._wire.waiting.append(data)
+        return self._link.receive()
+
+    def _convert(self, message: Any) -> None:
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            armed, mode = messages.armed_and_mode(_fields_json(message))
+            if not isinstance(armed, bool) or not isinstance(mode, FlightMode):
+                raise Wrong(f"heartbeat: {armed}, {mode}")
+        elif kind == "COMMAND_ACK":
+            reason = messages.refusal(_fields_json(message))
+            if (reason is None) != (message.result == 0):
+                raise Wrong(f"COMMAND_ACK {message.result}: {reason}")
+        elif kind == "BATTERY_STATUS":
+            voltage_v, remaining = messages.battery(message.voltages[0] * 1e-3, float(message.battery_remaining))
+            if (voltage_v is not None and voltage_v <= 0.0) or (remaining is not None and not 0.0 <= remaining <= 1.0):
+                raise Wrong(f"battery {voltage_v} V, {remaining}")
+
+    def _check(self, state: VehicleState | None, yaw_rad: float | None) -> None:
+        if yaw_rad is not None and not math.isfinite(yaw_rad):
+            raise Wrong(f"yaw {yaw_rad}")
+        if state is not None:
+            numbers = (*state.position_world_m, *state.velocity_world_m_s, *state.angular_rate_body_rad_s)
+            if not all(map(math.isfinite, (*numbers, *state.specific_force_body_m_s2))):
+                raise Wrong(f"a vehicle state that is not finite: {state}")
+            if abs(math.hypot(*state.attitude_wxyz) - 1.0) > 1e-6:
+                raise Wrong(f"an attitude that is not of unit norm: {state}")
+
+
+class MavlinkWireTarget(Target):
+    """An input is a datagram from the autopilot's address to the port of an edge that flies."""
+
+    name: ClassVar[str] = "mavlink-wire"
+    share: ClassVar[float] = 0.02
+
+    def __init__(self) -> None:
+        self._corpus = corpus()
+        self._offboard = False
+        self._raised: list[str] = []
+
+    def __enter__(self) -> Self:
+        self._loop = asyncio.new_event_loop()
+        port = free_udp_port()
+        self._peer = Px4Peer(port)
+        self._peer.__enter__()
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=_DEADLINE_S)
+        self._edge = MavsdkAutopilot(device, time.monotonic)
+        self._loop.run_until_complete(self._edge.__aenter__())
+        self._peer.beating = False
+        # An exception in a callback of MAVSDK's threads escapes to nobody but this hook.
+        self._hook, sys.unraisablehook = sys.unraisablehook, self._on_unraisable
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        sys.unraisablehook = self._hook
+        self._loop.run_until_complete(self._edge.__aexit__(None, None, None))
+        self._loop.close()
+        self._peer.__exit__(None, None, None)
+
+    def _on_unraisable(self, event: Any) -> None:
+        self._raised.append(f"{event.exc_type.__name__}: {event.exc_value} ({event.err_msg})")
+
+    def make(self, rng: Random) -> bytes:
+        return damaged_datagram(rng, self._corpus)
+
+    def feed(self, data: bytes) -> None:
+        edge, peer = self._edge, self._peer
+        peer._socket.sendto(data, peer.remote)
+        self._offboard = not self._offboard
+        expected = FlightMode.OFFBOARD if self._offboard else FlightMode.HOLD
+        deadline_s = time.monotonic() + _DEADLINE_S
+        heartbeat = _heartbeat(6 << 16 if self._offboard else 4 << 16 | 3 << 24)
+        # The parser may take the first ones for the rest of a damaged message.
+        while (status := edge.status()) is None or status.mode != expected:
+            if time.monotonic() > deadline_s:
+                raise Wrong(f"a valid heartbeat behind it is not understood: {status}")
+            peer.say(heartbeat)
+            time.sleep(0.0005)
+        edge.vehicle()
+        for line in edge.take_messages():
+            one_line(line, "a message for people")
+        peer.received.clear()
+        if self._raised:
+            raised, self._raised = self._raised, []
+            raise Wrong(f"an exception in a callback: {raised[0]}")
+
+
+def damaged_datagram(rng: Random, messages_: list[bytes]) -> bytes:
+    """Damaged messages; in half of them length and checksum fit the damage, so that the content counts."""
+    data = mutated(rng, messages_, _SIZE_MAX_BYTES)
+    return sealed(data) if rng.random() < 0.5 else data
+
+
+def sealed(data: bytes) -> bytes:
+    """One MAVLink 2 message with the payload of `data`, length and checksum made to fit, if its id is known."""
+    if len(data) < _HEADER_BYTES:
+        return data
+    number = int.from_bytes(data[7:10], "little")
+    kind = mavlink.mavlink_map.get(number)
+    if kind is None:
+        return data
+    payload = data[_HEADER_BYTES : _HEADER_BYTES + 255]
+    head = bytes((len(payload), 0)) + data[3:_HEADER_BYTES]
+    crc = x25crc(head + payload)
+    crc.accumulate(bytes((kind.crc_extra,)))
+    return bytes((_STX,)) + head + payload + struct.pack("<H", crc.crc)
+
+
+def corpus() -> list[bytes]:
+    """Everything that the edge listens to, and more of what PX4 says. First an armed heartbeat in OFFBOARD."""
+    speaker = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    said = [
+        _heartbeat(6 << 16),
+        _heartbeat(4 << 16 | 6 << 24),
+        mavlink.MAVLink_local_position_ned_message(1000, 1.0, 2.0, -3.0, 0.1, 0.2, 0.3),
+        mavlink.MAVLink_attitude_quaternion_message(1000, 1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3),
+        mavlink.MAVLink_highres_imu_message(1000, 0.1, 0.2, -9.8, 0.1, 0.2, 0.3, *(0.0,) * 7, 0xFFFF),
+        mavlink.MAVLink_extended_sys_state_message(0, 2),
+        mavlink.MAVLink_battery_status_message(0, 0, 1, 2000, [4000] * 4 + [65535] * 6, 100, 0, 0, 77, 0, 0),
+        mavlink.MAVLink_command_ack_message(400, 4, 0, 0, 1, 1),
+        mavlink.MAVLink_command_ack_message(176, 0, 0, 0, 1, 1),
+        mavlink.MAVLink_statustext_message(4, b"Preflight Fail: heading estimate invalid"),
+        mavlink.MAVLink_statustext_message(2, "Überlänge \n\x1b[31m".encode()),
+        mavlink.MAVLink_param_value_message(b"MPC_THR_HOVER", 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 100, 3),
+        mavlink.MAVLink_autopilot_version_message(0, 0x011001FF, 0, 0, 0, [1] * 8, [0] * 8, [0] * 8, 0, 0, 0),
+        mavlink.MAVLink_sys_status_message(0, 0, 0, 500, 16000, 2000, 77, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_timesync_message(0, 123456789),
+    ]
+    whole = [bytes(message.pack(speaker)) for message in said]
+    return [*whole, b"".join(whole)]
+
+
+def _heartbeat(custom_mode: int) -> Any:
+    flags = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+    return mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, flags, custom_mode, 4, 3
+    )
+
+
+def _fields_json(message: Any) -> str:
+    """The fields as MAVSDK's MavlinkDirect passes them on."""
+    fields = message.to_dict()
+    fields["message_name"] = fields.pop("mavpackettype")
+    return json.dumps(fields)

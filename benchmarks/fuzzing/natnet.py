@@ -1,0 +1,254 @@
+"""NatNet: datagrams through a real UDP socket into the datagram handler of an edge that a real server has opened."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import select
+import socket
+import struct
+from random import Random
+from types import TracebackType
+from typing import ClassVar, Self
+
+from benchmarks.fuzzing.campaign import Target, Wrong, one_line
+from benchmarks.fuzzing.mutate import mutated
+from companion.config.vehicle import MocapDevice
+from companion.io import natnet
+from companion.io.autopilot_messages import vision_ned
+from companion.io.edges import DeviceError
+from companion.io.mocap import NatNetMocap
+from companion.io.natnet import Message, NatNetVersion
+from companion.types import MocapPose
+from sitl.natnet import BodyPose, NatNetServer, encode_frame, encode_model_definitions
+
+VERSIONS: tuple[NatNetVersion, NatNetVersion] = ("3.0", "4.1")
+_BODY_ID = 1
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+_DATAGRAM_MAX_BYTES = 60_000
+_DELIVERY_DEADLINE_S = 20.0
+_FRESH = 0x80
+"""Bit of an input's first byte: the edge has not met a server yet. The bits below choose the version."""
+
+
+class NatNetTarget(Target):
+    """First byte of an input: version and state of the edge; the rest is the datagram."""
+
+    name: ClassVar[str] = "natnet"
+
+    def __init__(self) -> None:
+        self._rigs: dict[NatNetVersion, _Rig] = {}
+        self._corpus = {version: _corpus(version) for version in VERSIONS}
+
+    def __enter__(self) -> Self:
+        self._loop = asyncio.new_event_loop()
+        for version in VERSIONS:
+            self._rigs[version] = self._loop.run_until_complete(_Rig.opened(version))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for rig in self._rigs.values():
+            self._loop.run_until_complete(rig.close())
+        self._loop.close()
+
+    def make(self, rng: Random) -> bytes:
+        mode = rng.randrange(2) | (_FRESH if rng.random() < 0.1 else 0)
+        data = mutated(rng, self._corpus[VERSIONS[mode & 1]], _DATAGRAM_MAX_BYTES)
+        if len(data) >= 4 and rng.random() < 0.7:  # else the header's size gives most of them away
+            data = data[:2] + struct.pack("<H", len(data) - 4) + data[4:]
+        return bytes((mode,)) + data
+
+    def feed(self, data: bytes) -> None:
+        if data:
+            self._rigs[VERSIONS[data[0] & 1]].feed(data[1:], fresh=bool(data[0] & _FRESH))
+
+
+class _Rig:
+    """An edge, and a socket that stands for its server's."""
+
+    def __init__(self, version: NatNetVersion) -> None:
+        self.version = version
+        self.server = NatNetServer(version)
+        self.t_s = 0.0
+        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sender.bind(("127.0.0.1", 0))
+
+    @classmethod
+    async def opened(cls, version: NatNetVersion) -> _Rig:
+        rig = cls(version)
+        await rig.server.__aenter__()
+        fields = {
+            "server": "127.0.0.1",
+            "interface": "127.0.0.1",
+            "transport": "unicast",
+            "command_port": rig.server.command_port,
+            "data_port": rig.server.data_port,
+            "rigid_body_id": _BODY_ID,
+            "up_axis": "y" if version == "3.0" else "z",
+        }
+        deadline_s = _DELIVERY_DEADLINE_S
+        rig.edge = NatNetMocap(
+            MocapDevice.model_validate(fields), rig.clock, rig.on_pose, connect_timeout_s=deadline_s, body_timeout_s=deadline_s
+        )  # fmt: skip
+
+        async def publish() -> None:
+            while True:
+                rig.server.publish(1.0, [BodyPose(_BODY_ID, (0.0, 0.0, 1.0), _UPRIGHT)], 0.99)
+                await asyncio.sleep(0.01)
+
+        async with asyncio.TaskGroup() as group:
+            publisher = group.create_task(publish())
+            await rig.edge.__aenter__()
+            publisher.cancel()
+        command = rig.edge._command_socket
+        assert command is not None
+        rig.socket, rig.info = command, rig.edge.server_info
+        rig._take_what_waits()
+        return rig
+
+    async def close(self) -> None:
+        await self.edge.__aexit__(None, None, None)
+        await self.server.__aexit__(None, None, None)
+        self.sender.close()
+
+    def clock(self) -> float:
+        return self.t_s
+
+    def on_pose(self, pose: MocapPose) -> None:
+        vision_ned(pose)  # what the flight does with it; an exception shows in `callback_error`
+
+    def feed(self, datagram: bytes, *, fresh: bool) -> None:
+        edge = self.edge
+        if fresh:
+            edge._info, edge._version = None, None
+        self.t_s += 1.0
+        self._send(datagram)
+        self._wait()
+        edge._drain(self.socket)
+        if fresh and edge._info is not None:
+            try:
+                edge._check_server(edge._info)
+            except DeviceError as error:
+                one_line(str(error), "the refusal of a server")
+        self._check_state()
+        self._check_that_it_goes_on()
+
+    def _check_state(self) -> None:
+        edge, pose = self.edge, self.edge.latest()
+        health = edge.health()
+        if health.callback_error is not None:
+            edge._callback_error = None
+            raise Wrong(f"a pose that the autopilot edge refuses: {health.callback_error}")
+        if pose is not None:
+            numbers = (*pose.position_world_m, pose.marker_error_m, pose.latency_s or 0.0)
+            if not all(map(math.isfinite, numbers)):
+                raise Wrong(f"a pose that is not finite: {pose}")
+            if abs(math.hypot(*pose.attitude_wxyz) - 1.0) > 1e-9:
+                raise Wrong(f"an attitude that is not of unit norm: {pose}")
+        for number, name in edge._names.items():
+            one_line(edge._label(number), "the label of a rigid body")
+            if len(name) > natnet.MAX_NAME_BYTES:
+                raise Wrong(f"a name of {len(name)} characters")
+        if health.last_malformed is not None:
+            one_line(health.last_malformed, "the reason for a malformed datagram")
+
+    def _check_that_it_goes_on(self) -> None:
+        edge = self.edge
+        edge._info, edge._version, edge._names = self.info, self.version, {}
+        self.t_s += 1.0  # as after the loss of some frames
+        number = ((edge._last_number or 0) + 1) & 0xFFFFFFFF
+        x_m = float(number & 0xFFFF)
+        body = BodyPose(_BODY_ID, (x_m, 0.0, 0.0), _UPRIGHT)
+        self._send(encode_frame(self.version, number, 1.0, [body], 0.99, {_BODY_ID: "b"}))
+        while (pose := edge.latest()) is None or pose.frame_number != number or pose.position_world_m[0] != x_m:
+            if not self._wait():
+                raise Wrong(f"a valid frame behind it is not understood: {edge.health()}")
+            edge._drain(self.socket)
+
+    def _send(self, datagram: bytes) -> None:
+        self.sender.sendto(datagram, self.socket.getsockname())
+
+    def _wait(self) -> bool:
+        """False: nothing came."""
+        return bool(select.select([self.socket], [], [], _DELIVERY_DEADLINE_S)[0])
+
+    def _take_what_waits(self) -> None:
+        """The last frames of the server that opened the edge."""
+        while select.select([self.socket], [], [], 0.0)[0]:
+            self.edge._drain(self.socket)
+
+    edge: NatNetMocap
+    socket: socket.socket
+    info: natnet.ServerInfo | None
+
+
+def _corpus(version: NatNetVersion) -> list[bytes]:
+    """Every kind of datagram that a server sends, and those that only a client should."""
+    names = {1: "quad", 7: "net"}
+    bodies = [BodyPose(7, (3.0, 2.0, 0.1), (0.5, 0.5, 0.5, 0.5)), BodyPose(_BODY_ID, (1.0, -2.0, 1.5), _UPRIGHT)]
+    lost = [BodyPose(_BODY_ID, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), valid=False)]
+    crowd = [BodyPose(k, (float(k), 0.0, 0.0), _UPRIGHT) for k in range(40)]
+    frames = [
+        encode_frame(version, number, 12.5, poses, exposure_t_s, names)
+        for number, poses, exposure_t_s in ((900, bodies, 12.49), (901, lost, None), (902, [], 1.0), (903, crowd, 12.4))
+    ]
+    definitions = encode_model_definitions(version, list(names.items()))
+    sender = struct.pack("<256s4s4s", b"Motive", bytes((3, 1, 0, 0)), bytes((int(version[0]), int(version[2]), 0, 0)))
+    connection = struct.pack("<QH?4s", 10_000_000, 1511, True, bytes((239, 255, 42, 99)))
+    server_info = natnet.encode_message(Message.SERVER_INFO, sender + connection)
+    others = [
+        natnet.encode_message(message, b"Bitstream,4.1\0") for message in Message if message is not Message.SERVER_INFO
+    ]
+    return [
+        *frames * 4,
+        _full_frame(version),
+        _full_frame(version),
+        *[natnet.encode_message(Message.MODELDEF, definitions)] * 3,
+        natnet.encode_message(Message.MODELDEF, _all_definitions(version)),
+        *[server_info] * 3,
+        natnet.encode_message(Message.SERVER_INFO, sender),
+        natnet.encode_connect(),
+        b"",
+        *others,
+    ]
+
+
+def _full_frame(version: NatNetVersion) -> bytes:
+    """Two elements in every section, skeletons, assets, force plates and devices included."""
+
+    def section(parts: list[bytes]) -> bytes:
+        content = b"".join(parts)
+        return struct.pack("<I", len(parts)) + (struct.pack("<I", len(content)) if version == "4.1" else b"") + content
+
+    body = struct.pack("<IffffffffH", _BODY_ID, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 0.001, 1)
+    channels = struct.pack("<II", 5, 2) + struct.pack("<I2f", 2, 1.0, 2.0) + struct.pack("<If", 1, 3.0)
+    payload = struct.pack("<I", 77)
+    payload += section([name + struct.pack("<I3f", 1, 7.0, 7.0, 7.0) for name in (b"a longer name\0", b"\0")])
+    payload += section([struct.pack("<3f", 1.0, 1.0, 1.0)] * 2) + section([body] * 2)
+    payload += section([struct.pack("<II", 1, 2) + body * 2] * 2)
+    payload += section([struct.pack("<II", 1, 1) + body + bytes(38)] * 2) if version == "4.1" else b""
+    payload += section([struct.pack("<IffffHf", 65537, 1.0, 2.0, 3.0, 0.014, 2, 0.0)] * 2)
+    payload += section([channels] * 2) + section([channels] * 2)
+    payload += struct.pack("<IIdQQQ", 1, 2, 12.5, 1000, 1500, 3000) + bytes(8 if version == "4.1" else 0) + bytes(6)
+    return natnet.encode_message(Message.FRAME, payload)
+
+
+def _all_definitions(version: NatNetVersion) -> bytes:
+    """Payload of NAT_MODELDEF with one description of every type."""
+    body = b"quad\0" + struct.pack("<Ii3fI", 1, -1, 0.0, 0.0, 0.0, 1) + struct.pack("<3fI", 0.0, 0.0, 0.0, 0)
+    names = struct.pack("<I", 2) + b"Fx\0Fy\0"
+    descriptions = [
+        (0, b"set\0" + struct.pack("<I", 1) + b"m1\0"),
+        (2, b"skeleton\0" + struct.pack("<II", 1, 2) + body * 2),
+        (3, struct.pack("<I", 1) + b"serial\0" + bytes(4 * 161) + struct.pack("<II", 1, 0) + names),
+        (4, struct.pack("<I", 1) + b"daq\0serial\0" + struct.pack("<II", 1, 0) + names),
+        (5, b"camera\0" + struct.pack("<7f", *range(7))),
+        (1, body),
+    ]
+    sized = version == "4.1"
+    return struct.pack("<I", len(descriptions)) + b"".join(
+        struct.pack("<I", kind) + (struct.pack("<I", len(content)) if sized else b"") + content
+        for kind, content in descriptions
+    )

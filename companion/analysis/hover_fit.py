@@ -1,0 +1,133 @@
+"""Hover thrust of the machine without payload, from the calm parts of a flight's log: least squares over the balance of
+`companion.control.hover`, thrust = h . load, and over the battery's voltage where that changed enough to tell.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.analysis.log import Array, FlightLog
+from companion.control.hover import Balance
+from companion.control.sensing import acceleration_world_m_s2
+from companion.types import PhaseKind
+
+FIT_MIN_S = 2.0
+PIECE_S = 1.0
+"""What lies within so long is one piece of evidence: the vertical loop makes neighbouring ticks alike, not seconds."""
+SLOPE_MIN_V = 0.3
+"""Least change of the voltage from which a slope is fitted."""
+
+
+class HoverFitError(ValueError):
+    """The log does not show enough hovering: one line for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class VoltageSlope:
+    """How the hover thrust changes with the battery's voltage."""
+
+    per_v: float
+    """Normalised thrust per volt; negative: an empty battery takes more."""
+    standard_error_per_v: float
+
+
+@dataclass(frozen=True, slots=True)
+class HoverFit:
+    """What a flight tells; hover thrust is normalised, 0 to 1."""
+
+    hover_thrust: float
+    """At `voltage_mean_v`."""
+    standard_error: float
+    """Of the noise alone; a wrong mass in the vehicle file is not in it."""
+    used_s: float
+    """Calm flight that was used."""
+    configured: float | None
+    """What the flight started from."""
+    last_estimate: float | None
+    """What the flight itself had learnt at its end; the same as `configured` where it was not to learn."""
+    voltage_mean_v: float | None
+    """None: the autopilot did not tell it throughout."""
+    voltage_span_v: float | None
+    """Largest minus smallest."""
+    slope: VoltageSlope | None
+    """None: the voltage is not known, or did not change enough."""
+
+
+def fit_hover_thrust(log: FlightLog) -> HoverFit:
+    """Fit a log.
+
+    Raises:
+        HoverFitError: less than `FIT_MIN_S` of calm flight under the law, or no mass in the log's configuration.
+    """
+    airframe = (log.config.get("vehicle") or {}).get("airframe") or {}
+    samples = _calm(log)
+    dt_s, thrust, load, voltage_v = samples.T
+    used_s = float(dt_s.sum())
+    if used_s < FIT_MIN_S:
+        raise HoverFitError(
+            f"{log.path}: {used_s:.1f} s of calm flight, expected {FIT_MIN_S:g} s or more; fly a hover of some seconds"
+        )
+    pieces = np.floor(np.cumsum(dt_s) / PIECE_S)
+    values, errors = _least_squares(dt_s, load[:, None], thrust, pieces)
+    mean_v = span_v = slope = None
+    if np.isfinite(voltage_v).all():
+        mean_v, span_v = float(np.average(voltage_v, weights=dt_s)), float(np.ptp(voltage_v))
+        if span_v >= SLOPE_MIN_V:
+            columns = np.stack([load, load * (voltage_v - mean_v)], axis=1)
+            values, errors = _least_squares(dt_s, columns, thrust, pieces)
+            slope = VoltageSlope(float(values[1]), float(errors[1]))
+    learnt = [o.control.hover_thrust for o in log.outputs if o.control is not None]
+    return HoverFit(
+        hover_thrust=float(values[0]),
+        standard_error=float(errors[0]),
+        used_s=used_s,
+        configured=airframe.get("hover_thrust"),
+        last_estimate=learnt[-1] if learnt else None,
+        voltage_mean_v=mean_v,
+        voltage_span_v=span_v,
+        slope=slope,
+    )
+
+
+def _calm(log: FlightLog) -> Array:
+    """Ticks that can be trusted: duration s, thrust given, load as a share of the weight, battery V (NaN: not known)."""
+    vehicle = log.config.get("vehicle") or {}
+    mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
+    force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)
+    if mass_kg is None:
+        raise HoverFitError(f"{log.path}: no vehicle.airframe.mass_kg in its configuration; expected a flight's log")
+    balance = Balance(mass_kg)
+    rows: list[tuple[float, float, float, float]] = []
+    sent: float | None = None
+    before_s: float | None = None
+    carrying = False
+    for i, o, _ in log.rows():
+        dt_s = 0.0 if before_s is None else i.t_s - before_s
+        before_s = i.t_s
+        carrying = carrying or any(event.id == "catch" for event in o.events)
+        if sent is not None and i.vehicle is not None and o.control is not None:
+            force = o.control.force_ext_world_n
+            now = balance.step(dt_s, sent, acceleration_world_m_s2(i.vehicle), force, i.vehicle.attitude_wxyz)
+            blind = i.force is None or i.t_s - i.force.stamp_s > force_timeout_s
+            if now is not None and o.phase_kind is PhaseKind.FLIGHT and not (carrying and blind):
+                voltage_v = i.status.battery_voltage_v if i.status is not None else None
+                rows.append((dt_s, *now, math.nan if voltage_v is None else voltage_v))
+        sent = o.attitude.thrust if o.attitude is not None else None
+    return np.array(rows, dtype=np.float64).reshape(len(rows), 4)
+
+
+def _least_squares(dt_s: Array, columns: Array, thrust: Array, pieces: Array) -> tuple[Array, Array]:
+    """Weighted by time: the values, and their standard errors from the scatter of whole pieces (cluster-robust)."""
+    weighted = columns * dt_s[:, None]
+    inverse = np.linalg.inv(weighted.T @ columns)
+    values: Array = inverse @ (weighted.T @ thrust)
+    residual = thrust - columns @ values
+    _, index = np.unique(pieces, return_inverse=True)
+    scores = np.zeros((int(index.max()) + 1, columns.shape[1]))
+    np.add.at(scores, index, weighted * residual[:, None])
+    freedom = len(scores) / max(1, len(scores) - columns.shape[1])
+    errors: Array = np.sqrt(freedom * np.diag(inverse @ (scores.T @ scores) @ inverse))
+    return values, errors

@@ -1,0 +1,70 @@
+"""What acts on the base beside the forces that the companion knows of: a first-order observer on Newton's law.
+
+    d' = (m a - F - d) / T,    F = the known force, lagged as the rotors and the attitude loop lag
+
+Nothing is assumed of where the force comes from: wind, a payload, the arm's reaction, the tether, a wrong hover thrust.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.types import Vec3
+
+
+class DisturbanceObserver:
+    """Force on the base, world frame, N.
+
+    Args:
+        mass_kg: of the whole machine.
+        time_xyz_s: time constant per axis; 0: that axis stays 0.
+        lag_s: from the force asked for to the force given.
+        max_n: bound of the estimate per axis.
+    """
+
+    def __init__(self, mass_kg: float, time_xyz_s: Vec3, lag_s: float, max_n: float) -> None:
+        self._mass_kg = mass_kg
+        self._times_s = time_xyz_s
+        self._on = any(time_s > 0.0 for time_s in time_xyz_s)
+        self._lag_s = lag_s
+        self._max_n = max_n
+        self._lagged: Vec3 | None = None
+        self.force_n: Vec3 = (0.0, 0.0, 0.0)
+        """The estimate."""
+
+    def step(self, dt_s: float, known_n: Vec3, acceleration_world_m_s2: Vec3, learn: bool) -> Vec3:
+        """One tick; the estimate.
+
+        Args:
+            dt_s: since the last tick.
+            known_n: every force that is known to have been asked for in the last tick, weight included.
+            acceleration_world_m_s2: measured now.
+            learn: false: the estimate stands still (on the ground, or where the actuators clip).
+        """
+        if not self._on:
+            return self.force_n
+        (lx, ly, lz), (kx, ky, kz) = self._lagged or known_n, known_n
+        k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0
+        lx += k * (kx - lx)
+        ly += k * (ky - ly)
+        lz += k * (kz - lz)
+        self._lagged = (lx, ly, lz)
+        if learn:
+            (x, y, z), (ax, ay, az), (tx, ty, tz) = self.force_n, acceleration_world_m_s2, self._times_s
+            mass_kg, most = self._mass_kg, self._max_n
+            # d' = (m a - F - d) / T, implicit Euler; an axis without time constant stays 0.
+            if tx > 0.0:
+                x += dt_s / (dt_s + tx) * (mass_kg * ax - lx - x)
+            if ty > 0.0:
+                y += dt_s / (dt_s + ty) * (mass_kg * ay - ly - y)
+            if tz > 0.0:
+                z += dt_s / (dt_s + tz) * (mass_kg * az - lz - z)
+            if not (-most <= x <= most and -most <= y <= most and -most <= z <= most):
+                x, y, z = max(-most, min(most, x)), max(-most, min(most, y)), max(-most, min(most, z))
+            self.force_n = (x, y, z)
+        return self.force_n
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._lagged = None
+        self.force_n = (0.0, 0.0, 0.0)

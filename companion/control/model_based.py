@@ -1,0 +1,85 @@
+"""What the laws that know the machine's model share: their parts, the torque of an external force on the joints, the end of a tick."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from companion.config.vehicle import Vehicle
+from companion.control.common import ZERO8, Actuation, ActuationConfig, DesiredForce, ForceFilter
+from companion.control.dynamics import Dynamics
+from companion.control.manipulator import Manipulator
+from companion.control.types import PlantState, Wrench
+from companion.frames import quat_conjugate, quat_rotate
+from companion.types import ControlLog, Vec2, Vec3, Vec8
+
+
+class ModelBasedConfig(ActuationConfig, Protocol):
+    """The part of such a law's configuration that says what becomes of the measured force."""
+
+    @property
+    def force_lowpass_hz(self) -> float:
+        """Cutoff of the external force."""
+
+    @property
+    def desired_force_time_s(self) -> float | None:
+        """How fast F_d follows; None: it stays 0."""
+
+
+class ModelBasedLaw:
+    """Base of such a law.
+
+    Args:
+        config: of the law.
+        vehicle: the nominal machine, without payload.
+        hover_thrust: normalised thrust that holds it, 0 to 1.
+        model_mass_scale: the model's masses against the nominal ones.
+    """
+
+    def __init__(
+        self, config: ModelBasedConfig, vehicle: Vehicle, hover_thrust: float, model_mass_scale: float = 1.0
+    ) -> None:
+        self._dynamics = Dynamics(vehicle, model_mass_scale)
+        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._force = ForceFilter(config.force_lowpass_hz)
+        self._desired = DesiredForce(config.desired_force_time_s)
+        self._actuation = Actuation(config, vehicle, hover_thrust)
+        self.hover_thrust = hover_thrust
+        """For the log; who estimates it sets it before every step."""
+
+    def _joint_torques_nm(self, state: PlantState, force_world_n: Vec3) -> tuple[Vec2, Vec2]:
+        """J'F and J'F_d."""
+        to_body = quat_conjugate(state.attitude_wxyz)
+        ext = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force_world_n))
+        desired = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, self._desired.world_n))
+        return ext, desired
+
+    def _end(
+        self,
+        dt_s: float,
+        error: Vec8,
+        error_rate: Vec8,
+        e_tau: Vec8,
+        force_world_n: Vec3,
+        payload_estimate_kg: float | None = None,
+    ) -> Wrench:
+        """Let F_d follow the force, and write down the tick; what belongs to an adaptive law is 0."""
+        self._desired.advance(dt_s, force_world_n)
+        sent = self._actuation
+        (fx, fy, fz), (t1, t2) = sent.force_world_n, sent.arm_torque_nm
+        log = ControlLog(
+            error,
+            error_rate,
+            ZERO8,  # sliding
+            ZERO8,  # gamma
+            (fx, fy, fz, 0.0, 0.0, 0.0, t1, t2),
+            e_tau,
+            (0.0, 0.0, 0.0, 0.0),  # h_hat
+            0.0,  # zeta
+            0.0,  # rho
+            force_world_n,
+            sent.roll_pitch_yaw_rad,
+            self.hover_thrust,
+            sent.clipped,
+            payload_estimate_kg,
+        )
+        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)

@@ -1,0 +1,267 @@
+"""The stages of one flight as they follow one another: what each waits for, asks of PX4, and does when it takes too long.
+
+`FlightCore` owns judgement and command; this owns where in the sequence the flight is. Pure; time is an argument.
+"""
+
+from __future__ import annotations
+
+from companion.config.loader import FlightConfig
+from companion.control.pilot import Pilot
+from companion.frames import euler_zyx_from_quat
+from companion.mission import sequencer as seq
+from companion.mission.autopilot_landing import AutopilotLanding
+from companion.mission.check import check_start
+from companion.mission.course import Course
+from companion.mission.plan import Plan
+from companion.mission.sequencer import Stage
+from companion.safety.monitors import unfused
+from companion.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, SafetyAction, Severity
+
+NO_TOUCHDOWN_S = 5.0
+"""After the plan's end."""
+
+
+class FlightStages:
+    """Where the flight is, on which course, and what became of it.
+
+    Args:
+        config: the effective configuration.
+        pilot: takes the tare.
+    """
+
+    def __init__(self, config: FlightConfig, pilot: Pilot) -> None:
+        self._config = config
+        self._pilot = pilot
+        self._touchdown = seq.TouchdownDetector(config.vehicle.airframe.ground_clearance_m)
+        self._tare_start_s: float | None = None
+        self._landing: AutopilotLanding | None = None
+        self._plan: Plan | None = None
+        self._stage_s: float | None = None
+        self.stage = Stage.WAIT
+        self.course: Course | None = None
+        """The plan and its clock, from the first moment at which one is flown."""
+        self.aborting = False
+        """What is flown is not the mission."""
+        self.mission_start_s: float | None = None
+        self.outcome: Outcome | None = None
+        self.zero_thrust = False
+        """The landing by PX4 wants level setpoints without thrust."""
+        self.events: list[Event] = []
+        """What happened in this tick, from whomever."""
+
+    # -- for the core ----------------------------------------------------------------------------------------------
+
+    def begin_tick(self, i: Inputs) -> None:
+        """Nothing has happened yet in this tick."""
+        self.events = []
+        if self._stage_s is None:
+            self._stage_s = i.t_s
+
+    def tell(
+        self, i: Inputs, event_id: str, severity: Severity, action: SafetyAction, text: str, t_s: float | None = None
+    ) -> None:
+        """Something happened; ids are listed in docs/safety.md."""
+        self.events.append(Event(i.t_s if t_s is None else t_s, event_id, severity, action, text))
+
+    def enter(self, stage: Stage, i: Inputs, *, pilot_flies: bool = False) -> None:
+        """Go to a stage; `pilot_flies`: a landing by PX4 is only watched."""
+        if stage is Stage.AUTOPILOT_LAND:
+            self._landing = AutopilotLanding(i.t_s, self._config.vehicle.airframe.ground_clearance_m, pilot_flies)
+        self.stage = stage
+        self._stage_s = i.t_s
+
+    def finish(self, outcome: Outcome) -> None:
+        """Fix the outcome; a graver one replaces it, a better one never does."""
+        if self.outcome in (None, Outcome.COMPLETED) or outcome is Outcome.CRASHED:
+            self.outcome = outcome
+
+    def stand_down(self, i: Inputs, outcome: Outcome) -> None:
+        """Disarm and end, on the ground."""
+        self.finish(outcome)
+        self.enter(Stage.STAND_DOWN, i)
+
+    def leave_mission(self, plan: Plan, i: Inputs) -> None:
+        """Fly this plan from now on; the mission is over."""
+        self.finish(Outcome.ABORTED)
+        self.course = Course(plan, i.t_s)
+        self.aborting = True
+
+    @property
+    def pilot_flies(self) -> bool:
+        """Nothing is to be sent against the one who does."""
+        return self.stage is Stage.AUTOPILOT_LAND and self._landing is not None and self._landing.pilot
+
+    @property
+    def over(self) -> Outcome | None:
+        """The outcome, once nothing more is to be done."""
+        return self.outcome if self.stage is Stage.DONE else None
+
+    # -- words and shares ------------------------------------------------------------------------------------------
+
+    def phase(self, t_s: float) -> tuple[str, PhaseKind]:
+        """Name for people and kind for programs of what is going on."""
+        stage = self.stage
+        if stage is Stage.PLAN and self.course is not None:
+            segment = self.course.segment(t_s)
+            return (f"abort: {segment.name}" if self.aborting else segment.name), segment.kind
+        if stage in (Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND):
+            return stage.value, PhaseKind.LANDING
+        done = stage in (Stage.DISARM, Stage.DONE, Stage.STAND_DOWN)
+        return stage.value, PhaseKind.DONE if done else PhaseKind.GROUND
+
+    def progress(self, t_s: float) -> float:
+        """Share of the plan's time, 0 to 1."""
+        if self.mission_start_s is None or self.course is None:
+            return 0.0
+        return self.course.progress(t_s) if self.stage is Stage.PLAN else 1.0
+
+    def vertical_scale(self, i: Inputs) -> float:
+        """Share of the vertical force while rotors spool up or down on the ground."""
+        assert self._stage_s is not None
+        elapsed = i.t_s - self._stage_s
+        if self.stage is Stage.SPOOL:
+            return seq.SPOOL_SHARE * min(1.0, elapsed / seq.SPOOL_S)
+        if self.stage is Stage.TOUCHDOWN:
+            return max(0.0, seq.SPOOL_SHARE * (1.0 - elapsed / seq.TOUCHDOWN_RAMP_S))
+        if not self.aborting and elapsed < seq.SPOOL_TO_FULL_S:
+            return seq.SPOOL_SHARE + (1.0 - seq.SPOOL_SHARE) * elapsed / seq.SPOOL_TO_FULL_S
+        return 1.0
+
+    # -- sequence --------------------------------------------------------------------------------------------------
+
+    def advance(self, i: Inputs) -> AutopilotRequest:
+        """Move the sequence on; the request that the present stage makes."""
+        assert self._stage_s is not None
+        elapsed = i.t_s - self._stage_s
+        match self.stage:
+            case Stage.PLAN:
+                self._fly(i)
+            case Stage.WAIT:
+                self._wait(i, elapsed)
+            case Stage.OFFBOARD:
+                if seq.in_offboard(i.status):
+                    self.enter(Stage.ARM, i)
+                elif elapsed > seq.OFFBOARD_TIMEOUT_S:
+                    self._refuse(i, "offboard_refused", "PX4 did not enter OFFBOARD")
+                elif elapsed > seq.STREAM_BEFORE_OFFBOARD_S:
+                    return AutopilotRequest.OFFBOARD
+            case Stage.ARM:
+                if seq.is_armed(i.status):
+                    assert self._plan is not None
+                    self.course = Course(self._plan, i.t_s + seq.SPOOL_S)
+                    self.enter(Stage.SPOOL, i)
+                elif elapsed > seq.ARM_TIMEOUT_S:
+                    self._refuse(i, "arming_refused", "PX4 did not arm")
+                else:
+                    return AutopilotRequest.ARM
+            case Stage.SPOOL:
+                if elapsed >= seq.SPOOL_S:
+                    assert self._plan is not None
+                    self.mission_start_s = i.t_s
+                    self.course = Course(self._plan, i.t_s)
+                    self.enter(Stage.PLAN, i)
+                    self.tell(i, "takeoff", Severity.INFO, SafetyAction.NOMINAL, "take-off")
+            case Stage.TOUCHDOWN:
+                if elapsed >= seq.TOUCHDOWN_RAMP_S:
+                    self.enter(Stage.DISARM, i)
+            case Stage.DISARM:
+                return self._disarm(i, elapsed)
+            case Stage.AUTOPILOT_LAND:
+                return self._autopilot_land(i)
+            case Stage.STAND_DOWN:
+                if not seq.is_armed(i.status) or elapsed > seq.DISARM_TIMEOUT_S:
+                    self.enter(Stage.DONE, i)
+                else:
+                    return AutopilotRequest.DISARM
+            case Stage.DONE:
+                pass
+        return AutopilotRequest.NONE
+
+    def _wait(self, i: Inputs, elapsed_s: float) -> None:
+        """On the ground: until every input is there and PX4 demonstrably follows motion capture, for as long as the tare takes."""
+        missing = missing_inputs(i)
+        problem = _nothing_from(missing) if missing else unfused(i)
+        if problem is not None:
+            self._tare_start_s = None
+            if elapsed_s > seq.WAIT_TIMEOUT_S:
+                self._refuse(i, "inputs_missing" if missing else "vision_not_fused", problem)
+            return
+        assert i.vehicle is not None and i.arm is not None
+        if self._tare_start_s is None:
+            self._tare_start_s = i.t_s
+        self._pilot.collect_tare(i)
+        if i.t_s - self._tare_start_s < seq.TARE_S:
+            return
+        self._pilot.finish_tare()
+        mission, vehicle, position = self._config.mission, self._config.vehicle, i.vehicle.position_world_m
+        yaw = euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2]
+        problems = check_start(mission, vehicle, position, yaw, i.arm.angle_rad)
+        for problem in problems:
+            self.tell(i, "start_refused", Severity.CRITICAL, SafetyAction.NOMINAL, problem)
+        if problems:
+            self.stand_down(i, Outcome.REFUSED)
+            return
+        self._plan = Plan.build(mission, vehicle, position, yaw, i.arm.angle_rad)
+        self.enter(Stage.OFFBOARD, i)
+
+    def _refuse(self, i: Inputs, event_id: str, text: str) -> None:
+        self.tell(i, event_id, Severity.CRITICAL, SafetyAction.NOMINAL, text)
+        self.stand_down(i, Outcome.REFUSED)
+
+    def _fly(self, i: Inputs) -> None:
+        assert self.course is not None
+        vehicle = i.vehicle
+        if vehicle is not None and self.course.segment(i.t_s).kind is PhaseKind.LANDING:
+            reference_z = self.course.reference(i.t_s).position_world_m[2]
+            height, sink = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
+            if self._touchdown.update(i.t_s, height, sink, reference_z):
+                self.tell(i, "touchdown", Severity.INFO, SafetyAction.NOMINAL, "touch-down")
+                self.finish(Outcome.COMPLETED)
+                self.enter(Stage.TOUCHDOWN, i)
+                return
+        if self.course.left_s(i.t_s) < -NO_TOUCHDOWN_S:
+            self.tell(i, "no_touchdown", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "no touch-down was felt")
+            self.finish(Outcome.ABORTED)
+            self.enter(Stage.AUTOPILOT_LAND, i)
+
+    def _disarm(self, i: Inputs, elapsed_s: float) -> AutopilotRequest:
+        if not seq.is_armed(i.status):
+            self.enter(Stage.DONE, i)
+            return AutopilotRequest.NONE
+        if elapsed_s > seq.DISARM_TIMEOUT_S:
+            self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, "PX4 did not disarm")
+            self.finish(Outcome.ABORTED)
+            self.enter(Stage.AUTOPILOT_LAND, i)
+        return AutopilotRequest.DISARM if seq.on_ground(i.status) else AutopilotRequest.NONE
+
+    def _autopilot_land(self, i: Inputs) -> AutopilotRequest:
+        assert self._landing is not None
+        step = self._landing.step(i)
+        self.zero_thrust = step.zero_thrust
+        if step.text is not None:
+            severity = Severity.INFO if step.text == "touch-down" else Severity.CRITICAL
+            self.tell(i, "autopilot_landing", severity, SafetyAction.AUTOPILOT_LAND, step.text)
+        if step.ended:
+            if not step.landed:
+                self.outcome = Outcome.LOST
+            self.enter(Stage.DONE, i)
+        return step.request
+
+
+def missing_inputs(i: Inputs) -> list[str]:
+    """Devices that have delivered nothing."""
+    devices = {
+        "PX4 state": i.vehicle,
+        "PX4": i.status,
+        "motion capture": i.mocap,
+        "arm": i.arm,
+        "force sensor": i.force,
+    }
+    return [name for name, value in devices.items() if value is None]
+
+
+def _nothing_from(missing: list[str]) -> str:
+    hint = (
+        "; PX4 sends no local position: check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3" if "PX4 state" in missing else ""
+    )
+    return f"no data from: {', '.join(missing)}{hint}"

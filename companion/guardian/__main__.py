@@ -1,0 +1,10 @@
+"""`python -m companion.guardian`: started by the launcher."""
+
+from __future__ import annotations
+
+import sys
+
+from companion.guardian.process import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,290 @@
+"""The guardian's MAVLink link: the address that the flight process held, spoken to with pymavlink's codec. No call waits."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import socket
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
+from companion.io import autopilot_messages as messages
+from companion.types import AutopilotRequest, MocapPose
+
+Message = Any
+
+_NET = re.compile(r"(udpin|udpout|tcpout)://([^:/?]+):(\d+)")
+_SERIAL = re.compile(r"(serial|serial_flowcontrol)://(/[^:]+):(\d+)")
+_MAX_BYTES = 65535
+_CONNECT_TIMEOUT_S = 0.5
+_TYPE_MASK_IGNORE_RATES = 7
+# One NaN: PX4 takes EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
+_COVARIANCE_FROM_PARAMS = [math.nan] + [0.0] * 20
+
+
+class Wire(Protocol):
+    """Bytes to and from PX4."""
+
+    @property
+    def ready(self) -> bool:
+        """It is known where PX4 is."""
+
+    def fileno(self) -> int:
+        """What to wait on."""
+
+    def send(self, data: bytes) -> None:
+        """Send one message; what cannot leave is lost."""
+
+    def receive(self) -> list[bytes]:
+        """Everything that waits."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+class UdpWire:
+    """UDP. Bound to where PX4 sends (`udpin`), or sending to it (`udpout`), from the port that the flight process spoke from.
+
+    PX4 keeps the first partner of a UDP link, so the old port matters.
+    """
+
+    def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None) -> None:
+        self._remote = remote
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)
+            if local is not None:
+                self._socket.bind(local)
+        except OSError:
+            self._socket.close()
+            raise
+
+    @property
+    def ready(self) -> bool:
+        """A `udpin` link hears PX4 first."""
+        return self._remote is not None
+
+    def fileno(self) -> int:
+        """The socket."""
+        return self._socket.fileno()
+
+    def send(self, data: bytes) -> None:
+        """To PX4, once it is known where it is."""
+        if self._remote is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, self._remote)
+
+    def receive(self) -> list[bytes]:
+        """Datagrams; a `udpin` link learns its partner from the first."""
+        found: list[bytes] = []
+        while len(found) < 1000:
+            try:
+                data, address = self._socket.recvfrom(_MAX_BYTES)
+            except (BlockingIOError, InterruptedError):
+                break
+            except OSError:  # an ICMP error of an earlier send
+                continue
+            if self._remote is None and data[:1] in (b"\xfd", b"\xfe"):
+                self._remote = address
+            found.append(data)
+        return found
+
+    def close(self) -> None:
+        """Close it."""
+        self._socket.close()
+
+
+class TcpWire:
+    """A TCP client."""
+
+    ready = True
+
+    def __init__(self, remote: tuple[str, int]) -> None:
+        self._socket = socket.create_connection(remote, _CONNECT_TIMEOUT_S)
+        self._socket.setblocking(False)
+
+    def fileno(self) -> int:
+        """The socket."""
+        return self._socket.fileno()
+
+    def send(self, data: bytes) -> None:
+        """What does not fit into the send buffer is lost; the receiver finds the next message by itself."""
+        with contextlib.suppress(OSError):
+            self._socket.send(data)
+
+    def receive(self) -> list[bytes]:
+        """What waits."""
+        with contextlib.suppress(OSError):
+            return [self._socket.recv(_MAX_BYTES)]
+        return []
+
+    def close(self) -> None:
+        """Close it."""
+        self._socket.close()
+
+
+class SerialWire:
+    """A serial port, 8N1."""
+
+    ready = True
+
+    def __init__(self, path: str, baud: int, flow_control: bool) -> None:
+        import serial  # only here: the other links do not need it
+
+        self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, rtscts=flow_control)
+        self._errors = (OSError, serial.SerialException)
+
+    def fileno(self) -> int:
+        """The port."""
+        number: int = self._port.fileno()
+        return number
+
+    def send(self, data: bytes) -> None:
+        """Write what the port takes."""
+        with contextlib.suppress(*self._errors):
+            self._port.write(data)
+
+    def receive(self) -> list[bytes]:
+        """What waits."""
+        with contextlib.suppress(*self._errors):
+            return [self._port.read(_MAX_BYTES)]
+        return []
+
+    def close(self) -> None:
+        """Close it."""
+        with contextlib.suppress(*self._errors):
+            self._port.close()
+
+
+def address_problem(address: str) -> str | None:
+    """Why the guardian could not take this link over; None: it could. To be asked before take-off."""
+    if _NET.fullmatch(address) or _SERIAL.fullmatch(address):
+        return None
+    return f"autopilot {address}: the guardian can take over udpin, udpout, tcpout and serial only; use one of them"
+
+
+def open_wire(address: str, local_port: int) -> Wire:
+    """Open the link that the flight process has let go of.
+
+    Args:
+        address: as in `devices.autopilot.address`.
+        local_port: of the flight process's UDP socket, 0 if not known.
+
+    Raises:
+        OSError: it is not free, or not there.
+    """
+    net = _NET.fullmatch(address)
+    if net is not None:
+        kind, host, port = net[1], net[2], int(net[3])
+        if kind == "udpin":
+            return UdpWire((host, port), None)
+        if kind == "udpout":
+            return UdpWire(("", local_port) if local_port else None, (socket.gethostbyname(host), port))
+        return TcpWire((host, port))
+    port_of = _SERIAL.fullmatch(address)
+    if port_of is None:
+        raise OSError(f"{address} is no address that the guardian knows")
+    return SerialWire(port_of[2], int(port_of[3]), port_of[1] == "serial_flowcontrol")
+
+
+class Link:
+    """MAVLink 2 over a wire, as the companion speaks it.
+
+    Args:
+        wire: open.
+        own: system and component id of the companion.
+        autopilot_system: PX4's.
+    """
+
+    def __init__(self, wire: Wire, own: tuple[int, int], autopilot_system: int) -> None:
+        self.wire = wire
+        self._autopilot_system = autopilot_system
+        self._encoder = mavlink.MAVLink(None, srcSystem=own[0], srcComponent=own[1])
+        self._decoder = self._new_decoder()
+        self.poses_sent = 0
+
+    @staticmethod
+    def _new_decoder() -> Any:
+        decoder = mavlink.MAVLink(None)
+        decoder.robust_parsing = True
+        return decoder
+
+    def receive(self) -> list[Message]:
+        """Messages of PX4 itself that wait; nothing that comes in can raise."""
+        found: list[Message] = []
+        for data in self.wire.receive():
+            try:
+                parsed = self._decoder.parse_buffer(data) or ()
+            except (mavlink.MAVError, ValueError, IndexError):
+                self._decoder = self._new_decoder()
+                continue
+            if isinstance(self.wire, UdpWire) and self._decoder.buf_len():
+                self._decoder = self._new_decoder()  # a cut datagram must not swallow the ones after it
+            for message in parsed:
+                source = (message.get_srcSystem(), message.get_srcComponent())
+                if message.get_type() != "BAD_DATA" and source == (
+                    self._autopilot_system,
+                    messages.MAV_COMP_ID_AUTOPILOT1,
+                ):
+                    found.append(message)
+        return found
+
+    def send(self, message: Message) -> None:
+        """One message."""
+        data = message.pack(self._encoder)
+        self._encoder.seq = (self._encoder.seq + 1) % 256
+        self.wire.send(data)
+
+    def heartbeat(self) -> None:
+        """HEARTBEAT, as MAVSDK sends it for a companion computer."""
+        self.send(
+            mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_UNINIT, 3
+            )
+        )
+
+    def vision(self, pose: MocapPose) -> None:
+        """VISION_POSITION_ESTIMATE with the fields and the time base of the flight process.
+
+        Raises:
+            ValueError: the pose is not finite.
+        """
+        position_ned_m, euler_rad = messages.vision_ned(pose)
+        usec = max(1, int(pose.stamp_s * 1e6))
+        self.send(
+            mavlink.MAVLink_vision_position_estimate_message(
+                usec, *position_ned_m, *euler_rad, _COVARIANCE_FROM_PARAMS, 0
+            )
+        )
+        self.poses_sent += 1
+
+    def request(self, request: AutopilotRequest) -> None:
+        """The command of a request."""
+        self._command(*messages.command(request))
+
+    def ask_for(self, message_id: int) -> None:
+        """MAV_CMD_REQUEST_MESSAGE: one message now, instead of when it is due."""
+        self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), 0.0)
+
+    def set_rate(self, message_id: int, rate_hz: float) -> None:
+        """MAV_CMD_SET_MESSAGE_INTERVAL."""
+        self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz)
+
+    def stand_still(self, t_s: float, yaw_rad: float) -> None:
+        """SET_ATTITUDE_TARGET: level at `yaw_rad` (world ENU), no thrust. Only for a vehicle that stands."""
+        q = attitude_ned_frd_from_enu_flu(quat_from_euler_zyx(0.0, 0.0, yaw_rad))
+        target, component = self._autopilot_system, messages.MAV_COMP_ID_AUTOPILOT1
+        self.send(
+            mavlink.MAVLink_set_attitude_target_message(
+                int(t_s * 1e3) & 0xFFFFFFFF, target, component, _TYPE_MASK_IGNORE_RATES, q, 0.0, 0.0, 0.0, 0.0
+            )
+        )
+
+    def _command(self, command: int, param1: float, param2: float) -> None:
+        target, component = self._autopilot_system, messages.MAV_COMP_ID_AUTOPILOT1
+        self.send(
+            mavlink.MAVLink_command_long_message(target, component, command, 0, param1, param2, 0.0, 0.0, 0.0, 0.0, 0.0)
+        )

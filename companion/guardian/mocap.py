@@ -1,0 +1,157 @@
+"""The guardian's own motion capture: a second NatNet client, on plain sockets.
+
+In standby it only keeps its place at the server and looks at a frame now and then; in charge every frame counts. Parsing and frames
+are those of the flight (`companion.io.natnet`, `companion.io.mocap_pose`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+
+from companion.guardian.settings import MocapSettings
+from companion.io import natnet
+from companion.io.mocap_pose import VERSIONS, mocap_pose
+from companion.io.natnet import Malformed, Message, NatNetVersion
+from companion.types import MocapPose
+
+CONNECT_PERIOD_S = 0.25
+KEEP_ALIVE_PERIOD_S = 0.5
+SILENCE_RECONNECT_S = 1.0
+_MAX_DATAGRAMS = 256
+_MAX_BYTES = 65535
+
+
+class MocapProblem(Exception):
+    """Motion capture cannot be received: one line for the user."""
+
+
+class MocapClient:
+    """Receives the vehicle's rigid body; no call waits.
+
+    Args:
+        settings: addresses and body.
+
+    Raises:
+        MocapProblem: a name does not resolve, or a socket cannot be had.
+    """
+
+    def __init__(self, settings: MocapSettings) -> None:
+        self._settings = settings
+        where = f"mocap {settings.server}:{settings.command_port}"
+        try:
+            self._server = (socket.gethostbyname(settings.server), settings.command_port)
+        except OSError:
+            raise MocapProblem(f"{where}: the name cannot be resolved; put an IPv4 address") from None
+        self.sockets: list[socket.socket] = []
+        """What to wait on."""
+        try:
+            self._command = self._open(settings.interface, 0)
+            if settings.transport == "multicast":
+                data = self._open(settings.multicast_group, settings.data_port)
+                membership = socket.inet_aton(settings.multicast_group) + socket.inet_aton(settings.interface)
+                data.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        except OSError as error:
+            for opened in self.sockets:
+                opened.close()
+            raise MocapProblem(f"{where}: cannot listen beside the flight process: {error.strerror}") from None
+        self._version: NatNetVersion | None = None
+        self._clock_frequency_hz: int | None = None
+        self._last_number: int | None = None
+        self._heard_s = float("-inf")
+        self._spoke_s = float("-inf")
+        self.tracked_s = float("-inf")
+        """When (by `time.monotonic`) a frame with the body in view came last."""
+        self.trouble: str | None = None
+        """What was wrong with a datagram; the newest."""
+
+    def serve(self, now_s: float) -> None:
+        """Ask the server to go on; call it every few hundredths of a second."""
+        known = self._version is not None
+        if now_s - self._spoke_s < (KEEP_ALIVE_PERIOD_S if known else CONNECT_PERIOD_S):
+            return
+        self._spoke_s = now_s
+        # A server that was restarted knows its client only after a new connect request.
+        if not known or now_s - self._heard_s > SILENCE_RECONNECT_S:
+            self._send(natnet.encode_connect("companion guardian"))
+        elif self._settings.transport == "unicast":
+            self._send(natnet.encode_request(Message.KEEP_ALIVE))
+
+    def poses(self, now_s: float, origin_s: float = 0.0) -> list[MocapPose]:
+        """Read everything that waits; poses of the body in order, stamped `now_s - origin_s`."""
+        return [pose for datagram in self._datagrams() if (pose := self._pose(datagram, now_s, origin_s)) is not None]
+
+    def glance(self, now_s: float) -> None:
+        """Read everything that waits, look at the newest frame only: standby."""
+        newest = None
+        for datagram in self._datagrams():
+            newest = datagram
+        if newest is not None:
+            self._pose(newest, now_s, 0.0)
+
+    def close(self) -> None:
+        """Take leave of the server."""
+        if self._settings.transport == "unicast" and self.sockets:
+            self._send(natnet.encode_message(Message.DISCONNECT))
+        for opened in self.sockets:
+            opened.close()
+        self.sockets.clear()
+
+    def _open(self, address: str, port: int) -> socket.socket:
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sockets.append(opened)
+        opened.setblocking(False)
+        if port:
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        opened.bind((address, port))
+        return opened
+
+    def _send(self, datagram: bytes) -> None:
+        with contextlib.suppress(OSError):  # the network is down for now: the next one may get through
+            self._command.sendto(datagram, self._server)
+
+    def _datagrams(self) -> list[bytes]:
+        """Frames that wait; what else comes is dealt with."""
+        frames: list[bytes] = []
+        for opened in self.sockets:
+            for _ in range(_MAX_DATAGRAMS):
+                try:
+                    datagram, address = opened.recvfrom(_MAX_BYTES)
+                except (BlockingIOError, InterruptedError):
+                    break
+                except OSError:  # an ICMP error of an earlier send
+                    continue
+                if address[0] != self._server[0]:
+                    continue
+                kind = natnet.message_id(datagram)
+                if kind == Message.FRAME:
+                    frames.append(datagram)
+                elif kind == Message.SERVER_INFO:
+                    self._take_server_info(datagram)
+        return frames
+
+    def _take_server_info(self, datagram: bytes) -> None:
+        info = natnet.parse_server_info(datagram)
+        if isinstance(info, Malformed):
+            self.trouble = info.reason
+        elif info.version in VERSIONS:
+            self._version = VERSIONS[info.version]
+            self._clock_frequency_hz = info.clock_frequency_hz
+        else:
+            self.trouble = f"the server speaks NatNet {info.version}, expected {' or '.join(VERSIONS)}"
+
+    def _pose(self, datagram: bytes, now_s: float, origin_s: float) -> MocapPose | None:
+        if self._version is None:
+            return None
+        frame = natnet.parse_frame(datagram, self._version, self._settings.rigid_body_id, self._clock_frequency_hz)
+        if isinstance(frame, Malformed):
+            self.trouble = frame.reason
+            return None
+        if not natnet.is_newer(frame.number, self._last_number, now_s - self._heard_s):
+            return None
+        self._last_number = frame.number
+        self._heard_s = now_s
+        pose = mocap_pose(frame, now_s - origin_s, self._settings.up_axis)
+        if pose is not None and pose.tracking_valid:
+            self.tracked_s = now_s
+        return pose

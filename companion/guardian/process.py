@@ -1,0 +1,281 @@
+"""The guardian process: stands by the flight process, and takes over when that hangs or dies while the rotors turn.
+
+Started by the launcher as `python -m companion.guardian --config FILE --beats FD --channel FD --pidfd FD`. Exit code 0: not needed, or
+landed; 1: the vehicle is lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+
+from companion import status
+from companion.guardian import beat as words
+from companion.guardian.beat import Beat
+from companion.guardian.charge import Charge, Told
+from companion.guardian.link import Link, Wire, address_problem, open_wire
+from companion.guardian.mocap import MocapClient, MocapProblem
+from companion.guardian.settings import Settings, read_settings
+from companion.guardian.watch import StallWatch
+from companion.io.packets import TEXT, UNNUMBERED
+from companion.realtime import GUARDIAN_PRIORITY, claim_realtime
+from companion.record import pack_plain
+from companion.types import SafetyAction, Severity
+
+PERIOD_S = 0.01
+MOCAP_FRESH_S = 0.5
+KILL_TIMEOUT_S = 1.0
+LINK_TIMEOUT_S = 30.0
+"""A link that cannot be opened for this long is given up, and the vehicle with it."""
+STATUS_PERIOD_S = 0.5
+_MAX_BEATS = 512
+
+
+class FlightProcess:
+    """The flight process, held by its pidfd: no other process can be mistaken for it."""
+
+    def __init__(self, pidfd: int) -> None:
+        self.pidfd = pidfd
+        self._poll = select.poll()
+        self._poll.register(pidfd, select.POLLIN)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it is dead, after `timeout_s` at the latest. Dead means that its sockets are closed."""
+        return bool(self._poll.poll(max(0, round(timeout_s * 1e3))))
+
+    def kill(self) -> None:
+        """SIGKILL: the only signal that ends a process that hangs in any way."""
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
+
+
+class Beats:
+    """The guardian's end of the socket to the flight process."""
+
+    def __init__(self, channel: socket.socket) -> None:
+        channel.setblocking(False)
+        self._channel = channel
+        self.last: Beat | None = None
+        self.recorder: socket.socket | None = None
+        """The recorder's channel, once the flight process has shared it."""
+
+    def listen(self) -> bool:
+        """Read everything that waits; True: a beat was among it."""
+        heard = False
+        for _ in range(_MAX_BEATS):
+            try:
+                datagram, descriptors, _, _ = socket.recv_fds(self._channel, words.MAX_BYTES, 1)
+            except OSError:  # nothing more, or the flight process is gone: its pidfd tells
+                break
+            if not datagram:
+                break
+            for descriptor in descriptors:
+                if datagram[:1] == words.ADOPT and self.recorder is None:
+                    self.recorder = socket.socket(fileno=descriptor)
+                else:
+                    os.close(descriptor)
+            beat = words.unpack(datagram)
+            if beat is not None:
+                self.last, heard = beat, True
+        return heard
+
+    def tell(self, problem: str | None) -> None:
+        """Say that the guardian stands ready, or why not; never waits."""
+        text = words.READY if problem is None else words.PROBLEM + problem.encode()[: words.MAX_BYTES - 1]
+        with contextlib.suppress(OSError):
+            self._channel.send(text, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+
+
+class Guardian:
+    """Standby, take-over, landing."""
+
+    def __init__(self, settings: Settings, beats: Beats, channel: socket.socket, flight: FlightProcess) -> None:
+        self._settings = settings
+        self._beats = beats
+        self._channel = channel
+        self._flight = flight
+        self._mocap: MocapClient | None = None
+        self._problem = address_problem(settings.autopilot_address)
+        self._status_s = float("-inf")
+
+    def run(self) -> int:
+        """Until the flight has ended, one way or the other; the exit code."""
+        try:
+            try:
+                self._mocap = MocapClient(self._settings.mocap)
+            except MocapProblem as problem:
+                self._problem = self._problem or str(problem)
+            reason = self._stand_by()
+            if reason is None or self._beats.last is None:
+                return 0
+            return 0 if self._take_over(self._beats.last, reason) else 1
+        finally:
+            if self._mocap is not None:
+                self._mocap.close()
+            if self._beats.recorder is not None:
+                self._beats.recorder.close()
+
+    # -- standby ---------------------------------------------------------------------------------------------------
+
+    def _stand_by(self) -> str | None:
+        """Why the guardian must take over; None: it need not."""
+        watch = StallWatch(self._settings.timeout_s)
+        told_s = float("-inf")
+        while True:
+            dead = self._flight.wait(PERIOD_S)
+            now_s = time.monotonic()
+            heard = self._beats.listen()
+            last = self._beats.last
+            if self._mocap is not None:
+                self._mocap.serve(now_s)
+                self._mocap.glance(now_s)
+            if last is not None and last.goodbye:
+                return None
+            lifting = last is not None and last.lifting
+            if dead:
+                return "the flight process died" if lifting else None
+            if watch.update(now_s, heard or not lifting):
+                return f"{words.HANGS} (silent for {watch.silent_s * 1e3:.0f} ms)"
+            if now_s - told_s >= words.READY_PERIOD_S:
+                told_s = now_s
+                self._beats.tell(self._trouble(now_s))
+
+    def _trouble(self, now_s: float) -> str | None:
+        """Why the guardian could not land the vehicle now."""
+        if self._problem is not None or self._mocap is None:
+            return self._problem
+        if now_s - self._mocap.tracked_s <= MOCAP_FRESH_S:
+            return None
+        mocap = self._settings.mocap
+        wrong = f" ({self._mocap.trouble})" if self._mocap.trouble else ""
+        return f"mocap {mocap.server}:{mocap.command_port}: the guardian's own client sees no rigid body {mocap.rigid_body_id}{wrong}"
+
+    # -- take-over -------------------------------------------------------------------------------------------------
+
+    def _take_over(self, last: Beat, reason: str) -> bool:
+        """Kill, take the link, land; True: the vehicle stands."""
+        self._flight.kill()
+        gone = self._flight.wait(KILL_TIMEOUT_S)
+        now_s = time.monotonic() - last.origin_s
+        text = f"{reason}; the guardian has taken over" + ("" if gone else ", though it could not be ended")
+        self._tell(last, Told(now_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+        link = self._open_link(last)
+        if link is None:
+            self._result(last, False, None)
+            return False
+        try:
+            return self._land(last, link)
+        finally:
+            link.wire.close()
+
+    def _open_link(self, last: Beat) -> Link | None:
+        """The flight process's link; asked for again while something still holds it."""
+        deadline_s = time.monotonic() + LINK_TIMEOUT_S
+        told = False
+        while True:
+            try:
+                wire: Wire = open_wire(self._settings.autopilot_address, last.local_port)
+                return Link(wire, (last.own_system, last.own_component), last.autopilot_system)
+            except OSError as error:
+                now_s = time.monotonic()
+                if not told:
+                    told = True
+                    text = f"autopilot {self._settings.autopilot_address}: {error}; trying again"
+                    now = now_s - last.origin_s
+                    self._tell(
+                        last, Told(now, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text)
+                    )
+                if now_s > deadline_s:
+                    return None
+            self._sign_of_life(0)
+            time.sleep(PERIOD_S)
+
+    def _land(self, last: Beat, link: Link) -> bool:
+        mocap = self._mocap
+        waiting = select.poll()
+        waiting.register(link.wire.fileno(), select.POLLIN)
+        for opened in mocap.sockets if mocap is not None else ():
+            waiting.register(opened.fileno(), select.POLLIN)
+        charge = Charge(
+            last,
+            self._settings.clearance_m,
+            link,
+            time.monotonic() - last.origin_s,
+            lambda told: self._tell(last, told),
+        )
+        step_s = float("-inf")
+        while charge.landed is None:
+            waiting.poll(PERIOD_S * 1e3)
+            now_s = time.monotonic()
+            t_s = now_s - last.origin_s
+            if mocap is not None:
+                charge.take_poses(mocap.poses(now_s, last.origin_s))
+                mocap.serve(now_s)
+            charge.take_messages(t_s, link.receive())
+            if now_s - step_s >= PERIOD_S:
+                step_s = now_s
+                charge.step(t_s)
+            self._sign_of_life(link.poses_sent)
+        self._result(last, charge.landed, charge)
+        return charge.landed
+
+    def _sign_of_life(self, poses_sent: int) -> None:
+        """To the launcher, twice a second."""
+        now_s = time.monotonic()
+        if now_s - self._status_s >= STATUS_PERIOD_S:
+            self._status_s = now_s
+            status.send(self._channel, {"type": "guardian_status", "poses_sent": poses_sent})
+
+    def _tell(self, last: Beat, told: Told) -> None:
+        """To the launcher and into the log."""
+        mission_t_s = last.mission_t_s + told.t_s - last.t_s if last.mission_t_s else 0.0
+        message = {
+            "type": "event",
+            "source": "guardian",
+            "tick": last.tick,
+            "t_s": mission_t_s,
+            "flight_t_s": told.t_s,
+            "id": told.id,
+            "severity": told.severity.value,
+            "action": told.action.value,
+            "text": told.text,
+        }
+        status.send(self._channel, message)
+        print(f"{told.t_s:.3f} {told.id}: {told.text}", file=sys.stderr, flush=True)
+        if self._beats.recorder is not None:
+            packet = pack_plain((TEXT, UNNUMBERED, told.t_s, told.severity.value, told.id, told.text))
+            with contextlib.suppress(OSError):
+                self._beats.recorder.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+
+    def _result(self, last: Beat, landed: bool, charge: Charge | None) -> None:
+        pose = charge.pose if charge is not None else None
+        message = {
+            "type": "guardian_result",
+            "landed": landed,
+            "took_over_position_m": list(last.position_world_m),
+            "position_m": None if pose is None else list(pose.position_world_m),
+        }
+        status.send(self._channel, message)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    parser = argparse.ArgumentParser(prog="companion.guardian", description="Lands when the flight process cannot.")
+    parser.add_argument("--config", type=Path, required=True, help="effective configuration, JSON")
+    parser.add_argument("--beats", type=int, required=True, help="socket to the flight process")
+    parser.add_argument("--channel", type=int, required=True, help="socket to the launcher")
+    parser.add_argument("--pidfd", type=int, required=True, help="of the flight process")
+    arguments = parser.parse_args(argv)
+    for number in (signal.SIGINT, signal.SIGHUP):  # for the flight, which lands; the guardian ends when the flight does
+        signal.signal(number, signal.SIG_IGN)
+    settings = read_settings(arguments.config)
+    with socket.socket(fileno=arguments.beats) as beats, socket.socket(fileno=arguments.channel) as channel:
+        claim_realtime(GUARDIAN_PRIORITY)
+        return Guardian(settings, Beats(beats), channel, FlightProcess(arguments.pidfd)).run()

@@ -1,0 +1,76 @@
+"""What PX4 says, as the records that the rest of the companion knows. Pure: messages in, records out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from companion.frames import attitude_enu_flu_from_ned_frd, euler_zyx_from_quat
+from companion.io import autopilot_messages as messages
+from companion.mission.sequencer import PEOPLE_CHOOSE
+from companion.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
+
+MAV_STATE_CRITICAL = 5
+"""HEARTBEAT.system_status while one of PX4's failsafes acts."""
+MAV_STATE_EMERGENCY = 6
+# SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
+_NO_MANOEUVRES = (511, 512)
+
+
+class Px4State:
+    """The newest of each message that matters."""
+
+    def __init__(self) -> None:
+        self.refusal: str | None = None
+        """Why the last command was not accepted; None after one that was."""
+        self._heartbeat: tuple[float, bool, FlightMode, int] | None = None
+        self._landed = 0
+        self._position: tuple[float, Vec3, Vec3] | None = None
+        self._attitude: tuple[float, Quat, Vec3] | None = None
+        self._imu: tuple[float, Vec3] | None = None
+
+    def take(self, t_s: float, message: Any) -> None:
+        """One decoded message that arrived at `t_s` on the flight clock."""
+        m = message
+        match m.get_type():
+            case "HEARTBEAT":
+                armed = bool(m.base_mode & messages.MAV_MODE_FLAG_SAFETY_ARMED)
+                mode = messages.flight_mode(m.base_mode, m.custom_mode)
+                self._heartbeat = (t_s, armed, mode, m.system_status)
+            case "EXTENDED_SYS_STATE":
+                self._landed = m.landed_state
+            case "LOCAL_POSITION_NED":
+                self._position = (t_s, (m.x, m.y, m.z), (m.vx, m.vy, m.vz))
+            case "ATTITUDE_QUATERNION":
+                self._attitude = (t_s, (m.q1, m.q2, m.q3, m.q4), (m.rollspeed, m.pitchspeed, m.yawspeed))
+            case "HIGHRES_IMU":
+                self._imu = (t_s, (m.xacc, m.yacc, m.zacc))
+            case "COMMAND_ACK" if m.command not in _NO_MANOEUVRES:
+                self.refusal = None if m.result == 0 else f"MAV_CMD {m.command} {messages.result_text(m.result)}"
+
+    def status(self) -> AutopilotStatus | None:
+        """None before the first heartbeat."""
+        if self._heartbeat is None:
+            return None
+        stamp_s, armed, mode, _ = self._heartbeat
+        return AutopilotStatus(stamp_s, armed, mode, messages.landed_state(self._landed), None, None)
+
+    def vehicle(self) -> VehicleState | None:
+        """None before position, attitude and IMU have come, or when they are not finite."""
+        if self._position is None or self._attitude is None or self._imu is None:
+            return None
+        return messages.vehicle_state(*self._position, *self._attitude, *self._imu)
+
+    @property
+    def pilot(self) -> bool:
+        """A mode flies that only people choose, and that no failsafe has chosen."""
+        if self._heartbeat is None:
+            return False
+        _, armed, mode, system = self._heartbeat
+        return armed and mode in PEOPLE_CHOOSE and system not in (MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY)
+
+    def yaw_rad(self) -> float | None:
+        """Heading in the world (ENU)."""
+        if self._attitude is None or not any(self._attitude[1]) or not all(map(math.isfinite, self._attitude[1])):
+            return None
+        return euler_zyx_from_quat(attitude_enu_flu_from_ned_frd(self._attitude[1]))[2]

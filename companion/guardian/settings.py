@@ -1,0 +1,47 @@
+"""What the guardian takes from the effective configuration, which the launcher has checked already."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class MocapSettings:
+    """`devices.mocap` of the vehicle file; keys as there."""
+
+    server: str
+    interface: str
+    transport: str
+    multicast_group: str
+    command_port: int
+    data_port: int
+    rigid_body_id: int
+    up_axis: str
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The few things that the guardian must know."""
+
+    autopilot_address: str
+    """As MAVSDK writes it: udpin://0.0.0.0:14540, ..."""
+    mocap: MocapSettings
+    clearance_m: float
+    """`airframe.ground_clearance_m`."""
+    timeout_s: float
+    """`safety.guardian_timeout_s`."""
+
+
+def read_settings(path: Path) -> Settings:
+    """Settings from `config.json` of the flight's folder."""
+    vehicle = json.loads(path.read_text(encoding="utf-8"))["vehicle"]
+    devices = vehicle["devices"]
+    mocap = devices["mocap"]
+    return Settings(
+        autopilot_address=devices["autopilot"]["address"],
+        mocap=MocapSettings(**{name: mocap[name] for name in MocapSettings.__slots__}),
+        clearance_m=vehicle["airframe"]["ground_clearance_m"],
+        timeout_s=vehicle["safety"]["guardian_timeout_s"],
+    )

@@ -1,0 +1,269 @@
+"""One instant of a plan against every limit: room, tether, floor, joints, motion, thrust.
+
+Pure. A place is judged with what a flight may differ from its plan (`TRACKING_M`, more around a catch), a velocity with the way that
+stopping takes from a fault to rest. What is asked is the governor's own `SafeSet`, and more: a plan without a violation is never bent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from companion.config.mission import Mission
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.frames import quat_from_euler_zyx
+from companion.safety.governor import BODY_TOP_M, SafeSet
+from companion.safety.tether import TetherWatch
+from companion.types import PhaseKind, Quat, Reference, Vec2, Vec3
+
+ARM_RADIUS_M = 0.03
+"""Half the thickness of servos and links."""
+FLOOR_GAP_M = 0.01
+TRACKING_M = 0.10
+"""A flight may be so far from its plan; measured over winds of 3 m/s (benchmarks/missions.py)."""
+CATCH_M = 0.20
+"""The same, from the catch until the blow is over."""
+CATCH_NEAR_M = 0.05
+"""So near to the expected place, horizontally, the catch may happen."""
+CATCH_S = 2.0
+THRUST_SHARE_MAX = 0.9
+"""Whatever `limits.thrust_share_max` allows: the rest is for holding the attitude."""
+STOP = "stop "
+"""Before the name of a limit: it holds where the vehicle is to be, but not where it would come to rest."""
+TOLERANCE = 1e-6
+"""Relative; so that a mission may use its limits to the full."""
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """One limit exceeded in one sample. `excess` orders violations of the same limit."""
+
+    limit: str
+    excess: float
+    what: str
+    detail: str
+    advice: str
+
+
+class Judge:
+    """Holds one instant of a plan after another against every limit.
+
+    Raises:
+        ValueError: vehicle, tether and room leave nothing to fly in; one line.
+    """
+
+    def __init__(self, mission: Mission, vehicle: Vehicle) -> None:
+        self._limits = mission.limits
+        self._catch = mission.catch
+        self._vehicle = vehicle
+        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._safe = SafeSet(vehicle)
+        self._watch = TetherWatch(vehicle)
+        airframe, tether = vehicle.airframe, vehicle.tether
+        self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg
+        self._tether_n = tether.weight_n_per_m * tether.length_m
+        self._blow_until_s = 0.0
+        """0: the catch is still to come; a way back over the same place is none."""
+
+    def violations(
+        self, t_s: float, reference: Reference, jerks: tuple[Vec3, Vec2], kind: PhaseKind
+    ) -> Iterator[Violation]:
+        """What is wrong at one instant; instants must come in order.
+
+        Args:
+            t_s: on the plan's clock.
+            reference: of the plan then.
+            jerks: of the vehicle, world frame, m/s^3, and of the joints, rad/s^3.
+            kind: of the phase.
+        """
+        clearance_m = self._vehicle.airframe.ground_clearance_m
+        x_m, y_m, z_m = reference.position_world_m
+        if kind is PhaseKind.LANDING and z_m < clearance_m:
+            return  # the reference goes on below the floor until touchdown is detected
+        if kind is PhaseKind.FLIGHT and z_m < clearance_m - TOLERANCE:
+            yield Violation(
+                "floor",
+                clearance_m - z_m,
+                "flies into the floor",
+                f"the body's origin at {z_m:.2f} m, {clearance_m:.2f} m is the lowest",
+                "raise the waypoint",
+            )
+        position = (x_m, y_m, max(z_m, clearance_m)) if kind is PhaseKind.TAKEOFF else reference.position_world_m
+        yield from self._space(position, reference, self._off_m(t_s, position, kind))
+        yield from self._stop(position, reference, kind)
+        yield from self._line(t_s, position, reference)
+        yield from self._arm(position, reference)
+        yield from self._motion(reference, jerks)
+        yield from self._thrust(reference)
+
+    def _off_m(self, t_s: float, position: Vec3, kind: PhaseKind) -> float:
+        """How far from the plan the vehicle may be now."""
+        if self._catch is not None and kind is PhaseKind.FLIGHT and not 0.0 < self._blow_until_s <= t_s:
+            if math.dist(position[:2], self._catch.expected_at_m) <= CATCH_NEAR_M:
+                self._blow_until_s = t_s + CATCH_S
+        return CATCH_M if t_s < self._blow_until_s else TRACKING_M
+
+    def _space(self, position: Vec3, reference: Reference, off_m: float) -> Iterator[Violation]:
+        vehicle = self._vehicle
+        net_m = _world(position, reference.yaw_rad, self._manipulator.net_body_m(reference.arm_rad))
+        net_radius_m = vehicle.tool.net_radius_m
+        radius_m = vehicle.airframe.radius_m
+        room = vehicle.room
+        why = f"{off_m:g} m for {'the catch' if off_m == CATCH_M else 'tracking'}"
+        for axis, name, span in ((0, "x", room.x_m), (1, "y", room.y_m), (2, "z", room.z_m)):
+            if axis == 2 and position[2] < vehicle.airframe.ground_clearance_m:
+                continue  # told as flying into the floor
+            low = min(position[axis] - radius_m, net_m[axis] - net_radius_m) if axis < 2 else position[2] + off_m
+            high = max(position[axis] + (radius_m if axis < 2 else BODY_TOP_M), net_m[axis] + net_radius_m)
+            for edge, excess, reach in (("low", span[0] - low + off_m, low), ("high", high + off_m - span[1], high)):
+                if excess > TOLERANCE:
+                    yield Violation(
+                        f"room {name} {edge}",
+                        excess,
+                        "leaves the room",
+                        f"rotors, arm and net reach {name} = {reach:.2f} m, the room is {span[0]:g} to {span[1]:g} m less {why}",
+                        "move the waypoint inwards",
+                    )
+        beyond_m = self._safe.breach_tether_m(position) + off_m
+        if beyond_m > TOLERANCE:
+            limit_m = self._safe.radius_m - off_m
+            yield Violation(
+                "tether",
+                beyond_m,
+                "leaves the tether sphere",
+                f"{limit_m + beyond_m:.2f} m from the anchor, {limit_m:.2f} m (length less margin and {why}) allowed",
+                "shorten the line or move the anchor",
+            )
+
+    def _stop(self, position: Vec3, reference: Reference, kind: PhaseKind) -> Iterator[Violation]:
+        """Where it would come to rest after a fault at this instant."""
+        tether, safe = self._vehicle.tether, self._safe
+        speed = math.hypot(*reference.velocity_world_m_s)
+        share_s = tether.react_time_s + 0.5 * speed / tether.stop_deceleration_m_s2
+        x_m, y_m, z_m = (p + v * share_s for p, v in zip(position, reference.velocity_world_m_s, strict=True))
+        floor_m = self._vehicle.airframe.ground_clearance_m
+        if kind is PhaseKind.LANDING:
+            z_m = max(z_m, floor_m)  # the floor is where it is going
+        stop = (x_m, y_m, z_m)
+        found = (
+            ("tether", "tether sphere", safe.breach_tether_m(stop) - max(0.0, safe.breach_tether_m(position))),
+            ("room", "room", safe.breach_walls_m(stop) - max(0.0, safe.breach_walls_m(position))),
+            ("floor", "height above the floor", min(floor_m, position[2]) - z_m),
+        )
+        for limit, what, beyond_m in found:
+            if beyond_m > TOLERANCE:
+                yield Violation(
+                    f"{STOP}{limit}",
+                    beyond_m,
+                    f"could not stop within the {what}",
+                    f"{speed:.2f} m/s take {speed * share_s:.2f} m to stop, {beyond_m:.2f} m too far",
+                    "fly slower towards its edge or turn round earlier",
+                )
+
+    def _line(self, t_s: float, position: Vec3, reference: Reference) -> Iterator[Violation]:
+        """The tether itself: wound up, or in the rotors' way."""
+        tether = self._vehicle.tether
+        attitude = _leaning(reference)
+        state = self._watch.update(t_s, position, reference.velocity_world_m_s, attitude, reference.arm_rad, None, None)
+        if abs(state.turns) > tether.turns_max:
+            detail = f"{abs(state.turns):.2f} turns about anchor or vehicle, tether.turns_max is {tether.turns_max:g}"
+            yield Violation(
+                "turns", abs(state.turns), "winds up the tether", detail, "fly back the way it came, or turn back"
+            )
+        if state.clearance_m < tether.clearance_min_m:
+            detail = (
+                f"{state.clearance_m:.3f} m between line and rotors or arm, tether.clearance_min_m is {tether.clearance_min_m:g} "
+                f"(it is seen {math.degrees(state.elevation_rad):.0f} deg below the horizon)"
+            )
+            advice = "fly higher or nearer to the anchor, accelerate less, or tie it elsewhere"
+            yield Violation(
+                "line", tether.clearance_min_m - state.clearance_m, "brings the tether to the rotors", detail, advice
+            )
+
+    def _arm(self, position: Vec3, reference: Reference) -> Iterator[Violation]:
+        arm = self._vehicle.arm
+        for number, (angle_rad, joint) in enumerate(zip(reference.arm_rad, arm.joints, strict=True), start=1):
+            angle_deg = math.degrees(angle_rad)
+            low_deg, high_deg = joint.angle_deg
+            excess = max(low_deg - angle_deg, angle_deg - high_deg)
+            if excess > TOLERANCE:
+                what = f"drives joint {number} through its wall"
+                detail = f"{angle_deg:.1f} deg, {low_deg:g} to {high_deg:g} deg allowed"
+                yield Violation(f"joint {number}", excess, what, detail, "change arm_deg")
+        net_z_m = position[2] + self._manipulator.net_body_m(reference.arm_rad)[2] - self._vehicle.tool.net_radius_m
+        elbow_z_m = position[2] + self._manipulator.elbow_body_m(reference.arm_rad)[2] - ARM_RADIUS_M
+        for part, lowest_m in (("net", net_z_m), ("elbow", elbow_z_m)):
+            if lowest_m < FLOOR_GAP_M:
+                what = f"drags the {part} over the floor"
+                detail = f"its lowest point is {lowest_m:.2f} m high, {FLOOR_GAP_M:g} m is the least"
+                yield Violation(
+                    f"floor {part}", FLOOR_GAP_M - lowest_m, what, detail, "fly higher or fold the arm first"
+                )
+
+    def _motion(self, reference: Reference, jerks: tuple[Vec3, Vec2]) -> Iterator[Violation]:
+        limits = self._limits
+        speed = math.hypot(*reference.velocity_world_m_s)
+        acceleration = math.hypot(*reference.acceleration_world_m_s2)
+        arm_speed = math.degrees(max(map(abs, reference.arm_rate_rad_s)))
+        arm_acceleration = math.degrees(max(map(abs, reference.arm_acceleration_rad_s2)))
+        jerk = math.hypot(*jerks[0])
+        arm_jerk = math.degrees(max(map(abs, jerks[1])))
+        checked = (
+            ("speed_max_m_s", speed, limits.speed_max_m_s, "m/s", "flies too fast"),
+            ("acceleration_max_m_s2", acceleration, limits.acceleration_max_m_s2, "m/s^2", "accelerates too hard"),
+            ("jerk_max_m_s3", jerk, limits.jerk_max_m_s3, "m/s^3", "starts or stops too abruptly"),
+            ("arm_speed_max_deg_s", arm_speed, limits.arm_speed_max_deg_s, "deg/s", "turns a joint too fast"),
+            (
+                "arm_acceleration_max_deg_s2",
+                arm_acceleration,
+                limits.arm_acceleration_max_deg_s2,
+                "deg/s^2",
+                "accelerates a joint too hard",
+            ),
+            ("arm_jerk_max_deg_s3", arm_jerk, limits.arm_jerk_max_deg_s3, "deg/s^3", "jerks a joint"),
+        )
+        for key, value, limit, unit, what in checked:
+            if value > limit * (1.0 + TOLERANCE):
+                detail = f"{value:.3g} {unit}, limits.{key} is {limit:g}"
+                yield Violation(key, value / limit, what, detail, "take longer or go less far")
+        for number, joint in enumerate(self._vehicle.arm.joints, start=1):
+            rate = abs(math.degrees(reference.arm_rate_rad_s[number - 1]))
+            if rate > joint.velocity_max_deg_s * (1.0 + TOLERANCE):
+                what = f"turns joint {number} faster than it can"
+                detail = f"{rate:.3g} deg/s, the joint's velocity_max_deg_s is {joint.velocity_max_deg_s:g}"
+                yield Violation(f"velocity {number}", rate, what, detail, "take longer or go less far")
+
+    def _thrust(self, reference: Reference) -> Iterator[Violation]:
+        limits, airframe = self._limits, self._vehicle.airframe
+        ax, ay, az = reference.acceleration_world_m_s2
+        mass_kg = airframe.mass_kg + self._payload_kg
+        thrust_n = mass_kg * math.hypot(ax, ay, az + GRAVITY_M_S2) + self._tether_n
+        share = min(limits.thrust_share_max, THRUST_SHARE_MAX)
+        allowed_n = share * airframe.thrust_max_n
+        if thrust_n > allowed_n * (1.0 + TOLERANCE):
+            detail = (
+                f"{thrust_n:.1f} N with {self._payload_kg:g} kg of payload and the tether's weight, {allowed_n:.1f} N allowed "
+                f"({share:g} of {airframe.thrust_max_n:g} N)"
+            )
+            yield Violation("thrust", thrust_n, "needs too much thrust", detail, "take longer or carry less")
+        tilt_deg = math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2))
+        if tilt_deg > airframe.tilt_max_deg * (1.0 + TOLERANCE):
+            detail = f"{tilt_deg:.1f} deg, airframe.tilt_max_deg is {airframe.tilt_max_deg:g}"
+            yield Violation("tilt", tilt_deg, "leans too far", detail, "take longer or go less far")
+
+
+def _leaning(reference: Reference) -> Quat:
+    """Attitude of a vehicle that accelerates as the reference does."""
+    ax, ay, az = reference.acceleration_world_m_s2
+    c, s = math.cos(reference.yaw_rad), math.sin(reference.yaw_rad)
+    ahead, left, up = c * ax + s * ay, c * ay - s * ax, az + GRAVITY_M_S2
+    return quat_from_euler_zyx(-math.atan2(left, math.hypot(ahead, up)), math.atan2(ahead, up), reference.yaw_rad)
+
+
+def _world(position: Vec3, yaw_rad: float, body_m: Vec3) -> Vec3:
+    """A point of the level vehicle, world frame."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    x_m, y_m, z_m = body_m
+    return (position[0] + c * x_m - s * y_m, position[1] + s * x_m + c * y_m, position[2] + z_m)

@@ -1,0 +1,120 @@
+"""The way back along the tether: come to rest, fold the arm, go inward. Never outward, never up."""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Room, Vehicle
+from companion.mission.plan import (
+    FOLD_MIN_S,
+    FOLD_SPEED_RAD_S,
+    Plan,
+    PlanBuilder,
+    Segment,
+    stopping,
+)
+from companion.mission.reference import REST_TO_REST_PEAK_SPEED
+from companion.types import PhaseKind, Vec2, Vec3
+
+LEAST_WAY_M = 0.5
+"""So far inward in any case: a tether that pulls is shorter than the file says, or caught."""
+BESIDE_ANCHOR_M = 0.3
+"""Between rotors and the anchor's vertical: nobody lands on the anchor."""
+RETURN_MIN_S = 1.0
+
+
+def inward_only(velocity_m_s: Vec3, position_m: Vec3, anchor_m: Vec3) -> Vec3:
+    """The velocity without what leads up, or away from the anchor's vertical."""
+    vx, vy, vz = velocity_m_s
+    x, y = position_m[0] - anchor_m[0], position_m[1] - anchor_m[1]
+    away_m = math.hypot(x, y)
+    if away_m > 1e-6:
+        x, y = x / away_m, y / away_m
+        outward = max(0.0, vx * x + vy * y)
+        vx, vy = vx - outward * x, vy - outward * y
+    else:
+        vx = vy = 0.0
+    return (vx, vy, min(0.0, vz))
+
+
+def retract_from(
+    position_world_m: Vec3,
+    velocity_world_m_s: Vec3,
+    yaw_rad: float,
+    arm_rad: Vec2,
+    arm_fold_rad: Vec2,
+    vehicle: Vehicle,
+) -> Plan:
+    """Stop, then return slowly towards the anchor's vertical until `retract_slack_m` of tether is free; the arm folds meanwhile.
+
+    Distance from the anchor's vertical and height never grow, and no step leads out of the room. Two segments; a landing follows.
+
+    Args:
+        position_world_m: where the reference starts: the last reference.
+        velocity_world_m_s: what it starts with; what of it leads outward or up is dropped, the rest cut to `STOP_SPEED_MAX_M_S`.
+        yaw_rad: kept.
+        arm_rad: where the arm starts, from rest.
+        arm_fold_rad: where it goes.
+        vehicle: tether, room, airframe and speed of the return.
+    """
+    tether, safety, anchor = vehicle.tether, vehicle.safety, vehicle.tether.anchor_world_m
+    builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
+    fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
+    fold_s = max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * fold_rad / FOLD_SPEED_RAD_S)
+    builder.fold_arm(arm_fold_rad, fold_s)
+    velocity, stop_s = stopping(inward_only(velocity_world_m_s, position_world_m, anchor))
+    builder.t_s = builder.stop_within(_never_outward(velocity, stop_s, position_world_m, anchor), stop_s)
+    segments = [Segment("stop", PhaseKind.FLIGHT, 0.0, builder.t_s, -1)]
+    x, y, z = builder.position_m
+    away_m = math.hypot(x - anchor[0], y - anchor[1])
+    lever_m = math.hypot(*tether.attachment_body_m)
+    free_m = max(0.0, tether.length_m - safety.retract_slack_m - lever_m)
+    goal_m = min(math.sqrt(max(0.0, free_m * free_m - (z - anchor[2]) ** 2)), away_m - LEAST_WAY_M)
+    way_m = away_m - max(goal_m, vehicle.airframe.radius_m + BESIDE_ANCHOR_M)
+    if way_m > 0.0:
+        share = way_m / away_m
+        to = (x + share * (anchor[0] - x), y + share * (anchor[1] - y))
+        to = _inside(to, (x, y), vehicle.room, vehicle.airframe.radius_m)
+        duration_s = max(RETURN_MIN_S, REST_TO_REST_PEAK_SPEED * math.dist(to, (x, y)) / safety.retract_speed_m_s)
+        start_s = builder.t_s
+        builder.go((*to, z), duration_s)
+        builder.t_s = start_s + duration_s
+    builder.t_s = max(builder.t_s, fold_s)
+    segments.append(Segment("return", PhaseKind.FLIGHT, segments[0].end_s, builder.t_s, -1))
+    builder.segments += segments
+    return builder.plan("retract")
+
+
+def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anchor_m: Vec3) -> Vec3:
+    """The velocity turned so far inward that the straight way to the point of rest leads nowhere away from the anchor's vertical.
+
+    With r the distance at the start, a way of n inward and t sideways ends before it leads outward if n (r - n) >= t^2.
+    """
+    x, y = position_m[0] - anchor_m[0], position_m[1] - anchor_m[1]
+    away_m = math.hypot(x, y)
+    if away_m < 1e-6:
+        return (0.0, 0.0, velocity_m_s[2])
+    x, y = x / away_m, y / away_m
+    reach_s, half_m = 0.5 * duration_s, 0.5 * away_m
+    sideways_m = max(-half_m, min(half_m, reach_s * (x * velocity_m_s[1] - y * velocity_m_s[0])))
+    inward_m = max(
+        half_m - math.sqrt(max(0.0, half_m * half_m - sideways_m * sideways_m)),
+        min(half_m, -reach_s * (x * velocity_m_s[0] + y * velocity_m_s[1])),
+    )
+    return (
+        (-inward_m * x - sideways_m * y) / reach_s,
+        (-inward_m * y + sideways_m * x) / reach_s,
+        velocity_m_s[2],
+    )
+
+
+def _inside(to_m: Vec2, from_m: Vec2, room: Room, reach_m: float) -> Vec2:
+    """As far on the way as the rotors stay in the room; a start outside of it may go anywhere."""
+    share = 1.0
+    for goal, start, (low, high) in zip(to_m, from_m, (room.x_m, room.y_m), strict=True):
+        low, high = min(low + reach_m, start), max(high - reach_m, start)
+        if goal > high:
+            share = min(share, (high - start) / (goal - start))
+        elif goal < low:
+            share = min(share, (low - start) / (goal - start))
+    return (from_m[0] + share * (to_m[0] - from_m[0]), from_m[1] + share * (to_m[1] - from_m[1]))

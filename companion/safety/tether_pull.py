@@ -1,0 +1,129 @@
+"""How hard the tether pulls, from the force that nothing else explains.
+
+The residual is the disturbance of the whole machine less the force at the net: a caught payload is in both and drops out. What is
+left are wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the
+vertical part of the residual is worth less than the horizontal: the pull is the weighted least-squares fit of a force along the line.
+That is also why a payload is told apart when the force sensor is lost: it pulls down only, and the fit wants the horizontal part too.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Tether
+from companion.types import Vec3
+
+HORIZONTAL_N = 0.7
+"""Standard deviation of the horizontal residual without a tether: wind of a room, drag, tilt errors."""
+VERTICAL_N = 2.0
+"""Of the vertical residual: 7 % of the hover thrust."""
+CERTAIN = 3.0
+"""A pull is believed beyond so many standard deviations of the fit."""
+RELEASE = 0.6
+"""It has ended when it falls below this share of what started it."""
+SIDEWAYS_N = 6.0
+"""A horizontal residual of this size in any direction: held by something else than the anchor."""
+_FLAT, _STEEP = 1.0 / HORIZONTAL_N**2, 1.0 / VERTICAL_N**2
+"""Weights of the fit."""
+GROWTH_S = 0.3
+GROWTH_N_PER_M = 10.0
+"""Slope of the pull over the range from which on it is a line that tightens."""
+GROWTH_SPREAD_M2 = 1e-6
+"""Variance of the range below which there is no slope to see."""
+
+
+class PullEstimate:
+    """Low-pass, fit, and three verdicts with hysteresis.
+
+    Args:
+        tether: thresholds and time constants.
+    """
+
+    __slots__ = (
+        "_after_s",
+        "_cov",
+        "_f",
+        "_filter_s",
+        "_min_n",
+        "_pull_mean",
+        "_pull_s",
+        "_range_mean",
+        "_side_s",
+        "_var",
+        "growing",
+        "pull_n",
+        "pulling",
+        "sideways",
+    )
+
+    def __init__(self, tether: Tether) -> None:
+        self._min_n = tether.pull_min_n
+        self._filter_s = tether.pull_filter_s
+        self._after_s = tether.pull_time_s
+        self.forget()
+
+    def forget(self) -> None:
+        """As if nothing had been seen."""
+        self._f: Vec3 | None = None
+        self._pull_s = self._side_s = 0.0
+        self._range_mean = self._pull_mean = self._cov = self._var = 0.0
+        self.pull_n = 0.0
+        self.pulling = False
+        """Something pulls towards the anchor."""
+        self.sideways = False
+        """Something pulls horizontally, wherever to."""
+        self.growing = False
+        """While pulling: it grew with the range."""
+
+    def update(
+        self,
+        dt_s: float,
+        towards_anchor: Vec3,
+        range_m: float,
+        disturbance_world_n: Vec3 | None,
+        tool_force_world_n: Vec3 | None,
+    ) -> None:
+        """One tick; a unit vector from the attachment to the anchor, forces in the world frame."""
+        if disturbance_world_n is None:
+            if self._f is not None:
+                self.forget()
+            return
+        rx, ry, rz = disturbance_world_n
+        if tool_force_world_n is not None:
+            rx -= tool_force_world_n[0]
+            ry -= tool_force_world_n[1]
+            rz -= tool_force_world_n[2]
+        before = self._f
+        if before is None:
+            # Not the sample: a single one is mostly noise.
+            before = (0.0, 0.0, 0.0)
+            self._range_mean = range_m
+        gain = dt_s / (self._filter_s + dt_s)
+        fx = before[0] + gain * (rx - before[0])
+        fy = before[1] + gain * (ry - before[1])
+        fz = before[2] + gain * (rz - before[2])
+        self._f = (fx, fy, fz)
+        ux, uy, uz = towards_anchor
+        weight = (ux * ux + uy * uy) * _FLAT + uz * uz * _STEEP
+        if weight <= 0.0:
+            return  # at the anchor: no direction
+        pull = ((ux * fx + uy * fy) * _FLAT + uz * fz * _STEEP) / weight
+        self.pull_n = pull
+
+        gain = dt_s / (GROWTH_S + dt_s)
+        d_range, d_pull = range_m - self._range_mean, pull - self._pull_mean
+        self._range_mean += gain * d_range
+        self._pull_mean += gain * d_pull
+        keep = 1.0 - gain
+        self._cov = keep * (self._cov + gain * d_range * d_pull)
+        self._var = keep * (self._var + gain * d_range * d_range)
+
+        least = max(self._min_n, CERTAIN / math.sqrt(weight))
+        self._pull_s = self._pull_s + dt_s if pull > (RELEASE * least if self.pulling else least) else 0.0
+        self.pulling = self._pull_s > 0.0 and (self.pulling or self._pull_s >= self._after_s)
+        side_2 = fx * fx + fy * fy
+        limit = RELEASE * SIDEWAYS_N if self.sideways else SIDEWAYS_N
+        self._side_s = self._side_s + dt_s if side_2 > limit * limit else 0.0
+        self.sideways = self._side_s > 0.0 and (self.sideways or self._side_s >= self._after_s)
+        grows = self._var > GROWTH_SPREAD_M2 and self._cov > GROWTH_N_PER_M * self._var
+        self.growing = self.pulling and (self.growing or grows)

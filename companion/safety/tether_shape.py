@@ -1,0 +1,126 @@
+"""How near the hanging line comes to rotors and arm.
+
+A line that hangs still lies in the vertical plane through its two ends, below their chord, and above its own tangent at the vehicle:
+a hanging line is convex. So it is bounded by two rays from the attachment, the chord and the steepest tangent that its slack allows;
+what happens beyond a metre from the vehicle matters to neither rotors nor arm. The tangent is that of the parabola of the same length,
+which for much slack goes straight down, as the line does. Wind and rotor wash on the line are not in it: `clearance_min_m` is for them.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Vehicle
+from companion.types import Vec2, Vec3
+
+_NEVER = 1.0
+"""How far a line is followed that never leaves the disk, m."""
+
+
+def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float) -> Vec2:
+    """Unit direction (towards the anchor's vertical, up) of the hanging line at the vehicle.
+
+    A parabola over the horizontal span h with the sag s has the length c + 8/3 s^2 h^2 / c^3 (c the chord, flat enough), so
+    s = sqrt(3/8 slack c^3) / h, and the slope at its end is that of the chord less 4 s / h.
+
+    Args:
+        level_m: horizontal distance to the anchor, h.
+        drop_m: height of the anchor above the attachment (negative: below).
+        chord_m: straight distance, c.
+        slack_m: length less chord, not negative.
+    """
+    along = level_m * level_m
+    up = drop_m * level_m - 4.0 * chord_m * math.sqrt(0.375 * slack_m * chord_m)
+    norm = math.sqrt(along * along + up * up)
+    return (along / norm, up / norm) if norm > 0.0 else (0.0, -1.0)
+
+
+class Clearance:
+    """Rotors as a ring in the plane through the body's origin, the arm as a slab about its plane.
+
+    Args:
+        vehicle: airframe, arm, tool, and where the tether is tied.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._p = vehicle.tether.attachment_body_m
+        self._inner_m = vehicle.tether.rotor_inner_radius_m
+        self._outer_m = max(vehicle.airframe.radius_m, self._inner_m)
+        self._off_axis_m = math.hypot(self._p[0], self._p[1])
+        self._below = self._p[2] <= 0.0
+        arm, tool = vehicle.arm, vehicle.tool
+        self._shoulder = arm.shoulder_body_m
+        self._l1, self._l2 = arm.link_lengths_m
+        self._net_m = tool.net_radius_m
+        self._reach_m = self._l1 + self._l2 + self._net_m
+        self._aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
+        self.judges_arm = self._aside_m > 0.0
+        """False: tied in the arm's own plane, the line hangs into its sweep whatever is flown: a matter of building, not of flying."""
+        self.needs_hanging = self.judges_arm or not self._below
+        """False: `least_m` has no use for the hanging direction."""
+
+    def least_m(self, straight_body: Vec3, hanging_body: Vec3 | None, arm_rad: Vec2 | None) -> float:
+        """Least distance, negative if the line touches.
+
+        Args:
+            straight_body: unit direction from the attachment to the anchor.
+            hanging_body: unit direction in which the line may leave when it hangs deepest; None: straight.
+            arm_rad: the paper's angles; None: the arm may be anywhere within its reach.
+        """
+        # Tied below the rotors the line comes nearest when it is straight, tied above them when it hangs deepest.
+        nearest = straight_body if self._below or hanging_body is None else hanging_body
+        least = self._rotors_m(nearest)
+        if self.judges_arm:
+            reach_m = self._reach_m if arm_rad is None else self._arm_reach_m(arm_rad)
+            least = min(least, self._arm_m(straight_body, reach_m))
+            if hanging_body is not None:
+                least = min(least, self._arm_m(hanging_body, reach_m))
+        return least
+
+    def _rotors_m(self, d: Vec3) -> float:
+        px, py, pz = self._p
+        dx, dy, dz = d
+        if not self._below:
+            pz, dz = -pz, -dz
+        flat_2 = dx * dx + dy * dy
+        inner, outer, off = self._inner_m, self._outer_m, self._off_axis_m
+        b, c = px * dx + py * dy, px * px + py * py
+        if off > outer:
+            if b >= 0.0 or flat_2 <= 0.0:
+                return off - outer  # leads away from the disk
+            passes_2 = c - b * b / flat_2
+            if passes_2 >= outer * outer:
+                return math.sqrt(passes_2) - outer
+        out_s = (math.sqrt(max(0.0, b * b - flat_2 * (c - outer * outer))) - b) / flat_2 if flat_2 > 1e-12 else _NEVER
+        if off >= inner:
+            at_s = 0.0 if off <= outer else (-b - math.sqrt(b * b - flat_2 * (c - outer * outer))) / flat_2
+            return -pz - max(at_s * dz, out_s * dz)
+        # Through the middle, where there are no blades: what counts is how steeply it passes the ring's inner edge.
+        flat = math.sqrt(flat_2)
+        if flat < 1e-6:
+            return math.hypot(inner - off, pz) if dz > 0.0 else inner - off
+        in_s = (math.sqrt(b * b - flat_2 * (c - inner * inner)) - b) / flat_2
+        return min(math.hypot(inner - off, pz), (-pz - max(in_s * dz, out_s * dz)) * flat)
+
+    def _arm_reach_m(self, arm_rad: Vec2) -> float:
+        """Farthest point of arm and net from the shoulder."""
+        l1, l2 = self._l1, self._l2
+        net_m = math.sqrt(max(0.0, l1 * l1 + l2 * l2 + 2.0 * l1 * l2 * math.cos(arm_rad[1])))
+        return max(l1, net_m + self._net_m)
+
+    def _arm_m(self, d: Vec3, reach_m: float) -> float:
+        """Distance of a ray from the slab |y - y_shoulder| <= net radius, within `reach_m` of the shoulder, in its plane."""
+        px, py, pz = self._p
+        sx, sy, sz = self._shoulder
+        dx, dy, dz = d
+        x, y, z = px - sx, py - sy, pz - sz
+        if y < 0.0:
+            y, dy = -y, -dy
+        aside = self._aside_m
+        if dy >= 0.0:
+            return max(aside, math.hypot(x, z) - reach_m)
+        enter_s = aside / -dy
+        leave_s = (y + self._net_m) / -dy
+        flat_2 = dx * dx + dz * dz
+        nearest_s = max(enter_s, min(leave_s, -(x * dx + z * dz) / flat_2)) if flat_2 > 1e-12 else enter_s
+        return math.hypot(x + nearest_s * dx, z + nearest_s * dz) - reach_m

@@ -1,0 +1,194 @@
+"""The guardian in the fast closed loop: its own watch and its own landing, on simulated time, over a wire that is only memory.
+
+What its process does beside that (kill, take the port) is told here by how long it takes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.config.vehicle import Vehicle
+from companion.guardian.beat import Beat
+from companion.guardian.charge import Charge, Tell, Told
+from companion.guardian.link import Link
+from companion.guardian.process import PERIOD_S
+from companion.guardian.watch import StallWatch
+from companion.types import AutopilotRequest, Event, Inputs, MocapPose, Outputs, PhaseKind, SafetyAction, Severity
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.receive import Receiver
+from sitl.autopilot.streams import STREAMS, Schedule
+
+TAKE_OVER_S = 0.03
+"""From the decision to the first message: the flight process is killed, its port opened."""
+_OWN = (1, 191)
+_IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
+
+
+class MemoryWire:
+    """The guardian's wire to the stub."""
+
+    def __init__(self, px4: Px4Stub) -> None:
+        self.schedule = Schedule(False)
+        self._px4 = px4
+        self._receiver = Receiver(px4)
+        self._end = _StubEnd(self)
+        self._decoder = mavlink.MAVLink(None)
+        self._encoder = mavlink.MAVLink(
+            None, srcSystem=px4.params.integer("MAV_SYS_ID"), srcComponent=px4.params.integer("MAV_COMP_ID")
+        )
+        self._waiting: deque[bytes] = deque()
+
+    # -- the guardian's end ----------------------------------------------------------------------------------------
+
+    def fileno(self) -> int:
+        """Nothing to wait on."""
+        return -1
+
+    @property
+    def ready(self) -> bool:
+        """There is nobody to look for."""
+        return True
+
+    def send(self, data: bytes) -> None:
+        """Handled at once."""
+        for message in self._decoder.parse_buffer(data) or ():
+            self._receiver.handle(self._end, message)
+
+    def receive(self) -> list[bytes]:
+        """What the stub has sent."""
+        waiting = list(self._waiting)
+        self._waiting.clear()
+        return waiting
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    # -- the stub's end --------------------------------------------------------------------------------------------
+
+    def pump(self, t_s: float) -> None:
+        """Streams that are due."""
+        for message_id in self.schedule.due(t_s):
+            message = STREAMS[message_id].build(self._px4)
+            if message is not None:
+                self.post(message)
+
+    def post(self, message: Any) -> None:
+        """One message of the stub."""
+        self._waiting.append(message.pack(self._encoder))
+
+
+class _StubEnd:
+    """What the receiver answers through."""
+
+    def __init__(self, wire: MemoryWire) -> None:
+        self._wire = wire
+        self.schedule = wire.schedule
+
+    def send(self, message: Any) -> None:
+        self._wire.post(message)
+
+    def send_all_params(self) -> None:
+        """Nobody here asks for them."""
+
+    def saw_ground_station(self) -> None:
+        """There is none."""
+
+    def status_text(self, severity: int, text: str) -> None:
+        """Nobody reads it."""
+
+
+class StandIn:
+    """The guardian of one fast flight.
+
+    Args:
+        vehicle: for the timeout and the height of a vehicle that stands.
+        px4: the other end of its wire.
+    """
+
+    def __init__(self, vehicle: Vehicle, px4: Px4Stub) -> None:
+        self._vehicle = vehicle
+        self._px4 = px4
+        self._watch = StallWatch(vehicle.safety.guardian_timeout_s)
+        self._beat: Beat | None = None
+        self._pilot = False
+        self._round_s = 0.0
+        self.events: list[Event] = []
+        self.alive = True
+
+    def beat(self, inputs: Inputs, outputs: Outputs) -> None:
+        """A control tick of the flight process, as `companion.flight_guard` tells it."""
+        self._pilot = self._pilot or any(event.id == "pilot_took_over" for event in outputs.events)
+        armed = inputs.status is not None and inputs.status.armed
+        mocap, before = inputs.mocap, self._beat
+        stamp_s, position = (
+            (before.pose_stamp_s, before.position_world_m) if before else (float("-inf"), (0.0, 0.0, 0.0))
+        )
+        if mocap is not None and mocap.tracking_valid and outputs.mocap_trusted:
+            stamp_s, position = mocap.stamp_s, mocap.position_world_m
+        self._beat = Beat(
+            tick=inputs.tick,
+            t_s=inputs.t_s,
+            origin_s=0.0,
+            mission_t_s=outputs.mission_t_s,
+            lifting=armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR,
+            pilot=self._pilot,
+            goodbye=outputs.outcome is not None,
+            autopilot_system=self._px4.params.integer("MAV_SYS_ID"),
+            own_system=_OWN[0],
+            own_component=_OWN[1],
+            local_port=0,
+            pose_stamp_s=stamp_s,
+            position_world_m=position,
+        )
+
+    def must_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
+        """One look at the flight process; to be asked in every tick."""
+        if not self.alive or self._beat is None or not self._beat.lifting or t_s - self._round_s < PERIOD_S - 1e-9:
+            return False
+        self._round_s = t_s
+        hangs = self._watch.update(t_s, heard)
+        if not (hangs or dead):
+            return False
+        reason = (
+            "the flight process died"
+            if dead
+            else f"the flight process hangs (silent for {self._watch.silent_s * 1e3:.0f} ms)"
+        )
+        text = f"{reason}; the guardian has taken over"
+        self._tell(Told(t_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+        return True
+
+    def take_over(self, t_s: float) -> Landing:
+        """In charge from now on."""
+        assert self._beat is not None
+        return Landing(self._beat, self._vehicle.airframe.ground_clearance_m, self._px4, t_s, self._tell)
+
+    def _tell(self, told: Told) -> None:
+        self.events.append(Event(told.t_s, told.id, told.severity, told.action, told.text))
+
+
+class Landing:
+    """The guardian in charge."""
+
+    def __init__(self, beat: Beat, clearance_m: float, px4: Px4Stub, t_s: float, tell: Tell) -> None:
+        self._wire = MemoryWire(px4)
+        self._link = Link(self._wire, _OWN, beat.autopilot_system)
+        self._charge = Charge(beat, clearance_m, self._link, t_s, tell)
+        self._round_s = float("-inf")
+
+    @property
+    def landed(self) -> bool | None:
+        """As `Charge.landed`."""
+        return self._charge.landed
+
+    def step(self, t_s: float, poses: list[MocapPose]) -> None:
+        """To be called in every step of the physics."""
+        self._charge.take_poses(poses)
+        if t_s - self._round_s >= PERIOD_S - 1e-9:
+            self._round_s = t_s
+            self._wire.pump(t_s)
+            self._charge.take_messages(t_s, self._link.receive())
+            self._charge.step(t_s)

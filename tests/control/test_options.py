@@ -1,0 +1,126 @@
+"""The options beyond the paper: each adds what its formula says, and nothing where it is off."""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Any
+
+import pytest
+
+from companion.config.controller import AdaptiveConfig
+from companion.config.loader import FlightConfig, load_flight
+from companion.control.adaptive import AdaptiveController
+from companion.control.arm_inertia import ArmInertia
+from companion.control.disturbance import DisturbanceObserver
+from companion.control.dynamics import Dynamics
+from companion.control.types import PlantState
+from companion.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+
+POSE: Vec2 = (math.radians(100), math.radians(60))
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+OFF: dict[str, Any] = {
+    "disturbance_time_xyz_s": ZERO,
+    "feedforward_lead_s": 0.0,
+    "arm_inertia_nominal": False,
+    "arm_friction_share": 0.0,
+}
+
+
+@pytest.fixture(scope="module")
+def config() -> FlightConfig:
+    return load_flight("configs/missions/catch.yaml", preset="recommended")
+
+
+def tau(config: FlightConfig, option: dict[str, Any], reference: Reference, rate: Vec2 = (0.0, 0.0)) -> list[float]:
+    assert isinstance(config.controller, AdaptiveConfig)
+    controller = AdaptiveController(config.controller.model_copy(update=OFF | option), config.vehicle, 0.49)
+    state = PlantState((0.0, 0.0, 1.0), ZERO, ZERO, IDENTITY_QUAT, ZERO, POSE, rate, ZERO)
+    return list(controller.step(0.005, state, reference, 1.0).log.tau)
+
+
+def difference(
+    config: FlightConfig, option: dict[str, Any], reference: Reference, rate: Vec2 = (0.0, 0.0)
+) -> list[float]:
+    with_it, without = tau(config, option, reference, rate), tau(config, {}, reference, rate)
+    return [a - b for a, b in zip(with_it, without, strict=True)]
+
+
+def test_the_lead_adds_mass_times_jerk_times_lead_and_only_sideways(config: FlightConfig) -> None:
+    reference = Reference((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0, POSE, (0.0, 0.0), (0.0, 0.0), (2.0, -1.0, 3.0))
+    added = difference(config, {"feedforward_lead_s": 0.15}, reference)
+    assert added[:3] == pytest.approx([3.0 * 0.15 * 2.0, -3.0 * 0.15 * 1.0, 0.0])
+    assert added[6:] == [0.0, 0.0]
+
+
+def test_friction_follows_the_rate_that_is_wanted_not_the_one_that_is_measured(config: FlightConfig) -> None:
+    option = {"arm_friction_share": 1.0}
+    friction_nm = config.vehicle.arm.joint_friction_nm
+    moving = Reference((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0, POSE, (1.0, -1.0), (0.0, 0.0))
+    added = difference(config, option, moving)
+    assert added[6:] == pytest.approx([friction_nm, -friction_nm], rel=1e-3)
+    resting = Reference((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0, POSE, (0.0, 0.0), (0.0, 0.0))
+    assert difference(config, option, resting, rate=(1.0, -1.0))[6:] == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
+def test_the_arms_inertia_takes_the_place_of_m_d(config: FlightConfig) -> None:
+    reference = Reference((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0, POSE, (0.0, 0.0), (2.0, 1.0))
+    added = difference(config, {"arm_inertia_nominal": True}, reference)
+    (m11, m12), (m21, m22) = Dynamics(config.vehicle).arm_terms(POSE, (0.0, 0.0)).mass
+    assert isinstance(config.controller, AdaptiveConfig)
+    first, second = config.controller.inertia_md[6:8]
+    assert added[6:] == pytest.approx([(m11 - first) * 2.0 + m12, m21 * 2.0 + m22 - second])
+
+
+def test_the_closed_form_of_the_arm_is_the_dynamics(config: FlightConfig) -> None:
+    draw = random.Random(1)
+    closed, dynamics = ArmInertia(config.vehicle), Dynamics(config.vehicle)
+    for _ in range(200):
+        angle, rate, acceleration = ((draw.gauss(0, 3), draw.gauss(0, 3)) for _ in range(3))
+        terms = dynamics.arm_terms(angle, rate)
+        (m11, m12), (m21, m22) = terms.mass
+        wanted = (
+            m11 * acceleration[0] + m12 * acceleration[1] + terms.coriolis[0],
+            m21 * acceleration[0] + m22 * acceleration[1] + terms.coriolis[1],
+        )
+        assert closed.torque_nm(angle, rate, acceleration) == pytest.approx(wanted, abs=1e-12)
+
+
+def test_the_observer_finds_a_steady_force_whatever_is_asked_for() -> None:
+    observer = DisturbanceObserver(3.0, (0.5, 0.5, 0.0), 0.1, 6.0)
+    push, lagged = 1.5, 0.0
+    for tick in range(1200):
+        asked = 4.0 * math.sin(0.01 * tick)
+        found = observer.step(0.005, (asked, 0.0, 0.0), ((lagged + push) / 3.0, 0.0, 5.0), learn=True)
+        lagged += (1.0 - math.exp(-0.005 / 0.1)) * (asked - lagged)
+    assert found == pytest.approx((push, 0.0, 0.0), abs=0.15)
+    observer.reset()
+    assert observer.force_n == ZERO
+
+
+def test_the_observer_is_bounded_and_stands_still_when_told() -> None:
+    observer = DisturbanceObserver(3.0, (0.1, 0.1, 0.1), 0.0, 2.0)
+    for _ in range(500):
+        observer.step(0.005, ZERO, (10.0, -10.0, 0.1), learn=True)
+    assert observer.force_n == pytest.approx((2.0, -2.0, 0.3), abs=1e-3)
+    before = observer.force_n
+    observer.step(0.005, ZERO, (-50.0, 50.0, 9.0), learn=False)
+    assert observer.force_n == before
+
+
+def test_a_force_that_the_base_gives_way_to_is_not_observed_away(config: FlightConfig) -> None:
+    """With base rows on, a pushed base that moves as its impedance says is not disturbed; without them the same push is."""
+    assert isinstance(config.controller, AdaptiveConfig)
+    found = []
+    for compliance in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
+        law = config.controller.model_copy(update={"base_compliance_xyz": compliance})
+        controller = AdaptiveController(law, config.vehicle, 0.49)
+        for _ in range(400):
+            state = PlantState(
+                (0.0, 0.0, 1.0), ZERO, (2.0 / 3.0, 0.0, 0.0), IDENTITY_QUAT, ZERO, POSE, (0.0, 0.0), (2.0, 0.0, 0.0)
+            )
+            reference = Reference((0.0, 0.0, 1.0), ZERO, ZERO, 0.0, 0.0, POSE, (0.0, 0.0), (0.0, 0.0))
+            controller.step(0.005, state, reference, 1.0)
+        found.append(controller._disturbance.force_n[0])
+    without, with_rows = found
+    assert without - with_rows > 1.0

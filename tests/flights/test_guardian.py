@@ -1,0 +1,152 @@
+"""The flight process is killed or hung in the air, over real wires: the guardian lands the vehicle. benchmarks/guardian.py measures."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from companion.analysis.log import FlightLog
+from companion.config.loader import load_flight
+from companion.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
+from companion.launcher import Launcher
+from companion.types import Outcome
+from sitl.flight_faults import SIGNALS
+from tests.support import CATCH, HOVER, Sandbox, read_summary, sandbox_in
+
+OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
+FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=3.0")
+IN_FLIGHT = "  hold\n"
+STAND_M = 0.4
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path) as sandbox:
+        yield sandbox
+
+
+def events_of(summary: dict[str, Any]) -> list[str]:
+    return [event["id"] for event in summary["events"]]
+
+
+def hooked(folder: Path) -> dict[str, str]:
+    """An environment in which every Python imports the `sitecustomize` of that folder."""
+    return {"PYTHONPATH": os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))}
+
+
+@pytest.mark.flight
+@pytest.mark.parametrize("kind", list(SIGNALS))
+def test_at_the_catch_the_guardian_lands(sandbox: Sandbox, kind: str) -> None:
+    fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
+    with sandbox.start("fly", CATCH, "--sitl", "--out", "out", "--set", fault) as running:
+        ended = running.end()
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    out = sandbox.cwd / "out"
+    assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
+    assert len(ended.err_lines) == 1, ended.err
+    how = "was ended by SIGKILL" if kind == "kill_flight" else "hung and was killed"
+    assert ended.err.startswith(f"flight: the flight process {how}; the guardian landed the vehicle")
+    summary = read_summary(out)
+    assert summary["outcome"] == "aborted"
+    ids = events_of(summary)
+    assert ids[-4:] == ["guardian_took_over", "guardian_land", "guardian_touchdown", "guardian_landed"]
+    stamps_s = [event["t_s"] for event in summary["events"] if event["id"].startswith("guardian")]
+    assert stamps_s == sorted(stamps_s)
+    log = FlightLog.read(out / "flight.mcap")
+    assert log.closed
+    assert log.missing_ticks() == 0
+    with open(out / "flight.mcap", "rb") as file:
+        lines = b"".join(message.data for _, _, message in make_reader(file).iter_messages(topics=["/log"]))
+    assert b"guardian_landed" in lines, "the log goes on to the end"
+
+
+@pytest.mark.flight
+def test_the_vehicle_stands_where_it_was_left(tmp_path: Path) -> None:
+    """The world's own word, not the guardian's."""
+    fault = "world.faults=[{kind: stop_flight, t_s: 6}]"
+    launcher = Launcher(load_flight(HOVER, overrides=[fault]), tmp_path, sitl=True, on_message=lambda message: None)
+    result = launcher.run()
+    assert result.outcome is Outcome.ABORTED
+    assert not result.world["crashed"]
+    report = result.world["flight_fault"]
+    assert report["kind"] == "stop_flight"
+    assert report["disarmed_s"] is not None
+    assert report["drift_m"] < 0.5
+    assert report["worst_tilt_deg"] < 30.0
+
+
+@pytest.mark.flight
+def test_a_guardian_that_dies_in_the_air_is_told_and_the_flight_goes_on(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for(IN_FLIGHT)
+        os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGKILL)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_OK
+    assert ended.err_lines == ["guardian: the guardian process was ended by SIGKILL; see out/guardian.log"]
+    assert "guardian_lost" in events_of(read_summary(sandbox.cwd / "out"))
+
+
+def test_without_a_guardian_nothing_takes_off(tmp_path: Path) -> None:
+    """It cannot even start: what it needs is broken."""
+    broken = tmp_path / "packages"
+    broken.mkdir()
+    hook = "import sys\nif 'companion.guardian' in sys.orig_argv:\n    raise SystemExit('a broken guardian')\n"
+    (broken / "sitecustomize.py").write_text(hook, encoding="utf-8")
+    with sandbox_in(tmp_path / "sandbox", hooked(broken)) as sandbox:
+        ended = sandbox.run(*FLY)
+        sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+        summary = read_summary(sandbox.cwd / "out")
+    assert ended.code == EXIT_REFUSED, ended.err
+    assert "guardian: expected it to stand by, found that its process ended" in ended.err
+    assert summary["outcome"] == "refused"
+
+
+def test_a_guardian_that_dies_before_take_off_refuses_the_flight(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("  wait\n")
+        os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGKILL)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_REFUSED, ended.err
+    ids = events_of(read_summary(sandbox.cwd / "out"))
+    assert "guardian_lost" in ids
+    assert "takeoff" not in ids
+
+
+@pytest.mark.flight
+def test_an_error_of_the_flight_process_lands_by_the_guardian(tmp_path: Path) -> None:
+    """A bug in the core, met in the air: the process ends at once, with a traceback in its log."""
+    hooks = tmp_path / "hooks"
+    hooks.mkdir()
+    (hooks / "sitecustomize.py").write_text(_BUG, encoding="utf-8")
+    with sandbox_in(tmp_path / "sandbox", hooked(hooks)) as sandbox:
+        ended = sandbox.run(*FLY)
+        sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+        summary = read_summary(sandbox.cwd / "out")
+    assert ended.code == EXIT_ABORTED, ended.err
+    assert "ended with exit code 70 (ZeroDivisionError: a bug); the guardian landed the vehicle" in ended.err
+    assert events_of(summary)[-1] == "guardian_landed"
+
+
+_BUG = """
+import sys
+
+if "companion.app" in sys.orig_argv:
+    import companion.core
+
+    class Breaking(companion.core.FlightCore):
+        def step(self, inputs):
+            outputs = super().step(inputs)
+            if outputs.mission_t_s > 4.0:
+                raise ZeroDivisionError("a bug")
+            return outputs
+
+    companion.core.FlightCore = Breaking
+"""

@@ -1,0 +1,286 @@
+"""The ladder flown: hold, go on, retract, abort, a pilot who takes over, broken inputs. Fast closed loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cache
+from itertools import pairwise
+
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.core import FlightCore
+from companion.frames import tilt_rad
+from companion.record import differences
+from companion.types import (
+    AutopilotRequest,
+    FlightMode,
+    Inputs,
+    OperatorCommand,
+    Outcome,
+    Outputs,
+    SafetyAction,
+    VehicleState,
+)
+from sitl.fast import FastFlight, FastResult
+
+replace = dataclasses.replace
+Change = Callable[[Inputs], Inputs]
+
+
+def configured(*overrides: str) -> FlightConfig:
+    return load_flight("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
+
+
+class Changed(FastFlight):
+    """A flight whose companion sees other inputs than there are."""
+
+    def __init__(self, config: FlightConfig, change: Change) -> None:
+        super().__init__(config)
+        self._change = change
+
+    def _inputs(self, tick: int) -> Inputs:
+        return self._change(super()._inputs(tick))
+
+
+def flown(change: Change, *overrides: str) -> FastResult:
+    return Changed(configured(*overrides), change).run()
+
+
+def asking(*script: tuple[float, OperatorCommand]) -> Change:
+    """Each command from its time on."""
+
+    def change(i: Inputs) -> Inputs:
+        asked = [command for t_s, command in script if i.t_s >= t_s]
+        return replace(i, command=asked[-1]) if asked else i
+
+    return change
+
+
+def event_ids(result: FastResult) -> list[str]:
+    return [event.id for outputs in result.outputs for event in outputs.events]
+
+
+def at(result: FastResult, t_s: float) -> Outputs:
+    return next(outputs for outputs in result.outputs if outputs.t_s >= t_s)
+
+
+def assert_safe(result: FastResult) -> None:
+    assert not result.crashed
+    assert max(tilt_rad(truth.attitude_wxyz) for truth in result.truth) < math.radians(25)
+    assert result.truth[-1].position_world_m[2] < 0.35
+
+
+def test_held_it_stays_and_going_on_it_completes() -> None:
+    result = flown(asking((8.0, OperatorCommand.HOLD), (14.0, OperatorCommand.RESUME)))
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert event_ids(result) == ["takeoff", "operator_hold", "operator_resume", "catch", "touchdown"]
+    held = [truth.position_world_m for truth in result.truth if 10.0 < truth.t_s < 14.0]
+    assert max(math.dist(held[0], p) for p in held) < 0.05
+    assert at(result, 12.0).action is SafetyAction.HOLD
+    assert at(result, 15.0).action is SafetyAction.NOMINAL
+    assert_safe(result)
+
+
+def test_held_too_long_it_lands() -> None:
+    result = flown(asking((8.0, OperatorCommand.HOLD)), "vehicle.safety.hold_max_s=3")
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert event_ids(result) == ["takeoff", "operator_hold", "hold_expired", "touchdown"]
+    assert_safe(result)
+
+
+def test_held_just_above_the_floor_it_lands() -> None:
+    result = flown(asking((3.6, OperatorCommand.HOLD)))
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert "no_room_to_stay" in event_ids(result)
+    assert_safe(result)
+
+
+def test_a_landing_is_not_held() -> None:
+    result = flown(asking((23.0, OperatorCommand.HOLD)))
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+
+
+@pytest.mark.parametrize(
+    "script", [((9.0, OperatorCommand.ABORT),), ((8.0, OperatorCommand.HOLD), (9.0, OperatorCommand.ABORT))]
+)
+def test_aborted_it_lands_at_once_with_the_arm_folded(script: tuple[tuple[float, OperatorCommand], ...]) -> None:
+    result = flown(asking(*script, (10.0, OperatorCommand.RESUME)))
+    last = result.outputs[-1]
+    assert (last.outcome, last.action) == (Outcome.ABORTED, SafetyAction.LAND)
+    assert last.t_s < 15.0
+    folded = [math.degrees(angle) for angle in result.truth[-1].joint_angle_rad]
+    assert max(abs(a - b) for a, b in zip(folded, (165.0, 140.0), strict=True)) < 12
+    assert_safe(result)
+
+
+TAUT = ("vehicle.tether.length_m=1.98", "vehicle.tether.margin_m=0.05", "vehicle.tether.taut_slack_m=0.15")
+"""Taut on the last centimetres of the way up."""
+
+
+def test_taut_it_goes_back_along_the_tether_and_lands() -> None:
+    result = flown(lambda i: i, *TAUT)
+    ids = event_ids(result)
+    assert ids == ["takeoff", "tether_taut", "retract_done", "touchdown"]
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    anchor = load_flight("configs/missions/catch.yaml").vehicle.tether.anchor_world_m
+    way = [o.reference.position_world_m for o in result.outputs if o.action is SafetyAction.RETRACT and o.reference]
+    away = [math.dist(p[:2], anchor[:2]) for p in way]
+    # The governor takes the little that is left of the climb out within its acceleration.
+    assert max(b - a for a, b in pairwise(away)) < 1e-4
+    assert max(p[2] for p in way) - way[0][2] < 0.01
+    assert at(result, result.outputs[-1].t_s - 2.5).tether.slack_m > 0.55  # type: ignore[union-attr]
+    assert_safe(result)
+
+
+def test_a_way_back_that_takes_too_long_becomes_a_landing() -> None:
+    result = flown(lambda i: i, *TAUT, "vehicle.safety.retract_max_s=1.0")
+    assert event_ids(result) == ["takeoff", "tether_taut", "retract_expired", "touchdown"]
+    assert_safe(result)
+
+
+@pytest.mark.parametrize(
+    ("script", "overrides", "stolen_s"),
+    [
+        (((8.0, OperatorCommand.HOLD),), (), 10.0),
+        ((), TAUT, 7.0),
+        (((8.0, OperatorCommand.LAND),), (), 9.0),
+    ],
+    ids=["in a hold", "in a retract", "in a landing"],
+)
+def test_a_pilot_who_takes_over_is_left_alone(
+    script: tuple[tuple[float, OperatorCommand], ...], overrides: tuple[str, ...], stolen_s: float
+) -> None:
+    asked = asking(*script)
+
+    def change(i: Inputs) -> Inputs:
+        i = asked(i)
+        if i.status is not None and i.t_s >= stolen_s:
+            i = replace(i, status=replace(i.status, mode=FlightMode.MANUAL))
+        return i
+
+    result = flown(change, *overrides)
+    assert "pilot_took_over" in event_ids(result)
+    after = [o for o in result.outputs if o.t_s >= stolen_s]
+    assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
+    assert len(after) > 100
+
+
+def test_a_pilot_who_takes_over_from_px4s_landing_is_left_alone() -> None:
+    """Motion capture is lost, PX4 lands, somebody takes the sticks: no request goes against them."""
+
+    def change(i: Inputs) -> Inputs:
+        if i.status is not None and i.t_s >= 9.5:
+            i = replace(i, status=replace(i.status, mode=FlightMode.MANUAL))
+        return i
+
+    result = flown(change, "world.faults=[{kind: mocap_loss, t_s: 6.0}]")
+    after = [o for o in result.outputs if o.t_s >= 9.5]
+    assert any(event.text == "a pilot took over" for o in after for event in o.events)
+    assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
+
+
+# -- broken inputs ---------------------------------------------------------------------------------------------------
+
+NAN3 = (math.nan, math.nan, math.nan)
+BROKEN: dict[str, Callable[[Inputs], Inputs]] = {
+    "mocap": lambda i: replace(i, mocap=replace(i.mocap, position_world_m=NAN3)),  # type: ignore[type-var]
+    "vehicle": lambda i: replace(i, vehicle=replace(i.vehicle, velocity_world_m_s=NAN3)),  # type: ignore[type-var]
+    "status": lambda i: replace(i, status=replace(i.status, battery_voltage_v=math.inf)),  # type: ignore[type-var]
+    "arm": lambda i: replace(i, arm=replace(i.arm, angle_rad=(math.nan, 1.0))),  # type: ignore[type-var]
+    "force": lambda i: replace(i, force=replace(i.force, force_sensor_n=(math.inf, 0.0, 0.0))),  # type: ignore[type-var]
+}
+
+
+@pytest.mark.parametrize("part", BROKEN)
+def test_broken_values_for_a_moment_never_reach_the_law_and_the_mission_goes_on(part: str) -> None:
+    def change(i: Inputs) -> Inputs:
+        now_and_then = 6.0 <= i.t_s < 12.0 and i.tick % 40 < 4
+        return BROKEN[part](i) if now_and_then else i
+
+    result = flown(change)
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert f"{part}_not_finite" in event_ids(result)
+    for o in result.outputs:
+        numbers = [*(o.attitude.attitude_wxyz if o.attitude else ()), *(o.arm_torque_nm or ())]
+        if o.control is not None:
+            numbers += [*o.control.tau, *o.control.h_hat, *o.control.gamma, o.control.hover_thrust]
+        assert all(map(math.isfinite, numbers))
+    assert_safe(result)
+
+
+@pytest.mark.parametrize(
+    ("part", "lost"), [("mocap", "mocap_lost"), ("vehicle", "vehicle_state_lost"), ("arm", "arm_lost")]
+)
+def test_broken_values_for_good_are_a_lost_device(part: str, lost: str) -> None:
+    result = flown(lambda i: BROKEN[part](i) if i.t_s >= 8.0 else i)
+    assert lost in event_ids(result)
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert not result.crashed
+
+
+def test_poses_of_another_body_are_not_passed_on_and_px4_lands() -> None:
+    def change(i: Inputs) -> Inputs:
+        if i.mocap is None or i.t_s < 8.0:
+            return i
+        x, y, z = i.mocap.position_world_m
+        return replace(i, mocap=replace(i.mocap, position_world_m=(x + 0.8, y, z)))
+
+    result = flown(change)
+    ids = event_ids(result)
+    assert ids[:3] == ["takeoff", "mocap_jump", "mocap_swapped"]
+    swapped = next(e for o in result.outputs for e in o.events if e.id == "mocap_swapped")
+    assert swapped.t_s - 8.0 < 0.15
+    assert all(o.mocap_trusted == (o.t_s < 8.0) for o in result.outputs if o.t_s < 10.0)
+
+
+# -- nothing is sent again -------------------------------------------------------------------------------------------
+
+
+@cache
+def ordinary() -> FastResult:
+    return FastFlight(configured()).run()
+
+
+@pytest.mark.parametrize("part", ["vehicle", "arm"])
+def test_no_command_answers_a_state_that_is_older_than_it_may_be(part: str) -> None:
+    """The link falls silent: the edge goes on showing the last state. Attitude ends within 100 ms, torque within 50 ms."""
+    inputs = ordinary().inputs
+    begin = next(k for k, i in enumerate(inputs) if i.t_s >= 8.0)
+    core = FlightCore(FastFlight(configured()).config)
+    for i in inputs[:begin]:
+        core.step(i)
+    sent = []
+    for i in inputs[begin : begin + 60]:
+        o = core.step(replace(i, **{part: getattr(inputs[begin], part)}))
+        frozen = inputs[begin].vehicle if part == "vehicle" else inputs[begin].arm
+        assert frozen is not None
+        stamp_s = frozen.attitude_stamp_s if isinstance(frozen, VehicleState) else frozen.stamp_s
+        sent.append((i.t_s - stamp_s, o.attitude if part == "vehicle" else o.arm_torque_nm))
+    limit_s = 0.1 if part == "vehicle" else 0.05
+    assert all((command is not None) == (age_s <= limit_s) for age_s, command in sent)
+    assert sent[-1][0] > 2 * limit_s
+
+
+def test_the_same_inputs_give_the_same_outputs_bit_for_bit_also_through_hold_and_retract() -> None:
+    for result in (
+        flown(asking((8.0, OperatorCommand.HOLD), (11.0, OperatorCommand.RESUME), (12.0, OperatorCommand.ABORT))),
+        flown(lambda i: i, *TAUT),
+    ):
+        core = None
+        for i, o in zip(result.inputs, result.outputs, strict=True):
+            core = core or FlightCore(
+                Changed(configured(*(TAUT if "tether_taut" in event_ids(result) else ())), lambda i: i).config
+            )
+            assert differences(o, core.step(i)) is None
+
+
+@pytest.mark.parametrize("payload_kg", [0.1, 0.3])
+@pytest.mark.parametrize("wind", ["[3, 0, 0]", "[0, -3, 0]", "[-2, 2, 0.5]"])
+def test_no_monitor_cries_in_an_ordinary_flight(payload_kg: float, wind: str) -> None:
+    result = FastFlight(configured(f"world.payload_kg={payload_kg}", f"world.wind_m_s={wind}")).run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert event_ids(result) == ["takeoff", "catch", "touchdown"]
+    assert all(o.action is SafetyAction.NOMINAL and not o.bent_by and o.mocap_trusted for o in result.outputs)

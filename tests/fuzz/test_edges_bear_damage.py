@@ -1,0 +1,58 @@
+"""Every wire bears a few thousand damaged inputs, and every input that it once did not bear. `benchmarks/fuzz.py` feeds a million."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+
+import pytest
+
+from benchmarks.fuzz import REGRESSIONS
+from benchmarks.fuzzing.campaign import feed_watched, run
+from benchmarks.fuzzing.targets import NAMES, target_class
+
+INPUTS = {
+    "natnet": 4000,
+    "dynamixel": 4000,
+    "dynamixel-wire": 60,
+    "force": 4000,
+    "mavlink": 4000,
+    "mavlink-wire": 60,
+    "channels": 4000,
+    "yaml": 2500,
+}
+SEED = 20
+FOUND = sorted(REGRESSIONS.glob("*.bin"))
+
+
+def target_of_file(stem: str) -> str:
+    return stem.rsplit("-", 2)[0]
+
+
+@pytest.fixture(autouse=True)
+def quiet() -> Iterator[None]:
+    """The edges say what they refuse; thousands of lines help nobody."""
+    logger = logging.getLogger("companion")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    yield
+    logger.setLevel(before)
+
+
+def test_every_target_is_fed_here() -> None:
+    assert set(INPUTS) == set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_input_is_borne(name: str) -> None:
+    with target_class(name)() as target:
+        stretch = run(target, SEED, 0, INPUTS[name])
+    assert stretch.inputs == INPUTS[name]
+    # Memory is judged over a million inputs, where caches and the interpreter's arenas are filled.
+    assert [str(finding) for finding in stretch.findings if finding.index is not None] == []
+
+
+@pytest.mark.parametrize("stem", [path.stem for path in FOUND])
+def test_what_was_found_once_is_borne(stem: str) -> None:
+    with target_class(target_of_file(stem))() as target:
+        assert feed_watched(target, (REGRESSIONS / f"{stem}.bin").read_bytes()) is None

@@ -1,0 +1,226 @@
+"""A guardian process on real sockets: beside it a child that plays the flight process, PX4's end of the wire, and a NatNet server."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion import status
+from companion.config.loader import load_flight
+from companion.guardian import beat as words
+from companion.guardian.beat import Beat
+from companion.io.packets import TEXT
+from companion.launcher import with_devices
+from companion.record import unpack_plain
+from companion.types import Quat, Vec3
+from sitl.natnet import BodyPose, NatNetServer
+from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from tests.support import DEADLINE_S, HOVER, wait_until
+
+LAND_MODE = 4 << 16 | 6 << 24
+HOLD_MODE = 4 << 16 | 3 << 24
+OFFBOARD_MODE = 6 << 16
+ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+DISARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+POSITION_M: Vec3 = (0.5, -0.25, 1.25)
+ATTITUDE: Quat = (0.9689124217106447, 0.0, 0.0, 0.24740395925452294)
+"""Yaw 0.5 rad."""
+OWN_IDS = (1, 195)
+# Holds PX4's port as the flight process does, and does nothing: the test speaks to the guardian in its name.
+_FLIGHT = "import socket, sys; s = socket.socket(type=2); s.bind(('127.0.0.1', int(sys.argv[1]))); print(flush=True); sys.stdin.read()"
+
+
+class Cameras:
+    """A NatNet server (unicast) that streams one still body at 100 Hz, in a thread."""
+
+    def __init__(self, body_id: int) -> None:
+        self.position_m: Vec3 = POSITION_M
+        self.tracked = True
+        self.port = 0
+        self._body_id = body_id
+        self._started = threading.Event()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="cameras")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        assert self._started.wait(DEADLINE_S)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join(DEADLINE_S)
+
+    async def _serve(self) -> None:
+        async with NatNetServer(bodies=((self._body_id, "companion"),)) as server:
+            self.port = server.command_port
+            self._started.set()
+            while not self._stop.is_set():
+                now_s = time.monotonic()
+                server.publish(now_s, (BodyPose(self._body_id, self.position_m, ATTITUDE, self.tracked),), now_s)
+                await asyncio.sleep(0.01)
+
+
+class Rig:
+    """One guardian with everything around it; `with` starts it and ends what is left by pid."""
+
+    def __init__(self, folder: Path, *, timeout_s: float = 0.2) -> None:
+        self._folder = folder
+        self._timeout_s = timeout_s
+        self.port = free_udp_port()
+        self.peer = Px4Peer(self.port)
+        self.peer.base_mode, self.peer.custom_mode = ARMED, OFFBOARD_MODE
+        self.peer.landed = mavlink.MAV_LANDED_STATE_IN_AIR
+        self.origin_s = time.monotonic() - 10.0
+        self.tick = 0
+        self.messages: list[status.Message] = []
+        self.logged: list[tuple[Any, ...]] = []
+
+    def __enter__(self) -> Self:
+        config = load_flight(HOVER)
+        body = config.vehicle.devices.mocap.rigid_body_id
+        self.cameras = Cameras(body).__enter__()
+        devices: dict[str, dict[str, Any]] = {
+            "autopilot": {"address": f"udpin://127.0.0.1:{self.port}"},
+            "mocap": {
+                "server": "127.0.0.1",
+                "interface": "127.0.0.1",
+                "transport": "unicast",
+                "command_port": self.cameras.port,
+            },
+        }
+        data = json.loads(with_devices(config, devices).model_dump_json())
+        data["vehicle"]["safety"]["guardian_timeout_s"] = self._timeout_s
+        path = self._folder / "config.json"
+        path.write_text(json.dumps(data), encoding="utf-8")
+
+        self.flight = subprocess.Popen(
+            [sys.executable, "-c", _FLIGHT, str(self.port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert self.flight.stdout is not None
+        self.flight.stdout.readline()  # it holds the port
+        self.peer.__enter__()
+        self.beats, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.channel, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.recorder, recorder = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.channel.setblocking(False)
+        self.recorder.setblocking(False)
+        self.beats.setblocking(False)
+        pidfd = os.pidfd_open(self.flight.pid)
+        self.log = self._folder / "guardian.log"
+        with theirs, channel, open(self.log, "wb") as log:
+            self.guardian = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "companion.guardian", "--config", str(path), "--pidfd", str(pidfd)),
+                    *("--beats", str(theirs.fileno()), "--channel", str(channel.fileno())),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                pass_fds=(theirs.fileno(), channel.fileno(), pidfd),
+            )
+        os.close(pidfd)
+        with recorder:
+            socket.send_fds(self.beats, [words.ADOPT], [recorder.fileno()])
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in (self.guardian, self.flight):
+            if process.poll() is None:
+                process.kill()
+            process.wait(DEADLINE_S)
+        for pipe in (self.flight.stdin, self.flight.stdout):
+            assert pipe is not None
+            pipe.close()
+        self.peer.__exit__(None, None, None)
+        self.cameras.__exit__(None, None, None)
+        for opened in (self.beats, self.channel, self.recorder):
+            opened.close()
+
+    def beat(self, *, lifting: bool = True, pilot: bool = False, goodbye: bool = False) -> None:
+        """One tick of the flight process."""
+        self.tick += 1
+        t_s = time.monotonic() - self.origin_s
+        beat = Beat(
+            tick=self.tick,
+            t_s=t_s,
+            origin_s=self.origin_s,
+            mission_t_s=5.0,
+            lifting=lifting,
+            pilot=pilot,
+            goodbye=goodbye,
+            autopilot_system=1,
+            own_system=OWN_IDS[0],
+            own_component=OWN_IDS[1],
+            local_port=self.port,
+            pose_stamp_s=t_s,
+            position_world_m=POSITION_M,
+        )
+        self.beats.send(words.pack(beat))
+
+    def beat_until_ready(self, **kind: bool) -> None:
+        """Ticks until the guardian says that it could take over; ends with a tick of this kind."""
+
+        def ready() -> bool:
+            self.beat(**kind)
+            try:
+                return bool(self.beats.recv(words.MAX_BYTES) == words.READY)
+            except BlockingIOError:
+                return False
+
+        wait_until(ready, lambda: f"the guardian is not ready: {self.log.read_text()}")
+        self.beat(**kind)
+
+    def listen(self) -> None:
+        """Take in what went to launcher and recorder."""
+        for into, opened in ((self.messages, self.channel), (self.logged, self.recorder)):
+            while True:
+                try:
+                    data = opened.recv(65536)
+                except (BlockingIOError, ConnectionResetError):
+                    break
+                if not data:
+                    break
+                into.append(json.loads(data) if opened is self.channel else unpack_plain(data))
+
+    @property
+    def events(self) -> list[str]:
+        """Ids of the guardian's events, as the launcher got them."""
+        self.listen()
+        return [message["id"] for message in self.messages if message["type"] == "event"]
+
+    @property
+    def log_ids(self) -> list[str]:
+        """Ids of the lines that the recorder got."""
+        self.listen()
+        return [packet[4] for packet in self.logged if packet[0] == TEXT]
+
+    @property
+    def result(self) -> status.Message | None:
+        """The guardian's last word."""
+        self.listen()
+        return next((message for message in self.messages if message["type"] == "guardian_result"), None)
+
+    def land_as_told(self) -> None:
+        """PX4's part, once LAND was commanded: the mode, the floor, the disarm."""
+        wait_until(lambda: bool(self.peer.commands(mavlink.MAV_CMD_NAV_LAND)), lambda: self.log.read_text())
+        self.peer.custom_mode = LAND_MODE
+        wait_until(lambda: "guardian_land" in self.events, lambda: self.log.read_text())
+        self.peer.landed = mavlink.MAV_LANDED_STATE_ON_GROUND
+        wait_until(lambda: bool(self.peer.commands(mavlink.MAV_CMD_COMPONENT_ARM_DISARM)), lambda: self.log.read_text())
+        self.peer.base_mode = DISARMED

@@ -1,0 +1,156 @@
+"""The flight process's side: what it tells, and what it makes of what it hears."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from companion.config.loader import load_flight
+from companion.core import FlightCore
+from companion.flight_guard import FlightGuard
+from companion.guardian import beat as words
+from companion.guardian.client import SILENT_S, GuardianClient
+from companion.io.autopilot import LinkIdentity
+from companion.io.edges import DeviceError
+from companion.types import (
+    AutopilotRequest,
+    AutopilotStatus,
+    Event,
+    FlightMode,
+    Inputs,
+    LandedState,
+    MocapPose,
+    OperatorCommand,
+    Outputs,
+    PhaseKind,
+    SafetyAction,
+    Severity,
+)
+from tests.support import HOVER
+
+Pair = tuple[GuardianClient, socket.socket]
+
+
+class Clock:
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def pair(clock: Clock) -> Iterator[Pair]:
+    ours, guardian = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    guardian.setblocking(False)
+    with ours, guardian:
+        yield GuardianClient(ours, clock), guardian
+
+
+def test_ready_is_a_word_of_the_last_second(pair: Pair, clock: Clock) -> None:
+    client, guardian = pair
+    client.listen()
+    assert not client.ready
+    guardian.send(words.READY)
+    client.listen()
+    assert client.ready
+    clock.now_s += SILENT_S
+    client.listen()
+    assert not client.ready
+
+
+def test_a_problem_ends_readiness_and_is_told(pair: Pair) -> None:
+    client, guardian = pair
+    guardian.send(words.READY)
+    guardian.send(words.PROBLEM + "mocap: ärger".encode())
+    client.listen()
+    assert not client.ready
+    with pytest.raises(DeviceError, match=r"guardian: not ready within -1 s: mocap: ärger"):
+        asyncio.run(client.wait_ready(-1.0))
+
+
+def test_a_dead_guardian_is_noticed_and_costs_nothing(pair: Pair) -> None:
+    client, guardian = pair
+    guardian.send(words.READY)
+    guardian.close()
+    client.listen()
+    assert not client.ready
+    client.beat(_beat())
+    with pytest.raises(DeviceError, match="its process ended"):
+        asyncio.run(client.wait_ready())
+
+
+def test_a_guardian_that_does_not_read_never_blocks_the_flight(pair: Pair) -> None:
+    client, guardian = pair
+    for _ in range(20_000):  # far beyond what the socket holds
+        client.beat(_beat())
+    assert words.unpack(guardian.recv(words.MAX_BYTES)) == _beat()
+
+
+def _beat() -> words.Beat:
+    return words.Beat(1, 2.0, 3.0, 0.0, True, False, False, 1, 1, 195, 14540, 1.9, (0.0, 0.0, 1.0))
+
+
+def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
+    status = AutopilotStatus(5.0, armed, FlightMode.OFFBOARD, LandedState.IN_AIR, None, None)
+    mocap = MocapPose(4.9, None, 1, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), tracking, 0.0)
+    return Inputs(9, 5.0, None, status, mocap, None, None, OperatorCommand.NONE, 0)
+
+
+@pytest.fixture(scope="module")
+def waiting() -> Outputs:
+    """What the core decides on the ground, in the first tick."""
+    airframe = {"vehicle.airframe.hover_thrust": 0.5}
+    config = load_flight(HOVER, overrides=[f"{key}={value}" for key, value in airframe.items()])
+    return FlightCore(config).step(inputs())
+
+
+@pytest.mark.parametrize(
+    ("armed", "request_", "kind", "lifting"),
+    [
+        (False, AutopilotRequest.NONE, PhaseKind.GROUND, False),
+        (False, AutopilotRequest.OFFBOARD, PhaseKind.GROUND, False),
+        (False, AutopilotRequest.ARM, PhaseKind.GROUND, True),
+        (True, AutopilotRequest.NONE, PhaseKind.GROUND, True),
+        (False, AutopilotRequest.NONE, PhaseKind.TAKEOFF, True),
+        (True, AutopilotRequest.NONE, PhaseKind.FLIGHT, True),
+        (False, AutopilotRequest.NONE, PhaseKind.LANDING, True),
+        (True, AutopilotRequest.DISARM, PhaseKind.DONE, True),
+        (False, AutopilotRequest.NONE, PhaseKind.DONE, False),
+    ],
+)
+def test_when_the_rotors_may_turn(
+    pair: Pair, waiting: Outputs, armed: bool, request_: AutopilotRequest, kind: PhaseKind, lifting: bool
+) -> None:
+    client, guardian = pair
+    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 14540), 77.0)
+    guard.tick(inputs(armed=armed), dataclasses.replace(waiting, request=request_, phase_kind=kind))
+    beat = words.unpack(guardian.recv(words.MAX_BYTES))
+    assert beat is not None
+    assert beat.lifting is lifting
+    assert (beat.tick, beat.t_s, beat.origin_s) == (9, 5.0, 77.0)
+    assert (beat.autopilot_system, beat.own_system, beat.own_component, beat.local_port) == (1, 1, 195, 14540)
+    assert (beat.pose_stamp_s, beat.position_world_m) == (4.9, (1.0, 2.0, 3.0))
+
+
+def test_a_pilot_stays_one_and_a_pose_that_is_not_believed_is_not_passed_on(pair: Pair, waiting: Outputs) -> None:
+    client, guardian = pair
+    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 0), 0.0)
+    event = Event(5.0, "pilot_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "a pilot")
+    guard.tick(inputs(tracking=False), dataclasses.replace(waiting, events=(event,)))
+    guard.tick(inputs(), dataclasses.replace(waiting, mocap_trusted=False))
+    guard.goodbye()
+    beats = [words.unpack(guardian.recv(words.MAX_BYTES)) for _ in range(3)]
+    assert [beat is not None and (beat.pilot, beat.goodbye, beat.pose_stamp_s) for beat in beats] == [
+        (True, False, float("-inf")),
+        (True, False, float("-inf")),
+        (True, True, float("-inf")),
+    ]

@@ -1,0 +1,193 @@
+"""The guardian's wires, each against a real other end, and what it says on them beside what MAVSDK says."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import select
+import socket
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.config.vehicle import AutopilotDevice
+from companion.frames import quat_from_euler_zyx
+from companion.guardian.link import Link, SerialWire, TcpWire, UdpWire, Wire, address_problem, open_wire
+from companion.io.autopilot import MavsdkAutopilot
+from companion.io.autopilot_link import udp_ports
+from companion.types import MocapPose
+from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from tests.support import DEADLINE_S, wait_until
+
+POSE = MocapPose(12.345678, None, 7, (1.25, -2.5, 0.75), quat_from_euler_zyx(0.1, -0.2, 2.3), True, 0.0002)
+
+
+def heartbeat(system: int = 1, component: int = 1) -> bytes:
+    encoder = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    packed: bytes = mavlink.MAVLink_heartbeat_message(2, 12, 209, 4 << 16 | 6 << 24, 4, 3).pack(encoder)
+    return packed
+
+
+def wait_readable(wire: Wire) -> None:
+    assert select.select([wire.fileno()], [], [], DEADLINE_S)[0]
+
+
+@contextmanager
+def opened(address: str, local_port: int = 0) -> Iterator[Wire]:
+    wire = open_wire(address, local_port)
+    try:
+        yield wire
+    finally:
+        wire.close()
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["udpin://0.0.0.0:14540", "udpout://10.0.0.7:14540", "tcpout://10.0.0.7:5760", "serial:///dev/ttyAMA0:921600"],
+)
+def test_addresses_that_can_be_taken_over(address: str) -> None:
+    assert address_problem(address) is None
+
+
+@pytest.mark.parametrize("address", ["tcpin://0.0.0.0:5760", "udpin://0.0.0.0", "/dev/ttyAMA0"])
+def test_addresses_that_cannot(address: str) -> None:
+    assert address in str(address_problem(address))
+
+
+def test_udpin_learns_where_px4_is() -> None:
+    port = free_udp_port()
+    with opened(f"udpin://127.0.0.1:{port}") as wire, closing(socket.socket(type=socket.SOCK_DGRAM)) as px4:
+        px4.settimeout(DEADLINE_S)
+        assert not wire.ready
+        wire.send(b"lost")
+        px4.sendto(b"no MAVLink", ("127.0.0.1", port))
+        wait_readable(wire)
+        assert wire.receive() == [b"no MAVLink"]
+        assert not wire.ready
+        px4.sendto(heartbeat(), ("127.0.0.1", port))
+        wait_readable(wire)
+        assert wire.receive() == [heartbeat()]
+        assert wire.ready
+        wire.send(b"heard")
+        assert px4.recv(100) == b"heard"
+
+
+def test_udpin_is_not_to_be_had_while_the_flight_holds_it() -> None:
+    with closing(socket.socket(type=socket.SOCK_DGRAM)) as flight:
+        flight.bind(("127.0.0.1", 0))
+        with pytest.raises(OSError, match="in use"):
+            open_wire(f"udpin://127.0.0.1:{flight.getsockname()[1]}", 0)
+
+
+def test_udpout_speaks_from_the_port_of_the_flight() -> None:
+    with closing(socket.socket(type=socket.SOCK_DGRAM)) as px4:
+        px4.settimeout(DEADLINE_S)
+        px4.bind(("127.0.0.1", 0))
+        port = free_udp_port()
+        with opened(f"udpout://127.0.0.1:{px4.getsockname()[1]}", port) as wire:
+            assert isinstance(wire, UdpWire) and wire.ready
+            wire.send(b"hello")
+            data, address = px4.recvfrom(100)
+            assert (data, address) == (b"hello", ("127.0.0.1", port))
+
+
+def test_tcpout() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+        server.settimeout(DEADLINE_S)
+        with opened(f"tcpout://127.0.0.1:{server.getsockname()[1]}") as wire:
+            assert isinstance(wire, TcpWire)
+            connection, _ = server.accept()
+            with connection:
+                connection.settimeout(DEADLINE_S)
+                wire.send(b"out")
+                assert connection.recv(100) == b"out"
+                connection.sendall(b"in")
+                wait_readable(wire)
+                assert wire.receive() == [b"in"]
+
+
+def test_serial() -> None:
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        with opened(f"serial://{os.ttyname(slave)}:921600") as wire:
+            assert isinstance(wire, SerialWire)
+            wire.send(heartbeat())
+            assert os.read(master, 1000) == heartbeat()
+            os.write(master, heartbeat())
+            wait_readable(wire)
+            assert b"".join(wire.receive()) == heartbeat()
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+def test_only_px4_itself_is_listened_to_and_noise_does_no_harm() -> None:
+    with closing(socket.socket(type=socket.SOCK_DGRAM)) as px4:
+        px4.bind(("127.0.0.1", 0))
+        with opened(f"udpout://127.0.0.1:{px4.getsockname()[1]}") as wire:
+            link = Link(wire, (1, 195), 1)
+            link.heartbeat()
+            _, ours = px4.recvfrom(1000)
+            cut = heartbeat()[:-5]
+            for data in (
+                b"\xfd",
+                cut,
+                os.urandom(300),
+                heartbeat(255, 190),
+                heartbeat(1, 154),
+                heartbeat(2, 1),
+                heartbeat(),
+            ):
+                px4.sendto(data, ours)
+            found = []
+
+            def heard() -> bool:
+                found.extend(link.receive())
+                return bool(found)
+
+            wait_until(heard, lambda: "nothing came")
+            assert [(m.get_type(), m.get_srcSystem(), m.get_srcComponent()) for m in found] == [("HEARTBEAT", 1, 1)]
+
+
+def test_it_says_what_mavsdk_says() -> None:
+    """VISION_POSITION_ESTIMATE and HEARTBEAT of the flight process and of the guardian, field by field."""
+    port = free_udp_port()
+
+    async def by_mavsdk() -> tuple[int, int, int]:
+        async with MavsdkAutopilot(AutopilotDevice(address=f"udpin://127.0.0.1:{port}"), time.monotonic) as autopilot:
+            assert autopilot.send_vision(POSE)
+            await asyncio.to_thread(peer.wait_for, "VISION_POSITION_ESTIMATE")
+            await asyncio.to_thread(peer.wait_for, "HEARTBEAT")
+            identity = autopilot.identity()
+            assert identity.local_port == port
+            return identity.autopilot_system, identity.own_system, identity.own_component
+
+    with Px4Peer(port) as peer:
+        system, *own = asyncio.run(by_mavsdk())
+        with opened(f"udpin://127.0.0.1:{port}") as wire:
+            link = Link(wire, (own[0], own[1]), system)
+            wait_until(lambda: bool(link.receive()), lambda: "PX4 is not heard")
+            before = len(peer.of("HEARTBEAT"))
+            link.heartbeat()
+            link.vision(POSE)
+            peer.wait_for("VISION_POSITION_ESTIMATE", 2)
+            peer.wait_for("HEARTBEAT", before + 1)
+        for name in ("VISION_POSITION_ESTIMATE", "HEARTBEAT"):
+            theirs, ours = peer.of(name)[0], peer.of(name)[-1]
+            assert str(ours) == str(theirs)
+            assert (ours.get_srcSystem(), ours.get_srcComponent()) == (
+                theirs.get_srcSystem(),
+                theirs.get_srcComponent(),
+            )
+
+
+def test_the_ports_of_this_process() -> None:
+    before = udp_ports()
+    with closing(socket.socket(type=socket.SOCK_DGRAM)) as one:
+        one.bind(("127.0.0.1", 0))
+        assert udp_ports() - before == {one.getsockname()[1]}

@@ -1,0 +1,177 @@
+"""The guardian process for real: sockets, a process that it ends, PX4 and cameras at their ends of the wires."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.frames import ned_from_enu, wrap_rad
+from tests.guardian.rig import HOLD_MODE, OWN_IDS, POSITION_M, Rig
+from tests.support import DEADLINE_S, wait_until
+
+NAV_LAND, ARM_DISARM = mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+
+
+def test_it_imports_no_more_than_it_needs() -> None:
+    code = "import sys, companion.guardian.process; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=DEADLINE_S)
+    tops = {name.partition(".")[0] for name in done.stdout.split()}
+    assert not tops & {"numpy", "pydantic", "mavsdk", "asyncio", "yaml", "rich", "serial", "foxglove", "subprocess"}
+
+
+def test_a_clean_end_of_the_flight_ends_it_quietly(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.beat(goodbye=True)
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        assert rig.flight.poll() is None, "it was not its business to end it"
+        assert (rig.events, rig.result, rig.log.read_text()) == ([], None, "")
+        assert rig.peer.received == []
+
+
+@pytest.mark.parametrize("ticks", [True, False])
+def test_a_flight_process_that_dies_on_the_ground_needs_no_guardian(tmp_path: Path, ticks: bool) -> None:
+    with Rig(tmp_path) as rig:
+        if ticks:
+            rig.beat_until_ready(lifting=False)
+        rig.flight.kill()
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        assert (rig.events, rig.result) == ([], None)
+        assert rig.peer.received == []
+
+
+def test_silence_on_the_ground_is_no_stall(tmp_path: Path) -> None:
+    with Rig(tmp_path, timeout_s=0.05) as rig:
+        rig.beat_until_ready(lifting=False)
+        # "ready" comes every 0.1 s of the loop that also counts silence
+        for _ in range(10):
+            rig.beats.setblocking(True)
+            rig.beats.recv(1024)
+        rig.beats.setblocking(False)
+        assert rig.flight.poll() is None
+        rig.beat(lifting=False, goodbye=True)
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        assert rig.events == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, number: signal.Signals) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        os.kill(rig.flight.pid, number)
+        rig.land_as_told()
+        assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
+        assert rig.flight.wait(DEADLINE_S) == -signal.SIGKILL
+        ids = ["guardian_took_over", "guardian_land", "guardian_landed"]
+        assert rig.events == ids
+        assert rig.log_ids == ids, "the recorder got the same"
+        assert rig.result is not None and rig.result["landed"] is True
+        sources = {(m.get_srcSystem(), m.get_srcComponent()) for m in rig.peer.received}
+        assert sources == {OWN_IDS}
+        beat = rig.peer.of("HEARTBEAT")[0]
+        assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
+        assert len(rig.peer.commands(ARM_DISARM)) >= 1
+        assert {m.param1 for m in rig.peer.commands(ARM_DISARM)} == {0.0}
+
+
+def test_poses_go_on_as_the_flight_sent_them(tmp_path: Path) -> None:
+    """Frames, fields and time base; compared with the values on the cameras' side, not with the code that converts."""
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.flight.kill()
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", 20)
+        poses = rig.peer.of("VISION_POSITION_ESTIMATE")
+        pose = poses[-1]
+        assert (pose.x, pose.y, pose.z) == pytest.approx(ned_from_enu(POSITION_M), abs=1e-6)
+        assert (pose.roll, pose.pitch) == pytest.approx((0.0, 0.0), abs=1e-6)
+        assert wrap_rad(pose.yaw - (math.pi / 2 - 0.5)) == pytest.approx(0.0, abs=1e-6)
+        assert math.isnan(pose.covariance[0])
+        stamps_s = [p.usec * 1e-6 for p in poses]
+        assert stamps_s == sorted(stamps_s)
+        assert 10.0 < stamps_s[0] < 10.0 + DEADLINE_S, "on the flight clock, which was 10 s old"
+
+
+def test_land_is_commanded_until_px4_lands(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.peer.acks[NAV_LAND] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+        rig.beat_until_ready()
+        rig.flight.kill()
+        wait_until(lambda: len(rig.peer.commands(NAV_LAND)) >= 4, rig.log.read_text)
+        wait_until(lambda: "guardian_refused" in rig.events, rig.log.read_text)
+        rig.land_as_told()
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        assert rig.events[-1] == "guardian_landed"
+
+
+def test_without_any_heartbeat_it_lands_all_the_same(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.peer.beating = False
+        rig.flight.kill()
+
+        def commanded() -> bool:
+            # One message of any kind tells where PX4 is; none tells its mode.
+            rig.peer.say(mavlink.MAVLink_system_time_message(0, 0))
+            return bool(rig.peer.commands(NAV_LAND))
+
+        wait_until(commanded, rig.log.read_text)
+
+
+@pytest.mark.parametrize("told_by", ["beat", "mode"])
+def test_a_pilot_is_respected(tmp_path: Path, told_by: str) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready(pilot=told_by == "beat")
+        rig.peer.custom_mode = HOLD_MODE
+        rig.flight.kill()
+        wait_until(lambda: "guardian_pilot" in rig.events, rig.log.read_text)
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", 50)
+        rig.peer.base_mode &= ~mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        asked = {m.command for m in rig.peer.of("COMMAND_LONG")}
+        assert asked <= {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE}
+        assert rig.peer.of("SET_ATTITUDE_TARGET") == []
+
+
+def test_a_pilot_who_takes_over_from_the_guardian_is_respected(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.flight.kill()
+        wait_until(lambda: bool(rig.peer.commands(NAV_LAND)), rig.log.read_text)
+        rig.peer.custom_mode = 3 << 16  # position mode
+        wait_until(lambda: "guardian_pilot" in rig.events, rig.log.read_text)
+        before = len(rig.peer.commands(NAV_LAND))
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", len(rig.peer.of("VISION_POSITION_ESTIMATE")) + 50)
+        assert len(rig.peer.commands(NAV_LAND)) == before
+
+
+def test_a_jump_of_motion_capture_is_held_back(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.flight.kill()
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", 5)
+        x, y, z = POSITION_M
+        rig.cameras.position_m = (x + 50.0, y, z)
+        wait_until(lambda: "guardian_mocap" in rig.events, rig.log.read_text)
+        assert max(abs(pose.y - x) for pose in rig.peer.of("VISION_POSITION_ESTIMATE")) < 1e-3
+
+
+def test_it_is_not_ready_without_a_body_of_its_own(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.cameras.tracked = False
+        said: list[bytes] = []
+
+        def blind() -> bool:
+            try:
+                said.append(rig.beats.recv(1024))
+            except BlockingIOError:
+                return False
+            return b"sees no rigid body" in said[-1]
+
+        wait_until(blind, lambda: f"{said} {rig.log.read_text()}")

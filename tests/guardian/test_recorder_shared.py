@@ -1,0 +1,47 @@
+"""The recorder's channel in the guardian's hands: its lines are written, nothing is miscounted, and the flight ends it."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from companion.io.packets import TEXT, UNNUMBERED
+from companion.io.recorder import RecorderProcess
+from companion.record import pack_plain
+from companion.types import Severity
+
+
+def lines_of(path: Path) -> bytes:
+    with open(path, "rb") as file:
+        return b"".join(message.data for _, _, message in make_reader(file).iter_messages(topics=["/log"]))
+
+
+def shared(path: Path) -> tuple[RecorderProcess, socket.socket]:
+    recorder = RecorderProcess.start(path, config_json="{}", epoch_offset_ns=0)
+    return recorder, socket.socket(fileno=os.dup(recorder.client.fileno()))
+
+
+def test_the_flight_closes_the_log_though_the_guardian_holds_the_channel(tmp_path: Path) -> None:
+    recorder, guardian = shared(tmp_path / "flight.mcap")
+    with guardian:
+        recorder.client.text(1.0, Severity.INFO, "flight", "of the flight")
+        guardian.send(pack_plain((TEXT, UNNUMBERED, 1.5, "warning", "guardian_land", "of the guardian")))
+        recorder.client.text(2.0, Severity.INFO, "flight", "of the flight again")
+        report = recorder.finish()
+    assert (report.error, report.dropped) == (None, 0)
+    assert lines_of(tmp_path / "flight.mcap").count(b"of the") == 3
+
+
+def test_the_log_ends_with_the_guardian_when_the_flight_is_dead(tmp_path: Path) -> None:
+    recorder, guardian = shared(tmp_path / "flight.mcap")
+    with guardian:
+        recorder.client._socket.close()  # as the kernel does it for a process that was killed
+        guardian.send(pack_plain((TEXT, UNNUMBERED, 1.5, "warning", "guardian_land", "of the guardian")))
+        assert recorder.process.poll() is None
+    assert recorder.process.wait(20.0) == 0
+    assert recorder.process.stdout is not None
+    recorder.process.stdout.close()
+    assert b"of the guardian" in lines_of(tmp_path / "flight.mcap")

@@ -1,0 +1,34 @@
+"""The worlds in which `adaptive/recommended` had the hardest time are flown again: `companion robustness --keep` writes them."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from companion.analysis.robustness import SAFE, WORST, Case, Cases, held_against, read_cases
+from companion.config.loader import load_flight
+from sitl import robustness
+from tests.support import ROOT
+
+FILE = Path(__file__).with_name("robustness.yaml")
+KEPT: Cases = read_cases(FILE)
+
+
+@cache
+def config_json() -> str:
+    return load_flight(ROOT / KEPT.mission, None, KEPT.controller, KEPT.preset).model_dump_json()
+
+
+def test_ten_are_kept_of_the_law_that_users_get() -> None:
+    assert len(KEPT.cases) == WORST
+    assert (KEPT.controller, KEPT.preset) == ("adaptive", "recommended")
+    assert all(case.kept.outcome.value in SAFE for case in KEPT.cases), "a crash is to be mended, not kept"
+
+
+@pytest.mark.parametrize("case", KEPT.cases, ids=lambda case: case.name)
+def test_no_worse_than_when_it_was_kept(case: Case) -> None:
+    flight = {"name": case.name, "number": None, "world": case.knobs()}
+    row = robustness.fly(config_json(), flight)["row"]
+    assert held_against(row, case.kept) is None, row

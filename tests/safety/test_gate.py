@@ -1,0 +1,152 @@
+"""The gate: what never leaves, and what leaves cut."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.config.loader import load_vehicle
+from companion.config.vehicle import Vehicle
+from companion.frames import quat_from_euler_zyx, tilt_rad
+from companion.safety.gate import Gate
+from companion.types import AttitudeSetpoint, Vec2
+
+NAN = math.nan
+LEVEL = quat_from_euler_zyx(0, 0, 0.4)
+VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
+
+
+@pytest.fixture
+def vehicle() -> Vehicle:
+    return VEHICLE
+
+
+BAD_ATTITUDES = {
+    "nan": AttitudeSetpoint((NAN, 0.0, 0.0, 1.0), 0.5),
+    "infinite thrust": AttitudeSetpoint(LEVEL, math.inf),
+    "not unit": AttitudeSetpoint((0.9, 0.0, 0.0, 0.0), 0.5),
+    "zero": AttitudeSetpoint((0.0, 0.0, 0.0, 0.0), 0.5),
+    "thrust above 1": AttitudeSetpoint(LEVEL, 1.0001),
+    "thrust below 0": AttitudeSetpoint(LEVEL, -0.0001),
+    "upside down": AttitudeSetpoint((0.0, 1.0, 0.0, 0.0), 0.5),
+    "leaning too far": AttitudeSetpoint(quat_from_euler_zyx(0.0, math.radians(25), 0.0), 0.5),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ATTITUDES)
+def test_a_bad_attitude_setpoint_never_leaves(vehicle: Vehicle, name: str) -> None:
+    verdict = Gate(vehicle).check(BAD_ATTITUDES[name], None, None, False)
+    assert verdict.attitude is None
+    assert len(verdict.refused) == 1
+
+
+def test_a_good_setpoint_leaves_as_it_is(vehicle: Vehicle) -> None:
+    good = AttitudeSetpoint(quat_from_euler_zyx(0.1, -0.1, 2.0), 0.5)
+    verdict = Gate(vehicle).check(good, (0.3, -0.2), (2.0, 1.0), True)
+    assert verdict.attitude == good
+    assert verdict.arm_torque_nm == (0.3, -0.2)
+    assert not verdict.refused
+
+
+@pytest.mark.parametrize(
+    ("torque", "angle", "fresh", "leaves"),
+    [
+        ((NAN, 0.0), (2.0, 1.0), True, None),
+        ((0.0, math.inf), (2.0, 1.0), True, None),
+        ((0.5, 0.5), None, True, None),
+        ((0.5, 0.5), (2.0, 1.0), False, None),
+        ((99.0, -99.0), (2.0, 1.0), True, (2.5, -2.5)),
+        ((1.0, 1.0), (math.radians(176), 1.0), True, (0.0, 1.0)),  # past the upper wall of joint 1
+        ((-1.0, 1.0), (math.radians(176), 1.0), True, (-1.0, 1.0)),
+        ((0.2, -1.0), (2.0, math.radians(-11)), True, (0.2, 0.0)),  # past the lower wall of joint 2
+    ],
+)
+def test_joint_torques(vehicle: Vehicle, torque: Vec2, angle: Vec2 | None, fresh: bool, leaves: Vec2 | None) -> None:
+    assert Gate(vehicle).check(None, torque, angle, fresh).arm_torque_nm == leaves
+
+
+@pytest.mark.parametrize(
+    ("torque", "rate_deg_s", "leaves"),
+    [
+        ((1.0, 1.0), (301.0, 0.0), (0.0, 1.0)),
+        ((-1.0, 1.0), (301.0, 0.0), (-1.0, 1.0)),
+        ((1.0, -1.0), (0.0, -301.0), (1.0, 0.0)),
+        ((1.0, 1.0), (299.0, -299.0), (1.0, 1.0)),
+    ],
+)
+def test_a_joint_that_is_too_fast_is_only_braked(
+    vehicle: Vehicle, torque: Vec2, rate_deg_s: Vec2, leaves: Vec2
+) -> None:
+    rate: Vec2 = (math.radians(rate_deg_s[0]), math.radians(rate_deg_s[1]))
+    assert Gate(vehicle).check(None, torque, (2.0, 1.0), True, arm_rate_rad_s=rate).arm_torque_nm == leaves
+
+
+def test_no_torque_asks_for_more_than_the_current_limit() -> None:
+    safety = VEHICLE.safety.model_copy(update={"servo_current_max_a": 1.0})
+    gate = Gate(VEHICLE.model_copy(update={"safety": safety}))
+    assert gate.check(None, (2.0, -2.0), (2.0, 1.0), True).arm_torque_nm == (1.3, -1.3)  # 1.3 N m/A
+
+
+def test_a_setpoint_from_an_old_state_does_not_leave(vehicle: Vehicle) -> None:
+    good = AttitudeSetpoint(LEVEL, 0.5)
+    assert Gate(vehicle).check(good, None, None, False, state_age_s=0.1).attitude == good
+    old = Gate(vehicle).check(good, None, None, False, state_age_s=0.101)
+    assert old.attitude is None
+    assert [refusal.kind for refusal in old.refused] == ["stale state"]
+    assert Gate(vehicle).check(good, None, None, False, state_age_s=NAN).attitude is None
+
+
+def test_thrust_changes_no_faster_than_it_may() -> None:
+    gate = Gate(VEHICLE)
+    gate.check(AttitudeSetpoint(LEVEL, 0.1), None, None, False, t_s=1.0)
+    cut = gate.check(AttitudeSetpoint(LEVEL, 0.9), None, None, False, t_s=1.005)
+    assert cut.attitude is not None
+    assert cut.attitude.thrust == pytest.approx(0.6)  # 100 /s
+    assert [refusal.kind for refusal in cut.refused] == ["thrust slew"]
+    free = gate.check(AttitudeSetpoint(LEVEL, 0.9), None, None, False, t_s=1.01)
+    assert free.attitude is not None and free.attitude.thrust == 0.9
+    assert not free.refused
+
+
+def test_after_a_silence_the_first_thrust_may_be_any() -> None:
+    gate = Gate(VEHICLE)
+    gate.check(AttitudeSetpoint(LEVEL, 0.9), None, None, False, t_s=1.0)
+    free = gate.check(AttitudeSetpoint(LEVEL, 0.0), None, None, False, t_s=1.2)
+    assert free.attitude is not None and free.attitude.thrust == 0.0
+
+
+number = st.floats(allow_nan=True, allow_infinity=True, width=32)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.lists(
+        st.tuples(number, number, number, number, number, number, number, number, number, st.floats(0.0, 0.3)),
+        max_size=6,
+    )
+)
+def test_whatever_is_asked_for_only_what_is_allowed_leaves(rows: list[tuple[float, ...]]) -> None:
+    gate, t_s, last = Gate(VEHICLE), 1.0, None
+    for w, x, y, z, thrust, first, second, angle, rate, pause_s in rows:
+        t_s += pause_s
+        verdict = gate.check(
+            AttitudeSetpoint((w, x, y, z), thrust),
+            (first, second),
+            (angle, angle),
+            True,
+            t_s=t_s,
+            arm_rate_rad_s=(rate, rate),
+        )
+        if verdict.attitude is not None:
+            sent = verdict.attitude
+            assert all(map(math.isfinite, (*sent.attitude_wxyz, sent.thrust)))
+            assert 0.0 <= sent.thrust <= 1.0
+            assert tilt_rad(sent.attitude_wxyz) <= math.radians(VEHICLE.airframe.tilt_max_deg) + 1e-3
+            if last is not None and t_s - last[0] <= 0.1:
+                assert abs(sent.thrust - last[1]) <= 100.0 * (t_s - last[0]) + 1e-9
+            last = (t_s, sent.thrust)
+        if verdict.arm_torque_nm is not None:
+            assert all(math.isfinite(torque) and abs(torque) <= 2.5 for torque in verdict.arm_torque_nm)

@@ -1,0 +1,455 @@
+"""Every rule raised by its own fault and by nothing else, in the air and on the ground; and none by a machine in good health."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+
+from companion.config.loader import load_vehicle
+from companion.frames import quat_from_euler_zyx, quat_multiply
+from companion.safety.monitors import Monitors, Situation, unfused
+from companion.safety.monitors_arm import error_text
+from companion.safety.rules import RULES, Rule
+from companion.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction
+from tests.safety.healthy import (
+    SLOW,
+    START_S,
+    TICK_S,
+    Change,
+    after_a_moment,
+    control,
+    flying,
+    healthy,
+    put,
+    standing,
+    stopped,
+    watched,
+)
+
+VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
+replace = dataclasses.replace
+NAN = math.nan
+RULE = {rule.id: rule for rule in RULES}
+
+
+def tethered(**fields: object) -> Situation:
+    return flying(tether=replace(SLOW, **fields))
+
+
+def moved(part: str, by_m: tuple[float, float, float]) -> Change:
+    def change(i: Inputs) -> Inputs:
+        x, y, z = getattr(i, part).position_world_m
+        return put(part, position_world_m=(x + by_m[0], y + by_m[1], z + by_m[2]))(i)
+
+    return change
+
+
+def turned(part: str, by_deg: float) -> Change:
+    turn = quat_from_euler_zyx(0.0, 0.0, math.radians(by_deg))
+    return lambda i: put(part, attitude_wxyz=quat_multiply(turn, getattr(i, part).attitude_wxyz))(i)
+
+
+def leaning(by_deg: float) -> Change:
+    lean = quat_from_euler_zyx(math.radians(by_deg), 0.0, 0.0)
+    return lambda i: put("vehicle", attitude_wxyz=lean)(put("mocap", attitude_wxyz=lean)(i))
+
+
+def both(*changes: Change) -> Change:
+    def change(i: Inputs) -> Inputs:
+        for one in changes:
+            i = one(i)
+        return i
+
+    return change
+
+
+def drifting(i: Inputs) -> Inputs:
+    """PX4's estimate slides away from where the vehicle is, by 0.2 m/s."""
+    return moved("vehicle", (0.2 * (i.t_s - START_S), 0.0, 0.0))(i)
+
+
+def turning(i: Inputs) -> Inputs:
+    return turned("vehicle", 10.0 * (i.t_s - START_S))(i)
+
+
+def frozen_values(part: str, *names: str) -> Change:
+    """Values stay, stamps and frame numbers go on."""
+    first = getattr(healthy(), part)
+    return put(part, **{name: getattr(first, name) for name in names})
+
+
+def at(x: float, y: float, z: float, vx: float = 0.05, vy: float = 0.0, vz: float = 0.0) -> Change:
+    """Somewhere else from the start on; PX4 and motion capture agree."""
+    p = (x, y, z)
+
+    def change(i: Inputs) -> Inputs:
+        d = 1e-4 * (i.tick % 7)
+        here = (p[0] + d, p[1], p[2])
+        vehicle = put("vehicle", position_world_m=here, velocity_world_m_s=(vx, vy, vz))
+        return put("mocap", position_world_m=here)(vehicle(i))
+
+    return change
+
+
+@dataclass(frozen=True)
+class Fault:
+    """How a rule's finding is made, and what else is found with it."""
+
+    change: Change = lambda i: i
+    situation: Callable[[], Situation] = flying
+    sound: int = 3
+    """Healthy ticks before it."""
+    also: frozenset[str] = field(default_factory=frozenset)
+
+
+def every_35_ms(i: Inputs) -> Inputs:
+    """30 poses in a second."""
+    k = i.tick - i.tick % 7
+    return replace(i, mocap=healthy(k).mocap)
+
+
+def slow_link(i: Inputs) -> Inputs:
+    """From one tick to the next, what arrives was said 100 ms ago."""
+    assert i.vehicle is not None and i.vehicle.boot_s is not None
+    return put("vehicle", boot_s=i.vehicle.boot_s - 0.1)(i)
+
+
+def jumping(i: Inputs) -> Inputs:
+    return moved("mocap", (0.4, 0.0, 0.0))(i) if i.tick == 100 else i
+
+
+FAULTS: dict[str, Fault] = {
+    "mocap_not_finite": Fault(put("mocap", position_world_m=(NAN, 0.0, 1.0)), also=frozenset({"mocap_lost"})),
+    "vehicle_not_finite": Fault(
+        put("vehicle", velocity_world_m_s=(0.0, math.inf, 0.0)), also=frozenset({"vehicle_state_lost"})
+    ),
+    "status_not_finite": Fault(put("status", battery_voltage_v=NAN), also=frozenset({"heartbeat_lost"})),
+    "arm_not_finite": Fault(put("arm", torque_nm=(0.0, NAN)), also=frozenset({"arm_lost"})),
+    "force_not_finite": Fault(put("force", force_sensor_n=(0.0, 0.0, -math.inf)), also=frozenset({"force_lost"})),
+    "mocap_lost": Fault(stopped("mocap")),
+    "mocap_invalid": Fault(put("mocap", tracking_valid=False)),
+    "mocap_slow": Fault(every_35_ms),
+    "mocap_late": Fault(put("mocap", latency_s=0.08)),
+    "mocap_too_late": Fault(put("mocap", latency_s=0.2)),
+    "mocap_jump": Fault(jumping),
+    "mocap_swapped": Fault(moved("mocap", (0.0, 0.3, 0.0)), also=frozenset({"mocap_jump"})),
+    "mocap_frozen": Fault(frozen_values("mocap", "position_world_m", "attitude_wxyz")),
+    "estimate_disagrees": Fault(drifting),
+    "yaw_disagrees": Fault(turning),
+    "vehicle_state_lost": Fault(stopped("vehicle")),
+    "estimate_frozen": Fault(frozen_values("vehicle", "position_world_m", "velocity_world_m_s")),
+    "heartbeat_lost": Fault(stopped("status")),
+    "px4_rebooted": Fault(put("vehicle", boot_s=2.0), also=frozenset({"link_late"})),
+    "link_late": Fault(slow_link),
+    "px4_disarmed": Fault(put("status", armed=False)),
+    "pilot_took_over": Fault(put("status", mode=FlightMode.MANUAL)),
+    "offboard_left": Fault(put("status", mode=FlightMode.LAND)),
+    "battery_warn": Fault(put("status", battery_remaining=0.25)),
+    "battery_low": Fault(put("status", battery_remaining=0.1), also=frozenset({"battery_warn"})),
+    "battery_voltage": Fault(put("status", battery_voltage_v=13.0)),
+    "arm_lost": Fault(stopped("arm")),
+    "arm_read_failures": Fault(put("arm", read_failures=5)),
+    "servo_error": Fault(put("arm", hardware_error=(0, 32))),
+    "arm_let_go": Fault(put("arm", hardware_error=(0x80, 0))),
+    "servo_warm": Fault(put("arm", temperature_c=(35.0, 68.0))),
+    "servo_hot": Fault(put("arm", temperature_c=(76.0, 35.0))),
+    "servo_overload": Fault(put("arm", torque_nm=(-2.5, 0.1))),
+    "joint_jump": Fault(put("arm", angle_rad=(2.0, 1.5))),
+    "joint_rate": Fault(put("arm", velocity_rad_s=(0.0, 13.0))),
+    "joint_wall": Fault(put("arm", angle_rad=(math.radians(180.0), 1.0)), sound=0),
+    "joint_far_past_wall": Fault(
+        put("arm", angle_rad=(2.0, math.radians(-25.0))), sound=0, also=frozenset({"joint_wall"})
+    ),
+    "force_lost": Fault(lambda i: replace(i, force=None)),
+    "force_overload": Fault(put("force", overload=True)),
+    "force_stuck": Fault(frozen_values("force", "force_sensor_n", "torque_sensor_nm")),
+    "force_drift": Fault(situation=lambda: flying(control=control(force_ext_world_n=(2.5, 0.0, 0.0)))),
+    "loop_late": Fault(),
+    "loop_stalled": Fault(),
+    "recorder_drops": Fault(lambda i: replace(i, recorder_dropped=3)),
+    "guardian_lost": Fault(lambda i: replace(i, guardian_ready=False)),
+    "tilt": Fault(leaning(45.0), sound=0),
+    "crashed": Fault(leaning(120.0), sound=0, also=frozenset({"tilt"})),
+    "tracking_warn": Fault(situation=lambda: flying(tracking_error_m=0.5)),
+    "tracking_hold": Fault(situation=lambda: flying(tracking_error_m=0.7), also=frozenset({"tracking_warn"})),
+    "tracking_error": Fault(
+        situation=lambda: flying(tracking_error_m=1.2), also=frozenset({"tracking_warn", "tracking_hold"})
+    ),
+    "thrust_saturated": Fault(
+        situation=lambda: flying(
+            control=control(saturated=(True, False, False), tau=(0.0, 0.0, 54.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        )
+    ),
+    "too_fast": Fault(at(0.0, 0.0, 1.0, vx=0.0, vy=2.1), sound=0),
+    "climbs_too_fast": Fault(at(0.0, 0.0, 0.6, vz=1.6), sound=0),
+    "sinks_too_fast": Fault(at(0.0, 0.0, 1.5, vz=-1.6), sound=0),
+    "geofence_near": Fault(at(1.6, 0.0, 1.0, vx=0.8), sound=0),
+    "geofence_left": Fault(at(-1.9, 0.0, 1.0), sound=0, also=frozenset({"geofence_near"})),
+    "tether_short": Fault(situation=lambda: tethered(stop_slack_m=0.05)),
+    "tether_taut": Fault(situation=lambda: tethered(taut=True)),
+    "tether_snagged": Fault(situation=lambda: tethered(snagged=True)),
+    "tether_near": Fault(situation=lambda: tethered(clearance_m=0.0)),
+    "tether_wound": Fault(situation=lambda: tethered(turns=-1.6)),
+    "tether_separated": Fault(situation=lambda: tethered(separated=True)),
+    "operator_hold": Fault(lambda i: replace(i, command=OperatorCommand.HOLD)),
+    "operator_resume": Fault(lambda i: replace(i, command=OperatorCommand.RESUME)),
+    "operator_land": Fault(lambda i: replace(i, command=OperatorCommand.LAND)),
+    "operator_abort": Fault(lambda i: replace(i, command=OperatorCommand.ABORT)),
+}
+
+
+def stream(rule_id: str) -> list[Inputs]:
+    if rule_id in ("loop_late", "loop_stalled"):
+        gap_s = 0.2 if rule_id == "loop_late" else 1.0
+        return [healthy(k, START_S + k * TICK_S + (gap_s if k > 2 else 0.0)) for k in range(700)]
+    fault = FAULTS[rule_id]
+    return after_a_moment(fault.change, sound=fault.sound)
+
+
+def test_every_rule_has_its_fault() -> None:
+    assert set(FAULTS) == set(RULE)
+    assert len(RULES) == len(RULE), "an id twice"
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
+def test_each_fault_is_told_once_by_name_and_asks_for_its_rung(rule: Rule) -> None:
+    fault = FAULTS[rule.id]
+    events = watched(VEHICLE, stream(rule.id), fault.situation())
+    assert {event.id for event in events} == {rule.id, *fault.also}
+    assert len(events) == 1 + len(fault.also), "told again"
+    for event in events:
+        assert event.action is RULE[event.id].air
+        assert event.text and "{" not in event.text
+
+
+IN_THE_AIR = {rule.id for rule in RULES if rule.ground is None}
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
+def test_on_the_ground_only_what_matters_there_is_told(rule: Rule) -> None:
+    fault = FAULTS[rule.id]
+    situation = standing(offboard_expected=rule.id in ("pilot_took_over", "offboard_left"))
+    events = watched(VEHICLE, stream(rule.id), situation)
+    expected = {rule.id, *fault.also} - IN_THE_AIR
+    assert {event.id for event in events} == expected
+    assert all(event.action is RULE[event.id].ground for event in events)
+
+
+@pytest.mark.parametrize("situation", [flying, standing])
+def test_a_machine_in_good_health_is_left_alone(situation: Callable[[], Situation]) -> None:
+    assert watched(VEHICLE, [healthy(k) for k in range(4000)], situation()) == []
+
+
+def test_what_was_a_warning_on_the_ground_is_judged_anew_in_the_air() -> None:
+    monitors = Monitors(VEHICLE)
+    no_force = [replace(healthy(k), force=None) for k in range(400)]
+    on_ground = watched(VEHICLE, no_force[:200], standing(), monitors)
+    in_air = watched(VEHICLE, no_force[200:], flying(), monitors)
+    assert [(e.id, e.action) for e in on_ground] == [("force_lost", SafetyAction.LAND)]
+    assert [(e.id, e.action) for e in in_air] == [("force_lost", SafetyAction.WARN)]
+
+
+# -- values that are no numbers --------------------------------------------------------------------------------------
+
+
+def broken_fields() -> list[tuple[str, str, int | None]]:
+    """Part, field and component of every float of the inputs."""
+    found: list[tuple[str, str, int | None]] = []
+    for part in ("vehicle", "status", "mocap", "arm", "force"):
+        record = getattr(healthy(), part)
+        for one in dataclasses.fields(record):
+            value = getattr(record, one.name)
+            if isinstance(value, float) and one.name not in ("marker_error_m", "written_s"):
+                found.append((part, one.name, None))
+            elif isinstance(value, tuple) and isinstance(value[0], float):
+                found += [(part, one.name, index) for index in range(len(value))]
+    return found
+
+
+@pytest.mark.parametrize("bad", [NAN, math.inf, -math.inf, 1e300])
+@pytest.mark.parametrize(("part", "name", "index"), broken_fields())
+def test_a_value_that_is_no_number_is_told_and_its_record_counts_as_missing(
+    part: str, name: str, index: int | None, bad: float
+) -> None:
+    monitors = Monitors(VEHICLE)
+    assert watched(VEHICLE, [healthy(0), healthy(1)], flying(), monitors) == []
+    value = getattr(getattr(healthy(2), part), name)
+    value = bad if index is None else (*value[:index], bad, *value[index + 1 :])
+    events = monitors.check(put(part, **{name: value})(healthy(2)), flying())
+    assert [(event.id, event.action) for event in events] == [(f"{part}_not_finite", SafetyAction.WARN)]
+    assert monitors.trusted is not None and getattr(monitors.trusted, part) is None
+    good = healthy(3)
+    assert monitors.check(good, flying()) == ()
+    assert monitors.trusted is good
+
+
+# -- motion capture --------------------------------------------------------------------------------------------------
+
+
+def test_a_pose_that_is_not_believed_is_passed_on_to_nobody() -> None:
+    monitors = Monitors(VEHICLE)
+    watched(VEHICLE, [healthy(k) for k in range(3)], flying(), monitors)
+    monitors.check(moved("mocap", (0.0, 0.3, 0.0))(healthy(3)), flying())
+    assert not monitors.mocap_trusted
+    assert monitors.trusted is not None and monitors.trusted.mocap is None
+    monitors.check(healthy(4), flying())
+    assert monitors.mocap_trusted
+    assert monitors.trusted.mocap is not None
+
+
+def test_bad_poses_of_every_kind_in_turn_are_no_motion_capture() -> None:
+    """None of the kinds lasts; but nothing to believe has come."""
+
+    def mixed(i: Inputs) -> Inputs:
+        kinds = (
+            moved("mocap", (0.0, 0.3, 0.0)),
+            put("mocap", tracking_valid=False),
+            put("mocap", position_world_m=(NAN,) * 3),
+        )
+        return kinds[i.tick % 3](i)
+
+    events = watched(VEHICLE, after_a_moment(mixed), flying())
+    first = next(event for event in events if event.action is SafetyAction.AUTOPILOT_LAND)
+    assert first.t_s - START_S <= VEHICLE.safety.mocap_timeout_s + 5 * TICK_S
+
+
+def test_fast_flight_and_a_gap_are_no_jump() -> None:
+    """1.5 m/s, and 80 ms without a frame."""
+
+    def fast(k: int) -> Inputs:
+        t_s = k * TICK_S
+        i = healthy(k)
+        assert i.mocap
+        x = -0.8 + 1.5 * t_s
+        vehicle = put("vehicle", position_world_m=(x, 0.0, 1.0), velocity_world_m_s=(1.5, 0.0, 0.0))(i)
+        return put("mocap", position_world_m=(x + 1e-4 * (k % 3), 0.0, 1.0))(vehicle)
+
+    inputs = [fast(k) for k in range(200)]
+    for k in range(100, 116):
+        inputs[k] = replace(inputs[k], mocap=inputs[99].mocap)
+    assert watched(VEHICLE, inputs, flying()) == []
+
+
+# -- a process that was held up --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "spoken"),
+    [(0.04, []), (0.2, [("loop_late", SafetyAction.WARN)]), (1.0, [("loop_stalled", SafetyAction.LAND)])],
+)
+def test_a_held_up_process_blames_itself_and_no_device(gap_s: float, spoken: list[tuple[str, SafetyAction]]) -> None:
+    """The first tick after a hold-up sees old stamps of everything; a moment later all is fresh."""
+    late_s = START_S + gap_s
+    inputs = [healthy(), replace(healthy(), t_s=late_s), *[healthy(k, late_s + k * TICK_S) for k in range(1, 60)]]
+    events = watched(VEHICLE, inputs, flying())
+    assert [(event.id, event.action) for event in events] == spoken
+
+
+def test_a_mocap_that_stays_away_after_a_hold_up_is_lost() -> None:
+    inputs = [healthy(), *[stopped("mocap")(healthy(k, START_S + 0.2 + k * TICK_S)) for k in range(40)]]
+    assert [event.id for event in watched(VEHICLE, inputs, flying())] == ["loop_late", "mocap_lost"]
+
+
+# -- what comes and goes ---------------------------------------------------------------------------------------------
+
+
+def test_what_flickers_is_not_told_in_every_tick() -> None:
+    def now_and_then(i: Inputs) -> Inputs:
+        return put("arm", read_failures=6)(i) if i.tick % 20 == 5 else i
+
+    assert len(watched(VEHICLE, after_a_moment(now_and_then), flying())) == 1
+
+
+def test_what_comes_back_after_a_while_is_told_again() -> None:
+    def twice(i: Inputs) -> Inputs:
+        return put("arm", read_failures=6)(i) if i.tick in (100, 500) else i
+
+    assert len(watched(VEHICLE, after_a_moment(twice), flying())) == 2
+
+
+def test_what_is_still_there_after_a_hold_was_taken_back_is_told_again() -> None:
+    monitors = Monitors(VEHICLE)
+    inputs = after_a_moment(at(1.6, 0.0, 1.0, vx=0.8), sound=0)
+    before = watched(VEHICLE, inputs[:100], flying(), monitors)
+    monitors.forget()
+    after = watched(VEHICLE, inputs[100:200], flying(), monitors)
+    assert [[event.id for event in events] for events in (before, after)] == [["geofence_near"], ["geofence_near"]]
+
+
+def test_people_may_ask_for_the_same_again() -> None:
+    asked = [
+        OperatorCommand.HOLD,
+        OperatorCommand.RESUME,
+        OperatorCommand.HOLD,
+        OperatorCommand.NONE,
+        OperatorCommand.HOLD,
+    ]
+    inputs = [replace(healthy(k), command=command) for k, command in enumerate(asked)]
+    told = [event.id for event in watched(VEHICLE, inputs, flying())]
+    assert told == ["operator_hold", "operator_resume", "operator_hold", "operator_hold"]
+
+
+def test_while_inputs_are_missing_only_people_and_broken_values_are_heard() -> None:
+    nothing = replace(healthy(), vehicle=None, status=None, mocap=None, force=None)
+    waiting = standing(waiting=True)
+    inputs: list[Inputs] = [replace(nothing, tick=k, t_s=START_S + k) for k in range(10)]
+    inputs.append(replace(nothing, t_s=START_S + 11.0, command=OperatorCommand.LAND))
+    events: list[Event] = watched(VEHICLE, inputs, waiting)
+    assert [(event.id, event.action) for event in events] == [("operator_land", SafetyAction.LAND)]
+
+
+# -- words -----------------------------------------------------------------------------------------------------------
+
+
+def test_hardware_errors_are_told_by_name() -> None:
+    assert error_text((0, 0b100100)) == "servo 2: overheating, overload"
+    assert error_text((0b1, 0b1000000)) == "servo 1: input voltage; servo 2: bit 6"
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "fused"),
+    [
+        ((0.0, 0.0, 1.0), 0.4, True),
+        ((0.05, 0.0, 1.0), 0.45, True),
+        ((0.2, 0.0, 1.0), 0.4, False),
+        ((0.0, 0.0, 1.0), 0.9, False),
+    ],
+)
+def test_fusion_is_proved_by_agreement(position: tuple[float, float, float], yaw: float, fused: bool) -> None:
+    pose = put("mocap", position_world_m=position, attitude_wxyz=quat_from_euler_zyx(0, 0, yaw))
+    assert (unfused(pose(healthy())) is None) == fused
+
+
+def test_a_link_that_was_always_slow_is_the_clocks_difference() -> None:
+    """What counts is how much later than at the best of times; and after a while the new difference is the clocks'."""
+    monitors = Monitors(VEHICLE)
+    told = watched(VEHICLE, (slow_link(healthy(k)) for k in range(400)), flying(), monitors)
+    assert told == []
+    later = watched(
+        VEHICLE, (put("vehicle", boot_s=healthy(k).t_s - 0.16)(healthy(k)) for k in range(400, 420)), flying(), monitors
+    )
+    assert later == [], "60 ms more"
+
+
+def test_in_the_air_a_repeated_pose_is_not_passed_on_at_once() -> None:
+    """Long before it is a finding: PX4 would take it for standing still."""
+    monitors, first = Monitors(VEHICLE), healthy()
+    assert first.mocap is not None
+    for k in range(5):
+        monitors.check(healthy(k), flying())
+        assert monitors.mocap_trusted
+    pose = healthy(4).mocap
+    assert pose is not None
+    same = put("mocap", position_world_m=pose.position_world_m, attitude_wxyz=pose.attitude_wxyz)
+    monitors.check(same(healthy(5)), flying())
+    assert not monitors.mocap_trusted
+    assert monitors.trusted is not None and monitors.trusted.mocap is not None, "it is no finding yet"
+    monitors.check(healthy(6), flying())
+    assert monitors.mocap_trusted
+    monitors.check(same(healthy(7)), standing())
+    monitors.check(same(healthy(8)), standing())
+    assert monitors.mocap_trusted, "on the ground a pose may well repeat"

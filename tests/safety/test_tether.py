@@ -1,0 +1,361 @@
+"""The tether watch: geometry against closed forms and brute force, pull and snag in the closed loop, and what must not alarm it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.config.vehicle import Vehicle
+from companion.frames import quat_from_euler_zyx
+from companion.safety.tether import TetherWatch, stop_distance_m
+from companion.safety.tether_shape import Clearance, steepest_slope
+from companion.types import Outcome, Outputs, PhaseKind, Quat, TetherState, Vec2, Vec3
+from sitl.fast import FastFlight, FastResult
+from sitl.world import Truth
+
+LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
+STILL: Vec3 = (0.0, 0.0, 0.0)
+FOLDED: Vec2 = (math.radians(165.0), math.radians(140.0))
+DOWN: Vec2 = (math.radians(90.0), 0.0)
+DT_S = 0.005
+ANCHOR: Vec3 = (0.0, -1.2, 0.0)
+LENGTH_M = 3.0
+
+
+@cache
+def config(*overrides: str) -> FlightConfig:
+    return load_flight("configs/missions/catch.yaml", overrides=overrides)
+
+
+def vehicle(*overrides: str) -> Vehicle:
+    return config(*overrides).vehicle
+
+
+def once(p: Vec3, v: Vec3 = STILL, attitude: Quat = LEVEL, *overrides: str) -> TetherState:
+    return TetherWatch(vehicle(*overrides)).update(0.0, p, v, attitude, FOLDED, None, None)
+
+
+# -- geometry ----------------------------------------------------------------------------------------------------------
+
+
+def test_range_slack_and_elevation() -> None:
+    state = once((0.0, 0.0, 1.6))
+    assert state.range_m == pytest.approx(2.0)
+    assert state.slack_m == pytest.approx(1.0)
+    assert state.stop_slack_m == state.slack_m
+    assert state.elevation_rad == pytest.approx(math.asin(0.8))
+    assert (state.taut, state.snagged, state.separated, state.pull_n) == (False, False, False, 0.0)
+
+
+def test_slack_at_the_stop_counts_outward_speed_only() -> None:
+    outward: Vec3 = (0.0, 0.6, 0.8)  # along the line: anchor at (0, -0.6, -0.8) * 2 from here
+    state = once((0.0, 0.0, 1.6), outward)
+    assert state.stop_slack_m == pytest.approx(1.0 - (1.0 * 0.15 + 1.0 / (2 * 2.0)))
+    assert once((0.0, 0.0, 1.6), (0.0, -0.6, -0.8)).stop_slack_m == pytest.approx(1.0)
+    assert once((0.0, 0.0, 1.6), (1.0, 0.0, 0.0)).stop_slack_m == pytest.approx(1.0)
+    assert stop_distance_m(vehicle().tether, 1.0) == pytest.approx(0.4)
+    assert stop_distance_m(vehicle().tether, -1.0) == 0.0
+
+
+def test_the_attachment_is_what_is_tied() -> None:
+    tied = "vehicle.tether.attachment_body_m=[0.1, 0, 0.2]"
+    yawed: Quat = quat_from_euler_zyx(0.0, 0.0, math.pi / 2)
+    assert once((0.0, 0.0, 0.8), STILL, yawed, tied).range_m == pytest.approx(math.dist((0.0, 0.1, 1.0), ANCHOR))
+
+
+def test_used_up_is_taut_and_far_beyond_is_separated() -> None:
+    assert not once((0.0, -1.2, LENGTH_M - 0.06)).taut
+    assert once((0.0, -1.2, LENGTH_M - 0.04)).taut
+    assert not once((0.0, -1.2, LENGTH_M + 0.2)).separated
+    gone = once((0.0, -1.2, LENGTH_M + 0.4))
+    assert gone.separated
+    assert not gone.snagged
+
+
+def turned(way: Callable[[float], tuple[Vec3, Quat]], overrides: tuple[str, ...] = ()) -> float:
+    watch = TetherWatch(vehicle(*overrides))
+    for step in range(1001):
+        p, q = way(step / 1000)
+        state = watch.update(step * DT_S, p, STILL, q, FOLDED, None, None)
+    return state.turns
+
+
+def circle(turns: float, *, yaw_turns: float = 0.0, centre: Vec3 = ANCHOR) -> Callable[[float], tuple[Vec3, Quat]]:
+    def way(share: float) -> tuple[Vec3, Quat]:
+        a = 2 * math.pi * turns * share
+        p = (centre[0] + math.cos(a), centre[1] + math.sin(a), 1.0)
+        return p, quat_from_euler_zyx(0.0, 0.0, 2 * math.pi * yaw_turns * share)
+
+    return way
+
+
+@pytest.mark.parametrize(
+    ("way", "turns"),
+    [
+        (circle(2.25), 2.25),
+        (circle(-1.5), -1.5),
+        (circle(2.0, yaw_turns=2.0), 2.0),  # about the anchor's post, not about the vehicle
+        (circle(0.0, yaw_turns=-3.0), 3.0),  # about the vehicle: seen from it, the line turns the other way
+        (circle(1.0, centre=(0.0, 1.2, 0.0)), 0.0),  # a round that leaves the anchor outside
+        (lambda share: ((0.0, -1.2, 0.5 + share), LEVEL), 0.0),  # straight above it
+    ],
+)
+def test_winding(way: Callable[[float], tuple[Vec3, Quat]], turns: float) -> None:
+    found = turned(way)
+    assert found == pytest.approx(turns, abs=1e-6)
+
+
+# -- sag, rotors and arm -----------------------------------------------------------------------------------------------
+
+
+def ring_distance_m(clearance_of: Vehicle, ray: Vec3) -> float:
+    """Brute force: least distance of a ray from the attachment to the ring of the rotors; negative if it comes up through it."""
+    p, inner = clearance_of.tether.attachment_body_m, clearance_of.tether.rotor_inner_radius_m
+    outer = clearance_of.airframe.radius_m
+    least, above = math.inf, -math.inf
+    for step in range(4000):
+        s = step * 0.0005
+        x, y, z = (a + s * b for a, b in zip(p, ray, strict=True))
+        r = math.hypot(x, y)
+        beside = max(0.0, inner - r, r - outer)
+        least = min(least, math.hypot(beside, z))
+        if beside == 0.0:
+            above = max(above, z)
+    return least if above < 0.0 else -max(above, 0.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.floats(-math.pi, math.pi),
+    st.floats(math.radians(-30), math.radians(89)),
+    st.sampled_from([(0.0, 0.0, 0.0), (0.0, 0.0, -0.1), (0.05, -0.05, -0.02)]),
+)
+def test_clearance_of_the_rotors_against_brute_force(azimuth: float, elevation: float, tied: Vec3) -> None:
+    machine = vehicle(f"vehicle.tether.attachment_body_m={list(tied)}")
+    ray = (
+        math.cos(elevation) * math.cos(azimuth),
+        math.cos(elevation) * math.sin(azimuth),
+        -math.sin(elevation),
+    )
+    found, true = Clearance(machine).least_m(ray, None, FOLDED), ring_distance_m(machine, ray)
+    if true <= 0.0:
+        assert found <= 1e-6
+    else:
+        assert found <= true + 5e-3, "it must not promise more room than there is"
+        assert found >= true - 0.11
+
+
+def test_a_line_that_leaves_level_touches_the_rotors_of_a_leaning_machine() -> None:
+    towards_anchor = quat_from_euler_zyx(math.radians(-20.0), 0.0, 0.0)  # the right side, where the anchor is, goes up
+    away = quat_from_euler_zyx(math.radians(20.0), 0.0, 0.0)
+    assert once((0.0, 1.2, 0.5), STILL, away).clearance_m < -0.02
+    assert once((0.0, 1.2, 0.5), STILL, LEVEL).clearance_m > 0.02
+    assert once((0.0, 1.2, 0.5), STILL, towards_anchor).clearance_m > 0.06
+
+
+def test_a_slack_line_from_above_hangs_into_the_rotors_and_a_straight_one_does_not() -> None:
+    above = ("vehicle.tether.attachment_body_m=[0, 0, 0.1]", "vehicle.tether.anchor_world_m=[0, -1.2, 2.6]")
+    slack = once((0.0, 0.0, 1.0), STILL, LEVEL, *above)
+    straight = once((0.0, 0.0, 1.0), STILL, LEVEL, *above, "vehicle.tether.length_m=1.93")
+    assert slack.clearance_m < 0.0 < straight.clearance_m
+
+
+def test_the_arm_counts_when_the_line_is_tied_beside_it() -> None:
+    beside = "vehicle.tether.attachment_body_m=[0, -0.13, -0.05]"
+    machine = vehicle(beside)
+    assert not Clearance(vehicle()).judges_arm
+    assert Clearance(machine).judges_arm
+    watch = TetherWatch(machine)
+
+    def clear(p: Vec3, yaw_deg: float, arm: Vec2 | None) -> float:
+        q = quat_from_euler_zyx(0.0, 0.0, math.radians(yaw_deg))
+        return watch.update(0.0, p, STILL, q, arm, None, None).clearance_m
+
+    # The anchor is on the attachment's side: the line leads away from the arm.
+    assert clear((0.0, 0.0, 1.0), 0.0, DOWN) == pytest.approx(0.04, abs=0.01)
+    # It is on the other side: the line crosses the arm's plane within its reach.
+    assert clear((0.0, 0.0, 1.0), 180.0, DOWN) < 0.0
+    assert clear((0.0, 0.0, 1.0), 180.0, None) <= clear((0.0, 0.0, 1.0), 180.0, FOLDED)
+
+
+@given(st.floats(0.05, 3.0), st.floats(-2.0, 2.0), st.floats(0.0, 2.0))
+def test_the_steepest_slope_lies_below_the_chord(level_m: float, drop_m: float, slack_m: float) -> None:
+    chord_m = math.hypot(level_m, drop_m)
+    along, up = steepest_slope(level_m, drop_m, chord_m, slack_m)
+    assert math.hypot(along, up) == pytest.approx(1.0)
+    assert along >= 0.0
+    assert up * level_m <= drop_m * along + 1e-9
+
+
+def test_the_sag_of_a_flat_line_is_that_of_the_catenary() -> None:
+    level_m, parameter_m = 2.0, 4.0  # z = a cosh(x / a): length 2 a sinh(h / 2a), slope sinh(h / 2a)
+    length_m = 2 * parameter_m * math.sinh(level_m / (2 * parameter_m))
+    along, up = steepest_slope(level_m, 0.0, level_m, length_m - level_m)
+    assert up / along == pytest.approx(-math.sinh(level_m / (2 * parameter_m)), rel=0.02)
+
+
+# -- pull, analytic ----------------------------------------------------------------------------------------------------
+
+
+def towards(p: Vec3, to: Vec3 = ANCHOR) -> Vec3:
+    away = math.dist(p, to)
+    return ((to[0] - p[0]) / away, (to[1] - p[1]) / away, (to[2] - p[2]) / away)
+
+
+def pulled(
+    seconds: float,
+    force: Callable[[float, Vec3], Vec3 | None],
+    tool: Callable[[float], Vec3 | None] = lambda t_s: STILL,
+    v: Vec3 = STILL,
+    p: Vec3 = (0.5, 0.0, 1.0),
+) -> list[TetherState]:
+    watch, states = TetherWatch(vehicle()), []
+    for tick in range(round(seconds / DT_S)):
+        t_s = tick * DT_S
+        at = (p[0] + v[0] * t_s, p[1] + v[1] * t_s, p[2] + v[2] * t_s)
+        states.append(watch.update(t_s, at, v, LEVEL, FOLDED, force(t_s, at), tool(t_s)))
+    return states
+
+
+def along(size_n: float, to: Vec3 = ANCHOR) -> Callable[[float, Vec3], Vec3]:
+    def force(t_s: float, p: Vec3) -> Vec3:
+        x, y, z = towards(p, to)
+        return (size_n * x, size_n * y, size_n * z)
+
+    return force
+
+
+def test_a_pull_towards_the_anchor_is_measured_and_is_a_snag_while_there_is_slack() -> None:
+    states = pulled(1.5, along(5.0))
+    assert states[-1].pull_n == pytest.approx(5.0, rel=0.01)
+    assert states[-1].snagged
+    assert not states[-1].taut, "it did not grow with the range"
+    first = next(k for k, state in enumerate(states) if state.snagged) * DT_S
+    assert 0.8 <= first <= 1.1, "longer than a blow, and no longer than it must be"
+
+
+def test_a_pull_that_grows_with_the_range_is_a_line_that_tightens() -> None:
+    def stretched(t_s: float, p: Vec3) -> Vec3:
+        return along(max(0.0, 60.0 * (math.dist(p, ANCHOR) - 1.7)))(t_s, p)
+
+    states = pulled(2.5, stretched, v=(0.2, 0.1, 0.0))
+    assert states[-1].taut
+    assert states[-1].slack_m > 0.5
+
+
+def test_the_pull_ends_when_the_line_falls_slack_again() -> None:
+    states = pulled(3.0, lambda t_s, p: along(8.0 if t_s < 1.0 else 0.0)(t_s, p))
+    assert states[190].snagged
+    assert not states[-1].snagged
+    assert not states[-1].taut
+
+
+@pytest.mark.parametrize("sensor", [True, False])
+@pytest.mark.parametrize("payload_kg", [0.1, 0.2, 0.4])
+def test_a_caught_payload_is_no_pull(payload_kg: float, sensor: bool) -> None:
+    """A blow forward and down, then the weight; with the force sensor, which sees the same, and without it."""
+
+    def load(t_s: float) -> Vec3:
+        if t_s < 0.5:
+            return STILL
+        blow = 12.0 * payload_kg * math.exp(-(t_s - 0.5) / 0.05)
+        return (-4.0 * blow, 0.3 * blow, -4.0 * blow - 9.81 * payload_kg)
+
+    states = pulled(3.0, lambda t_s, p: load(t_s), load if sensor else lambda t_s: None)
+    assert not any(state.taut or state.snagged for state in states)
+
+
+def test_wind_is_no_snag() -> None:
+    for wind in ((1.0, 0.0, 0.0), (-0.7, -0.7, 0.0), (0.0, -1.0, 0.0)):
+        states = pulled(3.0, lambda t_s, p, wind=wind: wind)  # type: ignore[misc]
+        assert not any(state.taut or state.snagged for state in states)
+
+
+def test_wrong_hover_thrust_above_the_anchor_is_no_pull() -> None:
+    states = pulled(3.0, lambda t_s, p: (0.0, 0.0, -4.5), p=(0.0, -1.2, 1.5))
+    assert not any(state.taut or state.snagged for state in states)
+    assert pulled(3.0, lambda t_s, p: (0.0, 0.0, -9.0), p=(0.0, -1.2, 1.5))[-1].snagged
+
+
+def test_held_by_something_else_than_the_anchor_is_a_snag() -> None:
+    states = pulled(1.5, along(12.0, to=(0.5, 1.8, 0.2)))
+    assert states[-1].snagged
+    assert states[-1].pull_n == 0.0
+
+
+def test_without_knowledge_of_forces_there_is_no_pull() -> None:
+    states = pulled(2.0, lambda t_s, p: None if t_s >= 1.5 else along(8.0)(t_s, p))
+    assert states[290].snagged
+    assert (states[-1].pull_n, states[-1].snagged) == (0.0, False)
+
+
+# -- closed loop -------------------------------------------------------------------------------------------------------
+
+ALARMS = ("tether_taut", "tether_snagged", "tether_separated", "tether_near", "tether_wound", "tether_short")
+
+
+def event_ids(result: FastResult) -> list[str]:
+    return [event.id for outputs in result.outputs for event in outputs.events]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("world.payload_kg=0.1", "world.wind_m_s=[3, 0, 0]"),
+        ("world.payload_kg=0.3", "world.wind_m_s=[0, -3, 0]"),
+        ("world.payload_kg=0.4", "world.hover_thrust_error=-0.1"),
+    ],
+)
+def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
+    result = FastFlight(config(*overrides)).run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert not set(event_ids(result)) & set(ALARMS)
+    states = [o.tether for o in result.outputs if o.tether is not None and o.phase_kind is PhaseKind.FLIGHT]
+    assert len(states) > 1000
+    assert not any(state.taut or state.snagged or state.separated for state in states)
+    assert max(state.pull_n for state in states) < 2.3
+    assert min(state.clearance_m for state in states) > vehicle().tether.clearance_min_m
+    assert max(abs(state.turns) for state in states) < 0.5
+
+
+def snag(flight: FastFlight, at_s: float, anchor: Vec3, extra_m: float) -> None:
+    """From `at_s` after arming on the line is held at `anchor`, and is that much longer than it is away."""
+    step, plant = flight.plant.step, flight.plant
+    done = False
+
+    def hooked(armed: bool) -> None:
+        nonlocal done
+        now_s = plant.mission_t_s()
+        if not done and now_s is not None and now_s >= at_s:
+            done = True
+            world = plant.world
+            world.model.site_pos[world.model.site("anchor").id] = anchor
+            world.model.tendon_range[0, 1] = math.dist(anchor, plant.truth.position_world_m) + extra_m
+        step(armed)
+
+    flight.plant.step = hooked  # type: ignore[method-assign]
+
+
+def first_s(result: FastResult, is_so: Callable[[Outputs, Truth], bool]) -> float:
+    return next(truth.t_s for outputs, truth in zip(result.outputs, result.truth, strict=True) if is_so(outputs, truth))
+
+
+@pytest.mark.parametrize(("at_s", "anchor"), [(15.0, ANCHOR), (9.0, ANCHOR), (14.0, (1.5, 1.5, 0.0))])
+def test_a_snagged_line_is_noticed_and_the_machine_lands(at_s: float, anchor: Vec3) -> None:
+    flight = FastFlight(config("world.payload_kg=0.2"))
+    snag(flight, at_s, anchor, 0.02)
+    result = flight.run(60.0)
+    tight_s = first_s(result, lambda _, truth: truth.tether_tension_n > 1.0)
+    seen_s = first_s(
+        result, lambda outputs, _: bool(outputs.tether and (outputs.tether.snagged or outputs.tether.taut))
+    )
+    assert 0.0 < seen_s - tight_s < 2.0
+    assert not result.crashed
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert set(event_ids(result)) & {"tether_taut", "tether_snagged"}

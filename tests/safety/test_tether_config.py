@@ -1,0 +1,56 @@
+"""A vehicle file whose tether is not known is not loaded, and one line says where and what."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from companion.config.document import ConfigError
+from companion.config.loader import load_flight
+
+ROOT = Path(__file__).parents[2]
+ANCHOR = "  anchor_world_m: [0.0, -1.2, 0.0]\n"
+LENGTH = "  length_m: 3.0\n"
+
+
+@pytest.fixture
+def mission(tmp_path: Path) -> Path:
+    for folder, name in (("vehicles", "tarot650_2r"), ("missions", "catch")):
+        (tmp_path / folder).mkdir()
+        shutil.copy(ROOT / "configs" / folder / f"{name}.yaml", tmp_path / folder)
+    return tmp_path / "missions" / "catch.yaml"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (ANCHOR, "", r"tether\.anchor_world_m: missing; expected a list of 3 numbers"),
+        (LENGTH, "", r"tether\.length_m: missing; expected a number > 0"),
+        (LENGTH, "  length_m:\n", r"tether\.length_m: expected a number > 0, got nothing"),
+        (LENGTH, "  length_m: 0.0\n", r"tether\.length_m: expected a number > 0, got 0\.0"),
+        (LENGTH, LENGTH + "  turns: 2\n", r"tether\.turns: unknown key; .*turns_max.*"),
+        (LENGTH, LENGTH + "  pull_min_n: -1\n", r"tether\.pull_min_n: expected a number > 0, got -1"),
+    ],
+)
+def test_a_tether_that_is_not_known_is_not_loaded(mission: Path, old: str, new: str, line: str) -> None:
+    path = mission.parents[1] / "vehicles" / "tarot650_2r.yaml"
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_flight(mission)
+    (found,) = str(caught.value).splitlines()
+    assert re.fullmatch(rf".*tarot650_2r\.yaml:\d+:\d+: {line}", found), found
+
+
+def test_no_tether_section_at_all(mission: Path) -> None:
+    path = mission.parents[1] / "vehicles" / "tarot650_2r.yaml"
+    before, _, rest = path.read_text(encoding="utf-8").partition("tether:\n")
+    path.write_text(before + rest.partition("\n\n")[2], encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_flight(mission)
+    (found,) = str(caught.value).splitlines()
+    assert re.search(r"tarot650_2r\.yaml:\d+:\d+: tether: missing", found), found

@@ -1,0 +1,90 @@
+"""The fast closed loop itself: what it keeps of the world, what its knobs do, what it leaves behind."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from functools import cache
+
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.io.dynamixel import WATCHDOG_ERROR
+from companion.types import Outcome
+from sitl.fast import FastFlight, FastResult
+
+
+def configured(*overrides: str) -> FlightConfig:
+    return load_flight("configs/missions/hover.yaml", overrides=("world.payload_kg=0", *overrides))
+
+
+@cache
+def flown(*overrides: str) -> FastResult:
+    return FastFlight(configured(*overrides)).run()
+
+
+@pytest.fixture
+def collector() -> Iterator[None]:
+    was_on = gc.isenabled()
+    yield
+    (gc.enable if was_on else gc.disable)()
+
+
+def test_the_truth_that_is_made_afterwards_is_the_one_of_the_tick() -> None:
+    flight = FastFlight(configured())
+    seen = []
+    step = flight.core.step
+
+    def watched(inputs):  # type: ignore[no-untyped-def]
+        seen.append(flight.plant.truth)
+        return step(inputs)
+
+    flight.core.step = watched  # type: ignore[method-assign]
+    result = flight.run(limit_s=6.0)
+    assert len(seen) == len(result.inputs) > 1000
+    assert result.truth == seen
+    assert result.truth is result.truth, "made once"
+
+
+@pytest.mark.usefixtures("collector")
+@pytest.mark.parametrize("on", [True, False])
+def test_the_garbage_collector_is_left_as_it_was(on: bool) -> None:
+    (gc.enable if on else gc.disable)()
+    FastFlight(configured()).run(limit_s=0.1)
+    assert gc.isenabled() is on
+    broken = FastFlight(configured())
+    broken.core.step = None  # type: ignore[assignment, method-assign]
+    with pytest.raises(TypeError):
+        broken.run(limit_s=0.1)
+    assert gc.isenabled() is on
+
+
+def test_the_arm_delay_delays_the_currents_and_nothing_else() -> None:
+    prompt, late = flown(), flown("world.arm_delay_s=0.01")
+    assert late.outputs[-1].outcome is Outcome.COMPLETED
+
+    def first_current_s(result: FastResult) -> float:
+        return next(i.t_s for i in result.inputs if i.arm is not None and any(i.arm.torque_nm))
+
+    def first_command_s(result: FastResult) -> float:
+        return next(o.t_s for o in result.outputs if o.arm_torque_nm is not None and any(o.arm_torque_nm))
+
+    assert first_command_s(late) == first_command_s(prompt)
+    # Seen at ticks of 5 ms, given at steps of 2 ms.
+    assert first_current_s(late) - first_current_s(prompt) == pytest.approx(0.010, abs=0.0051)
+    before = [k for k, i in enumerate(late.inputs) if i.t_s < first_command_s(late)]
+    assert [late.inputs[k] for k in before] == [prompt.inputs[k] for k in before]
+
+
+def test_a_silent_servo_lets_go_and_that_is_told_when_it_answers_again() -> None:
+    """As over the wire: its watchdog trips, the edge restarts it and says so in one state."""
+    result = flown("world.faults=[{kind: servo_loss, t_s: 4.0, duration_s: 0.12}]")
+    armed_s = next(i.t_s for i in result.inputs if i.status is not None and i.status.armed)
+    told = [i.t_s - armed_s for i in result.inputs if i.arm is not None and i.arm.hardware_error != (0, 0)]
+    assert told == [pytest.approx(4.12, abs=0.011)] * len(told)
+    assert len({i.arm.stamp_s for i in result.inputs if i.arm is not None and any(i.arm.hardware_error)}) == 1
+    errors = {i.arm.hardware_error for i in result.inputs if i.arm is not None}
+    assert errors == {(0, 0), (WATCHDOG_ERROR, 0)}
+    back = next(i for i in result.inputs if i.arm is not None and any(i.arm.hardware_error))
+    assert back.arm is not None and back.arm.torque_nm[0] == 0.0
+    assert any(event.id == "arm_let_go" for o in result.outputs for event in o.events)

@@ -1,0 +1,173 @@
+"""Faults where they meet a wire or another process: noise on the bus, a slow link, a recorder that cannot write."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from companion.config.faults import Fault
+from companion.config.loader import load_flight
+from companion.types import AutopilotStatus, FlightMode, LandedState, VehicleState
+from sitl.fast import TICK_S, FastFlight
+from sitl.fast_link import FastLink
+from sitl.flight_faults import strike
+from sitl.servo_bus import ServoBus
+from sitl.servo_model import ServoModel
+from sitl.servo_protocol import packet, status
+from tests.support import CATCH, DEADLINE_S
+
+# -- the servo bus -----------------------------------------------------------------------------------------------------
+
+_LED = 65
+
+
+def test_a_damaged_instruction_is_heard_by_nobody() -> None:
+    async def scenario() -> tuple[int, bytes]:
+        servo = ServoModel(1)
+        async with ServoBus([servo], wire_time=False) as bus:
+            asked: list[bool] = []
+
+            def first_only() -> bool:
+                asked.append(not asked)
+                return asked[-1]
+
+            bus.damaged = first_only
+            fd = os.open(bus.path, os.O_RDWR | os.O_NOCTTY)
+            try:
+                speed = termios.tcgetattr(fd)
+                speed[4] = speed[5] = termios.B3000000
+                termios.tcsetattr(fd, termios.TCSANOW, speed)
+                os.write(fd, packet(1, bytes((3, _LED, 0, 1))))
+                await _turns_until(lambda: len(asked) == 1)
+                os.write(fd, packet(1, bytes((2, 0, 0, 6, 0))))
+                expected = status(1, 0, servo.read(0, 6))
+                return servo.read(_LED, 1)[0], await _read(fd, len(expected))
+            finally:
+                os.close(fd)
+
+    led, answer = asyncio.run(scenario())
+    assert led == 0, "the damaged write was carried out"
+    assert answer == status(1, 0, ServoModel(1).read(0, 6)), "and the answer to it came first"
+
+
+async def _turns_until(done: Callable[[], bool]) -> None:
+    loop = asyncio.get_running_loop()
+    give_up_s = loop.time() + DEADLINE_S
+    while not done():
+        assert loop.time() < give_up_s
+        await asyncio.sleep(0)
+
+
+async def _read(fd: int, size: int) -> bytes:
+    loop = asyncio.get_running_loop()
+    data = b""
+    while len(data) < size:
+        ready: asyncio.Future[None] = loop.create_future()
+        loop.add_reader(fd, ready.set_result, None)
+        try:
+            await asyncio.wait_for(ready, DEADLINE_S)
+        finally:
+            loop.remove_reader(fd)
+        data += os.read(fd, size - len(data))
+    return data
+
+
+# -- the link of the fast loop -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def flight() -> FastFlight:
+    return FastFlight(load_flight(CATCH))
+
+
+def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
+    level = (1.0, 0.0, 0.0, 0.0)
+    nothing = (0.0, 0.0, 0.0)
+    state = VehicleState(t_s, t_s, t_s, (t_s, 0.0, 0.0), nothing, level, nothing, (0.0, 0.0, 9.81), t_s)
+    return state, AutopilotStatus(t_s, True, FlightMode.OFFBOARD, LandedState.IN_AIR, 16.0, 1.0)
+
+
+def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: FastFlight) -> None:
+    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_S)
+    arrived: list[tuple[float, float]] = []
+    flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
+    for tick in range(40):
+        world.t_s = t_s = round(tick * TICK_S, 4)
+        link.deliver_late()
+        link.send(lambda sent_s=t_s: arrived.append((sent_s, world.t_s)))  # type: ignore[misc]
+        state, heard = link.hear(*at_rest(t_s))
+        assert state is not None
+        if tick >= 10:
+            assert state.position_world_m[0] == pytest.approx(t_s - 0.05), "what was said then"
+            assert state.attitude_stamp_s == heard.heartbeat_stamp_s == pytest.approx(t_s), "but it arrives now"
+            assert state.boot_s == pytest.approx(t_s - 0.05)
+    assert [sent_s for sent_s, _ in arrived] == sorted(sent_s for sent_s, _ in arrived)
+    assert len(arrived) == 30
+    assert all(at_s - sent_s == pytest.approx(0.05) for sent_s, at_s in arrived)
+
+
+def test_over_a_dead_link_nothing_comes_and_the_last_word_stays(flight: FastFlight) -> None:
+    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_S)
+    last = link.hear(*at_rest(0.0))
+    flight.faults.active["link_loss"] = Fault(kind="link_loss", t_s=0.0)
+    world.t_s = 1.0
+    link.send(lambda: pytest.fail("it arrived"))
+    link.deliver_late()
+    assert link.hear(*at_rest(1.0)) == last
+    flight.faults.active.clear()
+    assert link.hear(*at_rest(1.0)) == at_rest(1.0)
+    assert replace(last[1], heartbeat_stamp_s=1.0) == at_rest(1.0)[1]
+
+
+# -- processes ---------------------------------------------------------------------------------------------------------
+
+_WRITER = """
+import sys
+with open(sys.argv[2], "wb", buffering=0) as file:
+    file.write(b"before")
+    print("ready", flush=True)
+    sys.stdin.readline()
+    try:
+        file.write(b"after")
+    except OSError as error:
+        print(error.errno, flush=True)
+"""
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A child that is called as the recorder is, and writes when it is told to."""
+    command = [sys.executable, "-c", _WRITER, "companion.recorder_process", str(tmp_path / "log")]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate(timeout=DEADLINE_S)
+
+
+def test_on_a_full_disk_the_recorder_alone_cannot_write(recorder: subprocess.Popen[str], tmp_path: Path) -> None:
+    assert strike("disk_full", os.getpid())
+    out, _ = recorder.communicate("\n", timeout=DEADLINE_S)
+    assert out.strip().isdigit(), "its write went through"
+    assert (tmp_path / "log").read_bytes() == b"before"
+    (tmp_path / "other").write_bytes(b"x" * 10_000)
+
+
+def test_the_recorder_is_found_among_the_children_and_killed(recorder: subprocess.Popen[str]) -> None:
+    assert strike("kill_recorder", os.getpid())
+    assert recorder.wait(DEADLINE_S) == -9
+
+
+def test_a_process_that_is_not_there_is_not_struck() -> None:
+    assert not strike("kill_recorder", os.getpid())

@@ -1,0 +1,302 @@
+"""Faults in the simulated world: when they act, what they do, and how a flight with one of them ends."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from typing import Any
+
+import pytest
+
+from companion.analysis.faults import Row, Variant, good
+from companion.config.faults import KINDS, FaultKind, FlightPhase
+from companion.config.loader import FlightConfig, load_flight
+from companion.exit_codes import EXIT_BAD_INPUT
+from companion.mission.plan import Plan
+from companion.mission.sequencer import SPOOL_S
+from sitl.campaign import CampaignError
+from sitl.fast import FastFlight, FastResult
+from sitl.fault_campaign import fly, grid
+from sitl.faults import FaultError, in_time
+from sitl.flight_faults import environment
+from tests.support import CATCH, HOVER, sandbox_in
+
+CONFIG = load_flight(CATCH, preset="recommended")
+CONFIG_JSON = CONFIG.model_dump_json()
+
+
+def with_faults(*faults: dict[str, Any], mission: Any = CATCH, world: str = "world.seed=1") -> FlightConfig:
+    return load_flight(mission, overrides=[f"world.faults={json.dumps(list(faults))}", world])
+
+
+@cache
+def flown(kind: FaultKind, phase: FlightPhase, size: float | None = None, duration_s: float | None = None) -> Row:
+    row: Row = fly(CONFIG_JSON, {"kind": kind, "size": size, "duration_s": duration_s, "phase": phase})["row"]
+    return row
+
+
+# -- when --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_phase_is_a_time_of_the_plan() -> None:
+    plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
+    expected: dict[FlightPhase, str] = {"takeoff": "take-off", "line": "catch", "return": "return", "landing": "land"}
+    for phase, name in expected.items():
+        (fault,) = in_time(with_faults({"kind": "mocap_loss", "phase": phase})).world.faults
+        assert fault.t_s is not None
+        assert fault.after == "arming"
+        assert plan.segment(fault.t_s - SPOOL_S).name == name, phase
+
+
+def test_the_catch_is_the_world_s_to_tell_unless_nothing_is_thrown() -> None:
+    (fault,) = in_time(with_faults({"kind": "mocap_loss", "phase": "catch"})).world.faults
+    assert fault.after == "catch"
+    (fault,) = in_time(with_faults({"kind": "mocap_loss", "phase": "catch"}, world="world.payload_kg=0")).world.faults
+    assert fault.after == "arming"
+
+
+def test_a_heavy_payload_is_the_one_that_is_thrown() -> None:
+    assert (
+        in_time(with_faults({"kind": "payload_heavy", "phase": "catch"})).world.payload_kg
+        == KINDS["payload_heavy"].default
+    )
+
+
+def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
+    with pytest.raises(FaultError, match="mission 'hover' has no return; give t_s instead"):
+        in_time(with_faults({"kind": "mocap_loss", "phase": "return"}, mission=HOVER))
+    with pytest.raises(CampaignError) as refused:
+        grid({"config": load_flight(HOVER).model_dump(mode="json"), "flights": [{"phase": "return"}]})
+    assert refused.value.bad_input
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ({"kind": "mocap_loss"}, "give either t_s or phase"),
+        ({"kind": "mocap_loss", "t_s": 1.0, "phase": "line"}, "give either t_s or phase"),
+        ({"kind": "mocap_loss", "t_s": 1.0, "size": 2.0}, "a mocap_loss has no size"),
+        ({"kind": "gust", "t_s": 1.0, "size": -2.0}, "must not be negative"),
+        ({"kind": "bus_noise", "t_s": 1.0, "size": 2.0}, "is a share, 0 to 1"),
+        ({"kind": "mocap_rate", "t_s": 1.0, "size": 0.0}, "must be above 0"),
+    ],
+)
+def test_a_fault_that_means_nothing_is_refused(
+    fault: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from companion.cli import main
+
+    assert main(["check", str(CATCH), "--set", f"world.faults={json.dumps([fault])}"]) == EXIT_BAD_INPUT
+    assert told in capsys.readouterr().err
+
+
+def test_faults_that_are_over_leave_the_world_as_it_was() -> None:
+    over = [{"kind": kind, "after": "start", "t_s": 0.0, "duration_s": 0.4} for kind in KINDS if kind not in _FOR_GOOD]
+    flight = FastFlight(with_faults(*over))
+    world, drives = flight.plant.world, flight.plant._drives
+    while flight.plant.t_s < 0.2:
+        flight.plant.step(False)
+    assert len(flight.faults.active) == len(over)
+    assert world.rotor_share is not None and world.snag is not None and world.wind_m_s != (0.0, 0.0, 0.0)
+    while flight.plant.t_s < 0.6:
+        flight.plant.step(False)
+    assert flight.faults.active == {}
+    assert world.rotor_share is None and world.snag is None
+    assert world.wind_m_s == pytest.approx((0.0, 0.0, 0.0))
+    assert world.tether_length_m == CONFIG.vehicle.tether.length_m
+    assert world.throw_aside_m == 0.0
+    assert not flight.px4.refuses_offboard and not flight.px4.refuses_arming
+    assert flight.faults.sag_v == 0.0
+    assert [drive.slip_counts for drive in drives] == [0, 0]
+    assert flight.faults.server_clock_s(1.0) == 1.0
+    assert flight.faults.pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)) == ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), True)
+    assert flight.faults.wrench((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)) == ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+
+
+_FOR_GOOD = (
+    "autopilot_reboot",
+    "servo_overload",
+    "payload_double",
+    "payload_dropped",
+    "payload_heavy",
+    "pilot_takeover",
+)
+
+
+def test_of_two_of_a_kind_the_other_one_goes_on() -> None:
+    first = {"kind": "mocap_jump", "after": "start", "t_s": 0.0, "duration_s": 0.2, "size": 0.5}
+    second = {"kind": "mocap_jump", "after": "start", "t_s": 0.1, "duration_s": 0.3, "size": 1.0}
+    flight = FastFlight(with_faults(first, second))
+    sizes = []
+    while flight.plant.t_s < 0.5:
+        flight.plant.step(False)
+        sizes.append((flight.plant.t_s, flight.faults.size("mocap_jump")))
+    assert {size for t_s, size in sizes if 0.11 < t_s < 0.39} == {1.0}
+    assert {size for t_s, size in sizes if t_s > 0.41} == {0.0}
+
+
+def test_a_clock_that_steps_makes_the_frames_late_that_were_on_their_way() -> None:
+    """Exposed by the old clock, sent by the new one; those after them are as they were."""
+    config = with_faults({"kind": "clock_step", "after": "start", "t_s": 0.503, "size": 5.0})
+    result = FastFlight(config).run(1.0)
+    poses = {i.mocap.frame_number: i.mocap for i in result.inputs if i.mocap is not None}
+    late = [pose for pose in poses.values() if pose.latency_s is not None and pose.latency_s > 1.0]
+    assert 1 <= len(late) <= 2
+    assert all(pose.latency_s == pytest.approx(5.0, abs=0.02) for pose in late)
+    assert poses[max(poses)].latency_s == pytest.approx(0.005, abs=0.003)
+
+
+def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
+    """A fault that never comes changes nothing but that the guardian is told of."""
+    late = FastFlight(with_faults({"kind": "mocap_loss", "t_s": 1000.0})).run(6.0)
+    never = FastFlight(CONFIG).run(6.0)
+    assert [o.attitude for o in late.outputs] == [o.attitude for o in never.outputs]
+    assert [s.q for s in late.snapshots] == [s.q for s in never.snapshots]
+
+
+# -- what comes of it --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "phase", "size", "duration_s", "outcome", "event", "action"),
+    [
+        ("mocap_freeze", "takeoff", None, None, "landed", "mocap_frozen", "autopilot_land"),
+        ("mocap_swap", "catch", 1.0, None, "landed", "mocap_jump", "autopilot_land"),
+        ("mocap_latency", "line", 0.2, None, "landed", "mocap_lost", "autopilot_land"),
+        ("link_loss", "return", None, None, "landed", "vehicle_state_lost", "autopilot_land"),
+        ("link_delay", "line", 0.15, None, "landed", "link_late", "autopilot_land"),
+        ("offboard_refused", "landing", None, None, "landed", "offboard_left", "autopilot_land"),
+        ("arming_refused", "ground", None, None, "refused", "arming_refused", "nominal"),
+        ("servo_overload", "line", None, None, "landed", "servo_error", "land"),
+        ("servo_angle", "return", 40.0, None, "landed", "joint_jump", "land"),
+        ("bus_noise", "takeoff", 0.6, None, "completed", "arm_read_failures", "warn"),
+        ("force_stuck", "line", None, None, "completed", "force_stuck", "warn"),
+        ("battery_sag", "line", 4.0, None, "landed", "battery_voltage", "land"),
+        ("payload_dropped", "catch", None, None, "completed", None, "nominal"),
+        ("kill_recorder", "landing", None, None, "completed", "recorder_drops", "warn"),
+        ("kill_guardian", "takeoff", None, None, "completed", "guardian_lost", "warn"),
+        ("stop_flight", "catch", None, None, "landed", "guardian_took_over", "autopilot_land"),
+        ("kill_flight", "takeoff", None, None, "landed", "guardian_took_over", "autopilot_land"),
+        ("stall_loop", "line", None, 0.06, "completed", "loop_late", "warn"),
+        ("pilot_takeover", "return", 1.0, None, "landed", "pilot_took_over", "autopilot_land"),
+    ],
+)  # fmt: skip
+def test_it_ends_well_and_is_told(
+    kind: FaultKind,
+    phase: FlightPhase,
+    size: float | None,
+    duration_s: float | None,
+    outcome: str,
+    event: str | None,
+    action: str,
+) -> None:
+    row = flown(kind, phase, size, duration_s)
+    assert good(row), row["problems"]
+    assert (row["outcome"], row["event"], row["action"]) == (outcome, event, action), row["events"]
+
+
+@pytest.mark.parametrize("kind", ["tether_taut", "tether_snag"])
+def test_a_tether_that_holds_it_brings_it_down(kind: FaultKind) -> None:
+    row = flown(kind, "line", 0.05)
+    assert good(row), row["problems"]
+    assert row["outcome"] == "landed"
+    assert {"tether_taut", "tether_snagged"} & set(row["events"])
+
+
+@pytest.mark.parametrize("duration_s", [0.2, 1.0, None])
+def test_mocap_lost_in_the_middle_of_the_line(duration_s: float | None) -> None:
+    """Issue 4, show 2."""
+    row = flown("mocap_loss", "line", None, duration_s)
+    assert row["outcome"] == "landed"
+    assert row["reacted_s"] <= 0.15
+    assert row["drift_m"] <= 0.3
+
+
+def test_a_gap_shorter_than_the_timeout_is_flown_through() -> None:
+    row = flown("mocap_loss", "line", None, 0.1)
+    assert (row["outcome"], row["action"]) == ("completed", "nominal")
+    assert row["drift_m"] < 0.05
+
+
+def test_a_second_payload_is_carried_too() -> None:
+    flight = FastFlight(with_faults({"kind": "payload_double", "after": "catch", "t_s": 0.5, "size": 0.2}))
+    result = flight.run()
+    begun_s = flight.faults.begun_s
+    assert begun_s is not None
+    assert _load_n(result, begun_s + 2.0) == pytest.approx(0.4 * 9.81, abs=0.6)
+
+
+def test_a_payload_that_is_dropped_is_felt_no_more() -> None:
+    flight = FastFlight(with_faults({"kind": "payload_dropped", "after": "catch", "t_s": 1.0}))
+    result = flight.run()
+    begun_s = flight.faults.begun_s
+    assert begun_s is not None
+    assert _load_n(result, begun_s - 0.3) == pytest.approx(0.2 * 9.81, abs=0.5)
+    assert _load_n(result, begun_s + 1.0) == pytest.approx(0.0, abs=0.4)
+
+
+def _load_n(result: FastResult, t_s: float) -> float:
+    """What hangs in the net, by the force sensor, over a quarter of a second."""
+    loads = [
+        -o.control.force_ext_world_n[2] for o in result.outputs if o.control is not None and t_s <= o.t_s < t_s + 0.25
+    ]
+    return sum(loads) / len(loads)
+
+
+def test_a_restart_of_px4_in_the_air_is_a_fall_and_is_called_so() -> None:
+    row = flown("autopilot_reboot", "line", 2.0)
+    assert row["outcome"] == "crashed"
+    assert row["problems"] == ["crashed"]
+    assert row["event"] == "vehicle_state_lost"
+
+
+def test_a_row_is_the_same_wherever_it_is_flown() -> None:
+    again: Row = fly(CONFIG_JSON, {"kind": "bus_noise", "size": 0.6, "duration_s": None, "phase": "takeoff"})["row"]
+    assert again == flown("bus_noise", "takeoff", 0.6)
+
+
+# -- processes ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_flight_process_is_told_for_how_long_it_stalls() -> None:
+    assert environment({"mocap_loss"}, 0.2) == {}
+    assert environment({"stall_loop"}, 0.2)["COMPANION_SITL_STALL_S"] == "0.2"
+    assert "COMPANION_SITL_STALL_S" not in environment({"stall_loop"})
+
+
+def test_the_campaign_as_a_process(tmp_path: Any) -> None:
+    with sandbox_in(tmp_path / "sandbox") as sandbox:
+        kinds = ("--kinds", "kill_flight,servo_hot", "--phases", "landing")
+        ended = sandbox.run("faults", CATCH, *kinds, "--json", "--out", "out")
+        sandbox.assert_nobody_left()
+    assert ended.code == 0, ended.err
+    table = json.loads(ended.out)
+    assert [(row["fault"], row["size"]) for row in table["rows"]] == [
+        ("servo_hot", 70.0),
+        ("servo_hot", 85.0),
+        ("kill_flight", None),
+    ]
+    assert table["summary"]["bad"] == 0
+    wanted = {
+        "fault",
+        "phase",
+        "size",
+        "outcome",
+        "detected_s",
+        "action",
+        "worst_tilt_deg",
+        "min_height_m",
+        "min_slack_m",
+    }
+    assert wanted <= set(table["rows"][0])
+    written = json.loads((sandbox.cwd / "out/faults.json").read_text())
+    assert written["rows"] == table["rows"]
+    assert (sandbox.cwd / "out/faults.html").read_text().count("<tr") == 4
+    assert len((sandbox.cwd / "out/faults.csv").read_text().splitlines()) == 4
+
+
+def test_variants_say_what_they_are() -> None:
+    assert Variant("mocap_loss", None, 0.5).text() == "mocap_loss 0.5 s"
+    assert Variant("gust", 8.0, 0.7).text() == "gust 8 m/s for 0.7 s"
+    assert math.isclose(Variant("bus_noise", 0.1).fault("line")["size"], 0.1)
