@@ -124,7 +124,10 @@ class Columns:
     """From valid frames not older than `MOCAP_FRESH_S`."""
     mocap_attitude_rad: Array
     """Roll, pitch, yaw (ZYX)."""
+    mocap_age_s: Array
+    """From the frame's exposure to the tick."""
     reference_position_world_m: Array
+    reference_velocity_world_m_s: Array
     attitude_desired_rad: Array
     arm_rad: Array
     arm_reference_rad: Array
@@ -146,6 +149,12 @@ def _columns(log: FlightLog) -> Columns:
         ),
         mocap_attitude_rad=log.column(
             lambda i, o, s: euler_zyx_from_quat(i.mocap.attitude_wxyz) if i.mocap and fresh(i) else None, 3
+        ),
+        mocap_age_s=log.column(
+            lambda i, o, s: i.t_s - i.mocap.stamp_s + (i.mocap.latency_s or 0.0) if i.mocap and fresh(i) else None
+        ),
+        reference_velocity_world_m_s=log.column(
+            lambda i, o, s: o.reference.velocity_world_m_s if o.reference else None, 3
         ),
         reference_position_world_m=log.column(lambda i, o, s: o.reference.position_world_m if o.reference else None, 3),
         attitude_desired_rad=log.column(lambda i, o, s: o.control.attitude_desired_rad if o.control else None, 3),
