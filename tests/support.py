@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import signal
@@ -23,6 +24,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from companion.config.loader import load_flight
+from companion.types import Inputs, Outputs
 
 ROOT = Path(__file__).parents[1]
 CATCH = ROOT / "configs/missions/catch.yaml"
@@ -323,3 +325,11 @@ def wait_until(condition: Callable[[], bool], why: Callable[[], str], within_s: 
     while not condition():
         assert time.monotonic() < deadline_s, why()
         time.sleep(0.05)
+
+
+def position_error_m(i: Inputs, o: Outputs) -> float:
+    """By motion capture against the reference of the frame's exposure: what the metrics say, written once more."""
+    assert i.mocap is not None and o.reference is not None
+    age_s = i.t_s - i.mocap.stamp_s + (i.mocap.latency_s or 0.0)
+    at, speed = o.reference.position_world_m, o.reference.velocity_world_m_s
+    return math.dist(i.mocap.position_world_m, [p - age_s * v for p, v in zip(at, speed, strict=True)])

@@ -26,7 +26,7 @@ from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from companion.types import Outcome, PhaseKind
 from sitl import campaign
 from sitl.fast import FastFlight, FastResult
-from tests.support import CATCH, DEADLINE_S, Ended, Sandbox, sandbox_in, wait_until
+from tests.support import CATCH, DEADLINE_S, Ended, Sandbox, position_error_m, sandbox_in, wait_until
 
 CONFIG = load_flight(CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
 FLIGHT: dict[str, Any] = {
@@ -67,9 +67,7 @@ def test_a_row_is_what_the_flight_was(fast: tuple[FastFlight, FastResult], resul
     parts: dict[str, list[float]] = {"pre": [], "post": []}
     for i, o in zip(flown.inputs, flown.outputs, strict=True):
         if o.phase_kind is PhaseKind.FLIGHT:
-            assert i.mocap is not None and o.reference is not None
-            error = math.dist(i.mocap.position_world_m, o.reference.position_world_m)
-            parts["post" if o.t_s >= catch.t_s - 1e-9 else "pre"].append(error)
+            parts["post" if o.t_s >= catch.t_s - 1e-9 else "pre"].append(position_error_m(i, o))
     for part, errors in parts.items():
         rms = math.sqrt(math.fsum(error**2 for error in errors) / len(errors))
         assert row["rms"][part]["e_p_m"] == pytest.approx(rms, rel=1e-9)

@@ -20,7 +20,7 @@ from sitl.campaign import CampaignError
 from sitl.fast import FastFlight
 from sitl.model import link_masses_kg
 from sitl.world import World as SimulatedWorld
-from tests.support import CATCH, DEADLINE_S, HOVER, sandbox_in
+from tests.support import CATCH, DEADLINE_S, HOVER, position_error_m, sandbox_in
 
 CONFIG = load_flight(CATCH, preset="recommended")
 PLACES = robustness.throws(CONFIG.mission, CONFIG.vehicle)
@@ -139,7 +139,7 @@ def test_a_row_is_what_the_flight_was(row: dict[str, Any]) -> None:
     begun_s = next(o.t_s - o.mission_t_s for o in flown.outputs if o.mission_t_s > 0)
     assert row["caught_s"] + begun_s == pytest.approx(flight.plant.world.caught_t_s)
     errors = [
-        math.dist(i.mocap.position_world_m, o.reference.position_world_m)
+        position_error_m(i, o)
         for i, o in zip(flown.inputs, flown.outputs, strict=True)
         if i.mocap and o.reference and o.phase_kind is PhaseKind.FLIGHT
     ]
