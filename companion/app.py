@@ -341,9 +341,12 @@ async def fly(
             try:
                 outcome = await flight.run()
             except Exception:  # whatever broke in here, the vehicle may be in the air
-                traceback.print_exc()
-                if guardian is not None and guardian.would_take_over:
+                with contextlib.suppress(
+                    OSError, ValueError
+                ):  # a full disk under flight.log costs the words, not the landing
+                    traceback.print_exc()
                     sys.stderr.flush()
+                if guardian is not None and guardian.would_take_over:
                     os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
                 outcome = await flight.hand_over()
             if guardian is not None and outcome is not Outcome.LOST:

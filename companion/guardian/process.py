@@ -248,7 +248,8 @@ class Guardian:
             "text": told.text,
         }
         status.send(self._channel, message)
-        print(f"{told.t_s:.3f} {told.id}: {told.text}", file=sys.stderr, flush=True)
+        with contextlib.suppress(OSError, ValueError):  # a full disk under guardian.log costs the line, not the landing
+            print(f"{told.t_s:.3f} {told.id}: {told.text}", file=sys.stderr, flush=True)
         if self._beats.recorder is not None:
             packet = pack_plain((TEXT, UNNUMBERED, told.t_s, told.severity.value, told.id, told.text))
             with contextlib.suppress(OSError):

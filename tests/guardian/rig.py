@@ -77,7 +77,7 @@ class Cameras:
 class Rig:
     """One guardian with everything around it; `with` starts it and ends what is left by pid."""
 
-    def __init__(self, folder: Path, *, timeout_s: float = 0.2) -> None:
+    def __init__(self, folder: Path, *, timeout_s: float = 0.2, disk_full: bool = False) -> None:
         self._folder = folder
         self._timeout_s = timeout_s
         self.port = free_udp_port()
@@ -87,6 +87,7 @@ class Rig:
         self.origin_s = time.monotonic() - 10.0
         self.tick = 0
         self.messages: list[status.Message] = []
+        self._disk_full = disk_full
         self.logged: list[tuple[Any, ...]] = []
 
     def __enter__(self) -> Self:
@@ -121,7 +122,8 @@ class Rig:
         self.beats.setblocking(False)
         pidfd = os.pidfd_open(self.flight.pid)
         self.log = self._folder / "guardian.log"
-        with theirs, channel, open(self.log, "wb") as log:
+        self.log.touch()
+        with theirs, channel, open("/dev/full" if self._disk_full else self.log, "wb") as log:
             self.guardian = subprocess.Popen(
                 [
                     *(sys.executable, "-m", "companion.guardian", "--config", str(path), "--pidfd", str(pidfd)),

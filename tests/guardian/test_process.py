@@ -81,6 +81,16 @@ def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, numb
         assert {m.param1 for m in rig.peer.commands(ARM_DISARM)} == {0.0}
 
 
+def test_a_full_disk_under_its_log_does_not_cost_the_landing(tmp_path: Path) -> None:
+    with Rig(tmp_path, disk_full=True) as rig:
+        rig.beat_until_ready()
+        os.kill(rig.flight.pid, signal.SIGKILL)
+        rig.land_as_told()
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        assert rig.events == ["guardian_took_over", "guardian_land", "guardian_landed"]
+        assert rig.result is not None and rig.result["landed"] is True
+
+
 def test_poses_go_on_as_the_flight_sent_them(tmp_path: Path) -> None:
     """Frames, fields and time base; compared with the values on the cameras' side, not with the code that converts."""
     with Rig(tmp_path) as rig:
