@@ -6,12 +6,12 @@ import argparse
 import datetime
 import os
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from companion import compare_command, faults_command, hover_command, robustness_command
+from companion.campaign_command import why_unusable
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
@@ -177,26 +177,11 @@ def _fly(arguments: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     out = Path(arguments.out) if arguments.out else Path("flights") / f"{stamp}-{config.mission.name}"
-    problem = _why_unusable(out)
+    problem = why_unusable(out, "flight.mcap")
     if problem is not None:
         tell(f"companion fly: --out {out}: {problem}")
         return EXIT_BAD_INPUT
     return run_flight(config, out, sitl=arguments.sitl is not None, console=terminal_console())
-
-
-def _why_unusable(out: Path) -> str | None:
-    """Make the folder; None if a flight can leave its files there."""
-    try:
-        if out.exists() and not out.is_dir():
-            return "is a file; choose a folder"
-        if (out / "flight.mcap").exists():
-            return "there is a flight.mcap already; choose another folder"
-        out.mkdir(parents=True, exist_ok=True)
-        # Only trying tells: root may write where the permissions say no, and nobody may in some file systems.
-        with tempfile.TemporaryFile(dir=out):
-            return None
-    except OSError as error:
-        return f"{error.strerror}; choose a folder that can be written to"
 
 
 def _sitl(arguments: argparse.Namespace) -> int:

@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import datetime
-import importlib.metadata
 import json
 import math
-import signal
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from companion.analysis.compare import Cell, Flight, Row, Variant, aggregate, flights_of, variants_of
 from companion.analysis.compare_html import write_html
 from companion.analysis.compare_table import EXPLAINED, print_tables, write_csv
 from companion.analysis.printed import SOURCE
-from companion.campaign_process import CampaignError, CampaignProcess, Message
+from companion.campaign_command import Flown, Place, count, fly, versions, wide_console
+from companion.campaign_process import CampaignProcess, Message
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
+from companion.exit_codes import EXIT_LOST
 from companion.mission.check import check_mission
-from companion.terminal import tell, terminal_console
-
-PIPED_WIDTH = 132
-"""Columns of a table that no terminal limits."""
+from companion.terminal import tell
 
 
 def add_parser(commands: Any) -> None:
@@ -51,12 +41,12 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--presets", type=_names, default=(), metavar="NAME,...", help="default: all of each law")
     parser.add_argument(
-        "--seeds", type=_count, default=5, metavar="N", help="flights per cell, seeds 1 to N (default: 5)"
+        "--seeds", type=count, default=5, metavar="N", help="flights per cell, seeds 1 to N (default: 5)"
     )
     parser.add_argument(
         "--ablation", action="store_true", help="also what is left when one thing at a time is taken away"
     )
-    parser.add_argument("--jobs", type=_count, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("--jobs", type=count, metavar="N", help="processes (default: one per core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, to fly on its workers")
     parser.add_argument("--mission", default="configs/missions/catch.yaml", metavar="FILE")
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
@@ -83,12 +73,6 @@ def _payloads(text: str) -> tuple[float, ...]:
     if not all(0 <= value <= 2 for value in values):
         raise argparse.ArgumentTypeError(f"expected masses in kg from 0 to 2 with commas between them, got '{text}'")
     return tuple(dict.fromkeys(values))
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 10_000:
-        raise argparse.ArgumentTypeError(f"expected a number from 1 to 10000, got '{text}'")
-    return int(text)
 
 
 @dataclass
@@ -120,40 +104,16 @@ class _Grid:
         }
 
 
-@dataclass
-class _Flown:
-    """What came of it: by position in the grid."""
-
-    results: dict[int, Message] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    """Why the grid is not complete."""
-    code: int = EXIT_OK
-
-    @property
-    def rows(self) -> list[Row]:
-        """In the order of the grid."""
-        return [self.results[index]["row"] for index in sorted(self.results)]
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Fly, show, write; returns the exit code."""
     grid = _grid(arguments)
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    out = Path(arguments.out) if arguments.out is not None else Path("comparisons") / stamp
-    problem = "expected the name of a folder, got an empty one" if arguments.out == "" else _why_unusable(out)
-    if problem is not None:
-        tell(f"companion compare: --out {out}: {problem}")
-        return EXIT_BAD_INPUT
-    flown = _fly(grid, arguments.jobs, arguments.scheduler, out)
+    place = Place.of("compare", arguments.out, "comparisons", "compare.json")
+    flown = _fly(grid, arguments.jobs, arguments.scheduler, place.folder)
     if not flown.results:
-        with contextlib.suppress(OSError):
-            out.rmdir()  # if nothing is in it
-            if arguments.out is None:
-                out.parent.rmdir()
-        for note in flown.notes:
-            tell(f"companion compare: {note}")
+        place.leave_empty()
+        flown.tell_notes("compare")
         return flown.code
-    return _show(grid, flown, arguments, out)
+    return _show(grid, flown, arguments, place.folder)
 
 
 def _grid(arguments: argparse.Namespace) -> _Grid:
@@ -186,53 +146,19 @@ def _grid(arguments: argparse.Namespace) -> _Grid:
     return _Grid(variants, configs, flights_of(variants, arguments.payloads, range(1, arguments.seeds + 1)))
 
 
-def _fly(grid: _Grid, jobs: int | None, scheduler: str | None, out: Path) -> _Flown:
-    flown = _Flown()
-    whole = len(grid.flights)
-    console = Console(stderr=True)
-    progress = Progress(
-        TextColumn("flying"),
-        BarColumn(bar_width=32),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("[dim]{task.description}[/]"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    with CampaignProcess(grid.job(jobs, scheduler), out / "campaign.log") as campaign, _interrupts(campaign), progress:
-        task = progress.add_task("", total=whole)
-        try:
-            for message in campaign.results():
-                flown.results[message["index"]] = message
-                row = message["row"]
-                text = f"{row['controller']}/{row['preset']} {row['payload_kg']:g} kg: {row['outcome']}"
-                progress.update(task, advance=1, description=text)
-        except CampaignError as error:
-            flown.notes.append(str(error))
-            flown.code = EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
-    if len(flown.results) < whole and flown.code != EXIT_BAD_INPUT:
-        if not flown.notes:
-            flown.notes.append("interrupted")
-            flown.code = EXIT_ABORTED
-        flown.notes.append(f"{len(flown.results)} of {whole} flights were flown")
-    return flown
+def _fly(grid: _Grid, jobs: int | None, scheduler: str | None, out: Path) -> Flown[Message]:
+    with CampaignProcess(grid.job(jobs, scheduler), out / "campaign.log") as campaign:
+        results = ((message["index"], message) for message in campaign.results())
+        return fly(results, len(grid.flights), campaign.ask_to_stop, _describe)
 
 
-@contextlib.contextmanager
-def _interrupts(campaign: CampaignProcess) -> Iterator[None]:
-    """While inside: Ctrl-C and SIGTERM end the campaign, and what was flown until then is shown."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    handlers = {number: signal.signal(number, lambda *_: campaign.ask_to_stop()) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+def _describe(_: Flown[Message], message: Message) -> str:
+    row = message["row"]
+    return f"{row['controller']}/{row['preset']} {row['payload_kg']:g} kg: {row['outcome']}"
 
 
-def _show(grid: _Grid, flown: _Flown, arguments: argparse.Namespace, out: Path) -> int:
-    rows = flown.rows
+def _show(grid: _Grid, flown: Flown[Message], arguments: argparse.Namespace, out: Path) -> int:
+    rows = [message["row"] for message in flown.rows]
     cells = aggregate(rows)
     settings = _settings(grid, arguments)
     table: dict[str, Any] = {"rows": rows, "aggregate": [cell.jsonable() for cell in cells]}
@@ -246,15 +172,12 @@ def _show(grid: _Grid, flown: _Flown, arguments: argparse.Namespace, out: Path) 
         sys.stdout.flush()
     else:
         _print(rows, cells, out)
-    for note in flown.notes:
-        tell(f"companion compare: {note}")
+    flown.tell_notes("compare")
     return flown.code
 
 
 def _print(rows: Sequence[Row], cells: Sequence[Cell], out: Path) -> None:
-    console = terminal_console()
-    if not console.is_terminal:
-        console.width = max(console.width, PIPED_WIDTH)
+    console = wide_console()
     print_tables(cells, console)
     console.print(f"{EXPLAINED} Paper: {SOURCE}.", style="dim", highlight=False, markup=False)
     for row in rows:
@@ -265,13 +188,18 @@ def _print(rows: Sequence[Row], cells: Sequence[Cell], out: Path) -> None:
 
 
 def _write(
-    table: dict[str, Any], cells: Sequence[Cell], grid: _Grid, flown: _Flown, settings: dict[str, Any], out: Path
+    table: dict[str, Any],
+    cells: Sequence[Cell],
+    grid: _Grid,
+    flown: Flown[Message],
+    settings: dict[str, Any],
+    out: Path,
 ) -> None:
     """compare.csv, compare.json, pictures, compare.html."""
-    rows, versions = flown.rows, _versions()
+    rows, used = [message["row"] for message in flown.rows], versions()
     write_csv(rows, out / "compare.csv")
-    wall_s = [flown.results[index]["wall_s"] for index in sorted(flown.results)]
-    whole = {**table, "settings": settings, "versions": versions, "notes": flown.notes, "wall_s": wall_s}
+    wall_s = [message["wall_s"] for message in flown.rows]
+    whole = {**table, "settings": settings, "versions": used, "notes": flown.notes, "wall_s": wall_s}
     (out / "compare.json").write_text(json.dumps(whole, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     try:
         from companion.analysis.compare_plots import Track, write_pictures
@@ -295,7 +223,7 @@ def _write(
                     )
                 )
         pictures = write_pictures(tracks, cells, out)
-    write_html(rows, cells, pictures, settings, versions, flown.notes, out / "compare.html")
+    write_html(rows, cells, pictures, settings, used, flown.notes, out / "compare.html")
 
 
 def _settings(grid: _Grid, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -318,28 +246,3 @@ def _settings(grid: _Grid, arguments: argparse.Namespace) -> dict[str, Any]:
         "jobs": arguments.jobs,
         "scheduler": arguments.scheduler,
     }
-
-
-def _versions() -> dict[str, str]:
-    from companion.recorder_process import versions
-
-    found = versions()
-    for package in ("mujoco", "joblib", "distributed"):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[package] = importlib.metadata.version(package)
-    return found
-
-
-def _why_unusable(out: Path) -> str | None:
-    """Make the folder; None if a comparison can leave its files there."""
-    try:
-        if out.exists() and not out.is_dir():
-            return "is a file; choose a folder"
-        if (out / "compare.json").exists():
-            return "there is a compare.json already; choose another folder"
-        out.mkdir(parents=True, exist_ok=True)
-        # Only trying tells: root may write where the permissions say no, and nobody may in some file systems.
-        with tempfile.TemporaryFile(dir=out):
-            return None
-    except OSError as error:
-        return f"{error.strerror}; choose a folder that can be written to"

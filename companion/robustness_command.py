@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import datetime
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from companion.analysis import robustness
 from companion.analysis.robustness import DRIVERS, SAFE, Cases, Row
 from companion.analysis.robustness_table import flights_table, thirds_table
-from companion.campaign_process import CampaignError, CampaignProcess, Message
-from companion.compare_command import PIPED_WIDTH, _count, _interrupts, _versions
+from companion.campaign_command import Flown, Place, count, fly, versions, wide_console
+from companion.campaign_process import CampaignProcess, Message
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
+from companion.exit_codes import EXIT_LOST
 from companion.mission.check import check_mission
-from companion.terminal import tell, terminal_console
+from companion.terminal import tell
 
 DEFAULT_MISSION = "configs/missions/catch.yaml"
 _RESULTS = "robustness.json"
@@ -40,8 +34,8 @@ def add_parser(commands: Any) -> None:
         "wrong masses, a biased or missing force sensor. Exit code 5 if any of them crashed.",
     )
     parser.add_argument("mission", nargs="?", help=f"mission file, YAML (default: {DEFAULT_MISSION})")
-    parser.add_argument("--draws", type=_count, default=500, metavar="N", help="flights (default: 500)")
-    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of the draws (default: 1)")
+    parser.add_argument("--draws", type=count, default=500, metavar="N", help="flights (default: 500)")
+    parser.add_argument("--seed", type=count, default=1, metavar="N", help="of the draws (default: 1)")
     parser.add_argument("--first", type=_number, default=0, metavar="N", help="number of the first draw (default: 0)")
     parser.add_argument("--cases", metavar="FILE", help="fly the cases of this file instead of draws")
     parser.add_argument("--case", action="append", default=[], metavar="NAME", help="only this case of --cases")
@@ -55,7 +49,7 @@ def add_parser(commands: Any) -> None:
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="in every flight; a key of world. is then not drawn",
     )  # fmt: skip
-    parser.add_argument("--jobs", type=_count, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("--jobs", type=count, metavar="N", help="processes (default: one per core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, to fly on its workers")
     parser.add_argument("--out", metavar="DIR", help="where results go (default: robustness/TIME)")
     parser.add_argument("--json", action="store_true", help="print rows and summary as JSON, nothing else")
@@ -103,39 +97,16 @@ def _world_key(override: str) -> str:
     return key.partition("[")[0].partition(".")[0] if section == "world" else ""
 
 
-@dataclass
-class _Flown:
-    """What came of it."""
-
-    results: dict[int, Row] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    code: int = EXIT_OK
-
-    @property
-    def rows(self) -> list[Row]:
-        """In the order of the draws."""
-        return [self.results[index] for index in sorted(self.results)]
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Fly, show, write; returns the exit code."""
     job = _job(arguments)
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    out = Path(arguments.out) if arguments.out is not None else Path("robustness") / stamp
-    problem = "expected the name of a folder, got an empty one" if arguments.out == "" else _why_unusable(out)
-    if problem is not None:
-        tell(f"companion robustness: --out {out}: {problem}")
-        return EXIT_BAD_INPUT
-    flown = _fly(job, arguments, out)
+    place = Place.of("robustness", arguments.out, "robustness", _RESULTS)
+    flown = _fly(job, arguments, place.folder)
     if not flown.results:
-        with contextlib.suppress(OSError):
-            out.rmdir()  # if nothing is in it
-            if arguments.out is None:
-                out.parent.rmdir()
-        for note in flown.notes:
-            tell(f"companion robustness: {note}")
+        place.leave_empty()
+        flown.tell_notes("robustness")
         return flown.code
-    return _show(job, flown, arguments, out)
+    return _show(job, flown, arguments, place.folder)
 
 
 def _job(arguments: argparse.Namespace) -> _Job:
@@ -164,56 +135,18 @@ def _job(arguments: argparse.Namespace) -> _Job:
     return _Job(mission, config, chosen)
 
 
-def _why_unusable(out: Path) -> str | None:
-    """Make the folder; None if a campaign can leave its files there."""
-    try:
-        if out.exists() and not out.is_dir():
-            return "is a file; choose a folder"
-        if (out / _RESULTS).exists():
-            return f"there is a {_RESULTS} already; choose another folder"
-        out.mkdir(parents=True, exist_ok=True)
-        # Only trying tells: root may write where the permissions say no, and nobody may in some file systems.
-        with tempfile.TemporaryFile(dir=out):
-            return None
-    except OSError as error:
-        return f"{error.strerror}; choose a folder that can be written to"
+def _fly(job: _Job, arguments: argparse.Namespace, out: Path) -> Flown[Row]:
+    with CampaignProcess(job.message(arguments), out / "campaign.log", "sitl.robustness") as campaign:
+        results = ((message["index"], message["row"]) for message in campaign.results())
+        return fly(results, len(job.cases) or arguments.draws, campaign.ask_to_stop, _describe)
 
 
-def _fly(job: _Job, arguments: argparse.Namespace, out: Path) -> _Flown:
-    flown = _Flown()
-    whole = len(job.cases) or arguments.draws
-    console = Console(stderr=True)
-    progress = Progress(
-        TextColumn("flying"),
-        BarColumn(bar_width=32),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("[dim]{task.description}[/]"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    process = CampaignProcess(job.message(arguments), out / "campaign.log", "sitl.robustness")
-    with process as campaign, _interrupts(campaign), progress:
-        task = progress.add_task("", total=whole)
-        try:
-            for message in campaign.results():
-                row = message["row"]
-                flown.results[message["index"]] = row
-                safe = sum(one["outcome"] in SAFE for one in flown.results.values())
-                progress.update(task, advance=1, description=f"{row['name']}: {row['outcome']}; {safe} safe")
-        except CampaignError as error:
-            flown.notes.append(str(error))
-            flown.code = EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
-    if len(flown.results) < whole and flown.code != EXIT_BAD_INPUT:
-        if not flown.notes:
-            flown.notes.append("interrupted")
-            flown.code = EXIT_ABORTED
-        flown.notes.append(f"{len(flown.results)} of {whole} flights were flown")
-    return flown
+def _describe(flown: Flown[Row], row: Row) -> str:
+    safe = sum(one["outcome"] in SAFE for one in flown.results.values())
+    return f"{row['name']}: {row['outcome']}; {safe} safe"
 
 
-def _show(job: _Job, flown: _Flown, arguments: argparse.Namespace, out: Path) -> int:
+def _show(job: _Job, flown: Flown[Row], arguments: argparse.Namespace, out: Path) -> int:
     rows = flown.rows
     table = {"rows": rows, "summary": _summary(rows)}
     law, preset = job.law
@@ -242,8 +175,7 @@ def _show(job: _Job, flown: _Flown, arguments: argparse.Namespace, out: Path) ->
         sys.stdout.flush()
     else:
         _print(job, rows, list(zip(names, hardest, strict=True)), arguments, out)
-    for note in flown.notes:
-        tell(f"companion robustness: {note}")
+    flown.tell_notes("robustness")
     if any(row["outcome"] not in SAFE for row in rows):
         flown.code = EXIT_LOST
     return flown.code
@@ -290,7 +222,7 @@ def _write(
         title = f"{job.config.mission.name}, {law}/{preset}: {len(rows)} worlds"
         write_distribution(rows, title, out / "distribution.png")
     # The last one: where it is, the rest is.
-    whole = {**table, "settings": settings, "versions": _versions(), "notes": notes}
+    whole = {**table, "settings": settings, "versions": versions(), "notes": notes}
     (out / _RESULTS).write_text(json.dumps(whole, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -311,9 +243,7 @@ def _keep(job: _Job, rows: Sequence[Row], arguments: argparse.Namespace, path: P
 def _print(
     job: _Job, rows: Sequence[Row], hardest: Sequence[tuple[str, Row]], arguments: argparse.Namespace, out: Path
 ) -> None:
-    console = terminal_console()
-    if not console.is_terminal:
-        console.width = max(console.width, PIPED_WIDTH)
+    console = wide_console()
     law, preset = job.law
     counted = ", ".join(f"{count} {name}" for name, count in robustness.outcomes(rows).items())
     caught = sum(bool(row["caught"]) for row in rows)

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from companion.analysis.faults_table import kinds_markdown
-from companion.analysis.faults_table import written as with_faults
 from companion.analysis.summary import empty_summary
 from companion.cli import _normalised, _parser
 from companion.config.controller import AdaptiveConfig
@@ -21,9 +20,10 @@ from companion.config.faults import KINDS
 from companion.config.loader import PRESETS, load_flight
 from companion.config.vehicle import Safety
 from companion.config.world import Fault, World
+from companion.doc_tables import written
 from companion.exit_codes import EXIT_BAD_INPUT, EXIT_CODES
 from companion.safety.supervisor import HOLD_EXPIRED, RETRACT_DONE, RETRACT_EXPIRED
-from companion.safety.table import written
+from companion.safety.table import tables as safety_tables
 from companion.types import SafetyAction
 from sitl.autopilot.params import VEHICLE_DEFAULTS, Params
 
@@ -152,7 +152,7 @@ def test_knobs_match() -> None:
 
 def test_faults_match() -> None:
     """Made by `python -m companion.analysis.faults_table docs/faults.md`."""
-    assert with_faults(text_of(FAULTS), {"kinds": kinds_markdown()}) == text_of(FAULTS)
+    assert written(text_of(FAULTS), {"kinds": kinds_markdown()}) == text_of(FAULTS)
     assert [codes(row[0])[0] for row in table(FAULTS, "kind", "what happens")] == list(KINDS)
     told = [name for row in table(FAULTS, "key", "meaning") for name in codes(row[0])]
     assert told == ["kind", "t_s", "after", "phase", "duration_s", "size", "servo"]
@@ -167,7 +167,7 @@ def test_px4_parameters_match_those_that_the_stub_flies_with() -> None:
 
 def test_monitors_and_ladder_match() -> None:
     """Made by `python -m companion.safety.table docs/safety.md`."""
-    assert written(text_of(SAFETY)) == text_of(SAFETY)
+    assert written(text_of(SAFETY), safety_tables()) == text_of(SAFETY)
     named = {key for row in table(SAFETY, "id", "what is found") for cell in row[2:4] for key in codes(cell)}
     told = set(codes(text_of(SAFETY)))
     assert {key for key in Safety.model_fields if key not in named} <= told

@@ -21,6 +21,7 @@ from rich.table import Table
 from companion.analysis.faults import GOOD, Row, good, outcomes
 from companion.analysis.page import CLOSING, folded, opening
 from companion.config.faults import KINDS, PHASES
+from companion.doc_tables import write_page
 
 _STYLE = """
 :root { --width: 84rem; }
@@ -198,22 +199,6 @@ def _html(rows: Sequence[Row]) -> str:
     return f"<div class='wide'><table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
 
 
-def written(text: str, tables: dict[str, str]) -> str:
-    """The page with these tables in their places.
-
-    Raises:
-        ValueError: a table's place is not marked in it.
-    """
-    for name, table in tables.items():
-        begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->\n"
-        head, found, rest = text.partition(begin)
-        _, closed, tail = rest.partition(end)
-        if not found or not closed:
-            raise ValueError(f"no place for the table '{name}': expected {begin.strip()} and {end.strip()}")
-        text = f"{head}{begin}{table}\n{end}{tail}"
-    return text
-
-
 def main(argv: list[str] | None = None) -> int:
     """Write the tables into a page."""
     parser = argparse.ArgumentParser(prog="companion.analysis.faults_table")
@@ -221,17 +206,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("results", type=Path, nargs="?", help="faults.json of a campaign")
     parser.add_argument("--name", default="campaign", help="of the table that the results go to (default: campaign)")
     arguments = parser.parse_args(argv)
-    page: Path = arguments.page
-    try:
-        tables = {"kinds": kinds_markdown()}
-        if arguments.results is not None:
+    tables = {"kinds": kinds_markdown()}
+    if arguments.results is not None:
+        try:
             rows = json.loads(arguments.results.read_text(encoding="utf-8"))["rows"]
             tables[arguments.name] = outcomes_markdown(rows)
-        page.write_text(written(page.read_text(encoding="utf-8"), tables), encoding="utf-8")
-    except (OSError, ValueError, KeyError) as error:
-        print(f"{page}: {error}", file=sys.stderr)
-        return 2
-    return 0
+        except (OSError, ValueError, KeyError) as error:
+            print(f"{arguments.results}: {error}", file=sys.stderr)
+            return 2
+    return write_page(arguments.page, tables)
 
 
 if __name__ == "__main__":

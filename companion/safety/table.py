@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from companion.config.vehicle import ForceDevice, Safety, Tether
+from companion.doc_tables import write_page
 from companion.safety.rules import RULES, Part, Rule
 from companion.safety.supervisor import (
     HOLD_EXPIRED,
@@ -98,36 +99,16 @@ def ladder_table() -> str:
     return "\n".join(rows)
 
 
-TABLES = {"monitors": monitors_table, "ladder": ladder_table}
-
-
-def written(text: str) -> str:
-    """The page with its tables as the code has them.
-
-    Raises:
-        ValueError: a table's place is not marked in it.
-    """
-    for name, table in TABLES.items():
-        begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->\n"
-        head, found, rest = text.partition(begin)
-        _, closed, tail = rest.partition(end)
-        if not found or not closed:
-            raise ValueError(f"no place for the table '{name}': expected {begin.strip()} and {end.strip()}")
-        text = f"{head}{begin}{table()}\n{end}{tail}"
-    return text
+def tables() -> dict[str, str]:
+    """By the names of their places."""
+    return {"monitors": monitors_table(), "ladder": ladder_table()}
 
 
 def main(argv: list[str] | None = None) -> int:
     """Write the tables into a page."""
     parser = argparse.ArgumentParser(prog="companion.safety.table", description=__doc__)
     parser.add_argument("page", type=Path)
-    page: Path = parser.parse_args(argv).page
-    try:
-        page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
-    except (OSError, ValueError) as error:
-        print(f"{page}: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return write_page(parser.parse_args(argv).page, tables())
 
 
 if __name__ == "__main__":

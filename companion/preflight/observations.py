@@ -1,0 +1,102 @@
+"""What a preflight has seen: plain records, gathered by `companion.preflight.observe`, judged by the rooms beside it. No I/O here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from companion.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorReport:
+    """ESTIMATOR_STATUS (MAVLink 230), stamped on arrival with the flight clock."""
+
+    stamp_s: float
+    flags: int
+    """ESTIMATOR_STATUS_FLAGS."""
+    velocity_ratio: float
+    """Innovation test ratios: below 1 the measurements are accepted; 0 exactly: nothing is fused."""
+    position_horizontal_ratio: float
+    position_vertical_ratio: float
+    position_horizontal_accuracy_m: float
+    """One sigma."""
+    position_vertical_accuracy_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ServoReport:
+    """One servo's identity and settings, registers of the XM430 control table."""
+
+    servo_id: int
+    model: int
+    """Register 0; 1030 is the XM430-W210."""
+    firmware: int
+    """Register 6."""
+    operating_mode: int
+    """Register 11; 0 is current control."""
+    return_delay_us: int
+    """Register 9, times 2 us."""
+    current_limit_counts: int
+    """Register 38."""
+    watchdog_ms: int
+    """Register 98, times 20 ms."""
+    voltage_v: float
+    """Register 144."""
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """The computer itself; None: not told here."""
+
+    disk_free_bytes: int | None
+    """Where the flight's files go."""
+    governors: tuple[str, ...]
+    """Of each core, /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor; empty: none is told."""
+    realtime: str | None
+    """What `companion.realtime` would be permitted; None: SCHED_FIFO is refused."""
+    arm_latency_ms: int | None
+    """FTDI latency timer of the arm's serial port; None: not an FTDI port."""
+    force_latency_ms: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class MocapStream:
+    """What the motion-capture edge counted while it was watched."""
+
+    frames: int
+    """Frames of any kind that arrived."""
+    lost: int
+    """Gaps in the frame numbers."""
+    application: str
+    """Server's name and version."""
+    other_bodies: tuple[int, ...] = ()
+    """Rigid bodies in the stream that are not ours."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Everything that was seen in `duration_s`, newest last. Empty or None: nothing came."""
+
+    start_s: float
+    """Flight clock."""
+    duration_s: float
+    firmware: str | None = None
+    """As `MavsdkAutopilot.firmware` tells it: `PX4 1.16.1 release (git ...)`."""
+    params: Mapping[str, float | int] = field(default_factory=dict)
+    """PX4's parameters by name; one that PX4 does not have is absent."""
+    vehicle: tuple[VehicleState, ...] = ()
+    status: tuple[AutopilotStatus, ...] = ()
+    estimator: tuple[EstimatorReport, ...] = ()
+    mocap: tuple[MocapPose, ...] = ()
+    mocap_stream: MocapStream | None = None
+    arm: tuple[ArmState, ...] = ()
+    servos: tuple[ServoReport, ...] = ()
+    force: tuple[ForceSample, ...] = ()
+    machine: Machine | None = None
+    broker: str | None = None
+    """None: no broker was asked for. Empty: it answered. Else why it did not."""
+    hand_test: str | None = None
+    """None: not asked for. Else what is on record of the guided hand test of this set-up; empty: nothing is."""
+    failures: Mapping[str, str] = field(default_factory=dict)
+    """Device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`), and the edge's own line about it."""
