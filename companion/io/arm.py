@@ -19,6 +19,7 @@ from companion.config.vehicle import Arm, ArmDevice
 from companion.io.dynamixel import WATCHDOG_ERROR, WATCHDOG_TRIPPED, Block, JointScale
 from companion.io.dynamixel_bus import ArmBus, Pair
 from companion.io.edges import DeviceError
+from companion.preflight.observations import ServoReport
 from companion.types import ArmState, Vec2
 
 _OPEN_TIMEOUT_S = 8.0
@@ -57,6 +58,7 @@ class DynamixelArm:
         self._written_s: float | None = None
         self._problem = ""
         self._scales: tuple[JointScale, JointScale] | None = None
+        self._servos: tuple[ServoReport, ...] = ()
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._finished: asyncio.Future[None] | None = None
@@ -96,6 +98,11 @@ class DynamixelArm:
     def latest(self) -> ArmState | None:
         """Newest joint state."""
         return self._state
+
+    @property
+    def servos(self) -> tuple[ServoReport, ...]:
+        """Both servos as they were when the edge had been opened."""
+        return self._servos
 
     @property
     def problem(self) -> str:
@@ -162,6 +169,7 @@ class DynamixelArm:
     def _open(self, bus: ArmBus) -> DeviceError | None:
         try:
             self._scales = bus.open(_OPEN_TIMEOUT_S)
+            self._servos = bus.reports
             self._read_once(bus)
         except DeviceError as error:
             return error

@@ -8,24 +8,24 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from mavsdk import ComponentType, Configuration, Mavsdk, MavsdkError
 from mavsdk.plugins.info.info import Info
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectResult, MavlinkMessage
 from mavsdk.plugins.mocap.mocap import AngleBody, Covariance, Mocap, PositionBody, VisionPositionEstimate
-from mavsdk.plugins.param.param import Param, ParamError, ParamResult
+from mavsdk.plugins.param.param import Param
 from mavsdk.plugins.telemetry.telemetry import Telemetry
 
 from companion.clock import Clock
 from companion.config.vehicle import AutopilotDevice
 from companion.io import autopilot_messages as messages
+from companion.io.autopilot_calls import NATIVE_CALL_DEADLINE_S, NativeCalls
+from companion.io.autopilot_inbox import Inbox, ask_for_streams
 from companion.io.autopilot_link import (
     add_connection,
     check_address,
@@ -34,37 +34,21 @@ from companion.io.autopilot_link import (
     quiet_native_log,
     udp_ports,
 )
+from companion.io.autopilot_origin import ensure_origin
+from companion.io.autopilot_params import ParamTransfer
 from companion.io.autopilot_requests import RequestDesk
 from companion.io.edges import DeviceError
-from companion.types import (
-    AttitudeSetpoint,
-    AutopilotRequest,
-    AutopilotStatus,
-    FlightMode,
-    MocapPose,
-    Quat,
-    Vec3,
-    VehicleState,
-)
+from companion.preflight.observations import EstimatorReport, StateCounts
+from companion.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, MocapPose, VehicleState
 
-POSITION_RATE_HZ = 200.0
-"""Asked of LOCAL_POSITION_NED; PX4 gives about 124 Hz."""
-ATTITUDE_RATE_HZ = 250.0
-"""Asked of ATTITUDE_QUATERNION, which carries the angular rates too."""
-IMU_RATE_HZ = 250.0
-"""Asked of HIGHRES_IMU."""
-LANDED_RATE_HZ = 10.0
-"""Asked of EXTENDED_SYS_STATE."""
 _CONNECT_DEADLINE_S = 5.0
-# MAVSDK sends a command or parameter request up to six times, 0.5 s apart.
-_NATIVE_CALL_DEADLINE_S = 5.0
+_HEARTBEAT_DEADLINE_S = 5.0
+"""PX4 sends one a second."""
 _CLOSE_DEADLINE_S = 4.0
-_PARAM_NAME = re.compile(r"[A-Z0-9_]{1,16}")
 # One NaN: PX4 takes EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
 _COVARIANCE_FROM_PARAMS = Covariance([float("nan")])
 
 _log = logging.getLogger(__name__)
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,37 +75,22 @@ class MavsdkAutopilot:
         self._device = device
         self._clock = clock
         self._desk = RequestDesk()
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="autopilot")
-        self._last_call: Future[Any] | None = None
+        self._inbox = Inbox(clock, self._desk)
+        self._calls = NativeCalls(device.address)
         self._mavsdk: Any = None
         self._connection: Any = None
         self._restore_log: Callable[[], None] | None = None
         self._direct: Any = None
         self._mocap: Any = None
-        self._telemetry: Any = None
-        self._param: Any = None
         self._info: Any = None
+        self._params: ParamTransfer | None = None
         self._open = False
         self._system_id = 0
         self._own_ids = (0, 0)
         self._local_port = 0
 
-        # Written by MAVSDK's threads, one assignment each; a tuple is replaced as a whole, so a reader never sees half of it.
-        self._position: tuple[float, Vec3, Vec3] | None = None
-        self._attitude: tuple[float, Quat, int] | None = None
-        self._rates: Vec3 | None = None
-        self._imu: tuple[float, Vec3] | None = None
-        self._heartbeat: tuple[float, str] | None = None
-        self._landed = 0
-        self._battery: tuple[float, float] = (float("nan"), float("nan"))
-
-        self._vehicle_key: tuple[Any, ...] | None = None
-        self._vehicle: VehicleState | None = None
-        self._heartbeat_read: tuple[float, str] | None = None
-        self._armed_and_mode: tuple[bool, FlightMode] = (False, FlightMode.UNKNOWN)
-
     async def __aenter__(self) -> Self:
-        """Open the link, find PX4, ask for the streams.
+        """Open the link, find PX4, ask for the streams, give PX4 a global origin if it has none and is not armed.
 
         Raises:
             DeviceError: one line per way of failing; nothing is left open.
@@ -134,7 +103,7 @@ class MavsdkAutopilot:
             self._own_ids = (int(configuration.system_id), int(configuration.component_id))
             ports = udp_ports()
             self._mavsdk = Mavsdk(configuration)
-            self._connection = await self._call(
+            self._connection = await self._calls.run(
                 "the connection to open", _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address
             )
             system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
@@ -143,15 +112,18 @@ class MavsdkAutopilot:
             self._local_port = new.pop() if len(new) == 1 else 0
             self._direct = MavlinkDirect(system)
             self._mocap = Mocap(system)
-            self._telemetry = Telemetry(system)
-            self._param = Param(system)
+            telemetry = Telemetry(system)
+            self._params = ParamTransfer(
+                address, self._clock, self._calls, self._direct, Param(system), self._system_id
+            )
             self._info = Info(system)
-            self._subscribe()
-            await self._ask_for_streams()
+            self._inbox.subscribe(telemetry, self._direct)
+            await ask_for_streams(address, self._calls, telemetry, self._direct, self._system_id)
+            self._open = True
+            await self.ensure_origin()
         except BaseException:
             await self._close()
             raise
-        self._open = True
         return self
 
     async def __aexit__(
@@ -166,39 +138,19 @@ class MavsdkAutopilot:
 
     def vehicle(self) -> VehicleState | None:
         """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
-        position, attitude, rates, imu = self._position, self._attitude, self._rates, self._imu
-        if position is None or attitude is None or rates is None or imu is None:
-            return None
-        key = (position[0], attitude[0], rates, imu[0])
-        if key != self._vehicle_key:
-            self._vehicle_key = key
-            state = messages.vehicle_state(
-                position[0], position[1], position[2], attitude[0], attitude[1], rates, imu[0], imu[1]
-            )
-            if state is not None and attitude[2]:
-                state = replace(state, boot_s=attitude[2] * 1e-6)
-            # Values that are not finite are as good as not arrived: the last good state stays, and its stamps grow old.
-            self._vehicle = state or self._vehicle
-        return self._vehicle
+        return self._inbox.vehicle()
 
     def status(self) -> AutopilotStatus | None:
         """Latest slow state; None before the first heartbeat. `heartbeat_stamp_s` is when the newest HEARTBEAT arrived."""
-        heartbeat = self._heartbeat
-        if heartbeat is None:
-            return None
-        if heartbeat is not self._heartbeat_read:
-            self._heartbeat_read = heartbeat
-            self._armed_and_mode = messages.armed_and_mode(heartbeat[1])
-        armed, mode = self._armed_and_mode
-        voltage_v, remaining = messages.battery(*self._battery)
-        return AutopilotStatus(
-            heartbeat_stamp_s=heartbeat[0],
-            armed=armed,
-            mode=mode,
-            landed=messages.landed_state(self._landed),
-            battery_voltage_v=voltage_v,
-            battery_remaining=remaining,
-        )
+        return self._inbox.status()
+
+    def estimator(self) -> EstimatorReport | None:
+        """Latest ESTIMATOR_STATUS, stamped on arrival; None before the first."""
+        return self._inbox.estimator()
+
+    def counts(self) -> StateCounts:
+        """Messages of the fast state since the link was opened."""
+        return self._inbox.counts()
 
     def send_attitude(self, setpoint: AttitudeSetpoint) -> bool:
         """Send SET_ATTITUDE_TARGET at once. False: the link is closed or refused it.
@@ -255,26 +207,54 @@ class MavsdkAutopilot:
         """Refusals and STATUSTEXTs since the last call, oldest first."""
         return self._desk.take_messages()
 
+    async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
+        """Values of PX4's parameters by name, int or float as PX4 stores them; a name that PX4 does not have is left out.
+
+        Raises:
+            DeviceError: a name that cannot be one, or no answer within the deadline.
+        """
+        return await self._transfer().read(names)
+
     async def read_param(self, name: str) -> float | int:
         """Value of one PX4 parameter, int or float as PX4 stores it.
 
         Raises:
             DeviceError: no such name, or no answer within the deadline.
         """
-        address = self._device.address
-        if _PARAM_NAME.fullmatch(name) is None:
-            fix = "correct the name"
-            raise device_error(address, "a parameter name of up to 16 of A-Z 0-9 _", repr(name), fix)
+        values = await self._transfer().read([name])
+        if name not in values:
+            fix = "check the name against PX4's version"
+            raise device_error(self._device.address, f"PX4's parameter {name}", "no such parameter", fix)
+        return values[name]
+
+    async def write_param(self, name: str, value: float | int) -> float | int:
+        """Write one PX4 parameter and read it back; what PX4 now holds, a float in single precision.
+
+        Raises:
+            DeviceError: no such name, a value that PX4's type cannot hold, PX4 refused it, or holds another one afterwards.
+        """
+        return await self._transfer().write(name, value)
+
+    async def ensure_origin(self) -> bool:
+        """Give PX4 the global origin of `autopilot_origin` unless it has one or is armed. True: PX4 says that it has one.
+
+        PX4 says so only while its position is valid; False right after boot means nothing yet.
+
+        Raises:
+            DeviceError: PX4 does not answer, or sends no heartbeat.
+        """
         self._require_open()
+        return await ensure_origin(self._device.address, self._calls, self._direct, self._system_id, self._armed)
+
+    async def _armed(self) -> bool:
         try:
-            value: float | int = await self._call(
-                f"PX4's parameter {name}", 2 * _NATIVE_CALL_DEADLINE_S, _get_param, self._param, name
-            )
-        except ParamError as error:
-            found = error.result.name.lower().replace("_", " ")
-            fix = "check the name against PX4's version, and the link"
-            raise device_error(address, f"PX4's parameter {name}", found, fix) from None
-        return value
+            async with asyncio.timeout(_HEARTBEAT_DEADLINE_S):
+                while (status := self._inbox.status()) is None:  # noqa: ASYNC110 - written by MAVSDK's threads
+                    await asyncio.sleep(0.02)
+        except TimeoutError:
+            expected = f"a PX4 heartbeat within {_HEARTBEAT_DEADLINE_S:g} s"
+            raise device_error(self._device.address, expected, "none", "check the link") from None
+        return status.armed
 
     async def firmware(self) -> str:
         """PX4's version as it reports it, like `PX4 1.16.1 release (git 0123456789abcdef)`.
@@ -284,13 +264,18 @@ class MavsdkAutopilot:
         """
         self._require_open()
         try:
-            version = await self._call("PX4's version", 2 * _NATIVE_CALL_DEADLINE_S, _get_version, self._info)
+            version = await self._calls.run("PX4's version", 2 * NATIVE_CALL_DEADLINE_S, _get_version, self._info)
         except MavsdkError as error:
             found = str(error).split(";")[0]
             fix = "check the link"
             raise device_error(self._device.address, "PX4's version (AUTOPILOT_VERSION)", found, fix) from None
         number = f"{version.flight_sw_major}.{version.flight_sw_minor}.{version.flight_sw_patch}"
         return f"PX4 {number} {version.flight_sw_version_type.name.lower()} (git {version.flight_sw_git_hash or 'unknown'})"
+
+    def _transfer(self) -> ParamTransfer:
+        self._require_open()
+        assert self._params is not None
+        return self._params
 
     def _require_open(self) -> None:
         if not self._open:
@@ -305,47 +290,6 @@ class MavsdkAutopilot:
             return False
         return True
 
-    def _subscribe(self) -> None:
-        telemetry = self._telemetry
-        telemetry.subscribe_position_velocity_ned(self._on_position)
-        telemetry.subscribe_attitude_quaternion(self._on_attitude)
-        telemetry.subscribe_attitude_angular_velocity_body(self._on_rates)
-        telemetry.subscribe_imu(self._on_imu)
-        telemetry.subscribe_landed_state(self._on_landed)
-        telemetry.subscribe_battery(self._on_battery)
-        telemetry.subscribe_status_text(self._on_status_text)
-        # System.is_connected turns false seconds late; HEARTBEAT itself is the evidence, and carries armed and mode.
-        self._direct.subscribe_message("HEARTBEAT", self._on_heartbeat)
-
-    async def _ask_for_streams(self) -> None:
-        telemetry = self._telemetry
-        for stream, rate_hz, ask in (
-            ("LOCAL_POSITION_NED", POSITION_RATE_HZ, telemetry.set_rate_position_velocity_ned),
-            ("ATTITUDE_QUATERNION", ATTITUDE_RATE_HZ, telemetry.set_rate_attitude_quaternion),
-            ("HIGHRES_IMU", IMU_RATE_HZ, telemetry.set_rate_imu),
-            ("EXTENDED_SYS_STATE", LANDED_RATE_HZ, telemetry.set_rate_landed_state),
-        ):
-            expected = f"PX4 to stream {stream} at {rate_hz:g} Hz"
-            try:
-                await self._call(expected, _NATIVE_CALL_DEADLINE_S, ask, rate_hz)
-            except MavsdkError as error:
-                fix = "check the link's bandwidth (MAV_x_RATE, baud) and that it is an onboard-mode MAVLink instance"
-                raise device_error(self._device.address, expected, str(error).split(";")[0], fix) from None
-
-    async def _call(self, expected: str, deadline_s: float, call: Callable[..., _T], *args: Any) -> _T:
-        """Run a blocking native call off the event loop, one at a time.
-
-        Raises:
-            DeviceError: it did not return within `deadline_s`.
-        """
-        future = self._worker.submit(call, *args)
-        self._last_call = future
-        try:
-            return await asyncio.wait_for(asyncio.wrap_future(future), deadline_s)
-        except TimeoutError:
-            found = f"no answer within {deadline_s:g} s"
-            raise device_error(self._device.address, expected, found, "check the link") from None
-
     async def _close(self) -> None:
         self._open = False
         if self._connection is not None:
@@ -358,8 +302,7 @@ class MavsdkAutopilot:
         deadline_s = time.monotonic() + _CLOSE_DEADLINE_S
         try:
             # MAVSDK must not be destroyed under a call that is still inside it, nor before the last command's callback has run.
-            self._worker.shutdown(wait=False, cancel_futures=True)
-            if self._last_call is not None and wait([self._last_call], _CLOSE_DEADLINE_S).not_done:
+            if not self._calls.finish(_CLOSE_DEADLINE_S):
                 _log.error(
                     "autopilot %s: a call into MAVSDK hangs, left to the end of the process", self._device.address
                 )
@@ -373,49 +316,6 @@ class MavsdkAutopilot:
         finally:
             if self._restore_log is not None:
                 self._restore_log()
-
-    # Callbacks: C++ threads. Nothing but an assignment.
-
-    def _on_position(self, value: Any, _: Any) -> None:
-        p, v = value.position, value.velocity
-        self._position = (
-            self._clock(),
-            (p.north_m, p.east_m, p.down_m),
-            (v.north_m_s, v.east_m_s, v.down_m_s),
-        )
-
-    def _on_attitude(self, value: Any, _: Any) -> None:
-        self._attitude = (self._clock(), (value.w, value.x, value.y, value.z), value.timestamp_us)
-
-    def _on_rates(self, value: Any, _: Any) -> None:
-        self._rates = (value.roll_rad_s, value.pitch_rad_s, value.yaw_rad_s)
-
-    def _on_imu(self, value: Any, _: Any) -> None:
-        a = value.acceleration_frd
-        self._imu = (self._clock(), (a.forward_m_s2, a.right_m_s2, a.down_m_s2))
-
-    def _on_landed(self, value: Any, _: Any) -> None:
-        self._landed = int(value)
-
-    def _on_battery(self, value: Any, _: Any) -> None:
-        self._battery = (value.voltage_v, value.remaining_percent)
-
-    def _on_status_text(self, value: Any, _: Any) -> None:
-        self._desk.note(f"PX4 {value.type.name.lower()}: {value.text}")
-
-    def _on_heartbeat(self, message: Any, _: Any) -> None:
-        # A gimbal or camera behind the same system id has a heartbeat of its own.
-        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
-            self._heartbeat = (self._clock(), message.fields_json)
-
-
-def _get_param(param: Any, name: str) -> float | int:
-    try:
-        return float(param.get_param_float(name))
-    except ParamError as error:
-        if error.result not in (ParamResult.WRONG_TYPE, ParamResult.TYPE_MISMATCH):
-            raise
-    return int(param.get_param_int(name))
 
 
 def _get_version(info: Any) -> Any:

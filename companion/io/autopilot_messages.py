@@ -17,6 +17,7 @@ from companion.frames import (
     ned_from_enu,
     quat_normalize,
 )
+from companion.preflight.observations import EstimatorReport
 from companion.types import (
     AttitudeSetpoint,
     AutopilotRequest,
@@ -27,6 +28,10 @@ from companion.types import (
     Vec3,
     VehicleState,
 )
+
+GPS_GLOBAL_ORIGIN_ID = 49
+ESTIMATOR_STATUS_ID = 230
+_REQUEST_MESSAGE, _SET_MESSAGE_INTERVAL = 512, 511
 
 MAV_COMP_ID_AUTOPILOT1 = 1
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1
@@ -66,6 +71,7 @@ _COMMANDS: dict[AutopilotRequest, tuple[int, float, float]] = {
     AutopilotRequest.OFFBOARD: (176, float(_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(_PX4_MAIN_MODE_OFFBOARD)),
     AutopilotRequest.ARM: (400, 1.0, 0.0),
     AutopilotRequest.DISARM: (400, 0.0, 0.0),
+    AutopilotRequest.FORCE_DISARM: (400, 0.0, 21196.0),
     AutopilotRequest.LAND: (21, 0.0, 0.0),
 }
 
@@ -178,7 +184,41 @@ def command(request: AutopilotRequest) -> tuple[int, float, float]:
 
 def command_json(request: AutopilotRequest, target_system: int) -> str:
     """COMMAND_LONG for a request, fields as `command` gives them; raises as `command` does."""
-    number, param1, param2 = command(request)
+    return _command_json(*command(request), target_system)
+
+
+def request_message_json(message_id: int, target_system: int) -> str:
+    """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE (512): send that message once."""
+    return _command_json(_REQUEST_MESSAGE, float(message_id), 0.0, target_system)
+
+
+def set_message_interval_json(message_id: int, rate_hz: float, target_system: int) -> str:
+    """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511): stream that message; PX4 takes the interval in us."""
+    return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz, target_system)
+
+
+def estimator_report(fields_json: str, stamp_s: float) -> EstimatorReport:
+    """ESTIMATOR_STATUS. PX4 says NaN for the ratio of what it does not fuse, which becomes 0, and for an accuracy that it does not
+    know, which becomes infinite.
+    """
+    fields = json.loads(fields_json)
+
+    def number(key: str, unknown: float) -> float:
+        value = fields[key]
+        return float(value) if value is not None and math.isfinite(value) else unknown
+
+    return EstimatorReport(
+        stamp_s=stamp_s,
+        flags=int(fields["flags"]),
+        velocity_ratio=number("vel_ratio", 0.0),
+        position_horizontal_ratio=number("pos_horiz_ratio", 0.0),
+        position_vertical_ratio=number("pos_vert_ratio", 0.0),
+        position_horizontal_accuracy_m=number("pos_horiz_accuracy", math.inf),
+        position_vertical_accuracy_m=number("pos_vert_accuracy", math.inf),
+    )
+
+
+def _command_json(number: int, param1: float, param2: float, target_system: int) -> str:
     fields: dict[str, float | int] = {
         "target_system": target_system,
         "target_component": MAV_COMP_ID_AUTOPILOT1,

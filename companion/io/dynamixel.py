@@ -22,6 +22,8 @@ from companion.io.edges import DeviceError
 MODEL_NUMBER_XM430_W210 = 1030
 MODE_CURRENT = 0
 WATCHDOG_UNIT_MS = 20
+RETURN_DELAY_UNIT_US = 2
+VOLTAGE_UNIT_V = 0.1
 WATCHDOG_TRIPPED = 0xFF
 """Register 98 after the bus watchdog let go."""
 
@@ -45,6 +47,7 @@ class Register:
 
 
 MODEL = Register(0, 2, "model number")
+FIRMWARE = Register(6, 1, "firmware version")
 RETURN_DELAY = Register(9, 1, "return delay time")
 OPERATING_MODE = Register(11, 1, "operating mode")
 CURRENT_LIMIT = Register(38, 2, "current limit")
@@ -56,6 +59,7 @@ GOAL_CURRENT = Register(102, 2, "goal current", signed=True)
 PRESENT_CURRENT = Register(126, 2, "present current", signed=True)
 PRESENT_VELOCITY = Register(128, 4, "present velocity", signed=True)
 PRESENT_POSITION = Register(132, 4, "present position", signed=True)
+PRESENT_VOLTAGE = Register(144, 2, "present input voltage")
 PRESENT_TEMPERATURE = Register(146, 1, "present temperature")
 INDIRECT_ADDRESS_1 = 168
 INDIRECT_DATA_1 = 224

@@ -15,6 +15,7 @@ from companion.config.vehicle import Arm, ArmDevice, Joint
 from companion.io import dynamixel as dxl
 from companion.io.dynamixel import Block, JointScale, Register
 from companion.io.edges import DeviceError
+from companion.preflight.observations import ServoReport
 
 _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """In flight: an absent servo costs no more than this."""
@@ -44,6 +45,8 @@ class ArmBus:
         self._deadline_s = 0.0
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
         self._touched = False
+        self.reports: tuple[ServoReport, ...] = ()
+        """Identity and settings of both servos as `open` left them, read back."""
 
     def open(self, timeout_s: float) -> tuple[JointScale, JointScale]:
         """Open the port, check both servos, set them up and switch torque on with goal current 0.
@@ -68,6 +71,7 @@ class ArmBus:
         )
         for joint in self._joints:
             self._verify_ready(joint)
+        self.reports = tuple(self._report(joint) for joint in self._joints)
         for joint in self._joints:
             self._write(joint, dxl.TORQUE_ENABLE, 1)
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
@@ -227,6 +231,18 @@ class ArmBus:
             found = self._read(joint, register)
             if found != value:
                 raise self._error("servo", joint.servo_id, f"{register} reads {found} after set-up, expected {value}")
+
+    def _report(self, joint: Joint) -> ServoReport:
+        return ServoReport(
+            servo_id=joint.servo_id,
+            model=self._read(joint, dxl.MODEL),
+            firmware=self._read(joint, dxl.FIRMWARE),
+            operating_mode=self._read(joint, dxl.OPERATING_MODE),
+            return_delay_us=self._read(joint, dxl.RETURN_DELAY) * dxl.RETURN_DELAY_UNIT_US,
+            current_limit_counts=self._read(joint, dxl.CURRENT_LIMIT),
+            watchdog_ms=self._read(joint, dxl.BUS_WATCHDOG) * dxl.WATCHDOG_UNIT_MS,
+            voltage_v=round(self._read(joint, dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V, 1),
+        )
 
     # --- registers ---------------------------------------------------------------------------------------------------
 

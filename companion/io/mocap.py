@@ -107,6 +107,11 @@ class NatNetMocap:
         """What the server said about itself."""
         return self._info
 
+    @property
+    def bodies(self) -> dict[int, str]:
+        """Rigid bodies of the newest frame by streaming id; the name is empty where the server did not tell it."""
+        return {number: self._names.get(number, "") for number in self._seen_ids or ()}
+
     def health(self) -> MocapHealth:
         """Counters, for logs and preflight."""
         return MocapHealth(

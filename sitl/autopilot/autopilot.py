@@ -21,7 +21,7 @@ from sitl.autopilot.navigator import Navigator
 from sitl.autopilot.params import Params
 from sitl.autopilot.position_control import heading_rad
 from sitl.autopilot.setpoints import OffboardTarget, PositionTarget, RateTarget
-from sitl.autopilot.types import AttitudeTarget, Estimate, ImuSample, RotorCommands
+from sitl.autopilot.types import AttitudeTarget, Estimate, Fusion, ImuSample, RotorCommands
 
 Command7 = tuple[float, float, float, float, float, float, float]
 
@@ -134,6 +134,8 @@ class Px4Stub:
         """Fault."""
         self.booted_at_s = 0.0
         """World time at zero of PX4's own clock; before it nothing runs."""
+        self.clock_ahead_s = 0.0
+        """PX4's own clock goes on while the world is held up."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
         self._offboard: OffboardTarget | None = None
         self._setpoint_at_s: float | None = None
@@ -157,6 +159,11 @@ class Px4Stub:
     def setpoint_at_s(self) -> float | None:
         """World time at which the last offboard setpoint arrived; None: none ever did."""
         return self._setpoint_at_s
+
+    @property
+    def fusion(self) -> Fusion:
+        """How well vision fits the estimate."""
+        return self._estimator.fusion()
 
     @property
     def landed(self) -> bool:
@@ -215,7 +222,8 @@ class Px4Stub:
         if self.params.integer("EKF2_EV_CTRL") & _EV_POSITION_AND_YAW != _EV_POSITION_AND_YAW:
             return False
         self.vision_passed_on += 1
-        self._estimator.fuse_vision(t_s - self.params.real("EKF2_EV_DELAY") / 1000.0, position_ned_m, attitude_ned_frd)
+        taken_s = t_s - self.params.real("EKF2_EV_DELAY") / 1000.0
+        self._estimator.fuse_vision(taken_s, position_ned_m, attitude_ned_frd, self.params.real("EKF2_EVP_NOISE"))
         return True
 
     def on_command(self, t_s: float, command: int, params: Command7) -> Result:

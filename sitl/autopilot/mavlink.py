@@ -1,7 +1,7 @@
 """The PX4 stub's wire: MAVLink 2 over UDP on 127.0.0.1, an onboard link and optionally one to a ground station.
 
-As PX4 SITL does, a link sends to its remote port from the start and from then on to whoever spoke last. Streams run on world time,
-driven by `pump`; what arrives is handled when it arrives.
+As PX4 SITL does, a link sends to its remote port from the start, and from then on to whoever spoke first, for as long as PX4 runs;
+what others say is handled, too. Streams run on world time, driven by `pump`; what arrives is handled when it arrives.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ class Link(asyncio.DatagramProtocol):
         self._stub = stub
         self._receiver = receiver
         self._partner = partner
+        self._spoken_to_of_boot: float | None = None
         self._transport: asyncio.DatagramTransport | None = None
         system, component = stub.params.integer("MAV_SYS_ID"), stub.params.integer("MAV_COMP_ID")
         self._encoder = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
@@ -100,7 +101,8 @@ class Link(asyncio.DatagramProtocol):
             if message.get_type() == "BAD_DATA":
                 continue
             self.messages_in += 1
-            self._partner = (addr[0], addr[1])
+            if self._spoken_to_of_boot != self._stub.booted_at_s:
+                self._spoken_to_of_boot, self._partner = self._stub.booted_at_s, (addr[0], addr[1])
             self._receiver.handle(self, message)
 
     def close(self) -> None:

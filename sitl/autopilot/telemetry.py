@@ -1,6 +1,6 @@
 """Telemetry of the PX4 stub: one builder per MAVLink message. No I/O, no clock.
 
-A builder returns None while PX4 would not send the message: LOCAL_POSITION_NED without a valid position, HOME_POSITION without home.
+A builder returns None while PX4 would not send the message: ATTITUDE without an aligned filter, HOME_POSITION without home.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _VERSION = 1 << 24 | 16 << 16 | 1 << 8 | 255
 
 
 def _ms(stub: Px4Stub) -> int:
-    return int((stub.t_s - stub.booted_at_s) * 1e3) & 0xFFFFFFFF
+    return int((stub.t_s - stub.booted_at_s + stub.clock_ahead_s) * 1e3) & 0xFFFFFFFF
 
 
 def _us(stub: Px4Stub) -> int:
-    return int((stub.t_s - stub.booted_at_s) * 1e6)
+    return int((stub.t_s - stub.booted_at_s + stub.clock_ahead_s) * 1e6)
 
 
 def heartbeat(stub: Px4Stub) -> Message:
@@ -123,8 +123,8 @@ def attitude_quaternion(stub: Px4Stub) -> Message | None:
 
 
 def local_position_ned(stub: Px4Stub) -> Message | None:
-    """LOCAL_POSITION_NED; only while the position is valid."""
-    estimate = _position(stub)
+    """LOCAL_POSITION_NED; whether the position is valid or not, as PX4 sends it: (0, 0, 0) before vision, dead reckoning after it."""
+    estimate = _attitude(stub)
     if estimate is None:
         return None
     return mavlink.MAVLink_local_position_ned_message(_ms(stub), *estimate.position_ned_m, *estimate.velocity_ned_m_s)
@@ -174,22 +174,25 @@ def scaled_imu(stub: Px4Stub) -> Message | None:
 
 
 def estimator_status(stub: Px4Stub) -> Message | None:
-    """ESTIMATOR_STATUS. The absolute position flags follow the fusion of vision (they drop 0.55 s after its end)."""
+    """ESTIMATOR_STATUS as EKF2 1.16 makes it: a ratio is NaN while nothing of its kind is fused, the absolute position needs an origin,
+    and "constant position" is said at rest too.
+    """
     estimate = stub.estimate
     if estimate is None:
         return None
     flags = mavlink.ESTIMATOR_ATTITUDE if estimate.attitude_valid else 0
     if estimate.position_valid:
         flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_HORIZ_REL
-    else:
-        flags |= mavlink.ESTIMATOR_CONST_POS_MODE
+        flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS if stub.origin is not None else 0
     if estimate.vision_fused:
-        flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_VERT_ABS
-        flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
-    accuracy_m = 0.01 if estimate.vision_fused else 1.0
+        flags |= mavlink.ESTIMATOR_POS_VERT_ABS | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+    if not estimate.vision_fused or (stub.landed and not stub.armed):
+        flags |= mavlink.ESTIMATOR_CONST_POS_MODE
+    fusion = stub.fusion
     return mavlink.MAVLink_estimator_status_message(
-        _us(stub), flags, 0.01, 0.01, 0.01, 0.0, 0.0, 0.0, accuracy_m, accuracy_m
-    )
+        _us(stub), flags, _NAN, fusion.horizontal_ratio, fusion.vertical_ratio, _NAN, _NAN, _NAN,
+        fusion.horizontal_accuracy_m, fusion.vertical_accuracy_m,
+    )  # fmt: skip
 
 
 def vfr_hud(stub: Px4Stub) -> Message | None:
@@ -258,9 +261,9 @@ def global_position_int(stub: Px4Stub) -> Message | None:
 
 
 def gps_global_origin(stub: Px4Stub) -> Message | None:
-    """GPS_GLOBAL_ORIGIN."""
+    """GPS_GLOBAL_ORIGIN; only with an origin and a valid position."""
     origin = stub.origin
-    if origin is None:
+    if origin is None or _position(stub) is None:
         return None
     return mavlink.MAVLink_gps_global_origin_message(
         round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7), round(origin.altitude_m * 1e3), _us(stub)

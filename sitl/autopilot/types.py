@@ -35,6 +35,16 @@ class Estimate(NamedTuple):
     attitude_valid: bool
 
 
+class Fusion(NamedTuple):
+    """How well the estimator's vision fits: ratios of ESTIMATOR_STATUS, square roots of filtered test ratios, and one sigma in m."""
+
+    horizontal_ratio: float
+    """NaN: not fused."""
+    vertical_ratio: float
+    horizontal_accuracy_m: float
+    vertical_accuracy_m: float
+
+
 class AttitudeTarget(NamedTuple):
     """What the attitude loop follows."""
 

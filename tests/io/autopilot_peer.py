@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import socket
 import struct
 import threading
@@ -17,7 +16,11 @@ GYRO_FRD_RAD_S = (0.11, 0.22, -0.33)
 ACCEL_FRD_M_S2 = (0.5, -0.25, -9.5)
 POSITION_NED_M = (1.0, 2.0, -3.0)
 VELOCITY_NED_M_S = (0.1, 0.2, -0.3)
-PARAMS: dict[str, float | int] = {"MPC_THR_HOVER": 0.4375, "COM_RC_IN_MODE": 4}
+PARAMS: dict[str, float | int] = {
+    "MPC_THR_HOVER": 0.4375, "COM_RC_IN_MODE": 4, "MAV_SYS_ID": 1, "SDLOG_MODE": -1, "CAL_GYRO0_ID": 0x7FC00001,
+    "CBRK_FLIGHTTERM": 121212, "COM_FLTMODE6": -2147483648,
+}  # fmt: skip
+"""As PX4 stores them; the bytes of some of the integers are no number when they are read as a float."""
 
 
 def free_udp_port() -> int:
@@ -35,6 +38,13 @@ class Px4Peer:
         self.base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self.custom_mode = 3 << 16
         self.beating = True
+        self.origin: Any = True
+        """True: there was one from the start. None: there is none. Else the SET_GPS_GLOBAL_ORIGIN that was taken."""
+        self.params = dict(PARAMS)
+        self.deaf_to: set[str] = set()
+        """Parameters whose first request is lost."""
+        self.estimator: tuple[Any, ...] | None = None
+        """ESTIMATOR_STATUS without its time, sent once it was asked for."""
         self.landed = mavlink.MAV_LANDED_STATE_ON_GROUND
         self.attitude_ned_frd = (1.0, 0.0, 0.0, 0.0)
         self.acks: dict[int, int | None] = {}
@@ -122,13 +132,21 @@ class Px4Peer:
             self._changed.notify_all()
         if message.get_type() == "COMMAND_LONG":
             self._answer(message)
-        elif message.get_type() == "PARAM_REQUEST_READ" and message.param_id in PARAMS:
+        elif message.get_type() == "PARAM_REQUEST_READ" and message.param_id in self.deaf_to:
+            self.deaf_to.discard(message.param_id)
+        elif message.get_type() == "PARAM_REQUEST_READ" and message.param_id in self.params:
             self._say_param(message.param_id)
+        elif message.get_type() == "PARAM_SET" and message.param_id in self.params:
+            self._set_param(message)
+        elif message.get_type() == "SET_GPS_GLOBAL_ORIGIN":
+            self.origin = message
 
     def _answer(self, message: Any) -> None:
         if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self.asked_interval_us[int(message.param1)] = message.param2
         result = self.acks.get(message.command, mavlink.MAV_RESULT_ACCEPTED)
+        if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and message.param1 == 49 and self.origin is None:
+            result = mavlink.MAV_RESULT_DENIED
         if result is not None:
             self._say_ack(message, result)
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
@@ -150,11 +168,19 @@ class Px4Peer:
         )
 
     def _say_param(self, name: str) -> None:
-        value = PARAMS[name]
+        value = self.params[name]
         kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
         if isinstance(value, int):  # PX4 puts the bytes of the integer where the float is
             value = float(_float_of_int_bytes(value))
-        self.say(mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(PARAMS), 0))
+        self.say(mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(self.params), 0))
+
+    def _set_param(self, message: Any) -> None:
+        """As PX4: silent where the type is another one."""
+        integer = isinstance(self.params[message.param_id], int)
+        if message.param_type == (mavlink.MAV_PARAM_TYPE_INT32 if integer else mavlink.MAV_PARAM_TYPE_REAL32):
+            wire = struct.pack("<f", message.param_value)
+            self.params[message.param_id] = struct.unpack("<i" if integer else "<f", wire)[0]
+            self._say_param(message.param_id)
 
     def _say_slow(self) -> None:
         for command in list(self.working_on):
@@ -165,6 +191,8 @@ class Px4Peer:
             )
         )
         self.say(mavlink.MAVLink_extended_sys_state_message(0, self.landed))
+        if self.estimator is not None and mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS in self.asked_interval_us:
+            self.say(mavlink.MAVLink_estimator_status_message(int(time.monotonic() * 1e6), *self.estimator))
         cells = [4000] * 4 + [65535] * 6
         self.say(mavlink.MAVLink_battery_status_message(0, 0, 1, 2000, cells, 100, 0, 0, 77, 0, 0))
 
@@ -184,5 +212,4 @@ class Px4Peer:
 
 def _float_of_int_bytes(value: int) -> float:
     decoded: float = struct.unpack("<f", struct.pack("<i", value))[0]
-    assert math.isfinite(decoded)
     return decoded

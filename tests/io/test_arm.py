@@ -26,6 +26,7 @@ from companion.io.dynamixel import (
 )
 from companion.io.edges import Arm as ArmEdge
 from companion.io.edges import DeviceError
+from companion.preflight.observations import ServoReport
 from companion.types import ArmState
 from sitl.servo_bus import ServoBus
 from sitl.servo_model import ServoModel
@@ -489,3 +490,26 @@ def test_reads_end_though_the_caller_waits_for_less() -> None:
         assert failed.stamp_s <= time.monotonic()
 
     fly(scenario)
+
+
+def test_the_edge_tells_both_servos_as_it_left_them() -> None:
+    async def main() -> None:
+        servos = new_servos()
+        servos[0].set_voltage_v(11.8)
+        servos[1].write(38, (900).to_bytes(2, "little"))
+        async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path), arm_config(), flight_clock()) as arm:
+            first, second = arm.servos
+            assert first == ServoReport(
+                servo_id=11,
+                model=1030,
+                firmware=48,
+                operating_mode=0,
+                return_delay_us=0,
+                current_limit_counts=1193,
+                watchdog_ms=100,
+                voltage_v=11.8,
+            )
+            assert (second.servo_id, second.current_limit_counts, second.voltage_v) == (12, 900, 12.0)
+
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    assert_nothing_left()

@@ -9,6 +9,7 @@ import os
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -16,8 +17,10 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.clock import flight_clock
 from companion.config.vehicle import AutopilotDevice
 from companion.frames import quat_from_euler_zyx, quat_rotate
+from companion.io import autopilot_params
 from companion.io.autopilot import MavsdkAutopilot
 from companion.io.edges import DeviceError
+from companion.preflight.observations import EstimatorReport
 from companion.types import (
     AttitudeSetpoint,
     AutopilotRequest,
@@ -208,7 +211,7 @@ def test_values_that_are_not_finite_leave_the_last_good_state_to_grow_old() -> N
                 peer.attitude_ned_frd = (math.nan, 0.0, 0.0, 0.0)
                 packets = peer.packets_so_far()
                 await eventually(
-                    lambda: autopilot._attitude is not None and math.isnan(autopilot._attitude[1][0]), "NaN"
+                    lambda: (raw := autopilot._inbox._attitude) is not None and math.isnan(raw[1][0]), "NaN"
                 )
                 stale = autopilot.vehicle()
                 assert stale is not None
@@ -381,17 +384,95 @@ def test_statustext_is_passed_on() -> None:
 def test_parameters_and_firmware_are_read_from_the_wire() -> None:
     async def fly() -> None:
         port = free_udp_port()
-        with Px4Peer(port):
+        with Px4Peer(port) as peer:
             async with edge(port) as autopilot:
-                for name, value in PARAMS.items():
-                    read = await autopilot.read_param(name)
-                    assert read == value
-                    assert type(read) is type(value)
+                peer.deaf_to = {"COM_RC_IN_MODE", "SDLOG_MODE"}
+                read = await autopilot.read_params([*PARAMS, "NO_SUCH_ONE", "NOR_THIS"])
+                assert read == PARAMS
+                assert {name: type(value) for name, value in read.items()} == {n: type(v) for n, v in PARAMS.items()}
+                assert await autopilot.read_param("MPC_THR_HOVER") == PARAMS["MPC_THR_HOVER"]
                 assert (await autopilot.firmware()).startswith("PX4 1.16.1 release (git 01234567")
-                with pytest.raises(DeviceError, match=r"expected PX4's parameter NO_SUCH_ONE, found timeout"):
+                with pytest.raises(DeviceError, match=r"expected PX4's parameter NO_SUCH_ONE, found no such parameter"):
                     await autopilot.read_param("NO_SUCH_ONE")
                 with pytest.raises(DeviceError, match="16 of A-Z"):
-                    await autopilot.read_param("lower case")
+                    await autopilot.read_params(["MPC_THR_HOVER", "lower case"])
+
+    asyncio.run(fly())
+
+
+def test_a_silent_px4_does_not_pass_for_one_without_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(autopilot_params, "READ_DEADLINE_S", 2.0)
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port) as autopilot:
+                peer.params.clear()
+                with pytest.raises(DeviceError, match=r"PX4's parameters \(2 of them, first COM_RC_IN_MODE\), found 0"):
+                    await autopilot.read_params(["COM_RC_IN_MODE", "SDLOG_MODE"])
+
+    asyncio.run(fly())
+
+
+def test_a_parameter_is_written_and_read_back() -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port) as autopilot:
+                for name, value in (("MPC_THR_HOVER", 0.49), ("SDLOG_MODE", 2), ("COM_RC_IN_MODE", -1)):
+                    written = await autopilot.write_param(name, value)
+                    assert written == peer.params[name] == pytest.approx(value, rel=1e-7)
+                    assert type(written) is type(PARAMS[name])
+                with pytest.raises(DeviceError, match=r"a whole number for COM_RC_IN_MODE, an INT32, found 1\.5"):
+                    await autopilot.write_param("COM_RC_IN_MODE", 1.5)
+                with pytest.raises(DeviceError, match="NO_SUCH_ONE, found no such parameter"):
+                    await autopilot.write_param("NO_SUCH_ONE", 1)
+
+    asyncio.run(fly())
+
+
+def test_px4_without_an_origin_is_given_one_unless_it_is_armed() -> None:
+    async def fly(armed: bool) -> tuple[bool, Any]:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            peer.origin = None
+            peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+            async with edge(port) as autopilot:
+                known = await autopilot.ensure_origin()
+            return known, peer.origin
+
+    assert asyncio.run(fly(armed=True)) == (False, None)
+    known, origin = asyncio.run(fly(armed=False))
+    assert known
+    assert (origin.latitude, origin.longitude, origin.altitude) == (0, 0, 0)  # any other moves EKF2's local position
+    assert origin.target_system == 1
+
+
+def test_an_origin_that_px4_has_is_left_alone() -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port) as autopilot:
+                assert await autopilot.ensure_origin()
+            assert peer.of("SET_GPS_GLOBAL_ORIGIN") == []
+
+    asyncio.run(fly())
+
+
+def test_estimator_status_is_asked_for_and_told() -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port) as autopilot:
+                assert autopilot.estimator() is None
+                peer.estimator = (0x33F, math.nan, 0.25, 0.125, 0.0, 0.0, 0.0, 0.0625, math.nan)
+                await eventually(lambda: autopilot.estimator() is not None, "ESTIMATOR_STATUS")
+                report = autopilot.estimator()
+                assert report is not None
+                # PX4 says NaN of a velocity that it does not fuse, and of what it does not know.
+                assert report == EstimatorReport(report.stamp_s, 0x33F, 0.0, 0.25, 0.125, 0.0625, math.inf)
+                assert peer.asked_interval_us[mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS] == pytest.approx(200_000.0)
+                await eventually(lambda: autopilot.estimator() != report, "a newer one")
 
     asyncio.run(fly())
 

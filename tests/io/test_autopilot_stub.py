@@ -13,43 +13,11 @@ from companion.config.vehicle import AutopilotDevice
 from companion.frames import quat_from_euler_zyx
 from companion.io.autopilot import MavsdkAutopilot
 from companion.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, FlightMode, LandedState, MocapPose
-from sitl.autopilot.autopilot import Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
-from sitl.autopilot.estimator import Estimator
-from sitl.autopilot.mavlink import MavlinkServer, Ports
-from sitl.autopilot.params import Params
-from sitl.autopilot.types import ImuSample
 from tests.io.autopilot_peer import free_udp_port
+from tests.io.stub_rig import standing_stub
 
 POSITION_WORLD_M = (-1.0, 0.5, 0.25)
 YAW_RAD = 0.4
-STEP_S = 0.004
-
-
-@asynccontextmanager
-async def standing_stub(port: int) -> AsyncIterator[Px4Stub]:
-    """PX4 on the floor, in real time: an IMU at rest at 250 Hz. What it does with its rotors moves nothing."""
-    params = Params()
-    stub = Px4Stub(params, Estimator(), Cascade(gains_from_params(params)))
-    loop = asyncio.get_running_loop()
-    start_s = loop.time()
-
-    async def run() -> None:
-        steps = 0
-        while True:
-            # Catches up after a stall: world time follows the wall, sample by sample.
-            while steps * STEP_S <= loop.time() - start_s:
-                stub.step(ImuSample(steps * STEP_S, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81)))
-                steps += 1
-            server.pump(stub.t_s)
-            await asyncio.sleep(STEP_S)
-
-    async with MavlinkServer(stub, Ports(0, port)) as server, asyncio.TaskGroup() as group:
-        running = group.create_task(run())
-        try:
-            yield stub
-        finally:
-            running.cancel()
 
 
 class Companion:
@@ -154,6 +122,52 @@ def test_parameters_and_firmware_of_the_stub() -> None:
                 assert value == pytest.approx(stub.params[name])
                 assert type(value) is type(stub.params[name])
             assert (await autopilot.firmware()).startswith("PX4 1.16.1 release")
+
+    asyncio.run(fly())
+
+
+def test_parameters_of_the_stub_at_once_and_one_written() -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        async with standing_stub(port) as stub, MavsdkAutopilot(device, flight_clock()) as autopilot:
+            stub.params.set("BAT1_CAPACITY", -1.0)
+            read = await autopilot.read_params([*stub.params, "MAV_1_CONFIG"])
+            assert read == {name: stub.params[name] for name in stub.params}
+            assert all(type(read[name]) is type(stub.params[name]) for name in read)
+            assert await autopilot.write_param("COM_OF_LOSS_T", 0.3) == pytest.approx(0.3)
+            assert await autopilot.write_param("COM_FLTMODE1", -1) == -1
+            assert stub.params.real("COM_OF_LOSS_T") == pytest.approx(0.3)
+
+    asyncio.run(fly())
+
+
+def test_the_estimator_tells_when_vision_is_fused_and_how_well() -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        async with standing_stub(port) as stub:
+            async with MavsdkAutopilot(device, flight_clock()) as autopilot:
+                assert stub.origin is not None
+                assert not await autopilot.ensure_origin()  # PX4 tells only with a valid position
+                while (report := autopilot.estimator()) is None:  # noqa: ASYNC110 - MAVSDK's threads
+                    await asyncio.sleep(0.01)
+                aided = 16 | 32 | 256  # ESTIMATOR_POS_HORIZ_ABS, POS_VERT_ABS, PRED_POS_HORIZ_REL
+                assert report.flags & (1 | 128 | aided) == 1 | 128  # attitude, constant position
+                assert (report.position_horizontal_ratio, report.position_vertical_ratio) == (0.0, 0.0)
+            async with companion(port) as half:
+
+                def settled(_: AutopilotStatus) -> bool:
+                    report = half.autopilot.estimator()
+                    return (
+                        report is not None
+                        and report.flags & aided == aided
+                        and 0.0 < report.position_horizontal_ratio < 0.5
+                        and report.position_horizontal_accuracy_m < 0.02
+                    )
+
+                await half.until(settled, f"a settled estimate, not {half.autopilot.estimator()}")
+                assert await half.autopilot.ensure_origin()
 
     asyncio.run(fly())
 

@@ -110,6 +110,7 @@ def test_pose_arrives(version: NatNetVersion, transport: Transport) -> None:
                 assert second.stamp_s >= first.stamp_s
                 assert edge.server_info is not None
                 assert edge.server_info.version == version
+                assert set(edge.bodies) == {STRANGER.id, POSE.id}
 
     asyncio.run(run())
 

@@ -13,6 +13,7 @@ from sitl.autopilot.modes import NavState
 from sitl.autopilot.receive import Receiver
 from sitl.autopilot.setpoints import PositionTarget, RateTarget, decode_attitude_target, decode_position_target
 from sitl.autopilot.streams import STREAMS, Schedule
+from sitl.autopilot.telemetry import attitude_quaternion
 from sitl.autopilot.types import AttitudeTarget
 from tests.sitl.px4_rig import Rig
 
@@ -287,3 +288,16 @@ def test_every_stream_can_be_encoded(seconds: float) -> None:
         assert message is not None, message_id
         assert message.get_msgId() == message_id
         assert message.pack(encoder)
+
+
+def test_the_clock_in_its_messages_goes_on_while_the_world_is_held_up() -> None:
+    def told_ms() -> int:
+        message = attitude_quaternion(rig.stub)
+        assert message is not None
+        return int(message.time_boot_ms)
+
+    rig = Rig()
+    rig.run(1.0)
+    before_ms = told_ms()
+    rig.stub.clock_ahead_s += 0.25
+    assert told_ms() == before_ms + 250

@@ -86,24 +86,33 @@ def test_streams_reach_the_remote_port_unasked_and_in_sequence() -> None:
     asyncio.run(scenario())
 
 
-def test_the_partner_is_whoever_spoke_last_and_links_are_separate() -> None:
+def test_the_partner_is_whoever_spoke_first_until_px4_restarts_and_links_are_separate() -> None:
     async def scenario() -> None:
         rig = Rig()
-        with Peer() as first, Peer() as second, Peer() as ground:
-            async with MavlinkServer(rig.stub, Ports(0, first.port), Ports(0, ground.port)) as server:
-                await run(rig, server, first, 0.5)
-                assert first.received
+        with Peer() as nobody, Peer() as first, Peer() as second, Peer() as ground:
+            async with MavlinkServer(rig.stub, Ports(0, nobody.port), Ports(0, ground.port)) as server:
+                await run(rig, server, nobody, 0.5)
+                assert nobody.received, "before anybody speaks"
+                first.heartbeat(server.onboard_port, mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
+                await run_until_handled(rig, server, first, 1)
+                nobody.drain()
+                nobody.received.clear()
                 second.heartbeat(server.onboard_port, mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
-                await run_until_handled(rig, server, second, 1)
-                first.drain()
-                first.received.clear()
-                await run(rig, server, second, 1.0)
-                first.drain()
-                ground.drain()
-                assert not first.received
-                assert second.types()["ODOMETRY"] > 20
+                await run_until_handled(rig, server, first, 2)
+                await run(rig, server, first, 1.0)
+                for peer in (nobody, second, ground):
+                    peer.drain()
+                assert not nobody.received
+                assert not second.received
+                assert first.types()["ODOMETRY"] > 20
                 assert ground.types()["ATTITUDE"] > 0
                 assert ground.types()["ODOMETRY"] == 0, "not a ground station's stream"
+                rig.stub.reboot(0.1)
+                rig.run(0.2)
+                second.heartbeat(server.onboard_port, mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
+                await run_until_handled(rig, server, second, 3)
+                await run(rig, server, second, 1.0)
+                assert second.types()["HEARTBEAT"] > 0, "a new start, a new partner"
 
     asyncio.run(scenario())
 

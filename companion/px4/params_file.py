@@ -1,0 +1,172 @@
+"""Parameter files in QGroundControl's format: tab-separated Vehicle-Id, Component-Id, Name, Value, Type; `#` begins a comment.
+
+Types are MAV_PARAM_TYPE: 6 is INT32, 9 is REAL32; PX4 has no others. The reader takes nothing that QGroundControl would not, and tells
+each mistake with file and line; what the writer writes reads back equal.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+
+from companion.config.document import ConfigError
+
+INT32, REAL32 = 6, 9
+COLUMNS = "# Vehicle-Id\tComponent-Id\tName\tValue\tType"
+VEHICLE_ID = COMPONENT_ID = 1
+
+_NAME = re.compile(r"[A-Z0-9_]{1,16}")
+_INTEGER = re.compile(r"[+-]?\d+")
+_REAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_INT32_MIN, _INT32_MAX = -(2**31), 2**31 - 1
+
+Value = float | int
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line."""
+
+    name: str
+    value: Value
+    """int for INT32, float in single precision for REAL32."""
+    line: int
+    vehicle_id: int = VEHICLE_ID
+    component_id: int = COMPONENT_ID
+
+
+def read(path: str | Path) -> dict[str, Value]:
+    """Values by name, in the file's order.
+
+    Raises:
+        ConfigError: one line per problem, `file:line: what is wrong`.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError([f"{path}: expected UTF-8 text, found byte {error.object[error.start]:#04x}"]) from None
+    except OSError as error:
+        raise ConfigError([f"{path}: cannot be read: {error.strerror or error}"]) from None
+    return {entry.name: entry.value for entry in parse(text, str(path))}
+
+
+def parse(text: str, source: str) -> list[Entry]:
+    """The entries of a file's text; `source` is its name for messages.
+
+    Raises:
+        ConfigError: one line per problem, `source:line: what is wrong`.
+    """
+    entries: dict[str, Entry] = {}
+    problems: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            entry = _entry(line, number)
+            if entry.name in entries:
+                raise _WrongError(f"{entry.name} is there already, in line {entries[entry.name].line}")
+        except _WrongError as error:
+            problems.append(f"{source}:{number}: {error}")
+        else:
+            entries[entry.name] = entry
+    if not problems and not entries:
+        problems.append(f"{source}: expected parameters, found none")
+    if problems:
+        raise ConfigError(problems)
+    return list(entries.values())
+
+
+class _WrongError(Exception):
+    """What is wrong with a line."""
+
+
+def _entry(line: str, number: int) -> Entry:
+    cells = line.split("\t")
+    if len(cells) != 5:
+        hint = "; separate them by tabs, not spaces" if len(line.split()) == 5 else ""
+        raise _WrongError(f"expected 5 fields (vehicle, component, name, value, type), found {len(cells)}{hint}")
+    vehicle, component, name, value, kind = cells
+    for title, cell in (("vehicle id", vehicle), ("component id", component)):
+        if not (_INTEGER.fullmatch(cell) and 1 <= int(cell) <= 255):
+            raise _WrongError(f"expected a {title} from 1 to 255, found {cell!r}")
+    if _NAME.fullmatch(name) is None:
+        raise _WrongError(f"expected a name of up to 16 of A-Z 0-9 _, found {name!r}")
+    if kind not in (str(INT32), str(REAL32)):
+        raise _WrongError(f"{name}: expected type {INT32} (INT32) or {REAL32} (REAL32), found {kind!r}")
+    number_of = _int32 if kind == str(INT32) else _real32
+    return Entry(name, number_of(name, value), number, int(vehicle), int(component))
+
+
+def _int32(name: str, cell: str) -> int:
+    if _INTEGER.fullmatch(cell) is None:
+        raise _WrongError(f"{name}: expected a whole number (type {INT32}), found {cell!r}")
+    if not _INT32_MIN <= int(cell) <= _INT32_MAX:
+        raise _WrongError(f"{name}: expected a number of 32 bits, found {cell}")
+    return int(cell)
+
+
+def _real32(name: str, cell: str) -> float:
+    if _REAL.fullmatch(cell) is None:
+        raise _WrongError(f"{name}: expected a number (type {REAL32}), found {cell!r}")
+    try:
+        return single(float(cell))
+    except OverflowError:
+        raise _WrongError(f"{name}: expected a number of single precision, found {cell}") from None
+
+
+def single(value: float) -> float:
+    """Rounded to single precision, as PX4 stores it.
+
+    Raises:
+        OverflowError: too large for single precision.
+    """
+    if math.isinf(value):
+        raise OverflowError("infinite")
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+
+
+def same(one: Value, other: Value) -> bool:
+    """Both are the same parameter value: the same type, and equal as PX4 stores them."""
+    if isinstance(one, int) or isinstance(other, int):
+        return isinstance(one, int) and isinstance(other, int) and one == other
+    return single(one) == single(other)
+
+
+def value_text(value: Value) -> str:
+    """The fewest digits that read back equal."""
+    if isinstance(value, int):
+        return str(value)
+    stored = single(value)
+    short = next(text for digits in range(1, 10) if _is(text := f"{stored:.{digits}g}", stored))
+    if "e" in short and 1e-5 <= abs(stored) < 1e9:
+        short = f"{Decimal(short):f}"
+    return short if any(character in short for character in ".e") else f"{short}.0"
+
+
+def _is(text: str, stored: float) -> bool:
+    try:
+        return single(float(text)) == stored
+    except OverflowError:  # rounded up beyond the largest
+        return False
+
+
+def text(
+    values: Mapping[str, Value], heading: Iterable[str] = (), comments: Mapping[str, Iterable[str]] | None = None
+) -> str:
+    """A whole file. `heading` and the `comments` before a name are lines without their `#`."""
+    lines = [_comment(line) for line in heading]
+    lines.append(COLUMNS)
+    for name, value in values.items():
+        lines += [_comment(line) for line in (comments or {}).get(name, ())]
+        kind = INT32 if isinstance(value, int) else REAL32
+        lines.append(f"{VEHICLE_ID}\t{COMPONENT_ID}\t{name}\t{value_text(value)}\t{kind}")
+    return "\n".join(lines) + "\n"
+
+
+def _comment(line: str) -> str:
+    return f"# {line}".rstrip()

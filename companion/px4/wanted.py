@@ -1,0 +1,362 @@
+"""Every parameter of PX4 that a flight here depends on: what it must be, why, and what it means if it is not.
+
+One table. The preflight's rows, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/px4.md and the stub's own
+settings are made from it. Names, types and limits are those of PX4 1.16.1 and 1.18 (their parameter metadata); whether a change needs
+a reboot is what PX4 says of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from companion.config.vehicle import Vehicle
+from companion.mission.sequencer import SPOOL_S
+from companion.preflight.rows import Level
+
+GRAVITY_M_S2 = 9.81
+HOVER = "MPC_THR_HOVER"
+RADIO = "COM_RC_IN_MODE"
+NO_RADIO = 4
+_HOVER_OFF_MAX = 0.35
+_ROOM_MARGIN_M = 0.3
+_FAILURE_MARGIN_DEG = 10.0
+_RELATIVE = 1e-6
+"""A REAL32 is compared with this tolerance."""
+
+Value = float | int
+Limits = Callable[[Vehicle], tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """One parameter. Ok is what `ok` lists, or what lies within `limits`, else `value` alone."""
+
+    name: str
+    value: Value | None
+    """Goes into the file; its type is PX4's: int for INT32, float for REAL32. None: measured on each vehicle, in no file."""
+    why: str
+    """What happens to the machine otherwise."""
+    level: Level = Level.REFUSE
+    reboot: bool = False
+    ok: tuple[int, ...] = ()
+    limits: Limits | None = None
+    limits_text: str = ""
+    """In words where the limits depend on the vehicle file."""
+    fix: str = ""
+    """Instead of `set it`."""
+    hardware: bool = False
+    """Of the serial port TELEM2; looked at only on a serial link, and PX4's simulator does not have all of them."""
+    file: bool = True
+    """Part of configs/px4/indoor_mocap.params."""
+
+    @property
+    def integer(self) -> bool:
+        """PX4 stores an INT32."""
+        return isinstance(self.value, int)
+
+    def accepts(self, value: Value, vehicle: Vehicle) -> bool:
+        """PX4's value is one with which this vehicle can fly."""
+        if self.ok:
+            return value in self.ok
+        if self.limits is None:
+            assert self.value is not None
+            low = high = float(self.value)
+        else:
+            low, high = self.limits(vehicle)
+        slack = _RELATIVE * max(abs(low), abs(high), _RELATIVE)
+        return low - slack <= value <= high + slack
+
+    def text(self, vehicle: Vehicle | None = None) -> str:
+        """What is wanted, in words; without a vehicle file what depends on it is named."""
+        if self.ok:
+            return " or ".join(f"{value}" for value in self.ok)
+        if self.limits is None:
+            return f"{self.value:g}"
+        if vehicle is None and self.limits_text:
+            return self.limits_text
+        low, high = self.limits(vehicle) if vehicle is not None else self.limits(_NO_VEHICLE)
+        return " to ".join(f"{end:.3f}".rstrip("0").rstrip(".") for end in (low, high))
+
+
+_NO_VEHICLE: Vehicle = None  # type: ignore[assignment]
+"""For limits that do not look at it."""
+
+
+def _between(low: float, high: float) -> Limits:
+    return lambda _: (low, high)
+
+
+def _hover(vehicle: Vehicle) -> tuple[float, float]:
+    airframe = vehicle.airframe
+    expected = airframe.hover_thrust or airframe.mass_kg * GRAVITY_M_S2 / airframe.thrust_max_n
+    return expected * (1.0 - _HOVER_OFF_MAX), expected * (1.0 + _HOVER_OFF_MAX)
+
+
+def _below_ceiling(vehicle: Vehicle) -> tuple[float, float]:
+    return 0.0, max(0.0, vehicle.room.z_m[1] - _ROOM_MARGIN_M)
+
+
+def _below_own_landing(vehicle: Vehicle) -> tuple[float, float]:
+    return 0.05, max(0.05, vehicle.safety.battery_min - 0.02)
+
+
+def _above_abort(vehicle: Vehicle) -> tuple[float, float]:
+    return vehicle.safety.tilt_abort_deg + _FAILURE_MARGIN_DEG, 180.0
+
+
+_WARN = Level.WARN
+_CEILING = "0 to `room.z_m` less 0.3"
+
+GROUPS: dict[str, tuple[Wanted, ...]] = {
+    "Estimator: motion capture alone": (
+        Wanted("EKF2_EN", 1, "without EKF2 there is no estimate at all"),
+        Wanted(
+            "EKF2_EV_CTRL", 11, "position, height and yaw come from vision; what is left out drifts away", ok=(11, 15)
+        ),
+        Wanted(
+            "EKF2_HGT_REF",
+            3,
+            "height would follow the barometer, and rotor wash indoors moves that by a metre",
+            reboot=True,
+        ),
+        Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would pull the machine out of the room"),
+        Wanted(
+            "EKF2_BARO_CTRL",
+            0,
+            "the barometer feels the rotors' wash and doors, and is fused against motion capture",
+            _WARN,
+        ),
+        Wanted(
+            "EKF2_MAG_TYPE",
+            5,
+            "steel and motors bend the compass; yaw would be torn between it and motion capture",
+            reboot=True,
+        ),
+        Wanted("EKF2_OF_CTRL", 0, "an optical flow sensor sees the arm move and takes it for its own motion", _WARN),
+        Wanted("EKF2_RNG_CTRL", 0, "a range finder sees arm and net for the floor", _WARN),
+        Wanted(
+            "EKF2_EV_DELAY",
+            5.0,
+            "ms from exposure to arrival; an estimate that is wrong in time swings with the machine",
+            reboot=True,
+            limits=_between(0.0, 30.0),
+        ),
+        Wanted(
+            "EKF2_EVP_NOISE",
+            0.01,
+            "m; with much more the estimate follows the IMU's drift, not motion capture",
+            _WARN,
+            limits=_between(0.005, 0.05),
+        ),
+        Wanted(
+            "EKF2_EVA_NOISE",
+            0.05,
+            "rad; with much more yaw lags behind motion capture",
+            _WARN,
+            limits=_between(0.01, 0.1),
+        ),
+        Wanted("EKF2_EV_QMIN", 0, "VISION_POSITION_ESTIMATE carries no quality: with any minimum nothing is fused"),
+        *(
+            Wanted(
+                f"EKF2_EV_POS_{axis}",
+                0.0,
+                "m; the body's pivot is PX4's centre of mass: an offset moves the estimate when it tilts",
+                limits=_between(-0.02, 0.02),
+            )
+            for axis in "XYZ"
+        ),
+        Wanted("SYS_HAS_GPS", 0, "PX4 waits for, and complains of, a GPS that is not used", _WARN, reboot=True),
+        Wanted("SYS_HAS_MAG", 0, "arming is refused for a compass that is missing, or disturbed by steel", reboot=True),
+        Wanted("COM_ARM_WO_GPS", 1, "0 refuses arming without GPS", ok=(1, 2)),
+    ),
+    "When the companion falls silent": (
+        Wanted(
+            "COM_OF_LOSS_T",
+            0.5,
+            "s without setpoint until the failsafe; longer and the machine flies on its last attitude, shorter and "
+            "one delayed packet ends the flight",
+            limits=_between(0.2, 0.5),
+        ),
+        Wanted(
+            "COM_OBL_RC_ACT",
+            4,
+            "land; 0 to 2 hand over to sticks that nobody holds, 3 climbs and returns, 6 and 7 drop it",
+        ),
+    ),
+    "The pilot's radio": (
+        Wanted(
+            RADIO,
+            NO_RADIO,
+            "4 switches the pilot's sticks and mode switch off: only where nobody holds a radio",
+            ok=(0, 1, 2, 3, 4),
+            fix="set 4 without a radio (configs/px4/no_radio.params), else the one that fits the radio",
+            file=False,
+        ),
+        Wanted(
+            "NAV_RCL_ACT",
+            3,
+            "the radio is lost: land; 2 climbs and returns across the tether, 5 and 6 drop the machine",
+        ),
+        Wanted(
+            "COM_RCL_EXCEPT",
+            0,
+            "with bit 2 a lost radio goes unnoticed in OFFBOARD, and the pilot cannot take over",
+            _WARN,
+        ),
+    ),
+    "Other failsafes": (
+        Wanted("NAV_DLL_ACT", 0, "closing QGroundControl would end the flight, with a climb if it is 2"),
+        Wanted(
+            "COM_LOW_BAT_ACT",
+            2,
+            "land on a critical battery if nobody has landed before; 3 returns, 0 only warns",
+            _WARN,
+        ),
+        Wanted(
+            "BAT_CRIT_THR",
+            0.1,
+            "PX4's own landing must come after the companion's, which lands with position",
+            _WARN,
+            limits=_below_own_landing,
+            limits_text="0.05 to `safety.battery_min` less 0.02",
+        ),
+        Wanted(
+            "COM_FLTT_LOW_ACT", 1, "3 returns by itself when PX4 thinks that the battery's time is up", _WARN, ok=(0, 1)
+        ),
+        Wanted("GF_ACTION", 2, "3 climbs and returns at PX4's own fence, 4 stops the motors", ok=(0, 1, 2, 5)),
+        Wanted(
+            "RTL_RETURN_ALT",
+            1.5,
+            "m; whatever makes PX4 return climbs to this first: into the ceiling, or until the tether holds it",
+            limits=_below_ceiling,
+            limits_text=_CEILING,
+        ),
+        Wanted(
+            "CBRK_FLIGHTTERM",
+            121212,
+            "else PX4 stops the motors in the air when it thinks that attitude failed",
+            _WARN,
+            reboot=True,
+        ),
+        *(
+            Wanted(
+                f"FD_FAIL_{axis}",
+                60,
+                "deg; beyond it PX4 stops the motors in the first seconds after take-off; must lie well beyond "
+                "`safety.tilt_abort_deg`",
+                _WARN,
+                limits=_above_abort,
+                limits_text="`safety.tilt_abort_deg` plus 10 to 180",
+            )
+            for axis in "RP"
+        ),
+        Wanted("CBRK_SUPPLY_CHK", 0, "the check of the supply voltage is switched off", _WARN),
+        Wanted("SYS_FAILURE_EN", 0, "one stray message could switch off a motor", reboot=True),
+        Wanted("COM_THROW_EN", 0, "picked up and moved fast, an armed machine would start its motors"),
+    ),
+    "Arming, take-off and landing": (
+        Wanted(
+            HOVER,
+            None,
+            "PX4 holds and lands with it, and the companion starts from it: too high jumps, too low does not lift",
+            limits=_hover,
+            limits_text="within 35 % of `airframe.hover_thrust`, or of weight over `airframe.thrust_max_n`",
+            fix="measure it (companion hover fit) and set it, or correct airframe.mass_kg and airframe.thrust_max_n",
+            file=False,
+        ),
+        Wanted(
+            "COM_SPOOLUP_TIME",
+            1.0,
+            "s; so long after arming PX4 holds thrust back, and the companion spools up",
+            limits=_between(0.0, SPOOL_S),
+        ),
+        Wanted(
+            "COM_DISARM_LAND",
+            2.0,
+            "s; 0 or less: after PX4's own landing the rotors go on turning",
+            limits=_between(0.1, 5.0),
+        ),
+        Wanted(
+            "COM_DISARM_PRFLT",
+            10.0,
+            "s; shorter and PX4 disarms while the companion spools up",
+            limits=_between(5.0, 60.0),
+        ),
+        Wanted(
+            "MPC_LAND_SPEED",
+            0.7,
+            "m/s; PX4's own landing comes down that fast, the net first",
+            _WARN,
+            limits=_between(0.3, 1.0),
+        ),
+        Wanted(
+            "MIS_TAKEOFF_ALT",
+            1.0,
+            "m; a pilot's Takeoff mode climbs so high",
+            _WARN,
+            limits=_below_ceiling,
+            limits_text=_CEILING,
+        ),
+    ),
+    "Limits of PX4's own modes: hold, return, land, position": (
+        Wanted(
+            "MPC_TILTMAX_AIR",
+            25.0,
+            "deg; more lets PX4 dash across the room when it takes over",
+            _WARN,
+            limits=_between(20.0, 45.0),
+        ),
+        Wanted("MPC_XY_VEL_MAX", 2.0, "m/s; more leaves no room to stop", _WARN, limits=_between(0.5, 3.0)),
+        Wanted(
+            "MPC_Z_VEL_MAX_UP",
+            1.0,
+            "m/s; more leaves no room to stop below the ceiling",
+            _WARN,
+            limits=_between(0.5, 2.0),
+        ),
+    ),
+    "Serial link to the companion: TELEM2": (
+        Wanted("MAV_1_CONFIG", 102, "no MAVLink on TELEM2", _WARN, reboot=True, hardware=True),
+        Wanted(
+            "MAV_1_MODE", 2, "other modes stream to people: too little, too slowly", _WARN, reboot=True, hardware=True
+        ),
+        Wanted(
+            "MAV_1_RATE",
+            80000,
+            "B/s; 0 stands for half of the wire's bandwidth, and PX4 then slows every stream down",
+            _WARN,
+            reboot=True,
+            hardware=True,
+            limits=_between(60000.0, 92160.0),
+        ),
+        Wanted(
+            "SER_TEL2_BAUD",
+            921600,
+            "the state at full rate does not fit a slower wire",
+            _WARN,
+            reboot=True,
+            hardware=True,
+        ),
+    ),
+}
+"""In the order in which people read them."""
+
+WANTED: tuple[Wanted, ...] = tuple(one for group in GROUPS.values() for one in group)
+BY_NAME = {one.name: one for one in WANTED}
+
+
+def names() -> tuple[str, ...]:
+    """Every parameter that the preflight reads."""
+    return tuple(BY_NAME)
+
+
+def file_values() -> dict[str, Value]:
+    """What configs/px4/indoor_mocap.params holds."""
+    return {one.name: one.value for one in WANTED if one.file and one.value is not None}
+
+
+def simulated_values() -> dict[str, Value]:
+    """What a simulated PX4 is set to: the file without the serial port, and nobody holds a radio."""
+    values = {one.name: one.value for one in WANTED if one.file and not one.hardware and one.value is not None}
+    return {**values, RADIO: NO_RADIO}

@@ -1,0 +1,144 @@
+"""`companion px4 params` from outside, against the stub's MAVLink port and against a peer that sees each byte."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.cli import main
+from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.px4 import params_file
+from companion.px4.params_file import single
+from companion.px4.transfer import compare
+from companion.px4.wanted import file_values
+from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from tests.io.stub_rig import standing_stub
+
+SPOILED = {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 5.0, "EKF2_HGT_REF": 0}
+
+
+def params(port: int, *words: str) -> int:
+    return main(["px4", "params", "--address", f"udpin://127.0.0.1:{port}", *words])
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return loaded
+
+
+def test_diff_write_diff_on_the_stub(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    backup = tmp_path / "old.params"
+
+    async def session() -> None:
+        async def run(*words: str) -> int:
+            return await asyncio.to_thread(params, port, *words)
+
+        port = free_udp_port()
+        async with standing_stub(port, SPOILED) as stub:
+            assert await run("--diff", "--json") == EXIT_REFUSED
+            found = told(capsys)
+            assert found["ok"] is False
+            assert {row["name"]: (row["px4"], row["reboot"]) for row in found["differs"]} == {
+                "EKF2_EV_CTRL": (3, False),
+                "COM_OF_LOSS_T": (5.0, False),
+                "EKF2_HGT_REF": (0, True),
+            }
+            assert set(found["absent_port"]) == {"MAV_1_CONFIG", "MAV_1_MODE", "MAV_1_RATE", "SER_TEL2_BAUD"}
+            assert "written" not in found
+
+            revision = stub.params.revision
+            assert await run("--write", "--json", "--backup", str(backup)) == EXIT_OK
+            found = told(capsys)
+            assert set(found["written"]) == set(SPOILED)
+            assert found["reboot"] == ["EKF2_HGT_REF"]
+            assert stub.params.revision == revision + len(SPOILED), "only what differed was written"
+            assert all(stub.params[name] == single(file_values()[name]) for name in SPOILED)
+            assert params_file.read(backup) == SPOILED
+
+            assert await run("--diff") == EXIT_OK
+            assert "nothing differs" in capsys.readouterr().out
+            assert await run("--write", str(backup), "--backup", str(tmp_path / "older.params")) == EXIT_OK
+            assert "reboot PX4: EKF2_HGT_REF" in capsys.readouterr().out
+            assert all(stub.params[name] == value for name, value in SPOILED.items())
+
+    asyncio.run(session())
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.params"
+    path.write_text(params_file.text({"MPC_THR_HOVER": 0.5, "COM_RC_IN_MODE": 3}), encoding="utf-8")
+    return path
+
+
+def test_writing_is_refused_while_armed(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        assert params(port, "--write", str(mine), "--backup", str(mine.with_name("old"))) == EXIT_REFUSED
+        assert "expected a disarmed PX4, found it armed" in capsys.readouterr().err
+        assert peer.of("PARAM_SET") == []
+        assert params(port, "--diff", str(mine)) == EXIT_REFUSED
+        assert "2 differ" in capsys.readouterr().out
+    assert not mine.with_name("old").exists()
+
+
+def test_old_values_are_kept_before_anything_is_written(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        assert params(port, "--write", str(mine), "--backup", str(mine)) == EXIT_BAD_INPUT
+        assert "is there already; choose another name (nothing was written)" in capsys.readouterr().err
+        assert peer.of("PARAM_SET") == []
+
+
+def test_a_name_that_px4_does_not_have_is_not_all_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.params"
+    path.write_text(params_file.text({"NO_SUCH_ONE": 1, "COM_RC_IN_MODE": 3}), encoding="utf-8")
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        assert params(port, "--write", str(path), "--backup", str(tmp_path / "old.params")) == EXIT_REFUSED
+        assert "NO_SUCH_ONE       PX4 does not have it" in capsys.readouterr().out
+        assert peer.params["COM_RC_IN_MODE"] == 3
+
+
+def test_another_type_than_px4s_is_told_and_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.params"
+    path.write_text(params_file.text({"MPC_THR_HOVER": 1}), encoding="utf-8")
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        assert params(port, "--write", str(path), "--backup", str(tmp_path / "old.params")) == EXIT_REFUSED
+        assert "MPC_THR_HOVER: PX4 has a REAL32, the file says an INT32; correct the file" in capsys.readouterr().out
+        assert peer.of("PARAM_SET") == []
+
+
+def test_a_bad_address_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert params(99999, "--diff") == EXIT_REFUSED
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "a port from 1 to 65535" in said
+
+
+def test_a_damaged_file_is_told_before_anything_is_opened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.params"
+    path.write_text("1\t1\tA\tx\t6\n", encoding="utf-8")
+    assert params(1, "--diff", str(path)) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err.startswith(f"{path}:1: A: expected a whole number")
+
+
+@pytest.mark.parametrize("words", [[], ["--diff", "--write"], ["--diff", "--vehicle", "a", "--address", "b"]])
+def test_a_wrong_command_line_is_refused(words: list[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["px4", "params", *words])
+    assert caught.value.code == EXIT_BAD_INPUT
+
+
+def test_a_comparison_knows_values_as_px4_stores_them() -> None:
+    comparison = compare({"A": 0.1, "B": 1, "MAV_1_CONFIG": 102}, {"A": single(0.1), "B": 1})
+    assert comparison.same
+    assert comparison.absent_port == ("MAV_1_CONFIG",)
+    assert not compare({"A": 0.1, "C": 1}, {"A": 0.1}).same

@@ -1,0 +1,180 @@
+"""The preflight's rows of firmware and parameters: what is spoiled is named, with the fix; what is fine is not."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from companion.clock import flight_clock
+from companion.config.document import ConfigError
+from companion.config.loader import load_vehicle, load_world
+from companion.config.vehicle import AutopilotDevice, Vehicle
+from companion.config.world import World
+from companion.io.autopilot import MavsdkAutopilot
+from companion.preflight.px4 import firmware_row, rows
+from companion.preflight.rows import Level, Row
+from companion.px4.defaults import PX4_DEFAULTS
+from companion.px4.wanted import HOVER, WANTED, names, simulated_values
+from tests.io.autopilot_peer import free_udp_port
+from tests.io.stub_rig import standing_stub
+
+VEHICLE_FILE = Path(__file__).parents[2] / "configs/vehicles/tarot650_2r.yaml"
+FIRMWARE = "PX4 1.16.1 release (git 94cb20127)"
+UDP = "vehicle.devices.autopilot.address=udpin://127.0.0.1:14540"
+
+# Name, spoiled value, whether the machine stays on the ground, and a part of the fix.
+SPOILED = [
+    ("EKF2_EV_CTRL", 0, True, "set EKF2_EV_CTRL to 11"),
+    ("EKF2_HGT_REF", 1, True, "set EKF2_HGT_REF to 3 (companion px4 params --write), then reboot PX4"),
+    ("EKF2_GPS_CTRL", 7, True, "set EKF2_GPS_CTRL to 0"),
+    ("EKF2_MAG_TYPE", 0, True, "set EKF2_MAG_TYPE to 5"),
+    ("EKF2_EV_DELAY", 100.0, True, "set EKF2_EV_DELAY to 5"),
+    ("EKF2_EVP_NOISE", 0.5, False, "set EKF2_EVP_NOISE to 0.01"),
+    ("SYS_HAS_MAG", 1, True, "then reboot PX4"),
+    ("COM_OF_LOSS_T", 1.0, True, "set COM_OF_LOSS_T to 0.5"),
+    ("COM_OBL_RC_ACT", 0, True, "set COM_OBL_RC_ACT to 4"),
+    ("NAV_DLL_ACT", 2, True, "set NAV_DLL_ACT to 0"),
+    ("RTL_RETURN_ALT", 30.0, True, "set RTL_RETURN_ALT to 1.5"),
+    ("COM_RC_IN_MODE", 7, True, "no_radio.params"),
+    ("MPC_THR_HOVER", 0.2, True, "companion hover fit"),
+    ("BAT_CRIT_THR", 0.25, False, "set BAT_CRIT_THR to 0.1"),
+]
+
+
+def vehicle(*overrides: str) -> Vehicle:
+    return load_vehicle(VEHICLE_FILE, [UDP, *overrides])
+
+
+def good() -> dict[str, float | int]:
+    return {**simulated_values(), HOVER: 0.49}
+
+
+def wrong(params: dict[str, float | int], machine: Vehicle | None = None) -> list[Row]:
+    return [row for row in rows(FIRMWARE, params, machine or vehicle()) if not row.ok]
+
+
+def test_what_this_project_sets_is_fine() -> None:
+    found = rows(FIRMWARE, good(), vehicle())
+    assert wrong(good()) == []
+    assert [row.id for row in found[1:]] == [f"px4.param.{wanted.name}" for wanted in WANTED if not wanted.hardware]
+    assert all(row.why and row.wanted for row in found)
+
+
+@pytest.mark.parametrize(("name", "value", "refuses", "fix"), SPOILED)
+def test_a_spoiled_parameter_is_named_with_its_fix(name: str, value: float, refuses: bool, fix: str) -> None:
+    (row,) = wrong({**good(), name: value})
+    assert row.id == f"px4.param.{name}"
+    assert row.title == name
+    assert row.refuses is refuses
+    assert row.read == f"{value:g}"
+    assert fix in row.fix
+    assert name in row.line()
+
+
+def test_px4_as_it_comes_is_refused_for_what_matters() -> None:
+    refused = {row.title for row in wrong({**PX4_DEFAULTS}) if row.refuses}
+    assert refused >= {"EKF2_EV_CTRL", "EKF2_HGT_REF", "EKF2_GPS_CTRL", "EKF2_MAG_TYPE", "SYS_HAS_MAG", "COM_OF_LOSS_T"}
+    assert refused >= {"COM_OBL_RC_ACT", "NAV_RCL_ACT", "RTL_RETURN_ALT"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("COM_OF_LOSS_T", 0.2), ("COM_OF_LOSS_T", 0.20000000298023224), ("COM_RC_IN_MODE", 0)]
+)
+def test_the_ends_of_a_range_are_fine(name: str, value: float) -> None:
+    assert wrong({**good(), name: value}) == []
+
+
+def test_limits_follow_the_vehicle_file() -> None:
+    low = vehicle("vehicle.room.z_m=[0.0, 1.6]")
+    assert [row.title for row in wrong(good(), low)] == ["RTL_RETURN_ALT"]
+    strong = vehicle("vehicle.airframe.thrust_max_n=120.0")
+    assert [row.title for row in wrong(good(), strong)] == [HOVER]
+
+
+def test_a_parameter_that_px4_does_not_have_is_told() -> None:
+    params = good()
+    del params["EKF2_EV_QMIN"]
+    (row,) = wrong(params)
+    assert (row.title, row.read, row.level) == ("EKF2_EV_QMIN", "PX4 does not have it", Level.WARN)
+
+
+def test_the_serial_port_counts_on_a_serial_link_only() -> None:
+    serial = vehicle("vehicle.devices.autopilot.address=serial:///dev/ttyAMA0:921600")
+    found = {row.title: row for row in wrong({**good(), "MAV_1_RATE": 0, "MAV_1_MODE": 2, "MAV_1_CONFIG": 102}, serial)}
+    assert set(found) == {"MAV_1_RATE", "SER_TEL2_BAUD"}
+    assert not any(row.refuses for row in found.values())
+    assert wrong({**good(), "MAV_1_RATE": 0}) == []
+
+
+@pytest.mark.parametrize(
+    ("firmware", "ok", "refuses"),
+    [
+        ("PX4 1.16.0 release (git 0)", True, False),
+        ("PX4 1.18.2 release (git 0)", True, False),
+        ("PX4 1.18.0 beta (git 0)", False, False),
+        ("PX4 1.17.0 release (git 0)", False, False),
+        ("PX4 1.15.4 release (git 0)", False, False),
+        ("PX4 1.14.3 release (git 0)", False, True),
+        ("PX4 2.0.0 release (git 0)", False, False),
+        ("something", False, False),
+    ],
+)
+def test_firmware(firmware: str, ok: bool, refuses: bool) -> None:
+    row = firmware_row(firmware)
+    assert (row.ok, row.refuses, row.read) == (ok, refuses, firmware)
+    assert bool(row.fix) is not ok
+
+
+def test_parameters_that_nobody_could_read_keep_the_machine_down() -> None:
+    assert [row.id for row in rows(FIRMWARE, {}, vehicle()) if row.refuses] == ["px4.params"]
+    assert rows(None, {}, vehicle()) == []
+
+
+def test_types_and_names_are_those_of_px4() -> None:
+    for wanted in WANTED:
+        assert len(wanted.name) <= 16
+        if wanted.value is not None and wanted.name in PX4_DEFAULTS:
+            assert wanted.integer is isinstance(PX4_DEFAULTS[wanted.name], int), wanted.name
+        if wanted.value is not None:
+            assert wanted.accepts(wanted.value, vehicle()), wanted.name
+    assert {wanted.name for wanted in WANTED if wanted.name not in PX4_DEFAULTS} == {
+        wanted.name for wanted in WANTED if wanted.hardware
+    }
+
+
+def test_spoiled_over_real_mavlink_the_row_is_there() -> None:
+    spoiled = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0}
+    world = load_world([f"world.px4_params={spoiled}".replace("'", "")])
+
+    async def read() -> list[Row]:
+        port = free_udp_port()
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        async with (
+            standing_stub(port, {HOVER: 0.49, **world.spoiled_px4_params()}),
+            MavsdkAutopilot(device, flight_clock()) as autopilot,
+        ):
+            return rows(await autopilot.firmware(), await autopilot.read_params(names()), vehicle())
+
+    assert {row.title for row in asyncio.run(read()) if not row.ok} == set(spoiled)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("{EKF2_EV_CTL: 1}", 'the simulated PX4 has no parameter "EKF2_EV_CTL" (did you mean EKF2_EV_CTRL?)'),
+        ("{EKF2_EV_CTRL: 1.5}", "EKF2_EV_CTRL is an INT32, got 1.5"),
+        ("{EKF2_EVP_NOISE: 1.0e+39}", "EKF2_EVP_NOISE does not hold 1e+39"),
+    ],
+)
+def test_a_spoiled_parameter_that_px4_cannot_have_is_refused(override: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_world([f"world.px4_params={override}"])
+    assert said in caught.value.lines[0]
+
+
+def test_spoiled_parameters_come_in_px4s_types() -> None:
+    world = World(px4_params={"EKF2_EV_CTRL": 3.0, "COM_OF_LOSS_T": 1.0})
+    assert world.spoiled_px4_params() == {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 1.0}
+    assert [type(value) for value in world.spoiled_px4_params().values()] == [int, float]
