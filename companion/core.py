@@ -12,6 +12,7 @@ from companion.control.pilot import Command, Pilot
 from companion.flight_stages import FlightStages, missing_inputs
 from companion.mission import sequencer as seq
 from companion.mission.plan import Plan, landing_from
+from companion.mission.reattach import found_armed
 from companion.mission.retract import inward_only, retract_from
 from companion.mission.sequencer import Stage
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
@@ -72,6 +73,8 @@ class FlightCore:
         self._judged: Stage | None = None
         """The stage that the situation was last told; looking it up in sets costs time."""
         self._tether_watched = False
+        self._armed_by_others = False
+        """Nothing is to be sent to the rotors, not even no thrust."""
         self._last_t_s: float | None = None
         self._reference: Reference | None = None
         """What the law followed last, bent where it had to be."""
@@ -141,9 +144,13 @@ class FlightCore:
             situation.airborne = stage in seq.LIFTING
             situation.offboard_expected = stage in seq.COMMANDING
             self._tether_watched = stage not in seq.BEFORE_LIFT
+            situation.found_armed = None
         situation.tracking_error_m = self._pilot.tracking_error_m if stage is _PLAN else None
         situation.control = self._log
         situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs))
+        if stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status):
+            self._armed_by_others = True
+            situation.airborne, situation.found_armed = found_armed(inputs, self._vehicle.airframe.ground_clearance_m)
         # The tether is judged as it was a tick ago: what is believed of this tick's state is not known yet.
         events = self._monitors.check(inputs, situation)
         i = self._monitors.trusted
@@ -178,7 +185,9 @@ class FlightCore:
         stages, action, stage = self._stages, self._ladder.action, self._stages.stage
         if action.rank < SafetyAction.HOLD.rank:
             return
-        if stage in seq.BEFORE_LIFT:
+        if stage in seq.BEFORE_ARMING and self._situation.airborne:
+            stages.reattach(i)
+        elif stage in seq.BEFORE_LIFT:
             if action.rank >= SafetyAction.LAND.rank:
                 by_people = self._ladder.cause in ("operator_land", "operator_abort")
                 stages.stand_down(i, Outcome.ABORTED if by_people else Outcome.REFUSED)
@@ -284,6 +293,8 @@ class FlightCore:
         stages, stage = self._stages, self._stages.stage
         if stage in (Stage.WAIT, Stage.DONE):
             return None, Command()
+        if stage is Stage.STAND_DOWN and self._armed_by_others:
+            return None, dataclasses.replace(self._pilot.wait(i), attitude=None)
         if stage is Stage.AUTOPILOT_LAND:
             folding = self._pilot.fold(i, dt_s)
             return None, dataclasses.replace(folding, attitude=self._pilot.level(i)) if stages.zero_thrust else folding
@@ -310,3 +321,6 @@ class FlightCore:
             self._situation.caught = True
             text = f"payload caught at t = {caught_s - stages.mission_start_s:.2f} s"
             stages.tell(i, "catch", Severity.INFO, SafetyAction.NOMINAL, text, caught_s)
+        elif self._pilot.payload_left(i.t_s):
+            self._situation.caught = False
+            stages.tell(i, "payload_left", Severity.INFO, SafetyAction.NOMINAL, "the payload has left the net")

@@ -17,7 +17,7 @@ from companion.analysis.log import FlightLog, LogError
 from companion.config.faults import FlightPhase
 from companion.config.loader import FlightConfig
 from companion.exit_codes import EXIT_BAD_INPUT
-from companion.mission.sequencer import TouchdownDetector
+from companion.mission.touchdown import HEIGHT_MARGIN_M
 from companion.types import Event, Inputs, Outcome, SafetyAction, Severity
 
 FLIGHT_TIMEOUT_S = 240.0
@@ -121,7 +121,7 @@ def flown(folder: Path, config: FlightConfig) -> Flown:
         Point(t_s + offset_s, (x, y, z), tilt_rad, slack_m, abs(tension_n))
         for t_s, (x, y, z), tilt_rad, slack_m, tension_n in world["course"]
     ]
-    low_m = config.vehicle.airframe.ground_clearance_m + TouchdownDetector.HEIGHT_MARGIN_M
+    low_m = config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
     stands = bool(course) and course[-1].position_world_m[2] < low_m and not world["armed"]
     outcome = Outcome.CRASHED.value if world["crashed"] else summary["outcome"]
     fault_s = None if begun_s is None else begun_s + offset_s

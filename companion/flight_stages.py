@@ -14,6 +14,8 @@ from companion.mission.check import check_start
 from companion.mission.course import Course
 from companion.mission.plan import Plan
 from companion.mission.sequencer import Stage
+from companion.mission.settled import SettledEstimate
+from companion.mission.touchdown import STILL_M_S, Sinking, Touchdown
 from companion.safety.monitors import unfused
 from companion.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, SafetyAction, Severity
 
@@ -32,7 +34,10 @@ class FlightStages:
     def __init__(self, config: FlightConfig, pilot: Pilot) -> None:
         self._config = config
         self._pilot = pilot
-        self._touchdown = seq.TouchdownDetector(config.vehicle.airframe.ground_clearance_m)
+        self._clearance_m = config.vehicle.airframe.ground_clearance_m
+        self._touchdown = Touchdown(self._clearance_m)
+        self._sinking = Sinking()
+        self._settled = SettledEstimate()
         self._tare_start_s: float | None = None
         self._landing: AutopilotLanding | None = None
         self._plan: Plan | None = None
@@ -66,7 +71,7 @@ class FlightStages:
     def enter(self, stage: Stage, i: Inputs, *, pilot_flies: bool = False) -> None:
         """Go to a stage; `pilot_flies`: a landing by PX4 is only watched."""
         if stage is Stage.AUTOPILOT_LAND:
-            self._landing = AutopilotLanding(i.t_s, self._config.vehicle.airframe.ground_clearance_m, pilot_flies)
+            self._landing = AutopilotLanding(i.t_s, self._clearance_m, pilot_flies)
         self.stage = stage
         self._stage_s = i.t_s
 
@@ -74,6 +79,12 @@ class FlightStages:
         """Fix the outcome; a graver one replaces it, a better one never does."""
         if self.outcome in (None, Outcome.COMPLETED) or outcome is Outcome.CRASHED:
             self.outcome = outcome
+
+    def reattach(self, i: Inputs) -> None:
+        """PX4 flies already: it lands, or is only watched if people fly it; the mission is never begun."""
+        self.finish(Outcome.ABORTED)
+        self.stage, self._stage_s = Stage.AUTOPILOT_LAND, i.t_s
+        self._landing = AutopilotLanding(i.t_s, self._clearance_m, seq.people_fly(i.status), estimate_known=False)
 
     def stand_down(self, i: Inputs, outcome: Outcome) -> None:
         """Disarm and end, on the ground."""
@@ -122,10 +133,10 @@ class FlightStages:
         if self.stage is Stage.SPOOL:
             return seq.SPOOL_SHARE * min(1.0, elapsed / seq.SPOOL_S)
         if self.stage is Stage.TOUCHDOWN:
-            return max(0.0, seq.SPOOL_SHARE * (1.0 - elapsed / seq.TOUCHDOWN_RAMP_S))
+            return max(0.0, min(seq.SPOOL_SHARE, self._touchdown.relief) * (1.0 - elapsed / seq.TOUCHDOWN_RAMP_S))
         if not self.aborting and elapsed < seq.SPOOL_TO_FULL_S:
             return seq.SPOOL_SHARE + (1.0 - seq.SPOOL_SHARE) * elapsed / seq.SPOOL_TO_FULL_S
-        return 1.0
+        return self._touchdown.relief
 
     # -- sequence --------------------------------------------------------------------------------------------------
 
@@ -139,7 +150,8 @@ class FlightStages:
             case Stage.WAIT:
                 self._wait(i, elapsed)
             case Stage.OFFBOARD:
-                if seq.in_offboard(i.status):
+                # After a landing PX4 is in OFFBOARD already, but it arms only on a stream of setpoints.
+                if seq.in_offboard(i.status) and elapsed > seq.STREAM_BEFORE_OFFBOARD_S:
                     self.enter(Stage.ARM, i)
                 elif elapsed > seq.OFFBOARD_TIMEOUT_S:
                     self._refuse(i, "offboard_refused", "PX4 did not enter OFFBOARD")
@@ -169,7 +181,11 @@ class FlightStages:
             case Stage.AUTOPILOT_LAND:
                 return self._autopilot_land(i)
             case Stage.STAND_DOWN:
-                if not seq.is_armed(i.status) or elapsed > seq.DISARM_TIMEOUT_S:
+                if not seq.is_armed(i.status):
+                    self.enter(Stage.DONE, i)
+                elif elapsed > seq.DISARM_TIMEOUT_S:
+                    text = "PX4 did not disarm: its rotors may turn; disarm it by its switch or from a ground station"
+                    self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, text)
                     self.enter(Stage.DONE, i)
                 else:
                     return AutopilotRequest.DISARM
@@ -183,14 +199,21 @@ class FlightStages:
         problem = _nothing_from(missing) if missing else unfused(i)
         if problem is not None:
             self._tare_start_s = None
+            self._settled.forget()
             if elapsed_s > seq.WAIT_TIMEOUT_S:
                 self._refuse(i, "inputs_missing" if missing else "vision_not_fused", problem)
             return
-        assert i.vehicle is not None and i.arm is not None
+        assert i.vehicle is not None and i.arm is not None and i.mocap is not None
         if self._tare_start_s is None:
             self._tare_start_s = i.t_s
         self._pilot.collect_tare(i)
+        self._settled.take(i.t_s, i.vehicle, i.mocap)
         if i.t_s - self._tare_start_s < seq.TARE_S:
+            return
+        wanders = self._settled.problem(i.t_s)
+        if wanders is not None:
+            if elapsed_s > seq.WAIT_TIMEOUT_S:
+                self._refuse(i, "estimate_unsteady", wanders)
             return
         self._pilot.finish_tare()
         mission, vehicle, position = self._config.mission, self._config.vehicle, i.vehicle.position_world_m
@@ -213,8 +236,8 @@ class FlightStages:
         vehicle = i.vehicle
         if vehicle is not None and self.course.segment(i.t_s).kind is PhaseKind.LANDING:
             reference_z = self.course.reference(i.t_s).position_world_m[2]
-            height, sink = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
-            if self._touchdown.update(i.t_s, height, sink, reference_z):
+            share, landed = self._pilot.thrust_share, seq.on_ground(i.status)
+            if self._touchdown.update(i.t_s, vehicle, i.mocap, reference_z, share, landed):
                 self.tell(i, "touchdown", Severity.INFO, SafetyAction.NOMINAL, "touch-down")
                 self.finish(Outcome.COMPLETED)
                 self.enter(Stage.TOUCHDOWN, i)
@@ -232,7 +255,12 @@ class FlightStages:
             self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, "PX4 did not disarm")
             self.finish(Outcome.ABORTED)
             self.enter(Stage.AUTOPILOT_LAND, i)
-        return AutopilotRequest.DISARM if seq.on_ground(i.status) else AutopilotRequest.NONE
+        sink_m_s = self._sinking.update(i.t_s, i.mocap)
+        if seq.on_ground(i.status):
+            return AutopilotRequest.DISARM
+        # No thrust for seconds, and motion capture has seen nothing fall: it stands, PX4's land detector or not.
+        stands = sink_m_s is not None and sink_m_s < STILL_M_S
+        return AutopilotRequest.FORCE_DISARM if stands and elapsed_s > seq.FORCE_DISARM_S else AutopilotRequest.NONE
 
     def _autopilot_land(self, i: Inputs) -> AutopilotRequest:
         assert self._landing is not None

@@ -85,6 +85,7 @@ class AutopilotRequest(Enum):
     ARM = "arm"
     LAND = "land"  # PX4's own LAND mode
     DISARM = "disarm"
+    FORCE_DISARM = "force_disarm"  # against PX4's land detector: for a vehicle that stands by every other measure
 
 
 class Outcome(Enum):

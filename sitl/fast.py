@@ -40,7 +40,7 @@ from companion.types import (
 )
 from sitl.autopilot.autopilot import Command7, Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade
-from sitl.autopilot.commander import Command
+from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
@@ -139,6 +139,8 @@ class FastFlight:
         self._goal_s = 0.0
         hover = self.plant.world.hover_command * (1.0 + world.hover_thrust_error)
         params.set("MPC_THR_HOVER", hover)
+        for name, value in world.spoiled_px4_params().items():
+            params.set(name, value)
         if vehicle.airframe.hover_thrust is None:
             airframe = vehicle.airframe.model_copy(update={"hover_thrust": hover})
             vehicle = vehicle.model_copy(update={"airframe": airframe})
@@ -406,3 +408,5 @@ class FastFlight:
             self.px4.on_command(t_s, Command.NAV_LAND, _NOTHING)
         elif request is AutopilotRequest.DISARM:
             self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, _NOTHING)
+        elif request is AutopilotRequest.FORCE_DISARM:
+            self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, (0.0, float(FORCE_MAGIC), *_NOTHING[2:]))

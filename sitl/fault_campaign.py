@@ -18,7 +18,7 @@ import time
 from companion.analysis.faults import Flown, Point, Tick, Variant, row_of
 from companion.config.loader import FlightConfig
 from companion.frames import quat_rotate, tilt_rad
-from companion.mission.sequencer import TouchdownDetector
+from companion.mission.touchdown import HEIGHT_MARGIN_M
 from companion.types import Outcome
 from sitl import campaign
 from sitl.campaign import CampaignError, Data
@@ -74,7 +74,7 @@ def flown(fast: FastFlight | None, result: FastResult, error: str | None = None)
     events = sorted(
         [*(event for o in result.outputs for event in o.events), *result.guardian_events], key=lambda event: event.t_s
     )
-    low_m = fast.config.vehicle.airframe.ground_clearance_m + TouchdownDetector.HEIGHT_MARGIN_M
+    low_m = fast.config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
     stands = bool(course) and course[-1].position_world_m[2] < low_m and not result.armed
     return Flown(_outcome(result).value, fast.faults.begun_s, course, ticks, events, stands, result.caught, error)
 

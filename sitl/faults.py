@@ -17,10 +17,10 @@ from companion.config.faults import Fault, FaultKind, FlightPhase
 from companion.config.loader import FlightConfig
 from companion.config.world import World as WorldConfig
 from companion.frames import quat_from_euler_zyx, tilt_rad
-from companion.mission.plan import Plan, Segment
+from companion.mission.plan import Plan
+from companion.mission.segments import Segment
 from companion.mission.sequencer import SPOOL_S
 from companion.types import PhaseKind, Quat, Vec3, Vec4
-from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.modes import NavState
 from sitl.model import SECOND, SECOND_CATCH
 from sitl.servo_drive import COUNTS_PER_TURN, ServoDrive
@@ -56,6 +56,19 @@ class Servo(Protocol):
 
     def set_temperature_c(self, temperature_c: float) -> None:
         """Motor temperature."""
+
+
+class Autopilot(Protocol):
+    """What faults do to an autopilot (`sitl.autopilot.autopilot.Px4Stub`)."""
+
+    refuses_offboard: bool
+    refuses_arming: bool
+
+    def reboot(self, for_s: float) -> None:
+        """Restart; `for_s` from now it runs again."""
+
+    def pilot_chooses(self, state: NavState) -> None:
+        """A mode by somebody else."""
 
 
 def in_time(config: FlightConfig) -> FlightConfig:
@@ -131,7 +144,7 @@ class Faults:
         self,
         config: WorldConfig,
         world: World,
-        px4: Px4Stub,
+        px4: Autopilot,
         drives: Sequence[ServoDrive],
         anchor_world_m: Vec3,
         servos: Sequence[Servo] = (),

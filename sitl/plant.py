@@ -21,11 +21,13 @@ from companion.types import Quat, Vec2, Vec3, Vec4
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
 from sitl.faults import Faults
+from sitl.hand import Hand
+from sitl.mocap_axes import SpoiledFrame
 from sitl.world import Truth, World
 
 IMU_EVERY = 2
 """Physics steps per IMU sample: 250 Hz, as PX4's rate loop is stepped."""
-BATTERY_FULL_V, BATTERY_EMPTY_V, BATTERY_LIFE_S = 16.6, 14.0, 900.0
+BATTERY_FULL_V, BATTERY_EMPTY_V = 16.6, 14.0
 _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 
 
@@ -99,8 +101,11 @@ class Plant:
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
+        self._spoiled = SpoiledFrame.of(config)
+        self._hand = Hand(config, self.world.weight_n) if config.hand else None
         self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self._tick = 0
+        self._imu_sample: ImuSample | None = None
         self._mocap_queue: deque[tuple[float, MocapFrame]] = deque()
         self._mocap_next_s = 0.0
         self._mocap_number = 0
@@ -155,13 +160,27 @@ class Plant:
         torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * q[q1], sign1 * v[v1]) * k
         torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * q[q2], sign2 * v[v2]) * k
         if self._tick % IMU_EVERY == 0:
-            self._rotors = self._px4.step(self._imu())
+            self._rotors = self._px4.step(self._imu_sample or self._imu())
+            self._imu_sample = None
         self._tick += 1
         if config.push is not None:
             world.push(self._push(config.push))
+        if self._hand is not None:
+            world.hold(None if armed else self._hand.wrench(t_s, q, v))
         world.step(self._rotors, (torque1, torque2), armed)
         if world.t_s >= self._mocap_next_s - 1e-9:
             self._expose_mocap()
+
+    @property
+    def imu_due(self) -> bool:
+        """The next step begins with an IMU sample."""
+        return self._tick % IMU_EVERY == 0
+
+    def sample_imu(self) -> ImuSample:
+        """That sample, before the step: for an autopilot that needs time to answer."""
+        if self._imu_sample is None:
+            self._imu_sample = self._imu()
+        return self._imu_sample
 
     def _imu(self) -> ImuSample:
         world, config = self.world, self._config
@@ -192,6 +211,8 @@ class Plant:
         attitude = quat_multiply((qw, qx, qy, qz), turned)
         if faults is not None:
             position, attitude, valid = faults.pose(position, attitude)
+        if self._spoiled is not None:
+            position, attitude = self._spoiled.pose(position, attitude)
         self._mocap_queue.append((t_s + latency_s, MocapFrame(self._mocap_number, t_s, position, attitude, valid)))
 
     def take_mocap(self) -> list[MocapFrame]:
@@ -216,7 +237,7 @@ class Plant:
     def battery_remaining(self) -> float:
         """Charge, 0 to 1."""
         flown_s = 0.0 if self.armed_t_s is None else self.world.t_s - self.armed_t_s
-        remaining = self._config.battery_start - flown_s / BATTERY_LIFE_S
+        remaining = self._config.battery_start - flown_s / self._config.battery_life_s
         return remaining if remaining > 0.0 else 0.0
 
     def force_torque(self) -> tuple[Vec3, Vec3]:

@@ -12,6 +12,7 @@ import numpy as np
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
 from companion.types import Quat, Vec2, Vec3, Vec4
+from sitl.hand import Wrench
 from sitl.model import mjcf
 
 PHYSICS_DT_S = 0.002
@@ -86,7 +87,7 @@ class WorldEvent:
 
     t_s: float
     kind: str
-    """thrown, caught, missed, crashed."""
+    """thrown, caught, taken (out of the net), missed, crashed."""
 
 
 class Ball(NamedTuple):
@@ -140,12 +141,22 @@ class World:
         """Where the tether is caught, and how much of it is left from there."""
         self.throw_aside_m = 0.0
         """The throw goes so far beside the net."""
+        self._held: Wrench | None = None
         self._tether = m.tendon("tether").id
         self._attachment = m.site("tether").id
         self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self.thrown_t_s: float | None = None
         self.caught_t_s: float | None = None
         self.missed = False
+        """The first throw."""
+        self.throws = self.catches = 0
+        """Throws so far, and how many of them were caught."""
+        self._flies_since_s: float | None = None
+        """The throw that has not ended in the net yet; one that missed it still may."""
+        self._kept_since_s: float | None = None
+        """The catch that has not been taken out of the net yet."""
+        self._missed = False
+        """What flies since then has missed the net."""
         self.crashed = False
         self._events: list[WorldEvent] = []
         self._last_x = start_position_m[0]
@@ -153,6 +164,7 @@ class World:
         # Views: to ask MuJoCo for its arrays anew in every step costs more than to read them.
         self._ctrl, self._qpos, self._qvel, self._sensordata = d.ctrl, d.qpos, d.qvel, d.sensordata
         self._drag_force, self._push_force = d.xfrc_applied[self._base, 0:3], d.xfrc_applied[self._net, 0:3]
+        self._hold_torque = d.xfrc_applied[self._base, 3:6]
         self.t_s = 0.0
         """World time."""
         self.q: list[float] = []
@@ -182,11 +194,20 @@ class World:
         """Force on the net's centre from now on."""
         self._push_force[:] = force_world_n
 
+    def hold(self, wrench: Wrench | None) -> None:
+        """A hand on the base from now on; None: it lets go."""
+        self._held = wrench
+        self._hold_torque[:] = (0.0, 0.0, 0.0) if wrench is None else wrench.torque_nm
+
+    @property
+    def weight_n(self) -> float:
+        """Of the machine without payload."""
+        return 9.81 * float(self.model.body_subtreemass[self._base])
+
     @property
     def hover_command(self) -> float:
         """True normalised thrust that holds the machine without payload."""
-        weight = 9.81 * float(self.model.body_subtreemass[self._base])
-        return weight / self._vehicle.airframe.thrust_max_n
+        return self.weight_n / self._vehicle.airframe.thrust_max_n
 
     def step(self, rotor_commands: Vec4, joint_torque_nm: Vec2, airborne: bool = True, *, drag: bool = True) -> None:
         """Advance by one physics step; `airborne`: the throw may happen."""
@@ -214,11 +235,13 @@ class World:
             )
         if self.snag is not None:
             self._drag_force += self._snag_pull_n(*self.snag)
+        if self._held is not None:
+            self._drag_force += self._held.force_n
         mujoco.mj_step(self.model, self.data)
         self.t_s = self.data.time
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()
         self._sensors = None
-        if self._has_payload and self.caught_t_s is None:
+        if self._has_payload and not (self._kept_since_s is not None and self.throws == self._config.throws):
             self._throw_and_catch(airborne)
         self._watch_crash()
 
@@ -228,7 +251,11 @@ class World:
         self.data.eq_active[self._park] = 0
 
     def _throw_and_catch(self, airborne: bool) -> None:
-        if self.thrown_t_s is None:
+        if self._kept_since_s is not None:
+            if self.t_s - self._kept_since_s >= self._config.keep_s:
+                self._take_out()
+            return
+        if self._flies_since_s is None:
             vx = self.v[0]
             ahead = self.q[0] + vx * _THROW_LEAD_S
             if airborne and vx > 0.05 and self._last_x < self._config.catch_at_m[0] <= ahead:
@@ -236,17 +263,41 @@ class World:
             self._last_x = ahead
             return
         if self.catch(self._payload):
-            self.caught_t_s = self.t_s
+            self.catches += 1
+            if self.throws == 1:
+                self.caught_t_s = self.t_s
+            self._flies_since_s, self._kept_since_s = None, self.t_s
             self._events.append(WorldEvent(self.t_s, "caught"))
-        elif not self.missed and self.t_s - self.thrown_t_s > 2 * _THROW_LEAD_S:
-            self.missed = True
+        elif not self._missed and self.t_s - self._flies_since_s > 2 * _THROW_LEAD_S:
+            self._missed = True
+            self.missed = self.missed or self.throws == 1
             self._events.append(WorldEvent(self.t_s, "missed"))
+            if self.throws < self._config.throws:
+                self._flies_since_s = None
+                self._await_pass()
 
     def _throw(self) -> None:
         """Launch the payload so that it meets the net where the vehicle will be, at the velocity asked."""
-        self.thrown_t_s = self.t_s
+        if self.throws == 0:
+            self.thrown_t_s = self.t_s
+        self.throws += 1
+        self._flies_since_s, self._missed = self.t_s, False
         self.throw(self._payload, self.throw_aside_m)
         self._events.append(WorldEvent(self.t_s, "thrown"))
+
+    def _take_out(self) -> None:
+        """Somebody takes the payload out of the net, to throw it again."""
+        ball, d = self._payload, self.data
+        self._kept_since_s = None
+        d.eq_active[ball.catch] = 0
+        d.qpos[ball.q : ball.q + 7] = self.model.qpos0[ball.q : ball.q + 7]
+        d.qvel[ball.v : ball.v + 6] = 0.0
+        self._await_pass()
+        self._events.append(WorldEvent(self.t_s, "taken"))
+
+    def _await_pass(self) -> None:
+        """The next throw is on a pass that is still to come."""
+        self._last_x = self.q[0] + self.v[0] * _THROW_LEAD_S
 
     def throw(self, ball: Ball, aside_m: float = 0.0) -> None:
         """The same with any ball, `aside_m` to the left (world y) of the net."""
@@ -275,7 +326,7 @@ class World:
 
     def drop(self) -> None:
         """The payload falls out of the net, if it is in there."""
-        if self.caught_t_s is not None:
+        if self._kept_since_s is not None:
             self.data.eq_active[self._payload.catch] = 0
 
     @property

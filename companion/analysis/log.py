@@ -17,12 +17,15 @@ from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
+from companion.analysis.timing import Stopwatch, Timing, timing_of
 from companion.frames import euler_zyx_from_quat
 from companion.record import RecordError, from_jsonable
 from companion.types import Inputs, Outputs, Sent
 
 Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
+_TOPICS = tuple(_RECORDS)
+"""In the order of a tick's records in the file."""
 
 
 class LogError(Exception):
@@ -31,7 +34,7 @@ class LogError(Exception):
 
 @dataclass(frozen=True)
 class FlightLog:
-    """A flight: three lists of the same length, one entry per recorded tick, in order."""
+    """A flight: three lists of the same length, one entry per recorded tick, in order; of a long flight perhaps not every tick."""
 
     path: Path
     inputs: tuple[Inputs, ...]
@@ -41,16 +44,25 @@ class FlightLog:
     """All metadata records by name: companion, config, flight, recorder, ..."""
     closed: bool
     """The recorder closed the file itself."""
+    stride: int = 1
+    """Every so many ticks are kept, and those with events; 1: all."""
+    measured: Timing | None = None
+    """Of all ticks, where not all are kept."""
 
     @staticmethod
-    def read(path: Path) -> FlightLog:
+    def read(path: Path, *, ticks_max: int | None = None) -> FlightLog:
         """Read a log.
+
+        Args:
+            path: of the file.
+            ticks_max: keep no more ticks than about this, evenly spread (`stride`), and those with events; one of them takes some 8 kB
+                of memory. None: keep all, which a replay needs.
 
         Raises:
             LogError: no such file, no MCAP file, not written by the recorder, damaged, or records of another shape. Records of a
                 version that lacked a field which may be None are no other shape: that field is None.
         """
-        rows: dict[str, list[Any]] = {topic: [] for topic in _RECORDS}
+        rows = _Rows(ticks_max)
         metadata: dict[str, dict[str, str]] = {}
         channels: dict[int, str] = {}
         closed = False
@@ -61,7 +73,7 @@ class FlightLog:
                 elif isinstance(record, Message):
                     topic = channels[record.channel_id]
                     if topic in _RECORDS:
-                        rows[topic].append(from_jsonable(_RECORDS[topic], json.loads(record.data)))
+                        rows.take(topic, from_jsonable(_RECORDS[topic], json.loads(record.data)))
                 elif isinstance(record, Metadata):
                     metadata[record.name] = dict(record.metadata)
                 elif isinstance(record, Footer):
@@ -74,11 +86,12 @@ class FlightLog:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
         if "companion" not in metadata:
             raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
-        # Chunks hold whole ticks, so a difference means that the file was not written by the recorder.
-        ticks = [[row.tick for row in rows[topic]] for topic in _RECORDS]
-        if not ticks[0] == ticks[1] == ticks[2]:
+        if not rows.whole():
             raise LogError(f"{path}: damaged: /inputs, /outputs and /sent hold different ticks")
-        return FlightLog(path, tuple(rows["/inputs"]), tuple(rows["/outputs"]), tuple(rows["/sent"]), metadata, closed)
+        inputs = tuple(row[0] for row in rows.kept)
+        outputs = tuple(row[1] for row in rows.kept)
+        sent = tuple(row[2] for row in rows.kept)
+        return FlightLog(path, inputs, outputs, sent, metadata, closed, rows.stride, rows.measured)
 
     @property
     def config_json(self) -> str | None:
@@ -96,7 +109,13 @@ class FlightLog:
 
     def missing_ticks(self) -> int:
         """Ticks between the first and the last one that are not in the log."""
-        return self.inputs[-1].tick - self.inputs[0].tick + 1 - len(self.inputs) if self.inputs else 0
+        timing = self.timing
+        return timing.last_tick - timing.first_tick + 1 - timing.ticks if timing.ticks else 0
+
+    @cached_property
+    def timing(self) -> Timing:
+        """Of every recorded tick, also of those that are not kept."""
+        return self.measured or timing_of(self.rows())
 
     def rows(self) -> Iterator[tuple[Inputs, Outputs, Sent]]:
         """Ticks in order."""
@@ -112,6 +131,56 @@ class FlightLog:
     def columns(self) -> Columns:
         """What metrics and plots share, as arrays."""
         return _columns(self)
+
+
+class _Rows:
+    """Puts the three records of each tick together; thins out what is kept when it grows too long.
+
+    Chunks hold whole ticks, so anything else means that the file was not written by the recorder.
+    """
+
+    def __init__(self, ticks_max: int | None) -> None:
+        self._ticks_max = ticks_max
+        self._stopwatch = Stopwatch() if ticks_max is not None else None
+        self._open: list[Any] = []
+        self.kept: list[tuple[Inputs, Outputs, Sent]] = []
+        self.stride = 1
+        self._torn = False
+
+    def take(self, topic: str, record: Any) -> None:
+        """The next record of the file."""
+        expected = _TOPICS[len(self._open)]
+        if topic != expected or (self._open and record.tick != self._open[0].tick):
+            self._torn = True
+            return
+        self._open.append(record)
+        if len(self._open) == len(_TOPICS):
+            inputs, outputs, sent = self._open
+            self._open = []
+            if self._stopwatch is not None:
+                self._stopwatch.take(inputs, sent)
+            row = (inputs, outputs, sent)
+            if self._wanted(row):
+                self.kept.append(row)
+                self._thin_out()
+
+    def _wanted(self, row: tuple[Inputs, Outputs, Sent]) -> bool:
+        inputs, outputs, _ = row
+        return inputs.tick % self.stride == 0 or bool(outputs.events) or outputs.outcome is not None
+
+    def _thin_out(self) -> None:
+        if self._ticks_max is not None and len(self.kept) > self._ticks_max:
+            self.stride *= 2
+            self.kept = [row for row in self.kept if self._wanted(row)]
+
+    def whole(self) -> bool:
+        """Every tick had its three records."""
+        return not self._torn and not self._open
+
+    @property
+    def measured(self) -> Timing | None:
+        """Of all ticks; None: it can be told from those that are kept."""
+        return self._stopwatch.read() if self._stopwatch is not None and self.stride > 1 else None
 
 
 @dataclass(frozen=True)

@@ -107,11 +107,14 @@ def final_e_z_m(log: FlightLog) -> float | None:
 
 
 def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
-    """RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m); None for rows without a desired impedance.
+    """RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m); None for rows without a desired impedance,
+    and of a log that was thinned out.
 
     dI = M_d e'' + K_d e' + K_p e - e_tau: what keeps the machine from its desired impedance. Laws with a sliding variable s log the
     same as M_d s' + (K_d - M_d Phi) s. Derivatives are central differences, low-passed at 10 Hz without phase shift.
     """
+    if log.stride > 1:
+        return None, None  # derivatives need every tick
     pre, post = flight_masks(log)
     used = np.array([o.control is not None for o in log.outputs], dtype=np.bool_) & (pre | post)
     if not (used & post).any() or int(used.sum()) < 10:
@@ -179,54 +182,18 @@ def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
 
 def loop_rate_hz(log: FlightLog) -> float | None:
     """Mean rate of ticks as they really started."""
-    if len(log.sent) < 2:
-        return None
-    span_s = log.sent[-1].start_s - log.sent[0].start_s
-    return (log.inputs[-1].tick - log.inputs[0].tick) / span_s if span_s > 0 else None
+    timing = log.timing
+    return (timing.last_tick - timing.first_tick) / timing.span_s if timing.span_s > 0 else None
 
 
 def missed_deadlines(log: FlightLog) -> int:
     """Ticks that started later than one whole period."""
-    if len(log.inputs) < 2:
-        return 0
-    return int((log.columns.lateness_s > period_s(log)).sum())
-
-
-def period_s(log: FlightLog) -> float:
-    """The loop's nominal period: the median of the ticks' times."""
-    return float(np.median(np.diff(log.columns.t_s))) if len(log.inputs) > 1 else math.nan
+    return int((log.timing.lateness_s > log.timing.period_s).sum())
 
 
 def lateness(log: FlightLog) -> Percentiles | None:
     """Tick start after its deadline."""
-    return percentiles(log.columns.lateness_s)
-
-
-def joint_read_to_write_s(log: FlightLog) -> Array:
-    """Answers of all servos read -> currents written, both by the bus thread, of ticks that wrote currents.
-
-    The write is known in the next tick's joint state.
-    """
-    used = []
-    for tick, sent, after in zip(log.inputs, log.sent, log.inputs[1:], strict=False):
-        if sent.arm_torque_sent_nm is None or tick.arm is None or after.arm is None or after.arm.written_s is None:
-            continue
-        if after.arm.written_s >= sent.core_s and after.arm.stamp_s > tick.arm.stamp_s:
-            used.append(after.arm.written_s - tick.arm.stamp_s)
-    return np.array(used, dtype=np.float64)
-
-
-def mocap_to_setpoint_s(log: FlightLog) -> Array:
-    """Mocap datagram -> setpoint sent, of ticks that saw a new frame and sent a setpoint."""
-    latest: float | None = None
-    used: list[float] = []
-    for i, _, s in log.rows():
-        if i.mocap is not None and i.mocap.stamp_s != latest:
-            # The first frame seen may have waited for the loop to begin.
-            if latest is not None and s.attitude_sent:
-                used.append(s.setpoint_sent_s - i.mocap.stamp_s)
-            latest = i.mocap.stamp_s
-    return np.array(used, dtype=np.float64)
+    return percentiles(log.timing.lateness_s)
 
 
 def percentiles(durations_s: Array) -> Percentiles | None:

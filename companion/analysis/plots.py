@@ -18,11 +18,13 @@ from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, DASHED, INK, dress, mark_catch, new_figure, write_png
 from companion.control.manipulator import GRAVITY_M_S2
 from companion.frames import tilt_rad
-from companion.types import PhaseKind
+from companion.types import Outputs, PhaseKind
 
 _REFERENCE = "#55626e"
 _SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
 _SERIES_DARK = ("#0b365c", "#7d3d05")  # a reference drawn over its own measurement
+_PHASES_NAMED_MAX = 40
+"""With more phases than that only their kinds are told apart."""
 _PHASES = {
     PhaseKind.TAKEOFF: "#eaf3fb",
     PhaseKind.FLIGHT: "#ffffff",
@@ -182,8 +184,8 @@ def _timing(log: FlightLog) -> Figure | None:
     panes["time"].set_ylabel("tick lateness [ms]")
     for name, title, values_s in (
         ("late", "tick lateness", log.columns.lateness_s),
-        ("joint", "joint read to current write", metrics.joint_read_to_write_s(log)),
-        ("mocap", "mocap datagram to setpoint", metrics.mocap_to_setpoint_s(log)),
+        ("joint", "joint read to current write", log.timing.joint_read_to_write_s),
+        ("mocap", "mocap datagram to setpoint", log.timing.mocap_to_setpoint_s),
     ):
         ax = panes[name]
         dress(ax)
@@ -229,12 +231,13 @@ def _mark_phases(log: FlightLog, axes: list[Any]) -> None:
     start = 0
     outputs = log.outputs
     whole_s = max(outputs[-1].mission_t_s, 1e-3)
+    named = len({o.phase for o in outputs}) <= _PHASES_NAMED_MAX
+
+    def same(one: Outputs, other: Outputs) -> bool:
+        return one.phase_kind == other.phase_kind and (one.phase == other.phase or not named)
+
     for k in range(1, len(outputs) + 1):
-        if (
-            k < len(outputs)
-            and outputs[k].phase == outputs[start].phase
-            and outputs[k].phase_kind == outputs[start].phase_kind
-        ):
+        if k < len(outputs) and same(outputs[k], outputs[start]):
             continue
         colour = _PHASES.get(outputs[start].phase_kind)
         if colour is not None:
@@ -243,7 +246,7 @@ def _mark_phases(log: FlightLog, axes: list[Any]) -> None:
                 ax.axvspan(begin_s, end_s, facecolor=colour, zorder=0, lw=0)
                 if start:
                     ax.axvline(begin_s, color="#d5dbe1", lw=0.8, zorder=1)
-            name = outputs[start].phase
+            name = outputs[start].phase if named else outputs[start].phase_kind.value
             # A name is written where it fits: about 90 characters fill the whole axis.
             if (end_s - begin_s) / whole_s > 0.012 * len(name):
                 middle_s = (begin_s + end_s) / 2

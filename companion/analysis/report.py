@@ -58,7 +58,7 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
         opening(f"{mission}: {outcome}", _STYLE),
         f"<h1>{escape(str(mission))} <span class='badge {escape(outcome)}'>{escape(outcome)}</span></h1>",
         f"<p class='sub'>{escape(subtitle)}</p>",
-        _results(summary),
+        _results(summary, log.stride),
         "<h2>Plots</h2>" if plots else "",
         *(picture(plot.path, plot.title, escape(plot.caption)) for plot in plots),
         _events(summary["events"]),
@@ -79,7 +79,7 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
     return "\n".join(part for part in parts if part)
 
 
-def _results(summary: dict[str, Any]) -> str:
+def _results(summary: dict[str, Any], stride: int) -> str:
     pre, post = summary["rms"]["pre"], summary["rms"]["post"]
     rms = "".join(
         f"<tr><td>{label}</td><td class='n'>{_number(pre[key], digits)}</td><td class='n'>{_number(post[key], digits)}</td></tr>"
@@ -107,6 +107,7 @@ def _results(summary: dict[str, Any]) -> str:
             ("impedance error, position", _number(summary["impedance_error"]["position_n"], 2, " N")),
             ("impedance error, arm", _number(summary["impedance_error"]["arm_nm"], 3, " N m")),
             ("least tether slack", _number(summary["tether"]["min_slack_m"], 2, " m")),
+            *([("long flight: graded and drawn is", f"every {stride}th tick")] if stride > 1 else []),
         ]
     )
     machinery = _rows(

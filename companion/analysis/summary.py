@@ -42,6 +42,7 @@ def empty_summary(
         },
         "events": [],
         "tether": {"min_slack_m": None},
+        "graded_every": 1,
     }
 
 
@@ -68,7 +69,8 @@ def summarise(
         Keys as in the contract. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command), an event's `t_s`
         is on the flight clock (as recorded) and comes with `mission_t_s`.
     """
-    counted = {"samples": len(log.inputs), "dropped": log.missing_ticks()}
+    timing = log.timing
+    counted = {"samples": timing.ticks, "dropped": log.missing_ticks()}
     summary = empty_summary(
         outcome=outcome, controller=controller, preset=preset, payload_kg=payload_kg, recorder=recorder or counted
     )
@@ -84,16 +86,17 @@ def summarise(
         final_e_z_m=metrics.final_e_z_m(log),
         loop={
             "rate_hz": metrics.loop_rate_hz(log),
-            "ticks": log.inputs[-1].tick - log.inputs[0].tick + 1,
+            "ticks": timing.last_tick - timing.first_tick + 1,
             "missed": metrics.missed_deadlines(log),
             "lateness_ms": _spread(metrics.lateness(log)),
         },
         latency_ms={
-            "mocap_to_setpoint": _spread(metrics.percentiles(metrics.mocap_to_setpoint_s(log))),
-            "joint_read_to_write": _spread(metrics.percentiles(metrics.joint_read_to_write_s(log))),
+            "mocap_to_setpoint": _spread(metrics.percentiles(timing.mocap_to_setpoint_s)),
+            "joint_read_to_write": _spread(metrics.percentiles(timing.joint_read_to_write_s)),
         },
         events=_events(log),
         tether={"min_slack_m": metrics.min_slack_m(log)},
+        graded_every=log.stride,
     )
     return summary
 

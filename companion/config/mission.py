@@ -168,6 +168,8 @@ class Mission(Model):
     start: Start
     limits: Limits
     catch: Catch | None = None
+    repeat: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Everything between take-off and landing is flown so often."""
     phases: Annotated[tuple[Phase, ...], Field(min_length=2, max_length=200)]
 
     @model_validator(mode="after")
@@ -181,14 +183,19 @@ class Mission(Model):
             elif (phase.type == "land") != (index == last):
                 text = "the last phase must be a land" if index == last else "only the last phase can be a land"
                 problems.append((("phases", index, "type"), text))
+        if self.repeat > 1 and last < 2:
+            problems.append((("repeat",), "there is nothing between take-off and landing to repeat"))
         refuse("mission", problems)
         return self
 
     @model_validator(mode="after")
     def _paths_go_somewhere(self) -> Self:
-        problems: list[tuple[Location, str]] = []
+        problems: dict[Location, str] = {}
         at_m = (*self.start.position_m, 0.0)
-        for index, phase in enumerate(self.phases):
+        # The first phase of a further repetition begins where the last one ended.
+        again = range(1, len(self.phases) - 1) if self.repeat > 1 else ()
+        for index in (*range(len(self.phases)), *again):
+            phase = self.phases[index]
             if isinstance(phase, Takeoff):
                 at_m = (*self.start.position_m, phase.height_m)
             elif isinstance(phase, Line):
@@ -197,9 +204,9 @@ class Mission(Model):
                 for number, point_m in enumerate(phase.through_m):
                     if math.dist(at_m, point_m) < POINTS_APART_M:
                         text = f"is where the path already is; points must be {POINTS_APART_M:g} m apart or more"
-                        problems.append((("phases", index, "through_m", number), text))
+                        problems[("phases", index, "through_m", number)] = text
                     at_m = point_m
-        refuse("mission", problems)
+        refuse("mission", list(problems.items()))
         return self
 
 

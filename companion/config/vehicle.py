@@ -197,6 +197,9 @@ class Devices(Model):
 class Safety(Model):
     """Limits after which the companion reacts by itself, and how. What each of them does: docs/safety.md."""
 
+    preflight_s: Annotated[float, Field(ge=1, le=60)] = 5.0
+    """So long are all devices watched before anything is armed."""
+
     # Motion capture
     mocap_timeout_s: Positive = 0.12
     """Oldest mocap pose; beyond it the arm folds and PX4 lands on its own estimate."""

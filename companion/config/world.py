@@ -2,14 +2,42 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from companion.config.base import Fraction, Model, NonNegative, Positive, Vector2, Vector3
+from companion.config.explain import nearest
 from companion.config.faults import Fault as Fault
+from companion.px4.defaults import PX4_DEFAULTS
 
+REAL32_MAX = 3.4e38
 RelativeError = Annotated[float, Field(ge=-0.5, le=0.5)]
+SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+def _each_axis_once(names: tuple[str, str, str]) -> tuple[str, str, str]:
+    if {name[-1] for name in names} != {"x", "y", "z"}:
+        raise ValueError(f"each of x, y and z once, with or without a minus, got {list(names)}")
+    return names
+
+
+def _px4_has_them(params: dict[str, float]) -> dict[str, float]:
+    for name, value in params.items():
+        if name not in PX4_DEFAULTS:
+            close = nearest(name, [known.lower() for known in PX4_DEFAULTS])
+            hint = f" (did you mean {close.upper()}?)" if close else ""
+            raise ValueError(f"the simulated PX4 has no parameter {json.dumps(name)}{hint}")
+        if isinstance(PX4_DEFAULTS[name], int) and value != int(value):
+            raise ValueError(f"{name} is an INT32, got {value:g}")
+        if abs(value) >= (2**31 if isinstance(PX4_DEFAULTS[name], int) else REAL32_MAX):
+            raise ValueError(f"{name} does not hold {value:g}")
+    return params
+
+
+Px4Params = Annotated[dict[str, float], AfterValidator(_px4_has_them)]
+SignedAxes = Annotated[tuple[SignedAxis, SignedAxis, SignedAxis], AfterValidator(_each_axis_once)]
 
 
 class Push(Model):
@@ -31,6 +59,9 @@ class World(Model):
     """Where the vehicle is when the payload arrives in the net; thrown on its first pass in the direction of +x."""
     throw_velocity_m_s: Vector3 = (-2.0, 0.15, -1.5)
     """Velocity of the payload on arrival, world frame."""
+    throws: Annotated[int, Field(ge=1, le=1000)] = 1
+    """More than one: the payload is taken out of the net `keep_s` after it was caught, and thrown again on the next such pass."""
+    keep_s: Positive = 6.0
     hover_thrust_error: RelativeError = 0.0
     """Relative error of MPC_THR_HOVER against the truth."""
     rotor_lag_s: Positive = 0.04
@@ -54,7 +85,28 @@ class World(Model):
     link_mass_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
     """Relative error of the vehicle file's link masses against the truth; the base's mass stays as it is."""
     battery_start: Fraction = 1.0
+    battery_life_s: Positive = 900.0
+    """Of a full battery, from arming on."""
     push: Push | None = None
     """For tests of the impedance."""
     natnet_version: Literal["3.0", "4.1"] = "4.1"
+    mocap_axes: SignedAxes = ("x", "y", "z")
+    """What the streamed x, y and z truly are, "-y" and so on; a left-handed set is what a badly configured server may stream."""
+    mocap_body_yaw_deg: float = 0.0
+    """The rigid body's zero is off: its streamed yaw is larger than the true one by this."""
+    mocap_body_tilt_deg: Vector2 = (0.0, 0.0)
+    """The same for roll and pitch."""
+    hand: bool = False
+    """A hand carries the machine through the guided hand test, rotors off, again and again."""
+    hand_t_s: NonNegative = 20.0
+    """World time at which it first does."""
+    px4_params: Px4Params = Field(default={})
+    """Parameters of PX4 that somebody has spoiled after it was set up, by name."""
     faults: tuple[Fault, ...] = ()
+
+    def spoiled_px4_params(self) -> dict[str, float | int]:
+        """`px4_params` in PX4's types."""
+        return {
+            name: int(value) if isinstance(PX4_DEFAULTS[name], int) else value
+            for name, value in self.px4_params.items()
+        }

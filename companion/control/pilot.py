@@ -56,6 +56,8 @@ class Pilot:
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._sensing = ForceSensing(vehicle.tool, self._manipulator)
         self._catch = CatchDetector()
+        self._state: PlantState | None = None
+        """Of the last tick that the law flew."""
         self._law = build_controller(config.controller, vehicle, hover_thrust)
         self._controller: Controller = self._law
         fold = vehicle.safety.fold_arm_deg
@@ -68,6 +70,11 @@ class Pilot:
         )
         self.disturbance_world_n: Vec3 | None = None
         """What acts on the machine beside rotors and weight, payload included, N; None on the ground."""
+
+    @property
+    def thrust_share(self) -> float:
+        """Thrust of the last command that the law gave, as a share of hover thrust."""
+        return self._thrust_sent / self._hover.value
 
     def collect_tare(self, i: Inputs) -> None:
         """Add this tick's force sample, at rest, to the tare; the arm is to be held where it is."""
@@ -92,7 +99,11 @@ class Pilot:
 
     def fold(self, i: Inputs, dt_s: float) -> Command:
         """Nothing for the vehicle; the arm moves to its folded pose at a bounded rate."""
-        goal, now, step = self.fold_rad, self._arm_target_rad or self.fold_rad, FOLD_RATE_RAD_S * dt_s
+        goal, step = self.fold_rad, FOLD_RATE_RAD_S * dt_s
+        # Never held yet: from where it is.
+        now = self._arm_target_rad or (i.arm.angle_rad if i.arm is not None else None)
+        if now is None:
+            return Command()
         self._arm_target_rad = (
             now[0] + max(-step, min(step, goal[0] - now[0])),
             now[1] + max(-step, min(step, goal[1] - now[1])),
@@ -127,6 +138,7 @@ class Pilot:
             arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
             force,
         )
+        self._state = state
         if self._hover_adapts:
             airborne = off_the_ground(i, self._ground_clearance_m)
             self._hover.step(dt_s, self._thrust_sent, state, airborne, self._catch.caught_s is not None)
@@ -154,3 +166,11 @@ class Pilot:
     def catch_s(self, t_s: float, log: ControlLog) -> float | None:
         """Time of the blow, in the one tick in which a catch becomes certain."""
         return self._catch.caught_s if self._catch.update(t_s, log.force_ext_world_n) else None
+
+    def payload_left(self, t_s: float) -> bool:
+        """True in the one tick in which it becomes certain that a caught payload has left the net; after `fly`."""
+        state = self._state
+        if self._catch.caught_s is None or state is None:
+            return False
+        # Not what the law logs: that is zero while the sensor is silent, too.
+        return self._catch.left(t_s, state.force_ext_world_n, state.acceleration_world_m_s2[2])

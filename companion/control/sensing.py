@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from companion.config.vehicle import Tool
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.frames import quat_conjugate, quat_multiply, quat_rotate
@@ -59,17 +61,30 @@ class ForceSensing:
 
 
 class CatchDetector:
-    """A caught payload: a blow on the sensor, followed by a lasting pull downwards."""
+    """A caught payload: a blow on the sensor, followed by a lasting pull downwards. It has left the net when the pull has ended."""
 
     BLOW_N = 1.5
     PULL_N = 0.3
     PULL_TIME_S = 0.25
+    LEFT_SHARE = 0.3
+    """Of the payload's weight as it was felt so far: less force than that, in any direction, is an empty net."""
+    LEFT_TIME_S = 0.5
+    """A bump from below takes the weight off for less."""
+    FALLING_SHARE = 0.6
+    """Of gravity: with less specific force than that the whole machine falls, and what is in the net weighs little, too."""
+    LOWPASS_S, WEIGHT_S = 0.05, 1.0
 
     def __init__(self) -> None:
         self._blow_s: float | None = None
         self._pull = 0.0
         self._samples = 0
+        self._weight_n = 0.0
+        self._carried_n: Vec3 = (0.0, 0.0, 0.0)
+        """Low-passed, while a payload is in the net."""
+        self._last_s = 0.0
+        self._light_since_s: float | None = None
         self.caught_s: float | None = None
+        """Time of the blow of the payload that is in the net; None: it is empty."""
 
     def update(self, t_s: float, force_world_n: Vec3 | None) -> bool:
         """True in the one tick in which a catch becomes certain; `caught_s` is then the time of the blow."""
@@ -86,6 +101,37 @@ class CatchDetector:
             return False
         if self._pull / self._samples < -self.PULL_N:
             self.caught_s = self._blow_s
+            self._weight_n = self.PULL_N  # the mean has the blow in it
+            self._carried_n, self._last_s, self._light_since_s = force_world_n, t_s, None
             return True
         self._blow_s = None
+        return False
+
+    def left(self, t_s: float, force_world_n: Vec3 | None, acceleration_z_m_s2: float) -> bool:
+        """True in the one tick in which it becomes certain that the payload has left the net; the next catch may come.
+
+        Args:
+            t_s: flight clock.
+            force_world_n: on the net; None: unknown.
+            acceleration_z_m_s2: of the vehicle, upwards.
+        """
+        if self.caught_s is None:
+            return False
+        if force_world_n is None:
+            self._light_since_s, self._last_s = None, t_s
+            return False
+        dt_s, self._last_s = t_s - self._last_s, t_s
+        k = 1.0 - math.exp(-dt_s / self.LOWPASS_S)
+        (x, y, z), (fx, fy, fz) = self._carried_n, force_world_n
+        x, y, z = self._carried_n = (x + k * (fx - x), y + k * (fy - y), z + k * (fz - z))
+        force_n, light_n = math.sqrt(x * x + y * y + z * z), self.LEFT_SHARE * self._weight_n
+        falling = GRAVITY_M_S2 + acceleration_z_m_s2 < self.FALLING_SHARE * GRAVITY_M_S2
+        if falling or force_n > light_n:
+            self._light_since_s = None
+            self._weight_n = max(self.PULL_N, self._weight_n + dt_s / self.WEIGHT_S * (-z - self._weight_n))
+        elif self._light_since_s is None:
+            self._light_since_s = t_s
+        elif t_s - self._light_since_s >= self.LEFT_TIME_S:
+            self.caught_s = self._blow_s = self._light_since_s = None
+            return True
         return False

@@ -16,7 +16,7 @@ from companion.guardian.beat import Beat
 from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
 from companion.guardian.watch import Plausible
-from companion.mission.autopilot_landing import AutopilotLanding, LandingStep
+from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -41,6 +41,8 @@ ZERO_THRUST_PERIOD_S = 0.02
 LINK_FRESH_S = 2.5
 TOUCH_DOWN = "touch-down"
 """What the landing says when it feels the floor."""
+DISARMED_AFTER_S = 1.5
+"""PX4 says once a second whether it is armed; an older word does not count."""
 ROUNDS = 4
 """Landings of 30 s each that are watched before the vehicle counts as lost, as long as PX4 answers."""
 _STREAMS = (
@@ -145,6 +147,16 @@ class Charge:
             self._landing = AutopilotLanding(t_s, self._clearance_m, self._pilot)
         self._tick += 1
         self._carry_out(t_s, status, self._landing.step(self._inputs(t_s, status)))
+
+    def begin_again(self, t_s: float) -> None:
+        """The landing met an error of its own: a new one begins with the next step. If none gets anywhere, PX4 is told all the same."""
+        self._landing = None
+        status = self._px4.status()
+        if not self._pilot and status is not None and status.mode is not FlightMode.LAND and status.armed:
+            self._ask(t_s, AutopilotRequest.LAND)
+        disarmed = status is not None and not status.armed and t_s - self._start_s > DISARMED_AFTER_S
+        if disarmed or t_s - self._start_s > ROUNDS * TIMEOUT_S:
+            self.landed = disarmed
 
     def _mind_the_pilot(self, t_s: float) -> None:
         if not self._pilot and self._px4.pilot:

@@ -14,6 +14,8 @@ import signal
 import socket
 import sys
 import time
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
 
 from companion import status
@@ -35,6 +37,7 @@ KILL_TIMEOUT_S = 1.0
 LINK_TIMEOUT_S = 30.0
 """A link that cannot be opened for this long is given up, and the vehicle with it."""
 STATUS_PERIOD_S = 0.5
+ERROR_CHARS, ERRORS_TOLD_MAX = 300, 20
 _MAX_BEATS = 512
 
 
@@ -63,6 +66,8 @@ class Beats:
         channel.setblocking(False)
         self._channel = channel
         self.last: Beat | None = None
+        self.count = self.missed = 0
+        """Beats heard, and ticks of the flight in between that were not."""
         self.recorder: socket.socket | None = None
         """The recorder's channel, once the flight process has shared it."""
 
@@ -83,6 +88,9 @@ class Beats:
                     os.close(descriptor)
             beat = words.unpack(datagram)
             if beat is not None:
+                if self.last is not None:
+                    self.missed += max(0, beat.tick - self.last.tick - 1)
+                self.count += 1
                 self.last, heard = beat, True
         return heard
 
@@ -104,6 +112,10 @@ class Guardian:
         self._mocap: MocapClient | None = None
         self._problem = address_problem(settings.autopilot_address)
         self._status_s = float("-inf")
+        self._errors: set[str] = set()
+        """Errors of its own that have been told."""
+        self._silent_s = 0.0
+        """Longest silence while the rotors may lift."""
 
     def run(self) -> int:
         """Until the flight has ended, one way or the other; the exit code."""
@@ -117,6 +129,8 @@ class Guardian:
                 return 0
             return 0 if self._take_over(self._beats.last, reason) else 1
         finally:
+            beats, silent_ms = self._beats, self._silent_s * 1e3
+            _say(f"heard {beats.count} beats, {beats.missed} missed, silent for {silent_ms:.0f} ms at most in the air")
             if self._mocap is not None:
                 self._mocap.close()
             if self._beats.recorder is not None:
@@ -141,7 +155,9 @@ class Guardian:
             lifting = last is not None and last.lifting
             if dead:
                 return "the flight process died" if lifting else None
-            if watch.update(now_s, heard or not lifting):
+            hangs = watch.update(now_s, heard or not lifting)
+            self._silent_s = max(self._silent_s, watch.silent_s)
+            if hangs:
                 return f"{words.HANGS} (silent for {watch.silent_s * 1e3:.0f} ms)"
             if now_s - told_s >= words.READY_PERIOD_S:
                 told_s = now_s
@@ -215,16 +231,37 @@ class Guardian:
             waiting.poll(PERIOD_S * 1e3)
             now_s = time.monotonic()
             t_s = now_s - last.origin_s
-            if mocap is not None:
-                charge.take_poses(mocap.poses(now_s, last.origin_s))
-                mocap.serve(now_s)
-            charge.take_messages(t_s, link.receive())
+            with self._surviving(last, charge, "motion capture"):
+                if mocap is not None:
+                    charge.take_poses(mocap.poses(now_s, last.origin_s))
+                    mocap.serve(now_s)
+            with self._surviving(last, charge, "PX4's messages"):
+                charge.take_messages(t_s, link.receive())
             if now_s - step_s >= PERIOD_S:
                 step_s = now_s
-                charge.step(t_s)
+                with self._surviving(last, charge, "the landing"):
+                    charge.step(t_s)
             self._sign_of_life(link.poses_sent)
         self._result(last, charge.landed, charge)
         return charge.landed
+
+    @contextlib.contextmanager
+    def _surviving(self, last: Beat, charge: Charge, what: str) -> Iterator[None]:
+        """Nobody stands behind the guardian: an error of its own is told, and costs no more than what it broke."""
+        try:
+            yield
+        except Exception as error:
+            t_s = time.monotonic() - last.origin_s
+            text = f"an error in {what} ({type(error).__name__}: {error}); the landing goes on"
+            if text not in self._errors and len(self._errors) < ERRORS_TOLD_MAX:
+                self._errors.add(text)
+                _say(traceback.format_exc())
+                self._tell(
+                    last,
+                    Told(t_s, "guardian_error", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text[:ERROR_CHARS]),
+                )
+            if what == "the landing":
+                charge.begin_again(t_s)
 
     def _sign_of_life(self, poses_sent: int) -> None:
         """To the launcher, twice a second."""
@@ -248,8 +285,7 @@ class Guardian:
             "text": told.text,
         }
         status.send(self._channel, message)
-        with contextlib.suppress(OSError, ValueError):  # a full disk under guardian.log costs the line, not the landing
-            print(f"{told.t_s:.3f} {told.id}: {told.text}", file=sys.stderr, flush=True)
+        _say(f"{told.t_s:.3f} {told.id}: {told.text}")
         if self._beats.recorder is not None:
             packet = pack_plain((TEXT, UNNUMBERED, told.t_s, told.severity.value, told.id, told.text))
             with contextlib.suppress(OSError):
@@ -264,6 +300,12 @@ class Guardian:
             "position_m": None if pose is None else list(pose.position_world_m),
         }
         status.send(self._channel, message)
+
+
+def _say(text: str) -> None:
+    """One line of guardian.log; a full disk under it costs the line, not the landing."""
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -2,20 +2,26 @@
 
 PX4 lands on its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; then it only descends at constant
 thrust and never finds that it stands (measured). So the companion watches for touch-down as long as the dead-reckoned height can be
-trusted, takes OFFBOARD back with zero thrust once the vehicle stands, and disarms. Pure; time is an argument.
+trusted, takes OFFBOARD back with zero thrust once the vehicle stands, and disarms. No single source decides: PX4's estimate and motion
+capture must both see a vehicle that stands while PX4 wants it down, and if PX4 alone never notices, it is disarmed all the same. Pure;
+time is an argument.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from companion.mission.sequencer import PEOPLE_CHOOSE, TouchdownDetector, in_offboard, is_armed, on_ground
+from companion.mission.sequencer import FORCE_DISARM_S, PEOPLE_CHOOSE, in_offboard, is_armed, on_ground
+from companion.mission.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking
 from companion.types import AutopilotRequest, FlightMode, Inputs
 
 TRUST_ESTIMATE_S = 4.2
 """After the last good mocap pose: PX4's height still counts."""
 ZERO_THRUST_STREAM_S = 0.6
 """Zero-thrust setpoints flow for this long before OFFBOARD is asked for: no older setpoint may take effect."""
+BEGUN_S = 1.0
+"""PX4 takes a moment from LAND to a descent: until then a vehicle that does not sink proves nothing."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
 _MOCAP_FRESH_S = 0.3
@@ -44,17 +50,21 @@ class AutopilotLanding:
         start_s: flight time at its start.
         clearance_m: height of the body's origin when the vehicle stands.
         pilot: a pilot took over: watch only, ask for nothing. One who takes over later is seen by PX4's mode.
+        estimate_known: PX4 had motion capture until now; False: until poses come its estimate counts for nothing.
     """
 
-    def __init__(self, start_s: float, clearance_m: float, pilot: bool) -> None:
+    def __init__(self, start_s: float, clearance_m: float, pilot: bool, *, estimate_known: bool = True) -> None:
         self._start_s = start_s
         self._clearance_m = clearance_m
         self._pilot = pilot
         self._was_landing = False
-        self._touchdown = TouchdownDetector(clearance_m)
+        self._height = HeightEvidence(clearance_m)
+        self._sinking = Sinking()
         self._standing_since_s: float | None = None
         self._touched_s: float | None = None
-        self._pose_s = start_s
+        self._landing_since_s: float | None = None
+        self._unnoticed_since_s: float | None = None
+        self._pose_s = start_s if estimate_known else -math.inf
 
     @property
     def pilot(self) -> bool:
@@ -85,6 +95,8 @@ class AutopilotLanding:
             return LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND, False, False, False)
         if on_ground(i.status):
             return LandingStep(AutopilotRequest.DISARM, True, False, False)
+        if self._unnoticed(i):
+            return LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False)
         wait = i.t_s - self._touched_s < ZERO_THRUST_STREAM_S or in_offboard(i.status)
         return LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
 
@@ -95,20 +107,42 @@ class AutopilotLanding:
         return mode is FlightMode.MANUAL or (self._was_landing and mode in PEOPLE_CHOOSE)
 
     def _touches(self, i: Inputs) -> bool:
-        """PX4 is landing, and the height that it believes in says that the vehicle stands."""
-        if i.mocap is not None and i.mocap.tracking_valid and i.t_s - i.mocap.stamp_s < _MOCAP_FRESH_S:
+        """PX4 is landing, the height that it believes in says that the vehicle stands, and motion capture does not contradict."""
+        fresh = i.mocap is not None and i.mocap.tracking_valid and i.t_s - i.mocap.stamp_s < _MOCAP_FRESH_S
+        if fresh and i.mocap is not None:
             self._pose_s = i.mocap.stamp_s
+        sink_m_s = self._sinking.update(i.t_s, i.mocap)
         vehicle = i.vehicle
         landing = i.status is not None and i.status.mode in (FlightMode.LAND, FlightMode.OTHER)
-        if vehicle is None or not landing or i.t_s - self._pose_s > TRUST_ESTIMATE_S:
+        if not landing:
+            self._landing_since_s = None
+        elif self._landing_since_s is None:
+            self._landing_since_s = i.t_s
+        begun = self._landing_since_s is not None and i.t_s - self._landing_since_s > BEGUN_S
+        if vehicle is None or not begun or i.t_s - self._pose_s > TRUST_ESTIMATE_S:
             return False
         height, sink = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
-        return self._touchdown.update(i.t_s, height, sink, height - 1.0)
+        stands = self._height.update(i.t_s, height, sink, height - 1.0)
+        return stands and not (fresh and self._flies_by_mocap(i, sink_m_s))
+
+    def _flies_by_mocap(self, i: Inputs, sink_m_s: float | None) -> bool:
+        high = i.mocap is not None and i.mocap.position_world_m[2] > self._clearance_m + NEVER_ABOVE_M
+        return high or sink_m_s is None or sink_m_s > STILL_M_S
+
+    def _unnoticed(self, i: Inputs) -> bool:
+        """OFFBOARD with no thrust for so long, and motion capture sees nothing fall: it stands, whatever PX4's detector says."""
+        falls = self._flies_by_mocap(i, self._sinking.update(i.t_s, i.mocap))
+        if falls or not in_offboard(i.status):
+            self._unnoticed_since_s = None
+            return False
+        if self._unnoticed_since_s is None:
+            self._unnoticed_since_s = i.t_s
+        return i.t_s - self._unnoticed_since_s > FORCE_DISARM_S
 
     def _stands_by_mocap(self, i: Inputs) -> bool:
         pose = i.mocap
         fresh = pose is not None and pose.tracking_valid and i.t_s - pose.stamp_s < _MOCAP_FRESH_S
-        low = pose is not None and pose.position_world_m[2] < self._clearance_m + TouchdownDetector.HEIGHT_MARGIN_M
+        low = pose is not None and pose.position_world_m[2] < self._clearance_m + HEIGHT_MARGIN_M
         if not (fresh and low):
             self._standing_since_s = None
             return False

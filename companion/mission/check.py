@@ -13,13 +13,16 @@ from companion.config.vehicle import Vehicle
 from companion.frames import wrap_rad
 from companion.mission.check_judge import CATCH_NEAR_M, STOP, Judge, Violation
 from companion.mission.minsnap import Progress
-from companion.mission.plan import Plan, Segment
+from companion.mission.plan import Plan
+from companion.mission.segments import Segment
 from companion.safety.governor import SafeSet
 from companion.types import PhaseKind, Reference, Vec2, Vec3
 
 SAMPLE_S = 0.02
 SAMPLES_PER_SEGMENT_MAX = 3000
 TAKEOFF_RISE_MIN_M = 0.2
+SPEED_SHARE_MAX = 0.8
+"""Of the speed at which the flight is stopped: a caught payload, a gust and the way to the reference add to what is planned."""
 
 
 def check_mission(
@@ -34,7 +37,8 @@ def check_mission(
 ) -> list[str]:
     """Every reason not to fly this mission, one clear line each: what, where, when, how to fix; empty if there is none.
 
-    Of each limit, the worst violation in the first phase that exceeds it is told, and which other phases do.
+    Of each limit, the worst violation in the first phase that exceeds it is told, and which other phases do. Of a mission that repeats,
+    two repetitions are looked at: from the second on everything is the same but the winding of the tether, which adds up.
 
     Args:
         mission: what is to be flown.
@@ -53,11 +57,16 @@ def check_mission(
         return problems
     plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad, progress)
     problems = check_start(mission, vehicle, position, yaw_rad, start_arm_rad)
-    problems += _whole(mission, vehicle, plan, phase_origins)
+    problems += [*_speed(mission, vehicle), *_whole(mission, vehicle, plan, phase_origins)]
     judge = Judge(mission, vehicle)
     told: dict[str, str] = {}
+    where: dict[str, set[int]] = {}
     also: dict[str, list[str]] = {}
+    repetition = 0
     for segment in plan.segments:
+        if segment.repetition != repetition:
+            repetition = segment.repetition
+            judge.begin_repetition(repetition)
         worst: dict[str, tuple[Violation, float, Reference]] = {}
         for t_s in _samples(segment):
             reference = plan.reference(t_s)
@@ -69,9 +78,12 @@ def check_mission(
             if limit.startswith(STOP) and any(other.startswith(limit.removeprefix(STOP)) for other in worst):
                 continue  # the way itself leads out
             if limit in told:
-                also[limit].append(f"'{segment.name}'")
+                if segment.index not in where[limit]:
+                    where[limit].add(segment.index)
+                    also[limit].append(f"'{segment.name}'")
                 continue
             x, y, z = reference.position_world_m
+            where[limit] = {segment.index}
             also[limit] = []
             told[limit] = (
                 f"{_place(mission, segment, phase_origins)} {violation.what} at t = {t_s:.1f} s, "
@@ -79,6 +91,12 @@ def check_mission(
             )
     for limit, text in told.items():
         problems.append(text + (f" (also in {', '.join(also[limit])})" if also[limit] else ""))
+    turns = judge.turns_in_the_end(mission.repeat)
+    if "turns" not in told and turns > vehicle.tether.turns_max:
+        problems.append(
+            f"mission '{mission.name}': its {mission.repeat} repetitions wind up the tether: {turns:.2f} turns about anchor or vehicle "
+            f"in the end, tether.turns_max is {vehicle.tether.turns_max:g}; fly back the way it came, or lower repeat"
+        )
     return problems
 
 
@@ -149,6 +167,16 @@ def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, a
                 f"starts with the arm at ({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) deg, but it is at ({measured_deg[0]:.0f}, "
                 f"{measured_deg[1]:.0f}) deg, {start.arm_tolerance_deg:g} deg of difference allowed; move it there by hand"
             )
+
+
+def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
+    """A plan that may be as fast as the monitors allow would be stopped by them."""
+    planned, stopped = mission.limits.speed_max_m_s, vehicle.safety.speed_max_m_s
+    if planned > SPEED_SHARE_MAX * stopped:
+        yield (
+            f"mission '{mission.name}': limits.speed_max_m_s is {planned:g} m/s, but the flight is stopped at {stopped:g} m/s "
+            f"(safety.speed_max_m_s) and needs a margin of a fifth to that; lower it to {SPEED_SHARE_MAX * stopped:.2f} m/s or less"
+        )
 
 
 def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequence[str]) -> list[str]:

@@ -66,6 +66,24 @@ class Judge:
         self._tether_n = tether.weight_n_per_m * tether.length_m
         self._blow_until_s = 0.0
         """0: the catch is still to come; a way back over the same place is none."""
+        self._repetition = 0
+        self._windings: list[tuple[float, float]] = []
+        """Turns about anchor and vehicle in the course of the second repetition."""
+
+    def begin_repetition(self, repetition: int) -> None:
+        """The instants that follow are of this repetition, from 1, with a catch of its own; 0: of what is flown once."""
+        self._repetition = repetition
+        self._blow_until_s = 0.0
+
+    def turns_in_the_end(self, repetitions: int) -> float:
+        """Most turns of the tether in the last repetition: what the second one winds, each further one winds as well."""
+        if not self._windings:
+            return 0.0
+        most = 0.0
+        for turns in zip(*self._windings, strict=True):
+            further = (repetitions - 2) * (turns[-1] - turns[0])
+            most = max(most, *(abs(value + further) for value in turns))
+        return most
 
     def violations(
         self, t_s: float, reference: Reference, jerks: tuple[Vec3, Vec2], kind: PhaseKind
@@ -167,6 +185,8 @@ class Judge:
         tether = self._vehicle.tether
         attitude = _leaning(reference)
         state = self._watch.update(t_s, position, reference.velocity_world_m_s, attitude, reference.arm_rad, None, None)
+        if self._repetition == 2:
+            self._windings.append(self._watch.windings)
         if abs(state.turns) > tether.turns_max:
             detail = f"{abs(state.turns):.2f} turns about anchor or vehicle, tether.turns_max is {tether.turns_max:g}"
             yield Violation(

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 
-from companion.mission.plan import STOP_MIN_S, Plan, Segment
+from companion.mission.plan import STOP_MIN_S, Plan
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, slow_down, speed_up
+from companion.mission.segments import Segment
 from companion.types import Reference
 
 HOLD_DECELERATION_M_S2 = 1.5
@@ -31,7 +32,7 @@ class Course:
         """Begin (flight time), plan time there, duration, rate before, rate after."""
         self._asked_s: float | None = None
         """The flight time that was asked about last; several ask in one tick."""
-        self._segment: Segment
+        self._segment: Segment | None = None
 
     @property
     def held(self) -> bool:
@@ -86,8 +87,12 @@ class Course:
     def segment(self, t_s: float) -> Segment:
         """The plan's segment at a flight time."""
         if t_s != self._asked_s:
-            self._segment = self.plan.segment(self.pace(t_s)[0])
+            plan_s, segment = self.pace(t_s)[0], self._segment
+            if segment is None or not segment.start_s <= plan_s < segment.end_s:
+                segment = self.plan.segment(plan_s)
+            self._segment = segment
             self._asked_s = t_s
+        assert self._segment is not None
         return self._segment
 
     def left_s(self, t_s: float) -> float:

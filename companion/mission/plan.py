@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from companion.config.mission import ArmMove, Land, Line, Mission, Path, Phase, Takeoff
 from companion.config.vehicle import Vehicle
@@ -28,6 +28,7 @@ from companion.mission.reference import (
     speed_up,
     steady,
 )
+from companion.mission.segments import Repeats, Segment, counted, flown_phases, repeats_of
 from companion.types import PhaseKind, Reference, Vec2, Vec3
 
 BELOW_GROUND_M = 0.25
@@ -45,28 +46,19 @@ ARM_LEAST_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
-    """One phase on the plan's clock."""
-
-    name: str
-    kind: PhaseKind
-    start_s: float
-    end_s: float
-    index: int
-    """Number of the phase in the mission, from 0; -1 in a plan without a mission."""
-
-
-@dataclass(frozen=True, slots=True)
 class Plan:
-    """Segments without gaps from 0 to `duration_s`, and the motion in them. Built by `Plan.build` or `landing_from`."""
+    """Segments from 0 to `duration_s`, and the motion in them. Built by `Plan.build` or `landing_from`."""
 
     name: str
     segments: tuple[Segment, ...]
+    """Without gaps; of a mission that repeats two repetitions, and what comes before and after. `segment` knows the others."""
     duration_s: float
     _starts_s: tuple[float, ...]
+    """Of the segments, as if there were two repetitions at most; the tracks are on that clock, too."""
     _position: Track
     _yaw: Track
     _arm: Track
+    _repeats: Repeats | None = None
 
     @classmethod
     def build(
@@ -105,8 +97,10 @@ class Plan:
             start_arm_rad or arm_start,
         )
         limits, arm_limits = _vehicle_limits(mission), _arm_limits(mission, vehicle)
-        paths, solved = sum(isinstance(phase, Path) for phase in mission.phases), 0
-        for index, phase in enumerate(mission.phases):
+        flown = flown_phases(mission)
+        paths, solved = sum(isinstance(mission.phases[index], Path) for index, _ in flown), 0
+        for index, repetition in flown:
+            phase = mission.phases[index]
             start_s = builder.t_s
             kind = PhaseKind.FLIGHT
             if isinstance(phase, Takeoff):
@@ -131,22 +125,45 @@ class Plan:
                 builder.t_s = builder.descend(phase.speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
             else:
                 builder.t_s += phase.duration_s
-            builder.segments.append(Segment(phase.name or _default_name(phase), kind, start_s, builder.t_s, index))
-        return builder.plan(mission.name)
+            name = counted(_name(phase), repetition, mission.repeat)
+            builder.segments.append(Segment(name, kind, start_s, builder.t_s, index, repetition))
+        return builder.plan(
+            mission.name, repeats_of(mission, builder.segments, tuple(map(_name, mission.phases[1:-1])))
+        )
 
     def reference(self, t_s: float) -> Reference:
         """Where the machine should be; at rest before 0 and after `duration_s`. Position, yaw and arm are C2 in time."""
+        if self._repeats is not None:
+            t_s -= self._repeats.before(t_s) * self._repeats.period_s
         return reference_at(self._position, self._yaw, self._arm, t_s)
 
     def jerks(self, t_s: float) -> tuple[Vec3, Vec2]:
         """Third derivatives of position (world frame, m/s^3) and joint angles (rad/s^3), for checks."""
+        if self._repeats is not None:
+            t_s -= self._repeats.before(t_s) * self._repeats.period_s
         (x, y, z), (first, second) = self._position.at(t_s)[3], self._arm.at(t_s)[3]
         return (x, y, z), (first, second)
 
     def segment(self, t_s: float) -> Segment:
         """The segment at a time: the first before 0, the last after the end."""
+        repeats = self._repeats
+        if repeats is not None and t_s >= repeats.begin_s + repeats.period_s:
+            if t_s >= repeats.end_s:
+                return self.segments[-1]
+            return self._repeated(t_s, repeats)
         index = bisect_right(self._starts_s, t_s)
         return self.segments[index - 1 if index else 0]
+
+    def _repeated(self, t_s: float, repeats: Repeats) -> Segment:
+        """The segment of a repetition for which the second one stands."""
+        before = repeats.before(t_s)
+        shift_s = before * repeats.period_s
+        # The shift is rounded: just after the seam the shifted time may lie just before it.
+        number = max(0, bisect_right(self._starts_s, t_s - shift_s) - 1 - repeats.first)
+        number = min(number, len(repeats.names) - 1)
+        like = self.segments[repeats.first + number]
+        name = counted(repeats.names[number], before + 2, repeats.count)
+        return Segment(name, like.kind, like.start_s + shift_s, like.end_s + shift_s, like.index, before + 2)
 
     def progress(self, t_s: float) -> float:
         """Share of the whole duration, 0 to 1."""
@@ -299,13 +316,18 @@ class PlanBuilder:
                 t_s += duration_s
         return t_s
 
-    def plan(self, name: str) -> Plan:
-        """What was appended."""
+    def plan(self, name: str, repeats: Repeats | None = None) -> Plan:
+        """What was appended, its second repetition as often as there are further ones."""
         position, yaw, arm = (
             Track(initial, tuple(moves)) for initial, moves in zip(self._initial, self._moves, strict=True)
         )
-        starts_s = tuple(segment.start_s for segment in self.segments)
-        return Plan(name, tuple(self.segments), self.t_s, starts_s, position, yaw, arm)
+        segments, left_out_s = self.segments, 0.0
+        starts_s = tuple(segment.start_s for segment in segments)
+        if repeats is not None:
+            left_out_s = repeats.left_out_s
+            *earlier, last = segments
+            segments = [*earlier, replace(last, start_s=repeats.end_s, end_s=last.end_s + left_out_s)]
+        return Plan(name, tuple(segments), self.t_s + left_out_s, starts_s, position, yaw, arm, repeats)
 
     def _arm_delta(self, to_rad: Vec2) -> Vec2:
         first_rad, second_rad = self._at[2]
@@ -366,6 +388,10 @@ def _radians(angle_deg: Vec2) -> Vec2:
 
 
 _PLAIN_NAMES = {"takeoff": "take-off", "hold": "hold", "land": "land"}
+
+
+def _name(phase: Phase) -> str:
+    return phase.name or _default_name(phase)
 
 
 def _default_name(phase: Phase) -> str:

@@ -10,10 +10,10 @@ from companion.mission.plan import (
     FOLD_SPEED_RAD_S,
     Plan,
     PlanBuilder,
-    Segment,
     stopping,
 )
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
+from companion.mission.segments import Segment
 from companion.types import PhaseKind, Vec2, Vec3
 
 LEAST_WAY_M = 0.5

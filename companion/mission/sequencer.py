@@ -22,6 +22,8 @@ SPOOL_SHARE = 0.7
 SPOOL_TO_FULL_S = 0.4
 TOUCHDOWN_RAMP_S = 0.4
 DISARM_TIMEOUT_S = 8.0
+FORCE_DISARM_S = 4.0
+"""Without thrust, standing by every measure, and PX4 does not notice: it is told."""
 
 
 class Stage(Enum):
@@ -40,36 +42,13 @@ class Stage(Enum):
 
 
 BEFORE_LIFT = frozenset({Stage.WAIT, Stage.OFFBOARD, Stage.ARM})
+BEFORE_ARMING = frozenset({Stage.WAIT, Stage.OFFBOARD})
+"""Whoever armed PX4 now, the companion did not."""
 LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
 """Stages in which PX4 must be in OFFBOARD, by the companion's belief."""
 PEOPLE_CHOOSE = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
 """Modes that only people choose: theirs is the machine, nothing is sent against them."""
-
-
-class TouchdownDetector:
-    """The vehicle stands: low, not sinking though the reference sinks, held so for a while."""
-
-    HOLD_S = 0.35
-    HEIGHT_MARGIN_M = 0.12
-    SINK_M_S = 0.08
-    REFERENCE_BELOW_M = 0.05
-
-    def __init__(self, clearance_m: float) -> None:
-        self._clearance_m = clearance_m
-        self._since_s: float | None = None
-
-    def update(self, t_s: float, height_m: float, vertical_m_s: float, reference_height_m: float) -> bool:
-        """True once touch-down is certain."""
-        low = height_m < self._clearance_m + self.HEIGHT_MARGIN_M
-        pressed = reference_height_m < height_m - self.REFERENCE_BELOW_M
-        still = abs(vertical_m_s) < self.SINK_M_S
-        if not (low and still and pressed):
-            self._since_s = None
-            return False
-        if self._since_s is None:
-            self._since_s = t_s
-        return t_s - self._since_s >= self.HOLD_S
 
 
 def in_offboard(status: AutopilotStatus | None) -> bool:
@@ -85,3 +64,8 @@ def is_armed(status: AutopilotStatus | None) -> bool:
 def on_ground(status: AutopilotStatus | None) -> bool:
     """PX4's land detector says that the vehicle stands."""
     return status is not None and status.landed is LandedState.ON_GROUND
+
+
+def people_fly(status: AutopilotStatus | None) -> bool:
+    """PX4 is armed and in a mode that only people choose."""
+    return status is not None and status.armed and status.mode in PEOPLE_CHOOSE

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Safety
-from companion.safety.rules import BY_PEOPLE, RULES, Rule
+from companion.safety.rules import BY_PEOPLE, REATTACHED, RULES, Rule
 from companion.types import ControlLog, Event, SafetyAction, Severity, TetherState
 
 QUIET_S = 1.0
@@ -27,6 +27,8 @@ class Situation:
     caught: bool = False
     """A payload is on board."""
     tether: TetherState | None = None
+    found_armed: str | None = None
+    """PX4 is armed though the companion has not asked for it, in words; `airborne` then says whether it flies."""
     waiting: bool = False
     """Inputs are still missing on the ground: only people and broken values are judged."""
 
@@ -106,5 +108,5 @@ class Findings:
 def _severity(rule: Rule, action: SafetyAction, airborne: bool) -> Severity:
     if rule.id in BY_PEOPLE:
         return Severity.INFO
-    grave = airborne and action.rank >= SafetyAction.RETRACT.rank
+    grave = (airborne or rule.id == REATTACHED.id) and action.rank >= SafetyAction.RETRACT.rank
     return Severity.CRITICAL if grave else Severity.WARNING

@@ -19,6 +19,7 @@ from companion.safety.rules import (
     OPERATOR_HOLD,
     OPERATOR_LAND,
     OPERATOR_RESUME,
+    REATTACHED,
     RECORDER_DROPS,
 )
 from companion.types import Event, Inputs, OperatorCommand, VehicleState
@@ -82,6 +83,8 @@ class Monitors:
             self._command = command
             if command is not OperatorCommand.NONE:
                 findings.found(*_ASKED[command])
+        if situation.found_armed is not None:
+            findings.found(REATTACHED, "{}", situation.found_armed)
         if not situation.waiting:
             moving = i.vehicle is not None and _moves(i.vehicle)
             self._mocap.check(i, situation, awake_s, moving, findings)

@@ -180,6 +180,16 @@ HEARTBEAT_LOST = _rule(
 PX4_REBOOTED = _rule(
     "px4_rebooted", Part.PX4, "PX4's own clock went back: it restarted", (), 0.0, _PX4_LANDS, _PX4_LANDS, False
 )
+REATTACHED = _rule(
+    "reattached",
+    Part.PX4,
+    "PX4 was armed by somebody else: the companion was started in the air, or its forerunner died",
+    (),
+    0.0,
+    _LAND,
+    _PX4_LANDS,
+    False,
+)
 PX4_DISARMED = _rule(
     "px4_disarmed", Part.PX4, "PX4 says disarmed, well above the floor", (), 0.0, None, _PX4_LANDS, False
 )

@@ -101,6 +101,11 @@ class TetherWatch:
         self._about_vehicle = Winding()
         self._last_t_s: float | None = None
 
+    @property
+    def windings(self) -> tuple[float, float]:
+        """Turns about the anchor's vertical, and of the line about the vehicle."""
+        return self._about_anchor.turns, self._about_vehicle.turns
+
     def update(
         self,
         t_s: float,

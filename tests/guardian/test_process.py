@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.frames import ned_from_enu, wrap_rad
-from tests.guardian.rig import HOLD_MODE, OWN_IDS, POSITION_M, Rig
+from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
 
 NAV_LAND, ARM_DISARM = mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
@@ -32,8 +32,19 @@ def test_a_clean_end_of_the_flight_ends_it_quietly(tmp_path: Path) -> None:
         rig.beat(goodbye=True)
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.flight.poll() is None, "it was not its business to end it"
-        assert (rig.events, rig.result, rig.log.read_text()) == ([], None, "")
+        assert (rig.events, rig.result) == ([], None)
+        assert rig.log.read_text().startswith(f"heard {rig.tick} beats, 0 missed, silent for ")
         assert rig.peer.received == []
+
+
+def test_ticks_that_it_did_not_hear_of_are_counted(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.tick += 3
+        rig.beat()
+        rig.beat(goodbye=True)
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        assert rig.log.read_text().startswith(f"heard {rig.tick - 3} beats, 3 missed, ")
 
 
 @pytest.mark.parametrize("ticks", [True, False])
@@ -185,3 +196,55 @@ def test_it_is_not_ready_without_a_body_of_its_own(tmp_path: Path) -> None:
             return b"sees no rigid body" in said[-1]
 
         wait_until(blind, lambda: f"{said} {rig.log.read_text()}")
+
+
+_BUGS = """
+import sys
+
+if "companion.guardian" in sys.orig_argv:
+    import companion.guardian.charge as charge
+    import companion.guardian.mocap as mocap
+
+    class Breaking(charge.{broken}):
+        def {method}(self, *arguments):
+            Breaking.calls += 1
+            if {when}:
+                raise ZeroDivisionError("a bug")
+            return super().{method}(*arguments)
+
+    Breaking.calls = 0
+    charge.{broken} = Breaking
+"""
+
+
+@pytest.mark.parametrize(
+    ("broken", "method", "when", "where"),
+    [
+        ("AutopilotLanding", "step", "Breaking.calls == 5", "the landing"),
+        ("AutopilotLanding", "step", "True", "the landing"),
+        ("Px4State", "take", "arguments[1].get_type() != 'HEARTBEAT'", "PX4's messages"),
+        ("Plausible", "check", "Breaking.calls < 50", "motion capture"),
+    ],
+    ids=["once", "always", "messages", "poses"],
+)
+def test_an_error_of_its_own_is_told_and_the_landing_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, method: str, when: str, where: str
+) -> None:
+    hooks = tmp_path / "hooks"
+    hooks.mkdir()
+    (hooks / "sitecustomize.py").write_text(_BUGS.format(broken=broken, method=method, when=when), encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(hooks), os.environ.get("PYTHONPATH")))))
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        os.kill(rig.flight.pid, signal.SIGKILL)
+        wait_until(lambda: bool(rig.peer.commands(NAV_LAND)), rig.log.read_text)
+        wait_until(lambda: "guardian_error" in rig.events, rig.log.read_text)
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", 20)
+        rig.peer.custom_mode = LAND_MODE
+        rig.peer.base_mode = DISARMED
+        assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
+        assert rig.result is not None and rig.result["landed"] is True
+        errors = [message["text"] for message in rig.messages if message.get("id") == "guardian_error"]
+        assert len(errors) == 1, "told once"
+        assert errors[0] == f"an error in {where} (ZeroDivisionError: a bug); the landing goes on"
+        assert "Traceback" in rig.log.read_text()

@@ -95,6 +95,9 @@ def at(x: float, y: float, z: float, vx: float = 0.05, vy: float = 0.0, vz: floa
     return change
 
 
+FOUND = "PX4 is armed and the companion has not armed it"
+
+
 @dataclass(frozen=True)
 class Fault:
     """How a rule's finding is made, and what else is found with it."""
@@ -145,6 +148,7 @@ FAULTS: dict[str, Fault] = {
     "heartbeat_lost": Fault(stopped("status")),
     "px4_rebooted": Fault(put("vehicle", boot_s=2.0), also=frozenset({"link_late"})),
     "link_late": Fault(slow_link),
+    "reattached": Fault(situation=lambda: flying(found_armed=FOUND)),
     "px4_disarmed": Fault(put("status", armed=False)),
     "pilot_took_over": Fault(put("status", mode=FlightMode.MANUAL)),
     "offboard_left": Fault(put("status", mode=FlightMode.LAND)),
@@ -232,7 +236,10 @@ IN_THE_AIR = {rule.id for rule in RULES if rule.ground is None}
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
 def test_on_the_ground_only_what_matters_there_is_told(rule: Rule) -> None:
     fault = FAULTS[rule.id]
-    situation = standing(offboard_expected=rule.id in ("pilot_took_over", "offboard_left"))
+    situation = standing(
+        offboard_expected=rule.id in ("pilot_took_over", "offboard_left"),
+        found_armed=FOUND if rule.id == "reattached" else None,
+    )
     events = watched(VEHICLE, stream(rule.id), situation)
     expected = {rule.id, *fault.also} - IN_THE_AIR
     assert {event.id for event in events} == expected

@@ -143,7 +143,7 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
     velocity = m.jnt_dofadr[m.joint("payload").id]
     d.qvel[velocity : velocity + 3] = speed
     mujoco.mj_forward(m, d)
-    world.thrown_t_s = world.t_s
+    world.throws, world._flies_since_s = 1, world.t_s
 
     def momentum() -> Array:
         mujoco.mj_subtreeVel(m, d)

@@ -1,0 +1,124 @@
+"""How late ticks are, minute by minute: of a flight, from its log, and of an empty loop beside it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import time
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+
+from companion.clock import flight_clock
+from companion.core import NOMINAL_DT_S
+from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.ticker import Ticker
+
+MINUTE_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Minute:
+    """Lateness of the ticks of one minute, ms."""
+
+    begin_s: float
+    """`time.monotonic` for the empty loop, the flight clock for a flight."""
+    ticks: int
+    p50: float
+    p99: float
+    max: float
+
+
+class Minutes:
+    """Takes tick after tick; keeps the ticks of one minute at a time."""
+
+    def __init__(self) -> None:
+        self._begin_s: float | None = None
+        self._lateness_s = array("d")
+        self.done: list[Minute] = []
+        self.missed = 0
+        """Ticks that began later than a whole period."""
+
+    def take(self, start_s: float, lateness_s: float) -> None:
+        """A tick that began at `start_s`."""
+        if self._begin_s is None:
+            self._begin_s = start_s
+        while start_s >= self._begin_s + MINUTE_S:
+            self._close(self._begin_s)
+            self._begin_s += MINUTE_S
+        self._lateness_s.append(lateness_s)
+        self.missed += lateness_s > NOMINAL_DT_S
+
+    def finish(self) -> list[Minute]:
+        """All minutes; the last one may be shorter, and is left out if it is much so."""
+        if self._begin_s is not None and len(self._lateness_s) > 0.5 * MINUTE_S / NOMINAL_DT_S:
+            self._close(self._begin_s)
+        return self.done
+
+    def _close(self, begin_s: float) -> None:
+        if self._lateness_s:
+            values_ms = 1e3 * np.array(self._lateness_s)
+            p50, p99 = np.percentile(values_ms, [50, 99])
+            count, most = len(values_ms), float(values_ms.max())
+            self.done.append(Minute(begin_s, count, float(p50), float(p99), most))
+        self._lateness_s = array("d")
+
+
+@dataclass(frozen=True, slots=True)
+class Ticks:
+    """All ticks of a flight's log."""
+
+    minutes: list[Minute]
+    ticks: int
+    missed: int
+    """Began later than a whole period."""
+    skipped: int
+    """Deadlines that passed without a tick."""
+
+
+def ticks_of_log(path: Path) -> Ticks:
+    """Read from `/sent` alone, one chunk at a time."""
+    minutes = Minutes()
+    count = 0
+    first_s = last_s = 0.0
+    with path.open("rb") as file:
+        for _, _, message in make_reader(file).iter_messages(topics=["/sent"], log_time_order=False):
+            sent: dict[str, Any] = json.loads(message.data)
+            start_s = float(sent["start_s"])
+            minutes.take(start_s, float(sent["lateness_s"]))
+            first_s = start_s if count == 0 else first_s
+            last_s = start_s
+            count += 1
+    wanted = round((last_s - first_s) / NOMINAL_DT_S) + 1 if count else 0
+    return Ticks(minutes.finish(), count, minutes.missed, max(0, wanted - count))
+
+
+def run_empty_loop(path: Path) -> None:
+    """Tick as a flight does, with its priority, and do nothing; until SIGTERM. Then write the minutes as JSON."""
+    path.write_text(json.dumps(asyncio.run(_empty_loop())))
+
+
+async def _empty_loop() -> dict[str, Any]:
+    over = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, over.set)
+    origin_s = time.monotonic()
+    claim_realtime(FLIGHT_PRIORITY)
+    ticker, minutes = Ticker(NOMINAL_DT_S, flight_clock(origin_s)), Minutes()
+    parent = os.getppid()
+    while not over.is_set() and os.getppid() == parent:
+        tick = await ticker.next()
+        minutes.take(tick.start_s, tick.lateness_s)
+    rows = [[m.begin_s, m.ticks, m.p50, m.p99, m.max] for m in minutes.finish()]
+    return {"minutes": rows, "missed": minutes.missed, "skipped": ticker.skipped}
+
+
+def read_minutes(rows: Iterable[list[float]]) -> list[Minute]:
+    """What `run_empty_loop` has written."""
+    return [Minute(begin_s, int(ticks), p50, p99, most) for begin_s, ticks, p50, p99, most in rows]

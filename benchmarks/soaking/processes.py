@@ -1,0 +1,96 @@
+"""Memory and CPU time of a flight's processes, read from /proc without disturbing them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.realtime import FLIGHT_PRIORITY, GUARDIAN_PRIORITY, WORLD_PRIORITY
+
+ROLES = {
+    "companion.app": "flight",
+    "companion.recorder_process": "recorder",
+    "companion.guardian": "guardian",
+    "sitl": "world",
+}
+REALTIME_CLAIMED = frozenset({WORLD_PRIORITY, FLIGHT_PRIORITY, GUARDIAN_PRIORITY})
+LAUNCHER = "launcher"
+"""What was started, and starts the others."""
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+_CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """One process at one moment."""
+
+    rss_mb: float
+    """Resident memory, shared pages included, 1e6 bytes."""
+    cpu_s: float
+    """User and system time since its start."""
+
+
+def family(root_pid: int) -> dict[str, int]:
+    """Process ids of a flight by role; a role that is not there yet, or no more, is missing."""
+    parents: dict[int, int] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            with contextlib.suppress(OSError, ValueError, IndexError):
+                # The name, in brackets, may hold anything.
+                parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+    found = {LAUNCHER: root_pid}
+    for pid in parents:
+        if _descends(pid, root_pid, parents):
+            role = next((ROLES[word] for word in _command(pid) if word in ROLES), None)
+            if role is not None:
+                found[role] = pid
+    return found
+
+
+def _descends(pid: int, root_pid: int, parents: dict[int, int]) -> bool:
+    while pid in parents:
+        pid = parents[pid]
+        if pid == root_pid:
+            return True
+    return False
+
+
+def _command(pid: int) -> list[str]:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+    return []
+
+
+def usage(pid: int) -> Usage | None:
+    """What a process uses now; None: it is gone."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (OSError, IndexError):
+        return None
+    return Usage(pages * _PAGE_BYTES / 1e6, (int(fields[11]) + int(fields[12])) / _CLOCK_TICKS)
+
+
+def pss_mb(pid: int) -> float | None:
+    """Proportional set size, 1e6 bytes: shared pages are counted in parts. The kernel walks all pages for it: not every second."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("Pss:")), None)
+
+
+def lift(pid: int, by: int) -> None:
+    """Raise the real-time priority that a process has claimed, of every thread, so that other flights on the machine come second.
+
+    Raises:
+        PermissionError: not allowed to.
+    """
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        for thread in map(int, os.listdir(f"/proc/{pid}/task")):
+            with contextlib.suppress(ProcessLookupError):
+                priority = os.sched_getparam(thread).sched_priority
+                if os.sched_getscheduler(thread) == os.SCHED_FIFO and priority in REALTIME_CLAIMED:
+                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority + by))

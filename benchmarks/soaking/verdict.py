@@ -1,0 +1,174 @@
+"""What a soak shows: growth of memory and lateness, what was missed, as a table and as a plot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, median
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.soaking.lateness import Minute
+
+MEMORY_GROWTH_MAX = 1.05
+LATENESS_GROWTH_MAX = 1.2
+"""Beyond what the empty loop beside it has grown by: the machine is not the flight's alone."""
+EARLY, LATE = (5.0 / 60.0, 15.0 / 60.0), (50.0 / 60.0, 1.0)
+"""Shares of the flight: minutes 5 to 15 and the last 10 of an hour."""
+ROLES = ("flight", "recorder", "guardian", "world", "launcher")
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """All processes at one moment."""
+
+    t_s: float
+    """Since the first sample."""
+    rss_mb: dict[str, float]
+    cpu_s: dict[str, float]
+    pss_mb: dict[str, float]
+    """Not in every sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """Of one process."""
+
+    role: str
+    early_mb: float
+    """Mean resident memory over `EARLY`."""
+    late_mb: float
+    ratio: float
+    early_pss_mb: float | None
+    late_pss_mb: float | None
+    early_cpu_percent: float
+    """Of one core."""
+    late_cpu_percent: float
+
+
+def airborne(samples: Sequence[Sample]) -> list[Sample]:
+    """Those of the flight itself: the recorder is the last to come, and the launcher grades the log when all have gone."""
+    return [sample for sample in samples if all(role in sample.rss_mb for role in ROLES)]
+
+
+def memory_growth(samples: Sequence[Sample]) -> list[Growth]:
+    """Of every process, from `airborne` samples."""
+    if not samples:
+        return []
+    begin_s, end_s = samples[0].t_s, samples[-1].t_s
+
+    def within(share: tuple[float, float]) -> list[Sample]:
+        low, high = (begin_s + part * (end_s - begin_s) for part in share)
+        return [sample for sample in samples if low <= sample.t_s <= high]
+
+    early, late = within(EARLY), within(LATE)
+    found = []
+    for role in ROLES:
+        if len(early) > 1 and len(late) > 1:
+            before, after = (fmean(sample.rss_mb[role] for sample in part) for part in (early, late))
+            pss, late_pss = (_mean([s.pss_mb[role] for s in part if role in s.pss_mb]) for part in (early, late))
+            cpu, late_cpu = (_cpu_percent(part, role) for part in (early, late))
+            found.append(Growth(role, before, after, after / before, pss, late_pss, cpu, late_cpu))
+    return found
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return fmean(values) if values else None
+
+
+def _cpu_percent(part: Sequence[Sample], role: str) -> float:
+    first, last = part[0], part[-1]
+    return 100.0 * (last.cpu_s[role] - first.cpu_s[role]) / (last.t_s - first.t_s)
+
+
+def thirds(minutes: Sequence[Minute], value: str) -> tuple[float, float] | None:
+    """Median over the minutes of the first and of the last third of a percentile (`p50`, `p99`, `max`), ms; None: too short."""
+    count = len(minutes) // 3
+    if count == 0:
+        return None
+    first = [float(getattr(minute, value)) for minute in minutes[:count]]
+    last = [float(getattr(minute, value)) for minute in minutes[-count:]]
+    return median(first), median(last)
+
+
+def lateness_problems(flight: Sequence[Minute], empty: Sequence[Minute]) -> list[str]:
+    """Growth of the flight's lateness that the machine does not explain."""
+    found = []
+    for value in ("p50", "p99"):
+        of_flight, of_empty = thirds(flight, value), thirds(empty, value)
+        if of_flight is None:
+            found.append("too short to tell whether lateness grows")
+            break
+        grown = of_flight[1] / of_flight[0]
+        allowed = LATENESS_GROWTH_MAX * (max(1.0, of_empty[1] / of_empty[0]) if of_empty is not None else 1.0)
+        if grown > allowed:
+            found.append(f"lateness {value} grew {grown:.2f} times, {allowed:.2f} allowed")
+    return found
+
+
+def print_tables(console: Console, growth: Sequence[Growth], flight: Sequence[Minute], empty: Sequence[Minute]) -> None:
+    """Both tables."""
+    memory = Table(title="memory and CPU time, early and late in the flight")
+    for name in ("process", "RSS MB", "late", "ratio", "PSS MB", "late", "CPU %", "late"):
+        memory.add_column(name, justify="left" if name == "process" else "right", no_wrap=True)
+    for row in growth:
+        style = "red" if row.ratio > MEMORY_GROWTH_MAX else ""
+        pss = ["-" if value is None else f"{value:.1f}" for value in (row.early_pss_mb, row.late_pss_mb)]
+        cpu = [f"{value:.1f}" for value in (row.early_cpu_percent, row.late_cpu_percent)]
+        memory.add_row(
+            row.role, f"{row.early_mb:.1f}", f"{row.late_mb:.1f}", f"{row.ratio:.3f}", *pss, *cpu, style=style
+        )
+    console.print(memory)
+    lateness = Table(title="tick lateness, ms: median over the minutes of a third")
+    for name in ("loop", "p50 first", "last", "p99 first", "last", "max first", "last", "worst"):
+        lateness.add_column(name, justify="left" if name == "loop" else "right", no_wrap=True)
+    for name, minutes in (("flight", flight), ("empty loop", empty)):
+        cells: list[str] = []
+        for value in ("p50", "p99", "max"):
+            pair = thirds(minutes, value)
+            cells += ["-", "-"] if pair is None else [f"{pair[0]:.3f}", f"{pair[1]:.3f}"]
+        worst = max((minute.max for minute in minutes), default=float("nan"))
+        lateness.add_row(name, *cells, f"{worst:.2f}")
+    console.print(lateness)
+
+
+def draw(samples: Sequence[Sample], flight: Sequence[Minute], empty: Sequence[Minute], path: Path) -> None:
+    """Memory and lateness over time, as a PNG."""
+    from companion.analysis.plot_style import INK, dress, new_figure, write_png
+
+    colours = {
+        "flight": "#1864ab",
+        "recorder": "#2b8a3e",
+        "guardian": "#862e9c",
+        "world": "#e8590c",
+        "launcher": "#868e96",
+    }
+    samples = airborne(samples)
+    figure = new_figure(6.4)
+    memory, late = figure.subplots(2, 1, sharex=True)
+    for role in ROLES:
+        seen = [((s.t_s - samples[0].t_s) / 60.0, s.rss_mb[role]) for s in samples if role in s.rss_mb]
+        if seen:
+            memory.plot(*zip(*seen, strict=True), color=colours[role], lw=1.4, label=role)
+    memory.set_ylim(bottom=0.0)
+    memory.set_ylabel("resident memory [MB]")
+    for name, minutes, dash in (("flight", flight, "-"), ("empty loop", empty, (0, (4, 2)))):
+        if not minutes:
+            continue
+        middle = [(minute.begin_s - minutes[0].begin_s) / 60.0 + 0.5 for minute in minutes]
+        for value, colour in (("p50", "#1864ab"), ("p99", "#e8590c"), ("max", "#868e96")):
+            values = [float(getattr(minute, value)) for minute in minutes]
+            late.plot(middle, values, color=colour, ls=dash, lw=1.3, label=f"{name} {value}")
+    late.set_yscale("log")
+    for formatted in (late.yaxis.set_major_formatter, late.yaxis.set_minor_formatter):
+        formatted("{x:g}")
+    late.set_ylabel("tick lateness [ms]")
+    late.set_xlabel("minute of the flight")
+    for ax in (memory, late):
+        dress(ax)
+        ax.legend(fontsize=8, ncols=3, frameon=False)
+        ax.margins(x=0.0)
+    figure.suptitle("Soak", fontsize=13, fontweight="bold", color=INK)
+    write_png(figure, path)

@@ -1,0 +1,91 @@
+"""When things happened in a flight, from every tick of it: small enough to be kept whole where the ticks themselves are not."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.types import Inputs, Outputs, Sent
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Of consecutive recorded ticks; durations in s."""
+
+    ticks: int
+    first_tick: int
+    last_tick: int
+    span_s: float
+    """From the start of the first tick to that of the last."""
+    period_s: float
+    """The loop's nominal period: the median of the ticks' times; NaN for less than two ticks."""
+    lateness_s: Array
+    """Tick start after its deadline."""
+    joint_read_to_write_s: Array
+    """Answers of all servos read -> currents written, both by the bus thread, of ticks that wrote currents."""
+    mocap_to_setpoint_s: Array
+    """Mocap datagram -> setpoint sent, of ticks that saw a new frame and sent a setpoint."""
+
+
+class Stopwatch:
+    """Takes one tick after another; 40 bytes of each are kept."""
+
+    def __init__(self) -> None:
+        self._t_s, self._lateness_s = array("d"), array("d")
+        self._joint_s, self._mocap_s = array("d"), array("d")
+        self._first: tuple[int, float] | None = None
+        self._before: tuple[Inputs, Sent] | None = None
+        self._frame_s: float | None = None
+
+    def take(self, inputs: Inputs, sent: Sent) -> None:
+        """The next tick."""
+        self._t_s.append(inputs.t_s)
+        self._lateness_s.append(sent.lateness_s)
+        if self._first is None:
+            self._first = (inputs.tick, sent.start_s)
+        if self._before is not None:
+            self._joint(*self._before, inputs)
+        self._before = (inputs, sent)
+        mocap = inputs.mocap
+        if mocap is not None and mocap.stamp_s != self._frame_s:
+            # The first frame seen may have waited for the loop to begin.
+            if self._frame_s is not None and sent.attitude_sent:
+                self._mocap_s.append(sent.setpoint_sent_s - mocap.stamp_s)
+            self._frame_s = mocap.stamp_s
+
+    def _joint(self, tick: Inputs, sent: Sent, after: Inputs) -> None:
+        """The write is known in the next tick's joint state."""
+        if sent.arm_torque_sent_nm is None or tick.arm is None or after.arm is None or after.arm.written_s is None:
+            return
+        if after.arm.written_s >= sent.core_s and after.arm.stamp_s > tick.arm.stamp_s:
+            self._joint_s.append(after.arm.written_s - tick.arm.stamp_s)
+
+    def read(self) -> Timing:
+        """What was taken so far."""
+        first_tick, first_s = self._first or (0, 0.0)
+        last, sent = self._before or (None, None)
+        t_s = np.array(self._t_s)
+        return Timing(
+            ticks=len(t_s),
+            first_tick=first_tick,
+            last_tick=last.tick if last is not None else -1,
+            span_s=sent.start_s - first_s if sent is not None else 0.0,
+            period_s=float(np.median(np.diff(t_s))) if len(t_s) > 1 else np.nan,
+            lateness_s=np.array(self._lateness_s),
+            joint_read_to_write_s=np.array(self._joint_s),
+            mocap_to_setpoint_s=np.array(self._mocap_s),
+        )
+
+
+def timing_of(rows: Iterable[tuple[Inputs, Outputs, Sent]]) -> Timing:
+    """Of ticks in order."""
+    stopwatch = Stopwatch()
+    for inputs, _, sent in rows:
+        stopwatch.take(inputs, sent)
+    return stopwatch.read()

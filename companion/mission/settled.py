@@ -1,0 +1,73 @@
+"""Has PX4's estimate come to rest on motion capture? The core's own last look before it asks for OFFBOARD. Pure; time is an argument.
+
+An estimate that has only just begun to follow is near for a moment, too; one that has settled stays near. Compared are PX4's position
+and yaw with motion capture's, on a machine that stands.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from companion.frames import euler_zyx_from_quat, wrap_rad
+from companion.mission.sequencer import TARE_S
+from companion.types import MocapPose, Vec3, VehicleState
+
+SETTLED_S = TARE_S
+"""So long it must have been near and steady; as long as the tare, which runs meanwhile."""
+OFF_MAX_M = 0.05
+"""Mean distance, a real EKF2's noise averaged out."""
+SPREAD_MAX_M = 0.02
+"""Standard deviation of that, over all three axes; EKF2 with 1 cm of vision noise has a few millimetres at rest."""
+YAW_OFF_MAX_RAD = math.radians(5.0)
+YAW_SPREAD_MAX_RAD = math.radians(2.0)
+
+
+class SettledEstimate:
+    """Differences of the last `SETTLED_S`."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, Vec3, float]] = deque()
+        self._since_s: float | None = None
+
+    def forget(self) -> None:
+        """Inputs were missing: begin again."""
+        self._seen.clear()
+        self._since_s = None
+
+    def take(self, t_s: float, vehicle: VehicleState, pose: MocapPose) -> None:
+        """One tick."""
+        if self._since_s is None:
+            self._since_s = t_s
+        (x, y, z), (a, b, c) = vehicle.position_world_m, pose.position_world_m
+        yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2] - euler_zyx_from_quat(pose.attitude_wxyz)[2]
+        self._seen.append((t_s, (x - a, y - b, z - c), wrap_rad(yaw_rad)))
+        while self._seen[0][0] < t_s - SETTLED_S:
+            self._seen.popleft()
+
+    def problem(self, t_s: float) -> str | None:
+        """What wandered, in words; None: nothing has for `SETTLED_S`."""
+        if self._since_s is None or t_s - self._since_s < SETTLED_S:
+            return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s at a time"
+        count = len(self._seen)
+        mean = [math.fsum(off[axis] for _, off, _ in self._seen) / count for axis in range(3)]
+        spread_m = math.sqrt(math.fsum(math.dist(off, mean) ** 2 for _, off, _ in self._seen) / count)
+        yaw_rad = math.fsum(yaw for _, _, yaw in self._seen) / count
+        yaw_spread_rad = math.sqrt(math.fsum((yaw - yaw_rad) ** 2 for _, _, yaw in self._seen) / count)
+        off_m = math.hypot(*mean)
+        wrong = []
+        if off_m > OFF_MAX_M or spread_m > SPREAD_MAX_M:
+            wrong.append(
+                f"its position is {off_m * 1e3:.0f} mm off motion capture and wanders by {spread_m * 1e3:.0f} mm "
+                f"(allowed: {OFF_MAX_M * 1e3:.0f} and {SPREAD_MAX_M * 1e3:.0f} mm)"
+            )
+        if abs(yaw_rad) > YAW_OFF_MAX_RAD or yaw_spread_rad > YAW_SPREAD_MAX_RAD:
+            limits = f"{math.degrees(YAW_OFF_MAX_RAD):.0f} and {math.degrees(YAW_SPREAD_MAX_RAD):.0f} deg"
+            off_deg, spread_deg = math.degrees(yaw_rad), math.degrees(yaw_spread_rad)
+            wrong.append(f"its yaw is {off_deg:.1f} deg off and wanders by {spread_deg:.1f} deg (allowed: {limits})")
+        if not wrong:
+            return None
+        return (
+            f"PX4's estimate has not settled in the last {SETTLED_S:g} s: {', '.join(wrong)}; leave the vehicle alone on the floor, "
+            "and see that PX4 and Motive mean the same body and axes (EKF2_EV_DELAY, EKF2_EVP_NOISE, the rigid body's markers)"
+        )

@@ -1,0 +1,102 @@
+"""A log of an hour is graded in little memory: thinned-out ticks, but the timing of all of them."""
+
+from __future__ import annotations
+
+import json
+import select
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.analysis.log import FlightLog
+from companion.analysis.metrics import catch_index
+from companion.analysis.report import write_report
+from companion.analysis.summary import summarise
+from companion.flight import TICKS_MAX
+from companion.io.recorder import RecorderProcess
+from tests.analysis.synthetic_flight import CONFIG, record_flight, synthetic_flight
+
+TICKS = 500
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("flight") / "flight.mcap"
+    record_flight(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(path: Path) -> FlightLog:
+    return FlightLog.read(path)
+
+
+@pytest.fixture(scope="module")
+def thin(path: Path) -> FlightLog:
+    return FlightLog.read(path, ticks_max=TICKS)
+
+
+def test_so_many_ticks_are_kept_evenly_spread(whole: FlightLog, thin: FlightLog) -> None:
+    assert len(whole.inputs) > 4 * TICKS
+    assert TICKS / 2 <= len(thin.inputs) <= TICKS + 10
+    assert thin.stride > 1
+    regular = [inputs.tick for inputs in thin.inputs if inputs.tick % thin.stride == 0]
+    assert regular == list(range(0, whole.inputs[-1].tick + 1, thin.stride))
+
+
+def test_every_event_is_kept_and_so_is_the_outcome(whole: FlightLog, thin: FlightLog) -> None:
+    def told(log: FlightLog) -> list[tuple[float, str]]:
+        return [(event.t_s, event.id) for outputs in log.outputs for event in outputs.events]
+
+    assert told(thin) == told(whole)
+    assert [o.outcome for o in thin.outputs if o.outcome] == [o.outcome for o in whole.outputs if o.outcome]
+
+
+def test_timing_is_that_of_every_tick(whole: FlightLog, thin: FlightLog) -> None:
+    one, other = whole.timing, thin.timing
+    for name in ("lateness_s", "joint_read_to_write_s", "mocap_to_setpoint_s"):
+        assert len(getattr(one, name)) > 100
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    assert (one.ticks, one.first_tick, one.last_tick, one.span_s, one.period_s) == (
+        *(other.ticks, other.first_tick, other.last_tick, other.span_s, other.period_s),
+    )
+    assert thin.missing_ticks() == 0
+
+
+def test_the_summary_says_that_it_is_thinned_out_and_grades_nearly_the_same(whole: FlightLog, thin: FlightLog) -> None:
+    of_all, of_some = (
+        summarise(log, outcome="completed", controller="adaptive", preset="recommended") for log in (whole, thin)
+    )
+    assert (of_all["graded_every"], of_some["graded_every"]) == (1, thin.stride)
+    for key in ("loop", "latency_ms", "events", "recorder"):
+        assert of_all[key] == of_some[key]
+    assert of_some["impedance_error"] == {"position_n": None, "arm_nm": None}
+    for part in ("pre", "post"):
+        assert of_some["rms"][part]["e_p_m"] == pytest.approx(of_all["rms"][part]["e_p_m"], rel=0.1)
+    assert catch_index(thin) is not None
+    json.dumps(of_some, allow_nan=False)
+
+
+def test_the_report_says_so_too(thin: FlightLog, tmp_path: Path) -> None:
+    summary = summarise(thin, outcome="completed", controller="adaptive", preset="recommended")
+    assert f"every {thin.stride}th tick" in write_report(thin, summary, tmp_path).read_text()
+
+
+def test_a_log_that_fits_is_read_whole(path: Path, whole: FlightLog) -> None:
+    read = FlightLog.read(path, ticks_max=TICKS_MAX)
+    assert (read.stride, read.measured) == (1, None)
+    assert read.inputs == whole.inputs
+
+
+def test_a_thinned_out_log_counts_the_ticks_that_the_recorder_dropped(tmp_path: Path) -> None:
+    gap = tmp_path / "gap.mcap"
+    recorder = RecorderProcess.start(gap, config_json=json.dumps(CONFIG), epoch_offset_ns=1_700_000_000_000_000_000)
+    for inputs, outputs, sent in synthetic_flight(end_s=6.0):
+        if not 100 <= inputs.tick < 103:
+            select.select([], [recorder.client], [], 60.0)
+            recorder.client.record(inputs, outputs, sent)
+    assert recorder.finish(60.0).error is None
+    thin = FlightLog.read(gap, ticks_max=TICKS)
+    assert thin.stride > 1
+    assert thin.missing_ticks() == 3

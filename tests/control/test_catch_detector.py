@@ -1,0 +1,121 @@
+"""The catch, and that its payload has left the net: told apart from bumps, falls and a sensor that says nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from companion.control.sensing import CatchDetector
+from companion.types import Vec3
+
+DT_S = 0.005
+G_M_S2 = 9.81
+
+
+class Net:
+    """Drives a detector tick by tick; remembers when it said what."""
+
+    def __init__(self, payload_kg: float = 0.2) -> None:
+        self.detector = CatchDetector()
+        self.payload_kg = payload_kg
+        self.t_s = 0.0
+        self.caught: list[float] = []
+        self.left: list[float] = []
+
+    def feel(
+        self, seconds: float, force: Callable[[float], Vec3 | None] | Vec3 | None, acceleration_z_m_s2: float = 0.0
+    ) -> None:
+        """As the core does: a catch is looked for first."""
+        begin_s = self.t_s
+        for _ in range(round(seconds / DT_S)):
+            self.t_s += DT_S
+            now = force(self.t_s - begin_s) if callable(force) else force
+            if self.detector.update(self.t_s, now):
+                self.caught.append(self.t_s)
+            elif self.detector.left(self.t_s, now, acceleration_z_m_s2):
+                self.left.append(self.t_s)
+
+    def hang(self, acceleration_z_m_s2: float = 0.0) -> Vec3:
+        return (0.0, 0.0, -self.payload_kg * (G_M_S2 + acceleration_z_m_s2))
+
+    def catch(self) -> None:
+        """A blow of 40 ms, then the weight."""
+        self.feel(0.04, (-6.0, 0.5, -9.0))
+        self.feel(1.0, self.hang())
+        assert self.detector.caught_s is not None
+
+
+EMPTY: Vec3 = (0.05, -0.03, 0.04)
+
+
+@pytest.mark.parametrize("payload_kg", [0.05, 0.1, 0.2, 0.3, 0.6])
+def test_catch_after_catch(payload_kg: float) -> None:
+    net = Net(payload_kg)
+    for number in range(1, 4):
+        net.feel(2.0, EMPTY)
+        net.catch()
+        blow_s = net.t_s - 1.04
+        assert net.detector.caught_s == pytest.approx(blow_s + DT_S)
+        net.feel(5.0, net.hang())
+        assert (len(net.caught), len(net.left)) == (number, number - 1)
+        gone_s = net.t_s
+        net.feel(2.0, EMPTY)
+        assert net.detector.caught_s is None
+        assert len(net.left) == number
+        assert 0.5 <= net.left[-1] - gone_s < 0.8
+    assert len(net.caught) == 3
+
+
+def test_a_bump_from_below_is_no_leaving() -> None:
+    net = Net()
+    net.catch()
+    net.feel(0.3, (0.0, 0.0, 0.1))
+    net.feel(1.0, net.hang())
+    net.feel(0.1, (0.0, 0.0, 8.0))
+    net.feel(1.0, net.hang())
+    assert net.left == []
+
+
+def test_a_push_that_lasts_is_no_leaving() -> None:
+    net = Net()
+    net.catch()
+    net.feel(3.0, (0.0, 0.0, 4.0))
+    assert net.left == []
+
+
+def test_a_falling_machine_has_not_lost_its_payload() -> None:
+    net = Net()
+    net.catch()
+    net.feel(0.8, net.hang(-9.5), acceleration_z_m_s2=-9.5)
+    net.feel(0.8, net.hang(-6.0), acceleration_z_m_s2=-6.0)
+    net.feel(1.0, net.hang(-2.0), acceleration_z_m_s2=-2.0)
+    assert net.left == []
+
+
+def test_a_swinging_payload_is_not_lost() -> None:
+    net = Net()
+    net.catch()
+    net.feel(4.0, lambda t_s: (0.5, 0.0, -net.payload_kg * G_M_S2 * (1.0 if t_s % 0.8 < 0.4 else 0.1)))
+    assert net.left == []
+
+
+def test_a_sensor_that_says_nothing_says_nothing_of_the_payload() -> None:
+    net = Net()
+    net.catch()
+    net.feel(3.0, None)
+    assert net.detector.caught_s is not None
+    net.feel(0.4, EMPTY)
+    net.feel(0.1, None)
+    net.feel(0.4, EMPTY)
+    assert net.left == [], "half a second without a gap was asked for"
+    net.feel(0.4, EMPTY)
+    assert len(net.left) == 1
+
+
+def test_no_catch_no_leaving() -> None:
+    net = Net()
+    net.feel(2.0, EMPTY)
+    net.feel(0.05, (5.0, 0.0, 1.0))
+    net.feel(2.0, EMPTY)
+    assert (net.caught, net.left) == ([], [])

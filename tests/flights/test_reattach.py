@@ -1,0 +1,125 @@
+"""Launcher, flight and guardian die together in the air, over real wires; a new `companion fly` finds what they left."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.analysis.log import FlightLog
+from companion.exit_codes import EXIT_ABORTED, EXIT_REFUSED
+from companion.types import AutopilotRequest
+from tests.support import HOVER, Running, Sandbox, World, read_summary, sandbox_in, set_options, wait_until
+
+OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
+LONG = set_options(
+    **{"mission.phases[1].duration_s": 40.0, "mission.phases[0].height_m": 1.6, "mission.phases[0].duration_s": 5.0}
+)
+IN_FLIGHT = "  hold\n"
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path) as sandbox:
+        yield sandbox
+
+
+def kill_the_companion(sandbox: Sandbox, first: Running) -> None:
+    """Launcher, flight and guardian at once, as when the computer goes down; the recorder with them."""
+    names = ("companion.app", "companion.guardian", "companion.recorder_process")
+    pids = [first.process.pid, *(sandbox.pid_of(name) for name in names)]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)  # none of them may react to another's end
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+    first.process.wait()
+
+
+def fly_until_hover(sandbox: Sandbox, world: World) -> None:
+    with sandbox.start("fly", HOVER, "--out", "first", *LONG, *world.addresses()) as first:
+        first.wait_for(IN_FLIGHT)
+        kill_the_companion(sandbox, first)
+
+
+def ids(summary: dict[str, Any]) -> list[str]:
+    return [event["id"] for event in summary["events"]]
+
+
+class Paused:
+    """The world stands still: PX4, physics and all, while a companion starts. It goes on when that companion speaks to PX4."""
+
+    def __init__(self, world: World) -> None:
+        self._process: subprocess.Popen[bytes] = world.process
+
+    def __enter__(self) -> None:
+        self._process.send_signal(signal.SIGSTOP)
+
+    def __exit__(self, *_: object) -> None:
+        self._process.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.flight
+@pytest.mark.parametrize("arm_opens", [True, False])
+def test_started_again_in_the_air_it_lands_what_it_finds(sandbox: Sandbox, arm_opens: bool) -> None:
+    with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:
+        fly_until_hover(sandbox, world)
+        # Limp, the arm may hang past its walls, and then its edge refuses it.
+        walls = set_options(**{"vehicle.arm.joints[1].angle_deg": [-170.0, 150.0]})
+        but: dict[str, Any] = {} if arm_opens else {"arm": {"port": "/dev/pts/none"}}
+        with Paused(world), sandbox.start("fly", HOVER, "--out", "second", *walls, *world.addresses(**but)) as second:
+            flight_pid = sandbox.cwd / "second/flight.pid"
+            wait_until(flight_pid.exists, lambda: "no flight process")
+            pid = int(flight_pid.read_text())
+            wait_until(lambda: has_udp_socket(pid), lambda: (sandbox.cwd / "second/flight.log").read_text())
+            world.process.send_signal(signal.SIGCONT)
+            ended = second.end()
+        assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
+        summary = read_summary(sandbox.cwd / "second")
+        assert ids(summary)[0] == "reattached", ids(summary)
+        assert "PX4 is armed and the companion has not armed it" in ended.out
+        assert "takeoff" not in ids(summary)
+        log = FlightLog.read(sandbox.cwd / "second/flight.mcap")
+        asked = {o.request for o in log.outputs}
+        assert not asked & {AutopilotRequest.ARM} and AutopilotRequest.LAND in asked
+        assert all(o.attitude is None or o.attitude.thrust == 0.0 for o in log.outputs)
+        assert any(o.arm_torque_nm is not None for o in log.outputs) is arm_opens
+        assert ("landing without it: arm bus" in ended.out) is not arm_opens
+        assert any(i.mocap is not None for i in log.inputs) and all(o.mocap_trusted for o in log.outputs)
+        assert world.armings == 1 and not world.crashes
+        wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+
+
+@pytest.mark.flight
+def test_left_alone_px4_lands_by_itself_and_the_next_companion_judges_it_as_any_other_start(sandbox: Sandbox) -> None:
+    """Disarmed by the time, the arm limp, and not where the next mission begins."""
+    with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:
+        fly_until_hover(sandbox, world)
+        wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
+        assert not world.crashes
+        elsewhere = set_options(**{"mission.start.position_m": [0.6, 0.0]})
+        ended = sandbox.run("fly", HOVER, "--out", "second", *elsewhere, *world.addresses())
+        assert ended.code == EXIT_REFUSED, (ended.out, ended.err)
+        assert world.armings == 1
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+
+
+def at_rest(world: World) -> bool:
+    rests = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]
+    return bool(rests) and rests[-1]
+
+
+def has_udp_socket(pid: int) -> bool:
+    """The flight process opens its devices: motion capture first."""
+    own = set()
+    for name in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):  # closed while we looked
+            own.add(os.readlink(name))
+    rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
+    return any(f"socket:[{row[9]}]" in own for row in rows)
