@@ -19,6 +19,8 @@ from companion.config.loader import FlightConfig
 from companion.realtime import WORLD_PRIORITY, claim_realtime
 from sitl.autopilot.mavlink import LinkError
 from sitl.faults import FaultError, in_time
+from sitl.px4 import RealPx4
+from sitl.px4_link import Px4Error
 from sitl.server import Ports, Sitl, start_of
 
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
@@ -34,26 +36,32 @@ def _say(message: dict[str, Any]) -> None:
         )  # unbuffered: nothing is left to be flushed into a closed pipe
 
 
-async def _serve(config: FlightConfig, for_launcher: bool, witness: Path) -> None:
+async def _serve(config: FlightConfig, for_launcher: bool, witness: Path, px4_folder: Path | None) -> None:
     start = config.mission.start
     ports = Ports() if for_launcher else _STANDARD
-    sitl = Sitl(
-        config.vehicle, config.world, start_of(start.position_m, start.yaw_deg, start.arm_deg), ports,
-        _say if for_launcher else _tell,
-    )  # fmt: skip
+    on_message = _say if for_launcher else _tell
+    px4 = None
+    if px4_folder is not None:
+        px4 = RealPx4(config.world, px4_folder, lambda text: on_message({"type": "progress", "text": text}))
+    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
+    sitl = Sitl(config.vehicle, config.world, pose, ports, on_message, px4)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, sitl.stop)
     async with sitl.wires() as devices:
+
+        def on_ready() -> None:
+            if for_launcher:
+                _say({"type": "ready", "devices": devices, "flight_environment": sitl.flight_environment()})
+            else:
+                _introduce(devices, px4)
+
         if for_launcher:
-            _say({"type": "ready", "devices": devices, "flight_environment": sitl.flight_environment()})
             _leave_with_launcher(sitl)
-        else:
-            _introduce(devices)
         claim_realtime(WORLD_PRIORITY)
-        await sitl.run()
+        await sitl.run(on_ready)
     if for_launcher:
-        _say_last(sitl, witness if config.world.faults else None)
+        _say_last(sitl, witness if config.world.faults or config.world.throws > 1 else None)
 
 
 def _say_last(sitl: Sitl, witness: Path | None) -> None:
@@ -83,15 +91,19 @@ def _leave_with_launcher(sitl: Sitl) -> None:
 def _tell(message: dict[str, Any]) -> None:
     if message["type"] == "event":
         print(f"  t = {message['t_s']:7.2f} s  payload {message['kind']}", flush=True)
+    elif message["type"] == "progress":
+        print(f"  {message['text']}", file=sys.stderr, flush=True)
     elif message["type"] == "at_rest":
         print("  disarmed" if message["at_rest"] else "  armed", flush=True)
 
 
-def _introduce(devices: dict[str, dict[str, Any]]) -> None:
+def _introduce(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) -> None:
     mocap = devices["mocap"]
+    port = 14540 + (px4.number if px4 is not None else 0)
+    name = "PX4 stub" if px4 is None else f"PX4 {px4.about()['version']}"
     print(
         "companion sitl is running; Ctrl-C ends it\n"
-        f"  PX4 stub      MAVLink 2 on UDP 127.0.0.1:14540 (MAVSDK: udpin://0.0.0.0:14540), from port 14580;\n"
+        f"  {name:<13} MAVLink 2 on UDP 127.0.0.1:{port} (MAVSDK: udpin://0.0.0.0:{port}), from port {port + 40};\n"
         "                ground stations on 14550; it arms once somebody forwards mocap as VISION_POSITION_ESTIMATE\n"
         f"  mocap         NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port "
         f"{mocap.get('data_port')}\n"
@@ -106,12 +118,13 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sitl")
     parser.add_argument("--config", type=Path, required=True, help="effective configuration, JSON")
     parser.add_argument("--for-launcher", action="store_true")
+    parser.add_argument("--px4", type=Path, metavar="DIR", help="fly a real PX4, which lives in this folder")
     arguments = parser.parse_args(argv)
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     try:
         witness = arguments.config.with_name(WITNESS)
-        asyncio.run(_serve(in_time(config), arguments.for_launcher, witness))
-    except (OSError, LinkError, FaultError) as error:
+        asyncio.run(_serve(in_time(config), arguments.for_launcher, witness, arguments.px4))
+    except (OSError, LinkError, FaultError, Px4Error) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:
             _say({"type": "error", "text": text})

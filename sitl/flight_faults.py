@@ -86,7 +86,7 @@ class FlightFaults:
         self._start_m: Vec3 = (0.0, 0.0, 0.0)
         self._position_m: Vec3 = (0.0, 0.0, 0.0)
         self._setpoint_s: float | None = None
-        self._vision_count = 0
+        self._vision_count: int | None = None
         self._vision_s = 0.0
         self._vision_gap_s = 0.0
         self._vision_back_s: float | None = None
@@ -95,14 +95,14 @@ class FlightFaults:
         self._worst_tilt_rad = 0.0
         self._due_s = -math.inf
 
-    def plant(self, kind: FlightFaultKind, t_s: float, position_m: Vec3, vision_count: int) -> bool:
+    def plant(self, kind: FlightFaultKind, t_s: float, position_m: Vec3, vision_count: int | None) -> bool:
         """Do it to the flight process; False: done already, or there is no such process.
 
         Args:
             kind: which.
             t_s: world time.
             position_m: of the vehicle, world.
-            vision_count: poses that PX4 has got so far.
+            vision_count: poses that PX4 has got so far; None: that is not to be seen from here.
         """
         if self.kind is not None or self.pid is None:
             return False
@@ -121,9 +121,14 @@ class FlightFaults:
                 os.kill(self.pid, signal.SIGCONT)
 
     def watch(
-        self, t_s: float, setpoint_at_s: float | None, vision_count: int, nav_state: NavState, armed: bool
+        self,
+        t_s: float,
+        setpoint_at_s: float | None,
+        vision_count: int | None,
+        nav_state: NavState | None,
+        armed: bool,
     ) -> bool:
-        """After every step; True: `sample` wants to be called."""
+        """After every step; True: `sample` wants to be called. What is None is not to be seen from here."""
         if self.kind is None or self._disarmed_s is not None:
             return False
         if setpoint_at_s is not None and setpoint_at_s > self._t_s and self._land_s is None:
@@ -157,13 +162,14 @@ class FlightFaults:
         def since(t_s: float | None) -> float | None:
             return None if t_s is None else round(t_s - self._t_s, 4)
 
+        seen = self._vision_count is not None
         moved = [b - a for a, b in zip(self._start_m, self._position_m, strict=True)]
         return {
             "kind": self.kind,
             "t_s": self._t_s,
             "start_m": list(self._start_m),
-            "last_setpoint_s": since(self._setpoint_s) or 0.0,
-            "vision_gap_s": round(self._vision_gap_s, 4),
+            "last_setpoint_s": (since(self._setpoint_s) or 0.0) if seen else None,
+            "vision_gap_s": round(self._vision_gap_s, 4) if seen else None,
             "vision_back_s": since(self._vision_back_s),
             "land_s": since(self._land_s),
             "disarmed_s": since(self._disarmed_s),

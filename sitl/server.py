@@ -19,17 +19,14 @@ from companion.config.faults import FaultKind
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
 from companion.types import Vec2
-from sitl.autopilot.autopilot import Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
-from sitl.autopilot.estimator import Estimator
-from sitl.autopilot.mavlink import GROUND_PORTS, MavlinkServer
 from sitl.autopilot.mavlink import Ports as LinkPorts
-from sitl.autopilot.params import Params
+from sitl.ends import AutopilotEnd, StubEnd
 from sitl.faults import Faults, Sample, sample
 from sitl.flight_faults import SIGNALS, FlightFaults, environment, strike
 from sitl.force_torque import ForceTorqueServer
 from sitl.natnet import BodyPose, NatNetServer
 from sitl.plant import MocapFrame, Plant
+from sitl.px4_link import Px4Error
 from sitl.servo_bus import ServoBus
 from sitl.servo_model import ServoModel
 from sitl.world import PHYSICS_DT_S
@@ -66,10 +63,25 @@ class Start:
 
 
 class Sitl:
-    """The plant and its wires."""
+    """The plant and its wires.
+
+    Args:
+        vehicle: the machine.
+        config: of the world.
+        start: where the machine stands.
+        ports: of the wires.
+        on_message: takes what happens.
+        autopilot: a real PX4; None: the stub.
+    """
 
     def __init__(
-        self, vehicle: Vehicle, config: WorldConfig, start: Start, ports: Ports, on_message: OnMessage
+        self,
+        vehicle: Vehicle,
+        config: WorldConfig,
+        start: Start,
+        ports: Ports,
+        on_message: OnMessage,
+        autopilot: AutopilotEnd | None = None,
     ) -> None:
         self._vehicle = vehicle
         self._config = config
@@ -77,16 +89,15 @@ class Sitl:
         arm = vehicle.arm
         device = vehicle.devices.arm
         self.servos = [ServoModel(joint.servo_id, baud_bps=device.baud) for joint in arm.joints]
-        params = Params()
-        self.px4 = Px4Stub(
-            params, Estimator(), Cascade(gains_from_params(params)), setpoint_delay_s=config.setpoint_delay_s
-        )
-        self.plant = Plant(vehicle, config, self.px4, self.servos, (start.position_m, start.yaw_rad, start.arm_rad))
-        params.set("MPC_THR_HOVER", self.plant.world.hover_command * (1.0 + config.hover_thrust_error))
+        stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
+        self.autopilot: AutopilotEnd = autopilot or StubEnd(config, stub_ports)
+        pose = (start.position_m, start.yaw_rad, start.arm_rad)
+        self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose)
+        self.autopilot.attach(self.plant.world)
         self.faults = Faults(
             config,
             self.plant.world,
-            self.px4,
+            self.autopilot.faulty,
             [servo.drive for servo in self.servos],
             vehicle.tether.anchor_world_m,
             self.servos,
@@ -99,6 +110,8 @@ class Sitl:
         self._course_due_s = 0.0
         self.frames: list[tuple[int, float]] = []
         """Numbers of motion-capture frames that had just been sent, and when: by them a log's clock is told from the world's."""
+        self.modes: list[tuple[float, str | None, bool]] = []
+        """Every change of what the autopilot does: world time, mode, armed."""
         self._struck: set[FaultKind] = set()
         self._strike_due_s = 0.0
         self._ports = ports
@@ -125,13 +138,7 @@ class Sitl:
                     rate_hz=self._config.mocap_rate_hz,
                 )
             )
-            self.mavlink = await stack.enter_async_context(
-                MavlinkServer(
-                    self.px4,
-                    LinkPorts(self._ports.autopilot_local, self._ports.autopilot_remote),
-                    GROUND_PORTS if self._ports.autopilot_remote else None,
-                )
-            )
+            address = await stack.enter_async_context(self.autopilot.wires())
             mocap = {
                 "server": "127.0.0.1",
                 "interface": "127.0.0.1",
@@ -143,7 +150,7 @@ class Sitl:
             if self._ports.multicast:
                 mocap["data_port"] = self.mocap.data_port
             yield {
-                "autopilot": {"address": f"udpout://127.0.0.1:{self.mavlink.onboard_port}"},
+                "autopilot": {"address": address},
                 "mocap": mocap,
                 "arm": {"port": self.bus.path},
                 "force": {"port": self.force.port},
@@ -163,16 +170,37 @@ class Sitl:
         self._leaving = True
         self._end_s = min(self._end_s, self.plant.t_s + _LEAVE_S)
 
-    async def run(self) -> None:
-        """Follow the wall clock until asked to stop."""
+    async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
+        """Follow the wall clock until asked to stop; `on_ready` is called when the autopilot can be flown.
+
+        Raises:
+            Px4Error: a real PX4 is not to be had, has ended or hangs.
+        """
+        try:
+            async with asyncio.TaskGroup() as group:
+                preparing = group.create_task(self._prepare(on_ready))
+                await self._follow_clock()
+                preparing.cancel()
+        except* Px4Error as errors:
+            raise errors.exceptions[0] from None
+
+    async def _prepare(self, on_ready: Callable[[], None]) -> None:
+        await self.autopilot.prepare()
+        on_ready()
+
+    async def _follow_clock(self) -> None:
+        lockstep = self.autopilot.lockstep
         origin_s = time.monotonic() - self.plant.t_s
-        while self.plant.t_s < self._end_s and not (self._leaving and not self.px4.armed):
+        while self.plant.t_s < self._end_s and not (self._leaving and not self.autopilot.armed):
             behind_s = time.monotonic() - origin_s - self.plant.t_s
             if behind_s > _CATCH_UP_S:
                 origin_s += behind_s - _CATCH_UP_S
                 self.slipped_s += behind_s - _CATCH_UP_S
+                self.autopilot.skip(behind_s - _CATCH_UP_S)
                 behind_s = _CATCH_UP_S
             for _ in range(int(behind_s / PHYSICS_DT_S)):
+                if lockstep:
+                    await self.autopilot.answered()
                 self._step()
             ahead_s = self.plant.t_s + PHYSICS_DT_S - (time.monotonic() - origin_s)
             await asyncio.sleep(max(0.0, ahead_s))
@@ -181,19 +209,24 @@ class Sitl:
         plant = self.plant
         if plant.faults is not None:
             self._plant_faults()
-        plant.step(self.px4.armed)
+        autopilot = self.autopilot
+        plant.step(autopilot.armed)
+        if autopilot.lockstep and plant.imu_due:
+            autopilot.sense(plant.sample_imu())
         for frame in plant.take_mocap():
             self._publish(frame)
         self.force.set_wrench(*plant.force_torque())
         self.force.tick(plant.t_s)
-        self.px4.battery = plant.battery()
-        self.mavlink.pump(plant.t_s)
-        px4 = self.px4
-        if self.flight.watch(plant.t_s, px4.setpoint_at_s, px4.vision_received, px4.nav_state, px4.armed):
+        autopilot.pump(plant.t_s, plant.battery())
+        noticed, armed = autopilot.noticed(), autopilot.armed
+        mode = None if noticed.nav_state is None else noticed.nav_state.name
+        if not self.modes or self.modes[-1][1:] != (mode, armed):
+            self.modes.append((plant.t_s, mode, armed))
+        if self.flight.watch(plant.t_s, *noticed, armed):
             self.flight.sample(plant.truth.position_world_m, plant.truth.attitude_wxyz)
         for event in plant.world.take_events():
             self._on_message({"type": "event", "kind": event.kind, "t_s": event.t_s})
-        at_rest = not self.px4.armed
+        at_rest = not armed
         if at_rest != self._at_rest:
             self._at_rest = at_rest
             self._on_message({"type": "at_rest", "at_rest": at_rest})
@@ -208,13 +241,12 @@ class Sitl:
         plant = self.plant
         for kind in SIGNALS:
             if plant.fault(kind) is not None:
-                self.flight.plant(kind, plant.t_s, plant.truth.position_world_m, self.px4.vision_received)
+                seen = self.autopilot.noticed()
+                self.flight.plant(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
         self._strike()
         self._note_course()
-        down = plant.fault("link_loss") is not None or plant.t_s < self.px4.booted_at_s
-        if down is not self.mavlink.link_down:
-            self.mavlink.link_down = down
-        self.mavlink.delay_s = self.faults.size("link_delay")
+        down = plant.fault("link_loss") is not None or self.autopilot.down
+        self.autopilot.set_link(down, self.faults.size("link_delay"))
         self.bus.damaged = self.faults.packet_lost
         self.force.silent = plant.fault("force_loss") is not None
         fault = plant.fault("servo_loss")
@@ -249,9 +281,10 @@ class Sitl:
         """What a campaign wants to know of a flight with faults."""
         return {
             **self.final(),
-            "armed": self.px4.armed,
+            "armed": self.autopilot.armed,
             "fault_begun_s": self.faults.begun_s,
             "mocap_frames": self.frames,
+            "modes": self.modes,
             "course": [dataclasses.astuple(point) for point in self.course],
         }
 
@@ -264,11 +297,14 @@ class Sitl:
             return None if t_s is None or armed is None else t_s - armed
 
         return {
+            "autopilot": self.autopilot.about(),
             "payload_kg": self._config.payload_kg,
             "thrown": world.thrown_t_s is not None,
             "caught": caught is not None,
             "caught_after_arming_s": since_arming(caught),
             "missed": world.missed,
+            "throws": world.throws,
+            "catches": world.catches,
             "crashed": world.crashed,
             "slipped_s": self.slipped_s,
             "flight_fault": self.flight.report(),

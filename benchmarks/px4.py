@@ -1,0 +1,266 @@
+"""The same flights on the stub and on a real PX4 (SITL), side by side: what differs, in figures.
+
+    PX4_SITL=.../build/px4_sitl_default python benchmarks/px4.py --keep flights/px4           # 36 flights, half an hour
+    python benchmarks/px4.py --keep flights/px4 --table                                       # only what lies there
+
+Flights that lie in the folder already are not flown again. Times after a fault are on the autopilot's own clock: of a real PX4 by its
+ULog (needs pyulog), of the stub by the world's. Exit code 0: every flight ended as it must, 1: not, or one could not be flown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.analysis.log import FlightLog, LogError
+from companion.faults_wires import WITNESS
+from sitl.px4_link import Px4Error
+from sitl.px4_log import Px4Log, newest
+
+ROOT = Path(__file__).parents[1]
+MISSION = ROOT / "configs/missions/catch.yaml"
+AUTOPILOTS = ("stub", "px4")
+TIMEOUT_S = 300.0
+LIKE_THE_STUB = 0.25
+"""By so much the position error after the catch may differ."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is flown."""
+
+    name: str
+    overrides: tuple[str, ...]
+    outcome: str
+    fault: bool
+
+
+def _fault(name: str, fault: dict[str, Any]) -> Case:
+    return Case(name, (f"world.faults={json.dumps([fault])}",), "aborted", fault=True)
+
+
+CASES = (
+    *(Case(f"catch-{kg:g}kg", (f"world.payload_kg={kg:g}",), "completed", fault=False) for kg in (0.1, 0.2, 0.3)),
+    *(_fault(kind, {"kind": kind, "after": "catch", "t_s": 0.1}) for kind in ("kill_flight", "stop_flight")),
+    _fault("mocap_loss", {"kind": "mocap_loss", "after": "catch", "t_s": 0.1, "duration_s": 2.0}),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One flight; None: not known, or it never happened. Times `*_s` of faults are since the fault."""
+
+    case: str
+    autopilot: str
+    version: str | None
+    run: int
+    outcome: str
+    as_it_must: bool
+    e_p_m: float | None
+    """Root mean square after the catch."""
+    e_q_deg: float | None
+    e_alpha_deg: float | None
+    latency_p50_ms: float | None
+    """Motion capture to setpoint."""
+    latency_p99_ms: float | None
+    modes: str
+    last_setpoint_s: float | None = None
+    vision_gap_s: float | None = None
+    mode: str | None = None
+    """The first one after OFFBOARD."""
+    mode_s: float | None = None
+    failsafe_s: float | None = None
+    disarmed_s: float | None = None
+
+
+def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
+    """One flight, unless it lies there already."""
+    if (folder / "summary.json").exists():
+        return
+    command = [sys.executable, "-m", "companion.cli", "fly", str(MISSION), f"--sitl={autopilot}", "--out", str(folder)]
+    command += ["--set", *case.overrides, f"world.seed={run}"]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with open(folder.with_suffix(".txt"), "wb") as output:
+        subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, timeout=TIMEOUT_S, check=False)
+
+
+def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
+    """What a flight's folder tells; None: it was not flown."""
+    if not (folder / "summary.json").exists():
+        return None
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    post, latency = summary["rms"]["post"], summary["latency_ms"]["mocap_to_setpoint"]
+    known: dict[str, Any] = {
+        "case": case.name, "autopilot": autopilot, "version": summary["autopilot"]["version"], "run": run,
+        "outcome": summary["outcome"], "as_it_must": summary["outcome"] == case.outcome,
+        "e_p_m": post["e_p_m"], "e_q_deg": post["e_q_deg"], "e_alpha_deg": post["e_alpha_deg"],
+        "latency_p50_ms": latency["p50"], "latency_p99_ms": latency["p99"], "modes": "",
+    }  # fmt: skip
+    witness = json.loads((folder / WITNESS).read_text(encoding="utf-8")) if (folder / WITNESS).exists() else None
+    if autopilot == "px4":
+        log = Px4Log.read(newest(folder))
+        known["modes"] = log.modes()
+        if case.fault and witness is not None and witness["fault_begun_s"] is not None:
+            known |= asdict(log.after(witness["fault_begun_s"]))
+    else:
+        known["modes"] = _modes_of(folder)
+        if case.fault and witness is not None and witness["fault_begun_s"] is not None:
+            known |= _after_fault_of_the_stub(witness)
+    return Row(**known)
+
+
+def _modes_of(folder: Path) -> str:
+    """The modes that the companion heard of while armed."""
+    try:
+        statuses = [inputs.status for inputs in FlightLog.read(folder / "flight.mcap").inputs]
+    except LogError:
+        return ""
+    flown = [status.mode.name for status in statuses if status is not None and status.armed]
+    return ", ".join(mode for i, mode in enumerate(flown) if i == 0 or mode != flown[i - 1])
+
+
+def _after_fault_of_the_stub(witness: dict[str, Any]) -> dict[str, Any]:
+    fault_s, report = witness["fault_begun_s"], witness.get("flight_fault") or {}
+    later = [(t_s - fault_s, mode, armed) for t_s, mode, armed in witness["modes"] if t_s > fault_s]
+    left = next(((t_s, mode) for t_s, mode, _ in later if mode != "OFFBOARD"), (None, None))
+    return {
+        "last_setpoint_s": report.get("last_setpoint_s"),
+        "vision_gap_s": report.get("vision_gap_s"),
+        "mode": left[1],
+        "mode_s": left[0],
+        "disarmed_s": next((t_s for t_s, _, armed in later if not armed), None),
+    }
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Two tables for docs/px4.md: flights without and with a fault; spreads over the runs."""
+    versions = sorted({row.version or "?" for row in rows if row.autopilot == "px4"})
+    lines = [
+        f"PX4 {' and '.join(versions)}; each cell: smallest to largest of the runs.",
+        "",
+        "| flight | autopilot | ended as it must | e_p after the catch, mm | e_q, deg | arm error, deg "
+        "| mocap to setpoint, ms (p50, p99) | modes |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for case in CASES:
+        for autopilot in AUTOPILOTS:
+            some = [row for row in rows if (row.case, row.autopilot) == (case.name, autopilot)]
+            if some and not case.fault:
+                lines.append(_flight_line(case, autopilot, some))
+    lines += [
+        "",
+        "| fault | autopilot | ended as it must | last setpoint, s | longest gap in vision, s | next mode | after, s "
+        "| PX4's own failsafe, s | disarmed, s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for case in CASES:
+        for autopilot in AUTOPILOTS:
+            some = [row for row in rows if (row.case, row.autopilot) == (case.name, autopilot)]
+            if some and case.fault:
+                lines.append(_fault_line(case, autopilot, some))
+    return "\n".join(lines) + "\n"
+
+
+def _flight_line(case: Case, autopilot: str, rows: Sequence[Row]) -> str:
+    cells = (
+        case.name,
+        autopilot,
+        _count(rows),
+        _spread([row.e_p_m for row in rows], 1e3, 1),
+        _spread([row.e_q_deg for row in rows], 1.0, 2),
+        _spread([row.e_alpha_deg for row in rows], 1.0, 2),
+        f"{_spread([row.latency_p50_ms for row in rows], 1.0, 1)}, {_spread([row.latency_p99_ms for row in rows], 1.0, 1)}",
+        " / ".join(sorted({row.modes for row in rows})),
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def _fault_line(case: Case, autopilot: str, rows: Sequence[Row]) -> str:
+    cells = (
+        case.name,
+        autopilot,
+        _count(rows),
+        _spread([row.last_setpoint_s for row in rows], 1.0, 3),
+        _spread([row.vision_gap_s for row in rows], 1.0, 3),
+        " / ".join(sorted({row.mode or "-" for row in rows})),
+        _spread([row.mode_s for row in rows], 1.0, 3),
+        _spread([row.failsafe_s for row in rows], 1.0, 2),
+        _spread([row.disarmed_s for row in rows], 1.0, 1),
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def _count(rows: Sequence[Row]) -> str:
+    return f"{sum(row.as_it_must for row in rows)} of {len(rows)}"
+
+
+def _spread(values: Sequence[float | None], scale: float, digits: int) -> str:
+    known = [value * scale for value in values if value is not None]
+    if not known:
+        return "-"
+    low, high = f"{min(known):.{digits}f}", f"{max(known):.{digits}f}"
+    return low if low == high else f"{low} to {high}"
+
+
+def verdicts(rows: Sequence[Row]) -> list[str]:
+    """What is not as it must be, one line each."""
+    found = [f"{row.case} on the {row.autopilot}, run {row.run}: {row.outcome}" for row in rows if not row.as_it_must]
+    for case in CASES:
+        errors = {
+            autopilot: [row.e_p_m for row in rows if (row.case, row.autopilot) == (case.name, autopilot) and row.e_p_m]
+            for autopilot in AUTOPILOTS
+        }
+        if not case.fault and all(errors.values()):
+            stub, real = (statistics.mean(errors[autopilot]) for autopilot in AUTOPILOTS)
+            if abs(real / stub - 1.0) > LIKE_THE_STUB:
+                found.append(f"{case.name}: e_p after the catch {1e3 * real:.1f} mm, on the stub {1e3 * stub:.1f} mm")
+    return found
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--keep", type=Path, required=True, metavar="DIR", help="folder of the flights")
+    parser.add_argument("--case", choices=[case.name for case in CASES], action="append", help="default: all")
+    parser.add_argument("--autopilot", choices=AUTOPILOTS, action="append", help="default: both")
+    parser.add_argument("--repeat", type=int, default=3, help="flights of each case")
+    parser.add_argument("--table", action="store_true", help="fly nothing")
+    parser.add_argument("--json", type=Path, help="write the rows here as well")
+    arguments = parser.parse_args(argv)
+    rows: list[Row] = []
+    failed = False
+    for run in range(1, arguments.repeat + 1):
+        for case in CASES:
+            for autopilot in arguments.autopilot or AUTOPILOTS:
+                if arguments.case is not None and case.name not in arguments.case:
+                    continue
+                folder = arguments.keep / f"{case.name}-{autopilot}-{run}"
+                try:
+                    if not arguments.table:
+                        fly(case, autopilot, run, folder)
+                    row = row_of(case, autopilot, run, folder)
+                except (Px4Error, subprocess.TimeoutExpired) as error:
+                    print(f"{folder}: {error}", file=sys.stderr)
+                    failed = True
+                    continue
+                if row is not None:
+                    rows.append(row)
+                    if not arguments.table:
+                        print(f"{folder.name}: {row.outcome}", file=sys.stderr, flush=True)
+    print(markdown(rows))
+    problems = verdicts(rows)
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
+    return 1 if problems or failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,174 @@
+"""What a real PX4's own log (ULog) says of a flight: modes, arming, what reached it and when, on PX4's clock.
+
+PX4's clock is the world's, plus `sitl.px4_link.CLOCK_ORIGIN_S`: times here are world times. Needs `pyulog`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.sitl_process import PX4_FOLDER
+from sitl.px4_link import CLOCK_ORIGIN_S, Px4Error
+
+NAV_STATES = {
+    0: "MANUAL", 1: "ALTCTL", 2: "POSCTL", 3: "MISSION", 4: "HOLD", 5: "RTL", 10: "ACRO", 12: "DESCEND", 13: "TERMINATION",
+    14: "OFFBOARD", 15: "STABILIZED", 17: "TAKEOFF", 18: "LAND",
+}  # fmt: skip
+"""vehicle_status.nav_state."""
+_ARMED = 2
+"""vehicle_status.arming_state."""
+_TOPICS = [
+    "vehicle_status",
+    "vehicle_visual_odometry",
+    "vehicle_attitude_setpoint",
+    "estimator_status",
+    "vehicle_local_position",
+]
+_EVENT_WINDOW_S = 2.0
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """From now on PX4 is in this mode, armed or not."""
+
+    t_s: float
+    mode: str
+    armed: bool
+    failsafe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class AfterFault:
+    """What PX4 saw of a fault: seconds since it was planted, None for what never happened."""
+
+    last_setpoint_s: float | None
+    """Of those of before: the last SET_ATTITUDE_TARGET before the longest pause, or before another mode flew."""
+    vision_gap_s: float | None
+    """The longest pause between two vision poses that begins within two seconds."""
+    mode: str | None
+    """The first mode that is not OFFBOARD."""
+    mode_s: float | None
+    failsafe_s: float | None
+    """PX4's own failsafe, not somebody's command."""
+    disarmed_s: float | None
+
+
+@dataclass(frozen=True)
+class Px4Log:
+    """One flight as PX4 logged it; all times are world times in s."""
+
+    changes: tuple[Change, ...]
+    vision_s: Array
+    setpoint_s: Array
+    """SET_ATTITUDE_TARGET while in OFFBOARD; in PX4's own modes its position controller."""
+    estimate_s: Array
+    position_ned_m: Array
+    """vehicle_local_position, N x 3, at `estimate_s`."""
+    parameters: dict[str, float | int]
+
+    @staticmethod
+    def read(path: Path) -> Px4Log:
+        """Read a ULog.
+
+        Raises:
+            Px4Error: no pyulog, no such file, or not one of a flight.
+        """
+        try:
+            ulog = importlib.import_module("pyulog")  # of the tests' extra: a flight does not need it
+        except ImportError:
+            raise Px4Error(
+                "PX4's log: expected the package pyulog, found none; pip install 'companion[test]'"
+            ) from None
+        try:
+            log = ulog.ULog(str(path), _TOPICS)
+        except (OSError, TypeError, ValueError, KeyError) as error:
+            raise Px4Error(f"{path}: expected a ULog of PX4, found something that cannot be read ({error})") from None
+        topics = {data.name: data.data for data in log.data_list if data.multi_id == 0}
+        missing = [name for name in ("vehicle_status", "vehicle_local_position") if name not in topics]
+        if missing:
+            raise Px4Error(f"{path}: expected the log of a flight, found no {missing[0]} in it")
+        position = topics["vehicle_local_position"]
+        return Px4Log(
+            tuple(_changes(topics["vehicle_status"])),
+            _times(topics.get("vehicle_visual_odometry")),
+            _times(topics.get("vehicle_attitude_setpoint")),
+            _times(position),
+            np.stack([np.asarray(position[axis], float) for axis in "xyz"], axis=1),
+            dict(log.initial_parameters),
+        )
+
+    def after(self, fault_s: float) -> AfterFault:
+        """What came of a fault at this world time."""
+        later = [change for change in self.changes if change.t_s > fault_s]
+        left = next((change for change in later if change.mode != "OFFBOARD"), None)
+        until_s = left.t_s if left is not None else math.inf
+        failsafe = next((change for change in later if change.failsafe), None)
+        disarmed = next((change for change in later if not change.armed), None)
+        return AfterFault(
+            _last_before_pause(self.setpoint_s, fault_s, until_s),
+            _longest_gap(self.vision_s, fault_s),
+            None if left is None else left.mode,
+            None if left is None else left.t_s - fault_s,
+            None if failsafe is None else failsafe.t_s - fault_s,
+            None if disarmed is None else disarmed.t_s - fault_s,
+        )
+
+    def modes(self) -> str:
+        """The modes that flew, in order: `OFFBOARD, LAND`."""
+        flown = [change.mode for change in self.changes if change.armed]
+        return ", ".join(mode for i, mode in enumerate(flown) if i == 0 or mode != flown[i - 1])
+
+
+def newest(flight: Path) -> Path:
+    """The log of the flight itself in the folder of a flight: PX4 writes one at every start.
+
+    Raises:
+        Px4Error: there is none.
+    """
+    logs = sorted((flight / PX4_FOLDER / "log").rglob("*.ulg"), key=lambda path: path.stat().st_mtime_ns)
+    if not logs:
+        raise Px4Error(
+            f"{flight}: expected a log of PX4 in {PX4_FOLDER}/log, found none; was it flown with --sitl=px4?"
+        )
+    return logs[-1]
+
+
+def _times(topic: dict[str, Any] | None) -> Array:
+    if topic is None:
+        return np.zeros(0)
+    return np.asarray(topic["timestamp"], float) * 1e-6 - CLOCK_ORIGIN_S
+
+
+def _changes(status: dict[str, Any]) -> Iterable[Change]:
+    before: tuple[Any, ...] | None = None
+    rows = zip(_times(status), status["nav_state"], status["arming_state"], status["failsafe"], strict=True)
+    for t_s, nav_state, arming_state, failsafe in rows:
+        now = (int(nav_state), int(arming_state) == _ARMED, bool(failsafe))
+        if now != before:
+            before = now
+            yield Change(float(t_s), NAV_STATES.get(now[0], str(now[0])), now[1], now[2])
+
+
+def _last_before_pause(times_s: Array, fault_s: float, until_s: float) -> float | None:
+    """The last one before the longest pause that begins within the window, relative to the fault."""
+    inside = times_s[(times_s > fault_s - 0.1) & (times_s < min(until_s, fault_s + _EVENT_WINDOW_S))]
+    if not len(inside):
+        return None
+    ends = np.append(inside[1:], min(until_s, fault_s + _EVENT_WINDOW_S))
+    return float(inside[int(np.argmax(ends - inside))] - fault_s)
+
+
+def _longest_gap(times_s: Array, fault_s: float) -> float | None:
+    begins = times_s[:-1]
+    chosen = (begins > fault_s - 0.1) & (begins < fault_s + _EVENT_WINDOW_S)
+    return float(np.max(np.diff(times_s)[chosen])) if chosen.any() else None

@@ -1,0 +1,187 @@
+"""The simulator link to a real PX4 over a real TCP socket: lockstep, its deadline, sensors, a PX4 that leaves and comes back."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import socket
+
+import pytest
+
+from companion.frames import quat_from_euler_zyx
+from sitl import px4_link
+from sitl.autopilot.types import ImuSample
+from sitl.px4_link import HilSensors, Px4Error, SimulatorLink, field_frd_gauss, pressure_hpa
+from tests.sitl.px4_peer import Answer, LockstepPeer
+
+DEADLINE_S = 20.0
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+PERIOD_S = 0.004
+
+
+def sample(i: int) -> ImuSample:
+    return ImuSample(i * PERIOD_S, (0.1, 0.2, 0.3), (0.0, 0.0, -9.81))
+
+
+def link() -> SimulatorLink:
+    return SimulatorLink(socket.create_server(("127.0.0.1", 0)), HilSensors(1))
+
+
+async def connected(link: SimulatorLink, answer: Answer) -> LockstepPeer:
+    return await asyncio.to_thread(LockstepPeer, link.port, answer)
+
+
+async def boot(link: SimulatorLink, i: int = 0) -> int:
+    """Samples until the first answer; the number of the next one."""
+    async with asyncio.timeout(DEADLINE_S):
+        while not link.in_step:
+            link.send(sample(i), 0.3, LEVEL)
+            await link.until_in_step(PERIOD_S)
+            i += 1
+    return i
+
+
+async def until_it_fails(link: SimulatorLink, i: int) -> None:
+    async with asyncio.timeout(DEADLINE_S):
+        while True:
+            i += 1
+            link.send(sample(i), 0.3, LEVEL)
+            await link.answered()
+
+
+def test_each_sample_is_answered_before_the_next_one_and_the_answer_is_its_own() -> None:
+    def answer(message: object) -> list[float]:
+        return [(message.time_usec // 4000) % 100 / 100.0] * 4  # type: ignore[attr-defined]
+
+    async def scenario() -> None:
+        async with link() as under_test:
+            with await connected(under_test, answer) as peer:
+                first = await boot(under_test)
+                for i in range(first, first + 200):
+                    under_test.send(sample(i), 0.3, LEVEL)
+                    await under_test.answered()
+                    assert under_test.rotors[0] == pytest.approx((px4_link.clock_us(i * PERIOD_S) // 4000) % 100 / 100)
+                assert under_test.armed
+                stamps = [message.time_usec for message in peer.sensors]
+                assert {later - earlier for earlier, later in itertools.pairwise(stamps)} == {4000}
+                assert under_test.unanswered == 0
+
+    asyncio.run(scenario())
+
+
+def test_a_world_that_was_held_up_does_not_hold_up_px4s_clock() -> None:
+    async def scenario() -> None:
+        async with link() as under_test:
+            with await connected(under_test, lambda _: [0.0] * 4) as peer:
+                first = await boot(under_test)
+                under_test.clock_ahead_s += 0.1
+                under_test.send(sample(first), 0.3, LEVEL)
+                await under_test.answered()
+                before, after = (message.time_usec for message in peer.sensors[-2:])
+                assert after - before == 104_000
+
+    asyncio.run(scenario())
+
+
+def test_a_px4_that_boots_is_not_waited_for_and_one_that_stops_answering_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(px4_link, "ANSWER_PATIENCE_S", 0.05)
+    monkeypatch.setattr(px4_link, "ANSWER_DEADLINE_S", 0.15)
+    answers = 3
+
+    def answer(message: object) -> list[float] | None:
+        nonlocal answers
+        answers -= 1
+        return [0.5] * 4 if answers >= 0 else None
+
+    async def scenario() -> None:
+        async with link() as under_test:
+            under_test.send(sample(0), 0.3, LEVEL)
+            await under_test.answered()  # nobody there: nothing to wait for
+            with await connected(under_test, answer):
+                i = await boot(under_test, 1)
+                with pytest.raises(Px4Error, match=r"lockstep.*none for") as raised:
+                    await until_it_fails(under_test, i)
+                assert "\n" not in str(raised.value)
+                assert under_test.unanswered == 3, "patience, three times, is the deadline"
+
+    asyncio.run(scenario())
+
+
+def test_one_sample_without_an_answer_does_not_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(px4_link, "ANSWER_PATIENCE_S", 0.05)
+
+    async def scenario() -> None:
+        async with link() as under_test:
+            with await connected(under_test, lambda m: None if m.time_usec == px4_link.clock_us(1.0) else [0.5] * 4):
+                await boot(under_test)
+                for i in (249, 250, 251):
+                    under_test.send(sample(i), 0.3, LEVEL)
+                    await under_test.answered()
+                assert under_test.unanswered == 1
+
+    asyncio.run(scenario())
+
+
+def test_a_px4_that_leaves_stops_the_rotors_and_may_come_back() -> None:
+    async def scenario() -> None:
+        async with link() as under_test:
+            with await connected(under_test, lambda message: [0.5] * 4):
+                i = await boot(under_test)
+                assert under_test.rotors == (0.5, 0.5, 0.5, 0.5)
+                under_test.send(sample(i), 0.3, LEVEL)
+            assert await under_test.until_gone(DEADLINE_S)
+            await under_test.answered()  # what was pending will never come
+            assert under_test.rotors == (0.0, 0.0, 0.0, 0.0)
+            assert not under_test.armed
+            with await connected(under_test, lambda message: [0.25] * 4):
+                await boot(under_test, i + 1)
+                assert under_test.rotors[0] == 0.25
+                assert under_test.connections == 2
+
+    asyncio.run(scenario())
+
+
+def test_a_second_px4_is_turned_away() -> None:
+    async def scenario() -> None:
+        async with link() as under_test:
+            with await connected(under_test, lambda message: [0.5] * 4):
+                i = await boot(under_test)
+                reader, writer = await asyncio.open_connection("127.0.0.1", under_test.port)
+                async with asyncio.timeout(DEADLINE_S):
+                    with contextlib.suppress(ConnectionError):
+                        assert await reader.read(1) == b"", "closed"
+                writer.close()
+                under_test.send(sample(i), 0.3, LEVEL)
+                await under_test.answered()
+                assert (under_test.connections, under_test.unanswered) == (1, 0)
+
+    asyncio.run(scenario())
+
+
+def test_what_px4_senses() -> None:
+    sensors = HilSensors(1)
+    messages = [sensors.message(sample(i), 1.0, LEVEL) for i in range(250)]
+    accel_and_gyro = 0b111111
+    assert all(message.fields_updated & accel_and_gyro == accel_and_gyro for message in messages)
+    assert sum(message.fields_updated >> 6 & 1 for message in messages) == 50, "magnetometer, Hz"
+    pressures = [message.abs_pressure for message in messages if message.fields_updated >> 9 & 1]
+    assert len(pressures) == 50, "barometer, Hz"
+    assert sum(pressures) / 50 == pytest.approx(pressure_hpa(489.0), abs=0.01)
+    assert all(message.fields_updated >> 10 & 1 == 0 for message in messages), "no airspeed"
+    assert (messages[0].xgyro, messages[0].ygyro, messages[0].zgyro) == (0.1, 0.2, 0.3)
+    assert messages[0].zacc == -9.81
+
+
+def test_pressure_falls_with_height() -> None:
+    assert pressure_hpa(0.0) == pytest.approx(1013.25)
+    assert pressure_hpa(0.0) - pressure_hpa(8.4) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("yaw_enu_deg", "forward", "right"), [(90.0, 0.21, 0.01), (0.0, 0.01, -0.21)])
+def test_the_field_points_north_and_down(yaw_enu_deg: float, forward: float, right: float) -> None:
+    """World x is east: a vehicle that looks along y looks north."""
+    attitude = quat_from_euler_zyx(0.0, 0.0, yaw_enu_deg / 57.29577951308232)
+    assert field_frd_gauss(attitude) == pytest.approx((forward, right, 0.43), abs=1e-6)

@@ -1,0 +1,155 @@
+"""The world's own MAVLink link to PX4, against the stub on the ports where PX4's camera link is; and the relay for link faults."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import socket
+from collections.abc import AsyncIterator
+
+import pytest
+
+from companion.config.faults import Fault
+from companion.config.world import World
+from sitl.autopilot.mavlink import MavlinkServer, Ports
+from sitl.autopilot.modes import NavState
+from sitl.model import ROTOR_ARM_M
+from sitl.px4 import OF_THE_STUB, refuse_what_needs_the_stub
+from sitl.px4_link import Px4Error
+from sitl.px4_process import Instance
+from sitl.px4_relay import Relay
+from sitl.px4_vehicle import parameters, rotor_geometry
+from sitl.px4_witness import Witness, same
+from tests.sitl.px4_rig import Rig
+
+DEADLINE_S = 20.0
+
+
+@contextlib.asynccontextmanager
+async def witnessed() -> AsyncIterator[tuple[Witness, Rig]]:
+    with Instance.claim() as instance:
+        rig = Rig({"MAV_SYS_ID": instance.number + 1})
+        port = instance.witness.getsockname()[1]
+        stop = asyncio.Event()
+        async with (
+            MavlinkServer(rig.stub, Ports(instance.witness_address[1], port)) as server,
+            asyncio.TaskGroup() as group,
+        ):
+            group.create_task(rig.fly(server, stop))
+            try:
+                async with Witness(instance) as witness:
+                    yield witness, rig
+            finally:
+                stop.set()
+
+
+def test_parameters_are_written_by_type_and_read_back() -> None:
+    async def scenario() -> None:
+        async with witnessed() as (witness, rig):
+            await witness.until_heard()
+            await witness.write({"EKF2_EV_CTRL": 15, "MPC_THR_HOVER": 0.43, "COM_OF_LOSS_T": 0.3})
+            assert rig.params["EKF2_EV_CTRL"] == 15
+            assert rig.params["MPC_THR_HOVER"] == pytest.approx(0.43)
+            found = await witness.read(["EKF2_EV_CTRL", "MPC_THR_HOVER", "NO_SUCH_NAME"])
+            assert set(found) == {"EKF2_EV_CTRL", "MPC_THR_HOVER"}
+            assert same(found["MPC_THR_HOVER"], 0.43)
+            assert found["EKF2_EV_CTRL"] == 15 and isinstance(found["EKF2_EV_CTRL"], int)
+
+    asyncio.run(scenario())
+
+
+def test_a_parameter_that_is_not_taken_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sitl.px4_witness.PARAMS_DEADLINE_S", 0.5)
+
+    async def scenario() -> None:
+        async with witnessed() as (witness, _):
+            await witness.until_heard()
+            with pytest.raises(Px4Error, match="expected EKF2_EV_CTRL to become 15, found 11"):
+                await witness.write({"EKF2_EV_CTRL": 15.0})  # of the wrong type: PX4 ignores it
+
+    asyncio.run(scenario())
+
+
+def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sitl.px4_witness.HEARTBEAT_DEADLINE_S", 0.3)
+
+    async def scenario() -> None:
+        with Instance.claim() as instance:
+            async with Witness(instance) as witness:
+                with pytest.raises(Px4Error, match="expected a heartbeat on UDP"):
+                    await witness.until_heard()
+
+    asyncio.run(scenario())
+
+
+def test_a_mode_is_chosen_and_seen() -> None:
+    async def scenario() -> None:
+        async with witnessed() as (witness, rig):
+            await witness.until_heard()
+            witness.choose_mode(NavState.LAND)
+            async with asyncio.timeout(DEADLINE_S):
+                while witness.nav_state is not NavState.LAND:
+                    await witness.until_heard()
+            assert rig.stub.nav_state is NavState.LAND
+
+    asyncio.run(scenario())
+
+
+def test_the_geometry_is_that_of_the_world() -> None:
+    """Front right first, turning counter-clockwise; FRD, so right is positive."""
+    geometry = rotor_geometry()
+    offset = ROTOR_ARM_M / math.sqrt(2.0)
+    places = [(geometry[f"CA_ROTOR{i}_PX"], geometry[f"CA_ROTOR{i}_PY"]) for i in range(4)]
+    assert places == [(offset, offset), (-offset, -offset), (offset, -offset), (-offset, offset)]
+    assert [geometry[f"CA_ROTOR{i}_KM"] > 0 for i in range(4)] == [True, True, False, False]
+
+
+def test_the_hover_thrust_is_wrong_by_what_the_world_says() -> None:
+    assert parameters(World(hover_thrust_error=0.1), 0.5)["MPC_THR_HOVER"] == pytest.approx(0.55)
+
+
+@pytest.mark.parametrize("kind", list(OF_THE_STUB))
+def test_a_fault_that_needs_the_stub_is_refused_in_one_line(kind: str) -> None:
+    world = World(faults=(Fault.model_validate({"kind": kind, "t_s": 1.0}),))
+    with pytest.raises(Px4Error, match=f"world.faults: {kind} .* needs the stub's inside; fly it with --sitl"):
+        refuse_what_needs_the_stub(world)
+
+
+def test_every_other_fault_is_flown() -> None:
+    refuse_what_needs_the_stub(World(faults=(Fault(kind="link_delay", t_s=1.0), Fault(kind="kill_flight", t_s=1.0))))
+    with pytest.raises(Px4Error, match="battery_start"):
+        refuse_what_needs_the_stub(World(battery_start=0.5))
+
+
+def test_the_relay_passes_on_both_ways_until_it_is_down() -> None:
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        with Instance.claim() as instance, contextlib.ExitStack() as stack:
+            px4, companion = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+            px4.bind(instance.onboard_address)
+            for end in (px4, companion):
+                end.setblocking(False)
+            relay = Relay(instance)
+            async with relay.opened() as address, asyncio.timeout(DEADLINE_S):
+                host, port = address.removeprefix("udpout://").split(":")
+                companion.connect((host, int(port)))
+                companion.send(b"up")
+                data, source = await loop.sock_recvfrom(px4, 100)
+                assert (data, source[1]) == (b"up", instance.onboard_port)
+                px4.sendto(b"down", source)
+                assert await loop.sock_recv(companion, 100) == b"down"
+                relay.down = True
+                companion.send(b"lost")
+                px4.sendto(b"lost", source)
+                await asyncio.sleep(0)
+                relay.delay_s = 0.01
+                while relay.heard < 4:  # noqa: ASYNC110 - a datagram that is dropped sets no event
+                    await asyncio.sleep(0.001)
+                relay.down = False
+                companion.send(b"late")
+                assert await loop.sock_recv(px4, 100) == b"late", "what came while it was down is lost"
+                px4.sendto(b"late", source)
+                assert await loop.sock_recv(companion, 100) == b"late"
+
+    asyncio.run(scenario())
