@@ -16,8 +16,7 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import AsyncIterator, Coroutine, Iterator
-from dataclasses import dataclass
+from collections.abc import Coroutine, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,25 +24,29 @@ from companion import status
 from companion.clock import Clock, flight_clock
 from companion.config.loader import FlightConfig
 from companion.core import NOMINAL_DT_S, FlightCore
+from companion.devices import Edges, open_edges
 from companion.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
 from companion.flight_guard import FlightGuard
 from companion.guardian.client import GuardianClient
-from companion.io.arm import DynamixelArm
+from companion.hand_over import hand_over, unflown
 from companion.io.autopilot import MavsdkAutopilot
 from companion.io.edges import DeviceError
-from companion.io.force_torque import RobotousForceTorque
-from companion.io.mocap import NatNetMocap
 from companion.io.recorder import RecorderProcess, epoch_offset_ns
+from companion.mission.plan import Plan
+from companion.preflight import run as preflight
+from companion.preflight.observations import Observations
+from companion.preflight.rows import refusals
 from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.safety.rules import REATTACHED
 from companion.ticker import Ticker
 from companion.types import (
     AutopilotRequest,
+    Event,
     Inputs,
-    LandedState,
-    MocapPose,
     OperatorCommand,
     Outcome,
     Outputs,
+    SafetyAction,
     Sent,
     Severity,
     Vec2,
@@ -51,54 +54,21 @@ from companion.types import (
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.003
-HAND_OVER_S = 30.0
-HAND_OVER_MIN_S = 1.5
-"""PX4 says once a second whether it is armed; an older word does not count."""
 _HOVER_PARAM = "MPC_THR_HOVER"
 
 _T = TypeVar("_T")
 
 
-@dataclass(slots=True)
-class VisionValve:
-    """Whether poses are passed on to PX4; the core shuts it while it does not believe them."""
-
-    open: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class Edges:
-    """Everything on a wire, open."""
-
-    vision: VisionValve
-    autopilot: MavsdkAutopilot
-    mocap: NatNetMocap
-    arm: DynamixelArm
-    force: RobotousForceTorque
-
-
-@contextlib.asynccontextmanager
-async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]:
-    """Open every device; the arm, which gets torque, last. Motion capture flows to PX4 from the first frame on."""
-    devices = config.vehicle.devices
-    forward: list[MavsdkAutopilot] = []
-    valve = VisionValve()
-
-    def on_pose(pose: MocapPose) -> None:
-        if forward and valve.open and pose.tracking_valid:
-            forward[0].send_vision(pose)
-
-    async with contextlib.AsyncExitStack() as stack:
-        force = await stack.enter_async_context(RobotousForceTorque(devices.force, clock))
-        mocap = await stack.enter_async_context(NatNetMocap(devices.mocap, clock, on_pose))
-        autopilot = await stack.enter_async_context(MavsdkAutopilot(devices.autopilot, clock))
-        forward.append(autopilot)
-        arm = await stack.enter_async_context(DynamixelArm(devices.arm, config.vehicle.arm, clock))
-        yield Edges(valve, autopilot, mocap, arm, force)
-
-
 class GivenUp(Exception):
     """A landing was asked for before the flight began."""
+
+
+class Refused(Exception):
+    """The preflight refuses; `lines` say why, one each."""
+
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__("; ".join(lines))
+        self.lines = lines
 
 
 class Operator:
@@ -191,39 +161,22 @@ class Flight:
                 self._guardian.tick(inputs, outputs)
             if outputs.outcome is not None:
                 return outputs.outcome
-            tick += 1
-
-    async def hand_over(self) -> Outcome:
-        """After an error of our own, without a guardian: PX4 lands, motion capture goes on flowing to it, nothing else is sent.
-
-        Returns:
-            ABORTED once PX4 has disarmed, LOST if it has not within `HAND_OVER_S`.
-        """
-        autopilot, start_s = self._edges.autopilot, self._clock()
-        while self._clock() - start_s < HAND_OVER_S:
-            now = autopilot.status()
-            if now is not None and not now.armed and self._clock() - start_s > HAND_OVER_MIN_S:
+            if tick == 0 and self._edges.found_armed and not self._goes_on(outputs):
                 return Outcome.ABORTED
-            stands = now is not None and now.landed is LandedState.ON_GROUND
-            autopilot.request(AutopilotRequest.DISARM if stands else AutopilotRequest.LAND)
-            status.send(self._channel, {"type": "handed over"})
-            if self._guardian is not None:
-                self._guardian.still_here()
-            await asyncio.sleep(0.05)
-        return Outcome.LOST
+            tick += 1
 
     async def _tick(self, tick: int, start_s: float, lateness_s: float) -> tuple[Inputs, Outputs, Sent]:
         edges = self._edges
-        arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S)
+        arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S) if edges.arm is not None else None
         joint_read_s = self._clock()
         inputs = Inputs(
             tick=tick,
             t_s=joint_read_s,
             vehicle=edges.autopilot.vehicle(),
             status=edges.autopilot.status(),
-            mocap=edges.mocap.latest(),
+            mocap=edges.mocap.latest() if edges.mocap is not None else None,
             arm=arm_state,
-            force=edges.force.latest(),
+            force=edges.force.latest() if edges.force is not None else None,
             command=self._operator.command,
             recorder_dropped=self._recorder.client.dropped,
             guardian_ready=self._guardian.ready if self._guardian is not None else None,
@@ -232,7 +185,7 @@ class Flight:
         edges.vision.open = outputs.mocap_trusted
         core_s = self._clock()
         torque_sent: Vec2 | None = None
-        if outputs.arm_torque_nm is not None:
+        if outputs.arm_torque_nm is not None and edges.arm is not None:
             torque_sent = edges.arm.write_torque(outputs.arm_torque_nm)
         current_s = self._clock()
         attitude_sent = outputs.attitude is not None and edges.autopilot.send_attitude(outputs.attitude)
@@ -253,25 +206,41 @@ class Flight:
         self._recorder.client.record(inputs, outputs, sent)
         return inputs, outputs, sent
 
+    def _goes_on(self, outputs: Outputs) -> bool:
+        """Whether PX4, armed when its link was opened, still is: else there is nothing to land, and no reason to fly a mission."""
+        goes_on = any(event.id == REATTACHED.id for event in outputs.events)
+        lines = [f"landing without it: {line}" for line in self._edges.failures]
+        if not goes_on:
+            lines = [
+                "PX4 was armed when the companion started, and has disarmed since; nothing was lifted: start again to fly"
+            ]
+        for text in lines:
+            self._tell(0, outputs, Event(outputs.t_s, REATTACHED.id, Severity.WARNING, SafetyAction.WARN, text))
+            self._recorder.client.text(outputs.t_s, Severity.WARNING, REATTACHED.id, text)
+        return goes_on
+
     def _report(self, tick: int, outputs: Outputs, sent: Sent) -> None:
         for event in outputs.events:
-            message = {
-                "type": "event",
-                "tick": tick,
-                "t_s": outputs.mission_t_s,
-                "flight_t_s": event.t_s,
-                "id": event.id,
-                "severity": event.severity.value,
-                "action": event.action.value,
-                "text": event.text,
-            }
-            status.send(self._channel, message)
+            self._tell(tick, outputs, event)
         if tick % STATUS_EVERY and outputs.outcome is None:
             return
         for text in self._edges.autopilot.take_messages():
             self._recorder.client.text(outputs.t_s, Severity.WARNING, "px4", text)
             status.send(self._channel, {"type": "px4", "text": text})
         status.send(self._channel, self._status(tick, outputs, sent))
+
+    def _tell(self, tick: int, outputs: Outputs, event: Event) -> None:
+        message = {
+            "type": "event",
+            "tick": tick,
+            "t_s": outputs.mission_t_s,
+            "flight_t_s": event.t_s,
+            "id": event.id,
+            "severity": event.severity.value,
+            "action": event.action.value,
+            "text": event.text,
+        }
+        status.send(self._channel, message)
 
     def _status(self, tick: int, outputs: Outputs, sent: Sent) -> status.Message:
         error = outputs.control.error if outputs.control else None
@@ -297,7 +266,12 @@ class Flight:
 
 
 async def fly(
-    config: FlightConfig, out: Path, channel: socket.socket, guardian_channel: socket.socket | None = None
+    config: FlightConfig,
+    out: Path,
+    channel: socket.socket,
+    guardian_channel: socket.socket | None = None,
+    *,
+    sitl: bool = False,
 ) -> Outcome:
     """Open, fly, close.
 
@@ -306,10 +280,12 @@ async def fly(
         out: folder of the flight.
         channel: to the launcher.
         guardian_channel: to the guardian; None: nobody stands by.
+        sitl: the devices are those of the simulated world.
 
     Raises:
         DeviceError: a device is not there or not as it must be; nothing was armed.
-        GivenUp: a landing was asked for while the devices were being opened; nothing was armed.
+        Refused: something is not as it must be for a flight; nothing was armed.
+        GivenUp: a landing was asked for before the first tick; nothing was armed.
     """
     origin_s = time.monotonic()
     clock = flight_clock(origin_s)
@@ -318,18 +294,35 @@ async def fly(
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(operator.attention())
         edges = await operator.unless_land(stack.enter_async_context(open_edges(config, clock)))
-        config = await operator.unless_land(with_hover_thrust(config, edges.autopilot))
-        if client is not None:
-            await operator.unless_land(client.wait_ready())
-        recorder = await asyncio.to_thread(
-            RecorderProcess.start,
-            out / "flight.mcap",
-            config_json=config.model_dump_json(),
-            epoch_offset_ns=epoch_offset_ns(clock()),
-            metadata={"mission": config.mission.name, "law": config.controller.law, "preset": config.controller.preset},
-        )
+        if edges.found_armed:  # it flies, perhaps: nothing is waited for
+            config = unflown(config)
+        else:
+            await operator.unless_land(check_before_flight(edges, config, clock, out, channel, sitl))
+            config = await operator.unless_land(with_hover_thrust(config, edges.autopilot))
+            if client is not None:
+                await operator.unless_land(client.wait_ready())
         try:
-            recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
+            recorder = await asyncio.to_thread(
+                RecorderProcess.start,
+                out / "flight.mcap",
+                config_json=config.model_dump_json(),
+                epoch_offset_ns=epoch_offset_ns(clock()),
+                metadata={
+                    "mission": config.mission.name,
+                    "law": config.controller.law,
+                    "preset": config.controller.preset,
+                },
+            )
+        except DeviceError as error:
+            if not edges.found_armed:
+                raise
+            print(error, file=sys.stderr)  # no log, but a landing
+            outcome = await hand_over(edges.autopilot, channel, clock, None)
+            status.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
+            return outcome
+        try:
+            if not edges.found_armed:
+                recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
             guardian = FlightGuard(client, edges.autopilot.identity(), origin_s) if client is not None else None
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
@@ -348,7 +341,7 @@ async def fly(
                     sys.stderr.flush()
                 if guardian is not None and guardian.would_take_over:
                     os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
-                outcome = await flight.hand_over()
+                outcome = await hand_over(edges.autopilot, channel, clock, guardian)
             if guardian is not None and outcome is not Outcome.LOST:
                 guardian.goodbye()
         finally:
@@ -356,6 +349,34 @@ async def fly(
         recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}
         status.send(channel, {"type": "result", "outcome": outcome.value, "recorder": recorded})
     return outcome
+
+
+async def check_before_flight(
+    edges: Edges, config: FlightConfig, clock: Clock, out: Path, channel: socket.socket, sitl: bool
+) -> None:
+    """The preflight, told to the launcher and written to `preflight.json`.
+
+    Raises:
+        DeviceError: `preflight.json` cannot be written.
+        Refused: a row refuses.
+    """
+
+    def tell(text: str, share: float) -> None:
+        status.send(channel, {"type": "preflight_progress", "text": text, "share": share})
+
+    # A path takes seconds to plan, once in a process: here, where motion capture goes on flowing meanwhile.
+    plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
+    known = Observations(0.0, 0.0, mission_s=plan.duration_s)
+    rows = await preflight.preflight(edges, config, clock, out=out, tell=tell, known=known, sitl=sitl)
+    status.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
+    try:
+        preflight.write(rows, out)
+    except OSError as error:
+        raise DeviceError(
+            f"{out / preflight.FILE}: cannot be written: {error.strerror}; choose another --out"
+        ) from None
+    if refused := refusals(rows):
+        raise Refused([row.line() for row in refused])
 
 
 async def with_hover_thrust(config: FlightConfig, autopilot: MavsdkAutopilot) -> FlightConfig:
@@ -385,15 +406,20 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--channel", type=int, required=True, help="socket to the launcher")
     parser.add_argument("--guardian", type=int, required=True, help="socket to the guardian")
+    parser.add_argument("--sitl", action="store_true", help="the devices are those of the simulated world")
     arguments = parser.parse_args(argv)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the launcher's: it asks for a landing
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     channel = socket.socket(fileno=arguments.channel)
     channel.setblocking(False)
     try:
-        outcome = asyncio.run(fly(config, arguments.out, channel, socket.socket(fileno=arguments.guardian)))
+        guardian = socket.socket(fileno=arguments.guardian)
+        outcome = asyncio.run(fly(config, arguments.out, channel, guardian, sitl=arguments.sitl))
     except DeviceError as error:
         status.send(channel, {"type": "refused", "lines": str(error).splitlines()})
+        return EXIT_REFUSED
+    except Refused as refused:
+        status.send(channel, {"type": "refused", "lines": refused.lines})
         return EXIT_REFUSED
     except GivenUp:
         outcome = Outcome.ABORTED

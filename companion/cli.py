@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion import compare_command, faults_command, hover_command, robustness_command
+from companion import compare_command, faults_command, hover_command, px4_command, robustness_command
 from companion.campaign_command import why_unusable
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
@@ -83,12 +83,26 @@ def _parser() -> argparse.ArgumentParser:
 
     fly = commands.add_parser("fly", help="fly a mission", description="Fly a mission, on the vehicle or in SITL.")
     _add_flight_options(fly)
-    fly.add_argument("--sitl", metavar="stub", help="fly in the simulated world")
+    fly.add_argument(
+        "--sitl", metavar="stub|px4", help="fly in the simulated world: with our stub of PX4, or with a real PX4 (SITL)"
+    )
     fly.add_argument("--out", metavar="DIR", help="where log and report go (default: flights/TIME-MISSION)")
     fly.set_defaults(run=_fly)
 
-    check = commands.add_parser("check", help="check a mission without flying it")
-    _add_flight_options(check)
+    check = commands.add_parser(
+        "check",
+        help="may the machine fly? devices, PX4's parameters, frames and mission; nothing moves",
+        description="Look at everything that a flight would look at before it arms. Exit code 0: it may fly, 3: it may not.",
+    )
+    _add_flight_options(check, mission_default=True)
+    check.add_argument(
+        "--sitl",
+        metavar="stub|px4",
+        help="look at the simulated world's devices, with our stub of PX4 or with a real PX4",
+    )
+    check.add_argument("--hand", action="store_true", help="then do the guided hand test, for a new set-up")
+    check.add_argument("--json", action="store_true", help="print the rows as JSON, nothing else")
+    check.add_argument("--plan-only", action="store_true", help="look at the mission alone, at no device")
     check.set_defaults(run=_check)
 
     schema = commands.add_parser("schema", help="print the JSON Schema of a file, for editors")
@@ -97,12 +111,14 @@ def _parser() -> argparse.ArgumentParser:
 
     sitl = commands.add_parser("sitl", help="run the simulated world alone, for QGroundControl or a script of your own")
     _add_flight_options(sitl, mission_default=True)
+    sitl.add_argument("--px4", action="store_true", help="with a real PX4 (SITL) instead of our stub of it")
     sitl.set_defaults(run=_sitl)
 
     compare_command.add_parser(commands)
     robustness_command.add_parser(commands)
     faults_command.add_parser(commands)
     hover_command.add_parser(commands)
+    px4_command.add_parser(commands)
 
     report = commands.add_parser("report", help="make summary and report of a log again")
     report.add_argument("log", type=Path)
@@ -145,26 +161,19 @@ def _problems(config: FlightConfig) -> list[str]:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    config = _load(arguments)
-    problems = _problems(config)
-    for line in problems:
-        tell(line)
-    if problems:
+    from companion import check_command  # with it comes MAVSDK
+
+    if arguments.sitl not in (None, "stub", "px4"):
+        tell(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
-    print(f"{arguments.mission}: mission {config.mission.name!r} can be flown by {config.vehicle.name}")
-    return EXIT_OK
+    return check_command.run(arguments, _load(arguments), _problems)
 
 
 def _fly(arguments: argparse.Namespace) -> int:
     from companion.flight import run_flight
 
-    if arguments.sitl == "px4":
-        tell(
-            "companion fly: --sitl=px4: a real PX4 in the loop is not supported yet; use --sitl, which brings its own stub"
-        )
-        return EXIT_BAD_INPUT
-    if arguments.sitl not in (None, "stub"):
-        tell(f"companion fly: --sitl={arguments.sitl}: expected --sitl or --sitl=stub")
+    if arguments.sitl not in (None, "stub", "px4"):
+        tell(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
     if arguments.out is not None and not arguments.out.strip():
         tell("companion fly: --out: expected the name of a folder, got an empty one")
@@ -181,7 +190,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     if problem is not None:
         tell(f"companion fly: --out {out}: {problem}")
         return EXIT_BAD_INPUT
-    return run_flight(config, out, sitl=arguments.sitl is not None, console=terminal_console())
+    return run_flight(config, out, sitl=arguments.sitl, console=terminal_console())
 
 
 def _sitl(arguments: argparse.Namespace) -> int:
@@ -189,7 +198,11 @@ def _sitl(arguments: argparse.Namespace) -> int:
     # In place of this process: signals reach the world itself, and there is nobody whom it could outlive.
     file = os.memfd_create("sitl-config", 0)
     os.write(file, config.model_dump_json().encode())
-    os.execv(sys.executable, [sys.executable, "-m", "sitl", "--config", f"/proc/self/fd/{file}"])
+    command = [sys.executable, "-m", "sitl", "--config", f"/proc/self/fd/{file}"]
+    if arguments.px4:
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        command += ["--px4", str((Path("flights") / f"{stamp}-sitl" / "px4").resolve())]
+    os.execv(sys.executable, command)
 
 
 def _report(arguments: argparse.Namespace) -> int:

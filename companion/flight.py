@@ -12,17 +12,28 @@ from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.children import LaunchError
 from companion.config.loader import FlightConfig
-from companion.launcher import FlightResult, Launcher, landing_signals
+from companion.launcher import FlightResult, Launcher, Sitl, landing_signals
+from companion.status import Message
 from companion.terminal import FlightDisplay, print_result, tell
 from companion.types import Outcome
 
+TICKS_MAX = 60_000
+"""Of a longer flight (5 minutes at 200 Hz) fewer ticks are graded and drawn: all ticks of an hour would take 6 GB."""
 
-def run_flight(config: FlightConfig, out: Path, *, sitl: bool, console: Console) -> int:
+
+def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: Console) -> int:
     """Fly, then write summary and report; returns the exit code."""
-    where = "SITL" if sitl else config.vehicle.name
+    where = config.vehicle.name if sitl is None else "SITL" if sitl == "stub" else "a real PX4 in SITL"
     title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
     display = FlightDisplay(console, title)
-    launcher = Launcher(config, out, sitl=sitl, on_message=display.on_message)
+
+    def on_message(message: Message) -> None:
+        if message.get("type") == "progress" and message.get("source") == "sitl":
+            display.say(message["text"])
+        else:
+            display.on_message(message)
+
+    launcher = Launcher(config, out, sitl=sitl or False, on_message=on_message)
     # A second Ctrl-C may come when a short flight is over already: it must not cost the summary.
     with landing_signals(launcher.ask_to_land):
         with display:
@@ -56,7 +67,7 @@ def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[Fli
     path = out / "flight.mcap"
     if path.exists():
         try:
-            log = FlightLog.read(path)
+            log = FlightLog.read(path, ticks_max=TICKS_MAX)
         except LogError as error:
             tell(error)
     about: dict[str, Any] = {
@@ -67,11 +78,18 @@ def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[Fli
         "recorder": result.recorder,
     }
     summary = summarise(log, **about) if log is not None else empty_summary(**about)
+    summary["autopilot"] = _autopilot(log, result.world)
     logged = {event["id"] for event in summary["events"]}
     summary["events"] += [event for event in result.events if event["id"] not in logged]
     summary["events"] += result.guardian_events
     write_summary(summary, out / "summary.json")
     return log, summary
+
+
+def _autopilot(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]:
+    """Who flew: kind (stub or px4), version, and what else the world knows; on the vehicle by what PX4 said."""
+    firmware = None if log is None else log.metadata.get("autopilot", {}).get("firmware")
+    return {"kind": "px4", "version": firmware, "firmware": firmware, **world.get("autopilot", {})}
 
 
 def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None:
@@ -89,7 +107,7 @@ def report_again(path: Path, out: Path) -> Path | None:
     Raises:
         LogError: the file is no log.
     """
-    log = FlightLog.read(path)
+    log = FlightLog.read(path, ticks_max=TICKS_MAX)
     before = path.parent / "summary.json"
     known = json.loads(before.read_text(encoding="utf-8")) if before.exists() else {}
     recorded = [outputs.outcome for outputs in log.outputs if outputs.outcome is not None]
@@ -101,6 +119,7 @@ def report_again(path: Path, out: Path) -> Path | None:
         payload_kg=known.get("payload_kg"),
         recorder=known.get("recorder"),
     )
+    summary["autopilot"] = known.get("autopilot") or _autopilot(log, {})
     # The guardian acts after the last tick: its events are no outputs of the core.
     recorded_ids = {event["id"] for event in summary["events"]}
     summary["events"] += [event for event in known.get("events", ()) if event["id"] not in recorded_ids]

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from companion import status
 from companion.children import LaunchError, holds_traceback, how_it_ended, last_line, terminate, write_text
@@ -39,6 +39,8 @@ GUARDIAN_LEAVE_TIMEOUT_S = 5.0
 RECORDER_CLOSE_TIMEOUT_S = 10.0
 
 OnMessage = Callable[[status.Message], None]
+Sitl = Literal["stub", "px4"]
+"""Who stands for the autopilot in the simulated world."""
 
 
 @dataclass
@@ -79,14 +81,14 @@ class Launcher:
     Args:
         config: checked configuration; with SITL the device addresses are replaced by the world's.
         out: folder for everything that the flight leaves; exists already.
-        sitl: fly in the simulated world.
-        on_message: called with every message of the flight process, for the display.
+        sitl: fly in the simulated world; "px4": with a real PX4 in it, True or "stub": with the stub.
+        on_message: called with every message of the flight process, for the display; those of the world have a "source" of "sitl".
     """
 
-    def __init__(self, config: FlightConfig, out: Path, *, sitl: bool, on_message: OnMessage) -> None:
+    def __init__(self, config: FlightConfig, out: Path, *, sitl: bool | Sitl, on_message: OnMessage) -> None:
         self._config = config
         self._out = out
-        self._use_sitl = sitl
+        self._sitl_kind = sitl
         self._on_message = on_message
         self._stop_asked = False
         self._channel: socket.socket | None = None
@@ -118,9 +120,9 @@ class Launcher:
         sitl: SitlProcess | None = None
         try:
             config = self._config
-            if self._use_sitl:
-                sitl = SitlProcess(config, self._out)
-                config = with_devices(config, sitl.devices())
+            if self._sitl_kind:
+                sitl = SitlProcess(config, self._out, px4=self._sitl_kind == "px4")
+                config = with_devices(config, sitl.devices(self._on_world_message, lambda: self._stop_asked))
             path = self._out / "config.json"
             write_text(path, config.model_dump_json(indent=1))
             outcome = Outcome.ABORTED if self._stop_asked else self._fly(path, sitl)
@@ -140,6 +142,9 @@ class Launcher:
         events = tuple(self._guardian.summary_events()) if self._guardian is not None else ()
         return FlightResult(outcome, recorder, world, tuple(self._events), events, self._lines(outcome))
 
+    def _on_world_message(self, message: dict[str, Any]) -> None:
+        self._on_message({**message, "source": "sitl"})
+
     def _fly(self, config_path: Path, sitl: SitlProcess | None) -> Outcome:
         log_path = self._out / "flight.log"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -154,6 +159,7 @@ class Launcher:
                     [
                         *(sys.executable, "-m", "companion.app", "--config", str(config_path), "--out", str(self._out)),
                         *("--channel", str(theirs.fileno()), "--guardian", str(beats_out.fileno())),
+                        *(("--sitl",) if sitl is not None else ()),
                     ],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
@@ -251,7 +257,7 @@ class Launcher:
             readable, _, _ = select.select(channels, [], [], 0.5)
             if sitl is not None:
                 for message in sitl.messages(0.0):
-                    self._on_message({**message, "source": "sitl"})
+                    self._on_world_message(message)
                 if sitl.ended:  # there is nothing left that anybody could land
                     guardian.kill()
                     process.kill()

@@ -6,6 +6,7 @@ import contextlib
 import gc
 import os
 import sys
+import threading
 from pathlib import Path
 
 GIL_SWITCH_S = 0.0005
@@ -35,3 +36,18 @@ def claim_realtime(priority: int) -> str:
     except (OSError, AttributeError) as error:
         return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO); garbage collection off"
     return f"SCHED_FIFO {priority}; garbage collection off"
+
+
+def realtime_permitted(priority: int) -> str | None:
+    """Whether `claim_realtime` would get real-time scheduling: tried on a thread that ends at once. None: it is refused."""
+    got: list[str] = []
+
+    def attempt() -> None:
+        with contextlib.suppress(OSError, AttributeError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))  # 0: the calling thread alone
+            got.append(f"SCHED_FIFO {priority}")
+
+    thread = threading.Thread(target=attempt, name="realtime-permission")
+    thread.start()
+    thread.join()
+    return got[0] if got else None

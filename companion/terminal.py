@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from companion.preflight.rows import Level, Row
 from companion.status import Message
 
 
@@ -71,7 +72,7 @@ class _Numbers(ProgressColumn):
     def render(self, task: Task) -> Text:
         m: Message = task.fields.get("status") or {}
         if not m:
-            return Text("")
+            return Text(task.fields.get("note") or "", no_wrap=True, overflow="ellipsis")
         error = m.get("error_m")
         parts = [f"t {m['mission_t_s']:5.1f} s"]
         if error is not None:
@@ -128,15 +129,35 @@ class FlightDisplay:
                 )
         elif kind == "event":
             self._line(f"t {message['t_s']:6.2f} s", message["text"], _SEVERITY_STYLE[message["severity"]])
+        elif kind == "preflight_progress":
+            if not self._console.is_terminal and self._phase != "preflight":
+                self._line("preflight", message["text"], "cyan")
+            self._phase = "preflight"
+            self._progress.update(self._task, description="preflight", completed=message["share"], note=message["text"])
+        elif kind == "preflight":
+            self._preflight(message["rows"])
         elif kind == "px4":
             self._line("PX4", message["text"], "yellow")
+
+    def _preflight(self, rows: list[Message]) -> None:
+        """Rows that refuse are told at the end, as the reason of the refusal."""
+        self._progress.update(self._task, description="starting", completed=0.0, note="")
+        bad = [row for row in rows if not row["ok"]]
+        warned = [row for row in bad if row["level"] == Level.WARN.value]
+        refused = len(bad) - len(warned)
+        told = f"{len(rows)} checks: " + (f"{refused} refused" if refused else "ok")
+        self._line("preflight", told + (f", {len(warned)} to look at" if warned else ""), "red" if refused else "green")
+        for row in warned:
+            self._line("", Row(**{**row, "level": Level.WARN}).line(), "yellow")
 
     def say(self, text: str) -> None:
         """One line of the launcher's own."""
         self._line("", text, "yellow")
 
     def _line(self, head: str, text: str, style: str) -> None:
-        self._progress.console.print(f"  [dim]{escape(head):<11}[/] [{style}]{escape(text)}[/]", highlight=False)
+        self._progress.console.print(
+            f"  [dim]{escape(head):<11}[/] [{style}]{escape(text)}[/]", highlight=False, soft_wrap=True
+        )
 
 
 def print_result(console: Console, summary: dict[str, Any], out: Path, report: Path | None) -> None:
@@ -180,6 +201,9 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
     slack = (summary.get("tether") or {}).get("min_slack_m")
     if slack is not None:
         facts.add_row("tether", f"least slack {slack:.2f} m")
+    every = summary.get("graded_every", 1)
+    if every > 1:
+        facts.add_row("graded", f"every {every}th tick of a long flight; loop and latencies: every tick")
     facts.add_row("report", str(report) if report else f"none; what there is lies in {out}")
     console.print()
     console.print(facts, highlight=False, soft_wrap=True)

@@ -192,7 +192,7 @@ def test_bad_file(sandbox: Sandbox, case: str, command: str) -> None:
     name, edit, patterns = BAD_FILES[case]
     path = sandbox.cwd / name
     path.write_text(edit(path.read_text(encoding="utf-8")), encoding="utf-8")
-    assert_refused(sandbox, FLY if command == "fly" else ("check", "mission.yaml"), patterns)
+    assert_refused(sandbox, FLY if command == "fly" else ("check", "mission.yaml", "--plan-only"), patterns)
 
 
 def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox) -> None:
@@ -202,6 +202,6 @@ def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox) -> None:
 
 
 def test_the_good_files_that_the_bad_ones_are_made_of_pass(sandbox: Sandbox) -> None:
-    ended = sandbox.run("check", "mission.yaml", "--set", "world.payload_kg=0.1", "world.seed=2")
+    ended = sandbox.run("check", "mission.yaml", "--plan-only", "--set", "world.payload_kg=0.1", "world.seed=2")
     assert (ended.code, ended.err) == (EXIT_OK, "")
     assert "can be flown" in ended.out

@@ -7,8 +7,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import time
-import tty
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -53,25 +53,29 @@ def test_given_up_while_the_world_starts(sandbox: Sandbox, number: signal.Signal
 
 
 @contextmanager
-def pty_that_never_answers() -> Iterator[tuple[int, str]]:
-    """Master and name of a raw serial port."""
-    master, slave = os.openpty()
-    try:
-        tty.setraw(slave)
-        yield master, os.ttyname(slave)
-    finally:
-        os.close(slave)
-        os.close(master)
+def motive_that_never_answers() -> Iterator[tuple[socket.socket, list[str]]]:
+    """Its socket, and the options that lead there: motion capture is the first device to be opened."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as motive:
+        motive.bind(("127.0.0.1", 0))
+        motive.settimeout(DEADLINE_S)
+        there = {
+            "server": "127.0.0.1",
+            "interface": "127.0.0.1",
+            "transport": "unicast",
+            "command_port": motive.getsockname()[1],
+        }
+        yield motive, set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in there.items()})
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signal.Signals) -> None:
-    with pty_that_never_answers() as (master, port):
-        options = set_options(**{"vehicle.devices.force.port": port})
-        with sandbox.start("fly", HOVER, "--out", "out", *options) as running:
-            assert os.read(master, 1)  # the flight process speaks to the sensor
-            running.signal(number)
-            ended = running.end()
+    with (
+        motive_that_never_answers() as (motive, options),
+        sandbox.start("fly", HOVER, "--out", "out", *options) as running,
+    ):
+        assert motive.recv(100)  # the flight process speaks to it
+        running.signal(number)
+        ended = running.end()
     sandbox.assert_nobody_left()
     assert (ended.code, ended.err) == (EXIT_ABORTED, "")
     assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
@@ -79,12 +83,13 @@ def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signa
 
 
 def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
-    with pty_that_never_answers() as (master, port):
-        options = set_options(**{"vehicle.devices.force.port": port})
-        with sandbox.start("fly", HOVER, "--out", "out", *options) as running:
-            assert os.read(master, 1)
-            running.process.kill()
-            sandbox.assert_nobody_left(DEADLINE_S)
+    with (
+        motive_that_never_answers() as (motive, options),
+        sandbox.start("fly", HOVER, "--out", "out", *options) as running,
+    ):
+        assert motive.recv(100)
+        running.process.kill()
+        sandbox.assert_nobody_left(DEADLINE_S)
 
 
 def test_given_up_before_arming(sandbox: Sandbox) -> None:

@@ -68,10 +68,10 @@ def test_the_commands_show_it_in_a_terminal_and_not_in_a_pipe(
     monkeypatch.setattr(planning_progress, "SHOW_AFTER_S", 0.0)
     monkeypatch.setenv("TERM", "xterm")
     with terminal_as_standard_error(monkeypatch) as seen:
-        assert cli.main(["check", str(CIRCUIT)]) == 0
+        assert cli.main(["check", str(CIRCUIT), "--plan-only"]) == 0
     assert b"planning" in seen
     assert capsys.readouterr().out.count("\n") == 1
-    assert cli.main(["check", str(CIRCUIT)]) == 0
+    assert cli.main(["check", str(CIRCUIT), "--plan-only"]) == 0
     assert capsys.readouterr().err == ""
 
 

@@ -142,11 +142,11 @@ def test_refuses(sandbox: Sandbox, world: World, case: str) -> None:
 
 WRONG_START = {
     "arm far from the mission's start": Wrong(
-        r"^mission 'catch': starts with the arm at \(150, 140\) deg, but it is at \(165, 140\) deg, .*; move it there",
+        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) deg within 10 deg; move it there by hand",
         also={"mission.start.arm_deg": [150.0, 140.0]},
     ),
     "vehicle far from the mission's start": Wrong(
-        r"^mission 'catch': starts at \(-0\.5, 0\) m, but the vehicle stands at \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, .*; carry",
+        r"^start place in motion capture's axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m .*; carry it there",
         also={"mission.start.position_m": [-0.5, 0.0]},
     ),
 }
@@ -155,7 +155,7 @@ WRONG_START = {
 @pytest.mark.parametrize("case", WRONG_START)
 def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: World, case: str) -> None:
     wrong = WRONG_START[case]
-    ended = refused(sandbox, fresh_world, *fresh_world.addresses(), *set_options(**wrong.also), events=True)
+    ended = refused(sandbox, fresh_world, *fresh_world.addresses(), *set_options(**wrong.also))
     assert_one_line(ended, wrong.line)
 
 
@@ -255,13 +255,18 @@ def as_float_bits(value: int) -> float:
 
 def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world: World) -> None:
     with px4_param(fresh_world, "EKF2_EV_CTRL", 0):
-        ended = refused(sandbox, fresh_world, *fresh_world.addresses(), events=True)
-    assert_one_line(ended, r"^no data from: PX4 state")
+        ended = refused(sandbox, fresh_world, *fresh_world.addresses())
+    for pattern in (
+        r"^EKF2_EV_CTRL: 0, wanted 11 or 15; set EKF2_EV_CTRL to 11 \(companion px4 params --write\)$",
+        r"^EKF2 fuses motion capture: the estimator says that it has no good .*, wanted fused for 5 s; check EKF2_EV_CTRL = 11",
+    ):
+        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
 
 
-def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox, fresh_world: World) -> None:
-    with px4_param(fresh_world, "COM_OF_LOSS_T", -1.0):  # every setpoint is too old
-        ended = refused(sandbox, fresh_world, *fresh_world.addresses(), events=True)
+def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox, tmp_path: Path) -> None:
+    refuses = ("world.faults=[{kind: arming_refused, phase: ground}]",)
+    with sandbox_in(tmp_path / "world") as around, World(around, CATCH, refuses) as world:
+        ended = refused(sandbox, world, *world.addresses(), events=True)
     assert_one_line(ended, r"^PX4 did not arm; PX4 said: ARM refused: temporarily rejected")
 
 

@@ -72,6 +72,33 @@ class MocapStream:
     """Server's name and version."""
     other_bodies: tuple[int, ...] = ()
     """Rigid bodies in the stream that are not ours."""
+    body_name: str = ""
+    """Of ours, as the server says it; empty: it does not."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForceStream:
+    """What the force sensor's edge counted while it was watched."""
+
+    samples: int
+    bad_sums: int
+    """Packets with a wrong checksum since the port was opened."""
+    product: str
+    """The sensor's own name and firmware."""
+    lost: str | None = None
+    """Why the port is not read any more; None: it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class StateCounts:
+    """Messages of PX4's state while it was watched."""
+
+    position: int
+    """LOCAL_POSITION_NED."""
+    attitude: int
+    """ATTITUDE_QUATERNION."""
+    imu: int
+    """HIGHRES_IMU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,5 +125,25 @@ class Observations:
     """None: no broker was asked for. Empty: it answered. Else why it did not."""
     hand_test: str | None = None
     """None: not asked for. Else what is on record of the guided hand test of this set-up; empty: nothing is."""
+    hand_test_changed: str = ""
+    """What the set-up differs in from the one that the test was passed with; empty: it never was."""
+    state_counts: StateCounts | None = None
+    force_stream: ForceStream | None = None
+    arm_reads: tuple[int, int] | None = None
+    """Bus cycles, and how many of them brought no answer."""
+    mission_s: float | None = None
+    """Length of the planned mission."""
+    plan: tuple[str, ...] | None = None
+    """Why the mission cannot be flown as written, one line each; None: that was looked at before."""
+    recorder: str | None = None
+    """None: not tried. Empty: a log could be opened. Else why not."""
     failures: Mapping[str, str] = field(default_factory=dict)
     """Device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`), and the edge's own line about it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """What is worth waiting for, beyond the observation itself."""
+
+    what: str
+    longest_s: float

@@ -1,0 +1,245 @@
+"""The arm: the right servos, set up as the law needs them, sound, answering, and where joints can be. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+from companion.config.vehicle import Vehicle
+from companion.preflight.checks import Check
+from companion.preflight.observations import Observations, ServoReport
+from companion.preflight.rows import Row
+from companion.safety.monitors_arm import error_text
+from companion.types import ArmState
+
+DEVICE = Check(
+    "arm.device", "arm bus", "the port opens, both servos answer and take their settings", "no arm, no flight"
+)
+MODEL = Check(
+    "arm.model", "servos", "XM430-W210 (model 1030)", "another servo has another torque constant and other registers"
+)
+FIRMWARE = Check(
+    "arm.firmware",
+    "servo firmware",
+    "38 or newer, the same on both",
+    "older firmware has no bus watchdog: an arm whose companion died goes on pulling",
+)
+MODE = Check(
+    "arm.mode", "operating mode", "current control (register 11 is 0)", "a torque would be taken for something else"
+)
+RETURN_DELAY = Check(
+    "arm.return_delay",
+    "return delay",
+    "0 us (register 9)",
+    "the factory's 500 us a servo are a fifth of a control tick",
+)
+WATCHDOG = Check(
+    "arm.watchdog",
+    "bus watchdog",
+    "`devices.arm.watchdog_ms` (register 98)",
+    "a dead companion would leave the arm under torque",
+)
+CURRENT_LIMIT = Check(
+    "arm.current_limit",
+    "current limit",
+    "what `torque_max_nm` needs (register 38)",
+    "the arm would be weaker than the law believes",
+)
+VOLTAGE = Check(
+    "arm.voltage", "servo supply", "10.0 to 14.8 V", "outside of it the servos let go with an input voltage error"
+)
+TEMPERATURE = Check(
+    "arm.temperature",
+    "servo temperature",
+    "`safety.servo_warn_c`; from `safety.servo_max_c` on refused",
+    "at 80 degC a servo lets go",
+)
+ERROR = Check(
+    "arm.error",
+    "servo hardware error",
+    "none (register 70)",
+    "a servo with an error gives no torque until it is rebooted",
+)
+ANGLES = Check(
+    "arm.angles",
+    "joint angles",
+    "within the walls of both joints",
+    "beyond a wall links touch the airframe, or zero_count and sign are wrong",
+)
+STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "an arm that sinks or is touched falsifies the tare")
+READS = Check(
+    "arm.reads",
+    "bus cycles without an answer",
+    "0.1 %; above 10 % refused",
+    "`safety.arm_read_failures_max` of them in a row end the flight",
+)
+USB = Check(
+    "arm.usb_latency",
+    "arm's USB latency timer",
+    "1 ms, or no FTDI adapter",
+    "more costs control ticks; from 5 ms on the bus is refused when it is opened",
+    warns=True,
+)
+CHECKS = (
+    DEVICE, MODEL, FIRMWARE, MODE, RETURN_DELAY, WATCHDOG, CURRENT_LIMIT, VOLTAGE, TEMPERATURE, ERROR, ANGLES, STILL, READS, USB,
+)  # fmt: skip
+
+MODEL_XM430_W210 = 1030
+FIRMWARE_MIN = 38
+MODE_CURRENT = 0
+MODES = {0: "current", 1: "velocity", 3: "position", 4: "extended position", 5: "current-based position", 16: "PWM"}
+AMP_PER_COUNT = 2.69e-3
+VOLTAGE_MIN_V, VOLTAGE_MAX_V = 10.0, 14.8
+STILL_RAD = math.radians(3.0)
+MISSED_GOOD, MISSED_MAX = 0.001, 0.1
+LATENCY_GOOD_MS = 1
+WATCHDOG_BIT = 0x80
+
+
+def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
+    """What was seen of the arm."""
+    failure = o.failures.get("arm")
+    if failure is not None:
+        yield DEVICE.bad(failure, "", "")
+        return
+    yield DEVICE.good(f"{vehicle.devices.arm.port} at {vehicle.devices.arm.baud} baud")
+    if o.servos:
+        yield from _settings(o.servos, vehicle)
+    if o.arm:
+        yield from _states(o.arm, vehicle)
+    if o.arm_reads is not None:
+        yield _reads(*o.arm_reads)
+    if o.machine is not None:
+        yield usb_latency(USB, o.machine.arm_latency_ms)
+
+
+def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
+    models = [servo.model for servo in servos]
+    read = ", ".join(f"id {servo.servo_id}: {_model(servo.model)}" for servo in servos)
+    if all(model == MODEL_XM430_W210 for model in models):
+        yield MODEL.good(read, "XM430-W210")
+    else:
+        yield MODEL.bad(
+            read, "XM430-W210", "build in the servo that the vehicle file means, or correct arm.joints[].servo_id"
+        )
+    firmwares = [servo.firmware for servo in servos]
+    fix = "update with DYNAMIXEL Wizard: Recovery, newest firmware"
+    read, wanted = _both(firmwares), f"{FIRMWARE_MIN} or newer"
+    if min(firmwares) < FIRMWARE_MIN:
+        yield FIRMWARE.bad(read, wanted, fix)
+    elif len(set(firmwares)) > 1:
+        yield FIRMWARE.doubtful(read, f"{wanted}, the same on both", fix)
+    else:
+        yield FIRMWARE.good(read, wanted)
+    modes = [servo.operating_mode for servo in servos]
+    yield _equal(MODE, modes, MODE_CURRENT, _mode, "another program has set it: close that, cycle the servos' power")
+    delays_us = [servo.return_delay_us for servo in servos]
+    yield _equal(RETURN_DELAY, delays_us, 0, "{} us".format, "another program has set it: close that, start again")
+    watchdogs_ms = [servo.watchdog_ms for servo in servos]
+    wanted_ms = vehicle.devices.arm.watchdog_ms
+    yield _equal(WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; look for a loose supply")
+    yield _current_limit(servos, vehicle)
+    volts = [servo.voltage_v for servo in servos]
+    read, wanted = _both([f"{volt:.1f} V" for volt in volts]), f"{VOLTAGE_MIN_V:g} to {VOLTAGE_MAX_V:g} V"
+    if all(VOLTAGE_MIN_V <= volt <= VOLTAGE_MAX_V for volt in volts):
+        yield VOLTAGE.good(read, wanted)
+    else:
+        yield VOLTAGE.bad(read, wanted, "feed the servos with 12 V from a converter; check its plugs")
+
+
+def _current_limit(servos: Sequence[ServoReport], vehicle: Vehicle) -> Row:
+    per_count_nm = vehicle.arm.torque_per_amp_nm_a * AMP_PER_COUNT
+    limits = [servo.current_limit_counts for servo in servos]
+    needed = [math.floor(joint.torque_max_nm / per_count_nm + 1e-9) for joint in vehicle.arm.joints]
+    read = _both([f"{limit} ({limit * per_count_nm:.2f} N m)" for limit in limits])
+    wanted = f"at least {_both(needed)}"
+    if all(limit >= need for limit, need in zip(limits, needed, strict=True)):
+        return CURRENT_LIMIT.good(read, wanted)
+    return CURRENT_LIMIT.bad(
+        read, wanted, "raise register 38 with DYNAMIXEL Wizard, or lower arm.joints[].torque_max_nm"
+    )
+
+
+def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
+    last, safety = states[-1], vehicle.safety
+    hottest_c = max(max(state.temperature_c) for state in states)
+    read, wanted = f"{hottest_c:.0f} degC", f"below {safety.servo_warn_c:g} degC"
+    if hottest_c < safety.servo_warn_c:
+        yield TEMPERATURE.good(read, wanted)
+    else:
+        row = TEMPERATURE.doubtful if hottest_c < safety.servo_max_c else TEMPERATURE.bad
+        yield row(read, wanted, "let the arm cool down; look for a joint that jams or an arm that leans on something")
+    errors = (_or(state.hardware_error[0] for state in states), _or(state.hardware_error[1] for state in states))
+    named = error_text(errors)
+    if named:
+        yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
+    elif (errors[0] | errors[1]) & WATCHDOG_BIT:
+        fix = "look for a loose cable or supply, and for a computer that stalls"
+        yield ERROR.bad("a bus watchdog let go", "none", fix)
+    else:
+        yield ERROR.good("none", "none")
+    yield _angles(last, vehicle)
+    moved_rad = max(
+        max(s.angle_rad[joint] for s in states) - min(s.angle_rad[joint] for s in states) for joint in (0, 1)
+    )
+    read, wanted = f"moves by {math.degrees(moved_rad):.1f} deg", f"{math.degrees(STILL_RAD):.0f} deg"
+    if moved_rad <= STILL_RAD:
+        yield STILL.good(read, wanted)
+    else:
+        yield STILL.bad(read, wanted, "fold the arm so that it stays by itself, and let go of it")
+
+
+def _angles(last: ArmState, vehicle: Vehicle) -> Row:
+    degrees = [math.degrees(angle) for angle in last.angle_rad]
+    walls = [joint.angle_deg for joint in vehicle.arm.joints]
+    read = f"({degrees[0]:.0f}, {degrees[1]:.0f}) deg"
+    wanted = " and ".join(f"{low:g} to {high:g} deg" for low, high in walls)
+    if all(low <= angle <= high for angle, (low, high) in zip(degrees, walls, strict=True)):
+        return ANGLES.good(read, wanted)
+    return ANGLES.bad(read, wanted, "move the arm by hand, or correct zero_count and sign of the joint")
+
+
+def _reads(cycles: int, missed: int) -> Row:
+    share = missed / max(1, cycles)
+    read, wanted = f"{missed} of {cycles}", f"{MISSED_GOOD:.1%}"
+    if cycles and share <= MISSED_GOOD:
+        return READS.good(read, wanted)
+    fix = "look for a loose cable, a bad ground or interference on the servo bus"
+    return (READS.doubtful if cycles and share <= MISSED_MAX else READS.bad)(read, wanted, fix)
+
+
+def usb_latency(check: Check, latency_ms: int | None) -> Row:
+    """An adapter's latency timer; shared with the force sensor's port."""
+    wanted = f"{LATENCY_GOOD_MS} ms"
+    if latency_ms is None:
+        return check.good("not an FTDI adapter", wanted)
+    if latency_ms <= LATENCY_GOOD_MS:
+        return check.good(f"{latency_ms} ms", wanted)
+    fix = "keep it at 1 with a udev rule: README, Fly for real, Serial ports"
+    return check.bad(f"{latency_ms} ms", wanted, fix)
+
+
+def _equal(check: Check, values: Sequence[int], wanted: int, text: Callable[[int], str], fix: str) -> Row:
+    read = _both([text(value) for value in values])
+    good = all(value == wanted for value in values)
+    return check.good(read, text(wanted)) if good else check.bad(read, text(wanted), fix)
+
+
+def _both(values: Sequence[object]) -> str:
+    """One value if both servos have it, else both."""
+    return str(values[0]) if len(set(values)) == 1 else " and ".join(map(str, values))
+
+
+def _mode(mode: int) -> str:
+    return f"{mode} ({MODES.get(mode, 'unknown')})"
+
+
+def _model(model: int) -> str:
+    return "XM430-W210" if model == MODEL_XM430_W210 else f"model {model}"
+
+
+def _or(errors: Iterable[int]) -> int:
+    found = 0
+    for error in errors:
+        found |= error
+    return found

@@ -1,0 +1,286 @@
+"""PX4 as it shows itself on the link: alive, disarmed, fusing motion capture, charged. Firmware and parameters are judged elsewhere.
+
+Pure. Evidence that PX4 fuses vision is what its estimator says of itself and where it says that it is, for the whole time of the
+observation: PX4 takes poses that it does not fuse without a word.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from companion.config.vehicle import Vehicle
+from companion.frames import wrap_rad, yaw_from_quat
+from companion.preflight.checks import Check
+from companion.preflight.observations import EstimatorReport, Observations
+from companion.preflight.rows import Row
+from companion.px4.wanted import HOVER as HOVER_PARAM
+from companion.safety.monitors_mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
+from companion.types import FlightMode, MocapPose, VehicleState
+
+DEVICE = Check("px4.device", "PX4", "the link opens, PX4 answers", "without PX4 nothing flies")
+HEARTBEAT = Check(
+    "px4.heartbeat",
+    "PX4 heartbeat",
+    "newer than `safety.heartbeat_timeout_s`",
+    "a link that loses heartbeats loses setpoints, too, and the flight ends in PX4's failsafe",
+)
+DISARMED = Check("px4.disarmed", "PX4 is disarmed", "disarmed", "an armed machine is not to be checked but landed")
+RATES = Check(
+    "px4.rates",
+    "PX4 state rates",
+    "position, attitude and IMU at 80 Hz or more; below 40 Hz refused",
+    "the law flies on this state at 200 Hz; what comes too seldom is old, and the machine swings",
+)
+LAG = Check(
+    "px4.lag",
+    "PX4 link lag",
+    "nothing later than `safety.link_lag_max_s` beyond the best",
+    "a link that holds state back cannot be flown over",
+    warns=True,
+)
+VISION = Check(
+    "px4.vision",
+    "EKF2 fuses motion capture",
+    "local position, attitude, velocity and position flags, live test ratios below 1, accuracy below 0.1 m, all the time",
+    "PX4 takes poses without fusing them; it would drift away with the machine in the air",
+    settles=True,
+)
+AGREES = Check(
+    "px4.agrees",
+    "PX4 against motion capture",
+    "0.10 m, 8 deg of yaw",
+    "PX4 would hold another place or another heading than the mission means",
+    settles=True,
+)
+STEADY = Check(
+    "px4.steady",
+    "PX4's estimate at rest",
+    "wanders less than 0.04 m and 3 deg against motion capture",
+    "an estimate that still wanders carries the machine with it at take-off",
+    settles=True,
+)
+BATTERY = Check(
+    "px4.battery",
+    "battery",
+    "`safety.battery_warn` of charge and `safety.battery_voltage_min_v`",
+    "below `safety.battery_min` the flight lands by itself, wherever it is",
+)
+HOVER = Check(
+    "px4.hover_thrust",
+    "hover thrust",
+    "within 15 % of weight over `airframe.thrust_max_n`; beyond 35 % refused (PX4's own in its row)",
+    "the first second after take-off is flown on it: too high jumps, too low does not lift",
+)
+CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, HOVER)
+
+GRAVITY_M_S2 = 9.81
+RATE_GOOD_HZ, RATE_MIN_HZ = 80.0, 40.0
+ACCURACY_MAX_M = 0.1
+COVER_S = 0.6
+"""A stream that is there from the start on begins within this time."""
+PAIR_S = 0.1
+STEADY_M, STEADY_RAD = 0.04, math.radians(3.0)
+HOVER_GOOD, HOVER_MAX = 0.15, 0.35
+# ESTIMATOR_STATUS_FLAGS. PX4 sets the absolute horizontal one only once it knows a global origin, which nothing here needs, and the
+# one of constant position whenever the machine stands.
+FLAGS = {1: "attitude", 2: "horizontal velocity", 4: "vertical velocity", 8: "horizontal position", 32: "height"}
+
+
+def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
+    """What was seen of PX4."""
+    failure = o.failures.get("autopilot")
+    if failure is not None:
+        yield DEVICE.bad(failure, "", "")
+        return
+    yield DEVICE.good(f"answers on {vehicle.devices.autopilot.address}")
+    yield _heartbeat(o, vehicle)
+    yield _disarmed(o)
+    if o.state_counts is not None:
+        yield _rates(o)
+    if any(state.boot_s is not None for state in o.vehicle):
+        yield _lag(o, vehicle)
+    yield vision(o)
+    if o.mocap and o.vehicle:
+        yield from agreement(o)
+    if o.status:
+        yield _battery(o, vehicle)
+    hover = vehicle.airframe.hover_thrust or o.params.get(HOVER_PARAM)
+    if hover is not None:
+        yield _hover(float(hover), vehicle)
+
+
+def _heartbeat(o: Observations, vehicle: Vehicle) -> Row:
+    limit_s = vehicle.safety.heartbeat_timeout_s
+    wanted = f"newer than {limit_s:g} s"
+    if not o.status:
+        return HEARTBEAT.bad("none came", wanted, "check link and baud rate")
+    age_s = max(0.0, o.start_s + o.duration_s - o.status[-1].heartbeat_stamp_s)
+    if age_s > limit_s:
+        return HEARTBEAT.bad(f"the last one is {age_s:.1f} s old", wanted, "check cable, baud rate and PX4's power")
+    return HEARTBEAT.good(f"{age_s:.1f} s old", wanted)
+
+
+def _disarmed(o: Observations) -> Row:
+    if any(status.armed for status in o.status):
+        return DISARMED.bad("armed", "disarmed", "disarm it with the radio or QGroundControl, then start again")
+    mode = o.status[-1].mode if o.status else FlightMode.UNKNOWN
+    return DISARMED.good(f"disarmed, mode {mode.value.upper()}")
+
+
+def _rates(o: Observations) -> Row:
+    counts = o.state_counts
+    assert counts is not None
+    rates_hz = [count / o.duration_s for count in (counts.position, counts.attitude, counts.imu)]
+    read = "position {:.0f}, attitude {:.0f}, IMU {:.0f} Hz".format(*rates_hz)
+    wanted = f"{RATE_GOOD_HZ:g} Hz each"
+    if min(rates_hz) >= RATE_GOOD_HZ:
+        return RATES.good(read, wanted)
+    if rates_hz[0] == 0.0:
+        fix = "PX4 sends no position while it fuses no motion capture: see that row"
+    else:
+        fix = "make the link faster: 921600 baud, MAV_x_RATE 80000 or more, MAV_x_MODE onboard (docs/px4.md)"
+    return (RATES.doubtful if min(rates_hz) >= RATE_MIN_HZ else RATES.bad)(read, wanted, fix)
+
+
+def _lag(o: Observations, vehicle: Vehicle) -> Row:
+    """Over the whole time: arrival less PX4's own clock, against the least of it."""
+    offsets_s = sorted(state.attitude_stamp_s - state.boot_s for state in o.vehicle if state.boot_s is not None)
+    late_s = offsets_s[int(0.99 * (len(offsets_s) - 1))] - offsets_s[0]
+    limit_s = vehicle.safety.link_lag_max_s
+    read, wanted = f"{late_s * 1e3:.0f} ms at the 99th percentile", f"{limit_s * 1e3:.0f} ms"
+    if late_s <= limit_s:
+        return LAG.good(read, wanted)
+    return LAG.bad(read, wanted, "take other traffic off the link and the load off this computer")
+
+
+def vision(o: Observations) -> Row:
+    """Evidence of fusion for the whole observation."""
+    missing = missing_evidence(o)
+    wanted = f"fused for {o.duration_s:.0f} s"
+    if missing is None:
+        last = o.estimator[-1]
+        accuracy_m = max(last.position_horizontal_accuracy_m, last.position_vertical_accuracy_m)
+        ratio = max(_ratios(last))
+        return VISION.good(
+            f"fused for {o.duration_s:.0f} s, accuracy {accuracy_m:.3f} m, test ratio {ratio:.2f}", wanted
+        )
+    fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and that the body is tracked; then reboot PX4"
+    if not o.mocap:
+        fix = "there is no motion capture to fuse: see that first"
+    return VISION.bad(missing, wanted, fix)
+
+
+def missing_evidence(o: Observations) -> str | None:
+    """What of the evidence that EKF2 fuses vision is not there; None: all of it is, from the start of the observation on."""
+    if not o.vehicle:
+        return "no LOCAL_POSITION_NED"
+    if not o.estimator:
+        return "no ESTIMATOR_STATUS"
+    if o.vehicle[0].position_stamp_s > o.start_s + COVER_S or o.estimator[0].stamp_s > o.start_s + COVER_S:
+        return "the estimate has only just come"
+    end_s = o.start_s + o.duration_s
+    if o.vehicle[-1].position_stamp_s < end_s - COVER_S or o.estimator[-1].stamp_s < end_s - COVER_S:
+        return "the estimate has stopped coming"
+    for report in o.estimator:
+        lacking = [name for bit, name in FLAGS.items() if not report.flags & bit]
+        if lacking:
+            return f"the estimator says that it has no good {', '.join(lacking)}"
+    if all(max(_ratios(report)[1:]) == 0.0 for report in o.estimator):
+        return "the innovation test ratios of position are 0: nothing is fused"
+    worst = max(max(_ratios(report)) for report in o.estimator)
+    if worst >= 1.0:
+        return f"measurements are rejected (innovation test ratio {worst:.1f})"
+    horizontal_m = max(report.position_horizontal_accuracy_m for report in o.estimator)
+    vertical_m = max(report.position_vertical_accuracy_m for report in o.estimator)
+    if not max(horizontal_m, vertical_m) < ACCURACY_MAX_M:
+        return f"the estimator's own accuracy is {horizontal_m:.2f} m, {vertical_m:.2f} m in height"
+    return None
+
+
+def _ratios(report: EstimatorReport) -> tuple[float, float, float]:
+    ratios = (report.velocity_ratio, report.position_horizontal_ratio, report.position_vertical_ratio)
+    return (_finite(ratios[0]), _finite(ratios[1]), _finite(ratios[2]))
+
+
+def _finite(ratio: float) -> float:
+    """A ratio of what is not fused at all may be NaN."""
+    return ratio if math.isfinite(ratio) else 0.0
+
+
+def agreement(o: Observations) -> Iterator[Row]:
+    """Where PX4 says that it is against motion capture, frame by frame, and how that wanders."""
+    pairs = list(_pairs(o.vehicle, o.mocap))
+    if not pairs:
+        fix = "see the rates of both"
+        yield AGREES.bad("no two of them belong together in time", "", fix)
+        return
+    apart = [
+        tuple(a - b for a, b in zip(state.position_world_m, pose.position_world_m, strict=True))
+        for state, pose in pairs
+    ]
+    turned_rad = [wrap_rad(yaw_from_quat(s.attitude_wxyz) - yaw_from_quat(p.attitude_wxyz)) for s, p in pairs]
+    apart_m, yaw_rad = max(math.hypot(*d) for d in apart), max(abs(a) for a in turned_rad)
+    read = f"{apart_m:.3f} m and {math.degrees(yaw_rad):.1f} deg of yaw apart"
+    wanted = f"{FUSED_WITHIN_M:g} m, {math.degrees(FUSED_WITHIN_RAD):.0f} deg"
+    if apart_m <= FUSED_WITHIN_M and yaw_rad <= FUSED_WITHIN_RAD:
+        yield AGREES.good(read, wanted)
+    else:
+        fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and the body's axes in Motive; reboot PX4 after a change"
+        yield AGREES.bad(read, wanted, fix)
+    wander_m = max(max(d[axis] for d in apart) - min(d[axis] for d in apart) for axis in range(3))
+    wander_rad = max(turned_rad) - min(turned_rad)
+    read = f"wanders by {wander_m:.3f} m and {math.degrees(wander_rad):.1f} deg"
+    wanted = f"{STEADY_M:g} m, {math.degrees(STEADY_RAD):.0f} deg"
+    if wander_m <= STEADY_M and wander_rad <= STEADY_RAD:
+        yield STEADY.good(read, wanted)
+    else:
+        yield STEADY.bad(
+            read, wanted, "leave the machine standing still; if it goes on, reboot PX4 and calibrate its gyros"
+        )
+
+
+def _pairs(states: tuple[VehicleState, ...], poses: tuple[MocapPose, ...]) -> Iterator[tuple[VehicleState, MocapPose]]:
+    """Each state with the tracked pose that is nearest in time."""
+    tracked = [pose for pose in poses if pose.tracking_valid]
+    index = 0
+    for state in states:
+        at_s = state.position_stamp_s
+        while index + 1 < len(tracked) and abs(tracked[index + 1].stamp_s - at_s) <= abs(tracked[index].stamp_s - at_s):
+            index += 1
+        if index < len(tracked) and abs(tracked[index].stamp_s - at_s) <= PAIR_S:
+            yield state, tracked[index]
+
+
+def _battery(o: Observations, vehicle: Vehicle) -> Row:
+    status, safety = o.status[-1], vehicle.safety
+    remaining, voltage_v, voltage_min_v = (
+        status.battery_remaining,
+        status.battery_voltage_v,
+        safety.battery_voltage_min_v,
+    )
+    told = [f"{remaining:.0%}" if remaining is not None else "", f"{voltage_v:.1f} V" if voltage_v is not None else ""]
+    read = ", ".join(text for text in told if text) or "PX4 tells neither charge nor voltage"
+    wanted = f"{safety.battery_warn:.0%}" + (f", {voltage_min_v:g} V" if voltage_min_v is not None else "")
+    if remaining is not None and remaining < safety.battery_warn:
+        return BATTERY.bad(read, wanted, "charge the battery")
+    if voltage_v is not None and voltage_min_v is not None and voltage_v < voltage_min_v:
+        return BATTERY.bad(read, wanted, "charge the battery, or correct safety.battery_voltage_min_v for its cells")
+    if remaining is None or (voltage_v is None and voltage_min_v is not None):
+        return BATTERY.doubtful(read, wanted, "set BAT1_SOURCE, BAT1_N_CELLS and the power module up in PX4")
+    return BATTERY.good(read, wanted)
+
+
+def _hover(hover: float, vehicle: Vehicle) -> Row:
+    airframe = vehicle.airframe
+    expected = airframe.mass_kg * GRAVITY_M_S2 / airframe.thrust_max_n
+    off = hover / expected - 1.0
+    own = airframe.hover_thrust is not None
+    source = "airframe.hover_thrust" if own else HOVER_PARAM
+    read = f"{source} = {hover:.3f}"
+    wanted = f"about {expected:.3f}: {airframe.mass_kg:g} kg on {airframe.thrust_max_n:g} N"
+    if abs(off) <= HOVER_GOOD:
+        return HOVER.good(read, wanted)
+    fix = f"measure it (companion hover fit) and set {source}, or correct airframe.mass_kg and airframe.thrust_max_n"
+    # What is far off in PX4 is refused by the parameter's own row.
+    return (HOVER.bad if own and abs(off) > HOVER_MAX else HOVER.doubtful)(read, wanted, fix)

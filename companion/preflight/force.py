@@ -1,0 +1,163 @@
+"""The force-torque sensor at rest: often enough, quiet, not overloaded, and a tare that an empty net explains. Pure."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import Manipulator
+from companion.control.sensing import ForceSensing
+from companion.preflight.arm import usb_latency
+from companion.preflight.checks import Check
+from companion.preflight.observations import ForceStream, Observations
+from companion.preflight.rows import Row
+from companion.types import ForceSample, Vec3
+
+DEVICE = Check(
+    "force.device", "force sensor", "the port opens, an RFT60 answers and streams", "the law would not feel the payload"
+)
+RATE = Check(
+    "force.rate",
+    "force sensor rate",
+    "90 % of `devices.force.rate_hz`; below half refused",
+    "a catch is felt late, or not at all",
+)
+CHECKSUMS = Check(
+    "force.checksums",
+    "force sensor packets",
+    "none with a wrong checksum",
+    "a disturbed line loses samples, more so in flight",
+    warns=True,
+)
+NOISE = Check(
+    "force.noise",
+    "force sensor noise",
+    "0.3 N; above 1.5 N refused",
+    "the law answers to every force that it feels, and noise becomes motion",
+)
+OVERLOAD = Check(
+    "force.overload", "force sensor overload", "none", "an overloaded sensor saturates, and may be damaged for good"
+)
+TARE = Check(
+    "force.tare",
+    "force sensor tare",
+    "bias below 5 % of `devices.force.force_max_n`; above 10 % refused",
+    "what does not come from the empty net is taken out as bias: something that leans on the net is missing in flight",
+)
+STILL = Check(
+    "force.still",
+    "force sensor at rest",
+    "drifts less than `safety.force_drift_n`",
+    "a tare that is taken while somebody touches the net is wrong for the whole flight",
+)
+USB = Check(
+    "force.usb_latency",
+    "force sensor's USB latency timer",
+    "1 ms, or no FTDI adapter",
+    "samples come in bursts, up to 16 ms late",
+    warns=True,
+)
+CHECKS = (DEVICE, RATE, CHECKSUMS, NOISE, OVERLOAD, TARE, STILL, USB)
+
+RATE_GOOD, RATE_MIN = 0.9, 0.5
+NOISE_GOOD_N, NOISE_MAX_N = 0.3, 1.5
+TARE_GOOD, TARE_MAX = 0.05, 0.10
+
+
+def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
+    """What was seen of the force sensor."""
+    failure, stream = o.failures.get("force"), o.force_stream
+    if failure is not None:
+        yield DEVICE.bad(failure, "", "")
+        return
+    if stream is None:
+        yield DEVICE.bad("was not looked at", "", "")
+        return
+    if stream.lost is not None:
+        yield DEVICE.bad(stream.lost, "it goes on streaming", "check plug and cable")
+        return
+    yield DEVICE.good(stream.product or "answers")
+    yield _rate(o, stream, vehicle)
+    if stream.bad_sums:
+        yield CHECKSUMS.bad(
+            f"{stream.bad_sums} wrong", "none", "use a shielded cable, away from motors and their wires"
+        )
+    else:
+        yield CHECKSUMS.good("none wrong", "none")
+    if len(o.force) >= 10:
+        yield _noise(o.force)
+        yield _overload(o.force, vehicle)
+        if o.vehicle and o.arm:
+            yield _tare(o, vehicle)
+        yield _still(o.force, vehicle)
+    if o.machine is not None:
+        yield usb_latency(USB, o.machine.force_latency_ms)
+
+
+def _rate(o: Observations, stream: ForceStream, vehicle: Vehicle) -> Row:
+    rate_hz, expected_hz = stream.samples / o.duration_s, vehicle.devices.force.rate_hz
+    read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz} Hz"
+    if rate_hz >= RATE_GOOD * expected_hz:
+        return RATE.good(read, wanted)
+    fix = "check cable and adapter; power-cycle the sensor"
+    return (RATE.doubtful if rate_hz >= RATE_MIN * expected_hz else RATE.bad)(read, wanted, fix)
+
+
+def _noise(samples: Sequence[ForceSample]) -> Row:
+    """From one sample to the next: what drifts is judged elsewhere."""
+    squares = [0.0, 0.0, 0.0]
+    for before, now in itertools.pairwise(samples):
+        for axis in range(3):
+            squares[axis] += (now.force_sensor_n[axis] - before.force_sensor_n[axis]) ** 2
+    noise_n = math.sqrt(max(squares) / (2 * (len(samples) - 1)))
+    read, wanted = f"{noise_n:.2f} N (one sigma)", f"{NOISE_GOOD_N:g} N"
+    if noise_n <= NOISE_GOOD_N:
+        return NOISE.good(read, wanted)
+    fix = "switch off what shakes the machine; ground the sensor; lead its cable away from motors"
+    return (NOISE.doubtful if noise_n <= NOISE_MAX_N else NOISE.bad)(read, wanted, fix)
+
+
+def _overload(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
+    count = sum(sample.overload for sample in samples)
+    if not count:
+        return OVERLOAD.good("none", "none")
+    limit_n = vehicle.devices.force.force_max_n
+    fix = f"take the load off; without a load the sensor or its mount is damaged (devices.force.force_max_n is {limit_n:g} N)"
+    return OVERLOAD.bad(f"{count} of {len(samples)} samples", "none", fix)
+
+
+def _tare(o: Observations, vehicle: Vehicle) -> Row:
+    """The bias as the flight itself would find it: mean reading less the weight of the net."""
+    sensing = ForceSensing(vehicle.tool, Manipulator(vehicle.arm, vehicle.tool))
+    for sample in o.force:
+        sensing.collect(sample, o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad)
+    sensing.finish_tare()
+    bias_n = sensing.bias_sensor_n
+    assert bias_n is not None
+    size_n, full_n = math.hypot(*bias_n), vehicle.devices.force.force_max_n
+    x, y, z = bias_n
+    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beside the net's {vehicle.tool.net_mass_kg:g} kg"
+    wanted = f"{TARE_GOOD * full_n:g} N"
+    if size_n <= TARE_GOOD * full_n:
+        return TARE.good(read, wanted)
+    fix = "free the net; without a load correct tool.net_mass_kg, loosen the sensor's mount or set its bias with the vendor's tool"
+    return (TARE.doubtful if size_n <= TARE_MAX * full_n else TARE.bad)(read, wanted, fix)
+
+
+def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
+    """Between the means of the fifths of the time."""
+    size = max(1, len(samples) // 5)
+    means = [_mean(samples[i : i + size]) for i in range(0, len(samples) - size + 1, size)]
+    drift_n = max(max(mean[axis] for mean in means) - min(mean[axis] for mean in means) for axis in range(3))
+    limit_n = vehicle.safety.force_drift_n
+    read, wanted = f"drifts by {drift_n:.2f} N", f"{limit_n:g} N"
+    if drift_n <= limit_n:
+        return STILL.good(read, wanted)
+    return STILL.bad(read, wanted, "let nobody touch the net; let the sensor warm up for some minutes")
+
+
+def _mean(samples: Sequence[ForceSample]) -> Vec3:
+    x, y, z = (sum(sample.force_sensor_n[axis] for sample in samples) / len(samples) for axis in range(3))
+    return (x, y, z)

@@ -1,0 +1,357 @@
+"""Do motion capture, PX4 and the mission mean the same axes? What a machine at rest can tell of it. Pure.
+
+PX4 fuses motion capture: a wrong yaw is invisible to EKF2. Gravity by the accelerometer finds what is tilted; the mission's start place
+and yaw find what is turned; the rest is found by the hand test (`companion.preflight.hand_test`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from companion.config.mission import Mission
+from companion.config.vehicle import Vehicle
+from companion.frames import quat_conjugate, quat_multiply, quat_rotate, wrap_rad, yaw_from_quat
+from companion.preflight.axes import IDENTITY, MIRRORINGS, ROTATIONS, Y_UP, AxisMap
+from companion.preflight.checks import Check
+from companion.preflight.hand_motion import angle_rad, mean_attitude, mean_vector, norm, turned_rad
+from companion.preflight.observations import Observations
+from companion.preflight.rows import Row
+from companion.types import MocapPose, Quat, Vec3, VehicleState
+
+HAND_TEST = Check(
+    "frames.hand_test",
+    "hand test",
+    "passed once with this vehicle, server, rigid body, up axis and NatNet version (not in SITL)",
+    "PX4 fuses motion capture and cannot notice wrong axes; at rest not all of them show",
+    warns=True,
+)
+REST = Check("frames.rest", "at rest", "nothing moves while it is watched", "gravity is only known at rest")
+GRAVITY = Check(
+    "frames.gravity",
+    "gravity in motion capture's axes",
+    "what the accelerometer feels, turned by motion capture's attitude, points up within 5 deg",
+    "the thrust would point that far off",
+)
+HEIGHT = Check(
+    "frames.height",
+    "height at rest",
+    "`airframe.ground_clearance_m` within 3 cm; beyond the mission's `start.tolerance_m` refused",
+    "heights are wrong by that, and the touchdown comes early or late",
+)
+PLACE = Check(
+    "frames.place",
+    "start place in motion capture's axes",
+    "the mission's `start.position_m`",
+    "the room, the tether and the way are counted in these axes",
+)
+YAW = Check(
+    "frames.yaw",
+    "start yaw in motion capture's axes",
+    "the mission's `start.yaw_deg`",
+    "PX4 fuses this yaw and cannot notice that it is wrong: the machine would circle or fly off",
+)
+NOISE_POSITION = Check(
+    "frames.noise_position",
+    "noise of the position at rest",
+    "2 mm, and no frame 30 mm off; above 10 mm refused",
+    "the machine would shake, or lose its estimate",
+)
+NOISE_ATTITUDE = Check(
+    "frames.noise_attitude",
+    "noise of the attitude at rest",
+    "0.3 deg, and no frame 10 deg off; above 2 deg refused",
+    "a yaw that jumps is markers taken for one another; PX4 follows it",
+)
+ACCELEROMETER = Check(
+    "frames.accelerometer",
+    "gravity by the accelerometer",
+    "9.81 m/s2 within 0.5",
+    "PX4's height and tilt lean on it",
+    warns=True,
+)
+PX4_TILT = Check(
+    "frames.px4_tilt",
+    "PX4's tilt against motion capture's",
+    "within 3 deg",
+    "an attitude setpoint would lean the machine by that",
+    settles=True,
+)
+PX4_YAW = Check(
+    "frames.px4_yaw",
+    "PX4's yaw against motion capture's",
+    "`safety.yaw_disagreement_deg`",
+    "PX4 does not fuse motion capture's yaw: the machine would fly off sideways",
+    settles=True,
+)
+CHECKS = (
+    HAND_TEST, REST, GRAVITY, HEIGHT, PLACE, YAW, NOISE_POSITION, NOISE_ATTITUDE, ACCELEROMETER, PX4_TILT, PX4_YAW,
+)  # fmt: skip
+
+SAMPLES_MIN: Final = 20
+GRAVITY_MAX_DEG: Final = 5.0
+GRAVITY_M_S2: Final = 9.81
+GRAVITY_TOLERANCE_M_S2: Final = 0.5
+HEIGHT_GOOD_M: Final = 0.03
+TILT_MAX_DEG: Final = 3.0
+NOISE_GOOD_MM, NOISE_MAX_MM, JUMP_MAX_MM = 2.0, 10.0, 30.0
+NOISE_GOOD_DEG, NOISE_MAX_DEG, JUMP_MAX_DEG = 0.3, 2.0, 10.0
+"""Standard deviation of all axes together; furthest of a single frame."""
+MOVED_MAX_M, MOVED_MAX_DEG = 0.01, 2.0
+"""Between the first and the last quarter."""
+RATE_MAX_DEG_S: Final = 3.0
+"""Mean of the gyro at rest."""
+_EXPLAINED_DEG: Final = 10.0
+_UP: Vec3 = (0.0, 0.0, 1.0)
+_RESET = "set the machine level with its nose along the stream's +x and reset the rigid body's orientation in Motive"
+
+
+class Pose(NamedTuple):
+    """Where the machine stands by motion capture, in the mission's world as far as the stream is right."""
+
+    position_m: Vec3
+    attitude: Quat
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Where the mission says that it stands, with what is allowed."""
+
+    position_m: Vec3
+    yaw_rad: float
+    tolerance_m: float
+    yaw_tolerance_deg: float
+
+    @classmethod
+    def of(cls, mission: Mission, vehicle: Vehicle) -> Wanted:
+        """Of a mission and the machine that flies it."""
+        start = mission.start
+        position = (*start.position_m, vehicle.airframe.ground_clearance_m)
+        return cls(position, math.radians(start.yaw_deg), start.tolerance_m, start.yaw_tolerance_deg)
+
+
+def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iterator[Row]:
+    """One row per thing that can be told at rest; no more than the first ones if there is too little to judge by, or it moved."""
+    if observations.hand_test is not None:
+        yield _hand_test(observations.hand_test, observations.hand_test_changed)
+    poses = [pose for pose in observations.mocap if pose.tracking_valid]
+    states = observations.vehicle
+    if len(poses) < SAMPLES_MIN or len(states) < SAMPLES_MIN:
+        read = f"{len(poses)} tracked poses and {len(states)} states of PX4 to judge by"
+        yield REST.bad(read, f"{SAMPLES_MIN} of each", "see motion capture and PX4's link")
+        return
+    rest = _rest(poses, states)
+    yield rest
+    if not rest.ok:
+        return
+    force = mean_vector([state.specific_force_body_m_s2 for state in states])
+    at = Pose(mean_vector([p.position_world_m for p in poses]), mean_attitude([p.attitude_wxyz for p in poses]))
+    yield from standing(at, force, Wanted.of(mission, vehicle), vehicle.devices.mocap.up_axis)
+    yield from _noise(poses, at)
+    yield _accelerometer(force)
+    yield from _px4(at, states, vehicle)
+
+
+def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterator[Row]:
+    """Gravity, height, place and yaw of a machine at rest.
+
+    Args:
+        at: by motion capture, as configured.
+        force_m_s2: by the accelerometer, body FLU.
+        wanted: by the mission.
+        up_axis: devices.mocap.up_axis, "y" or "z".
+    """
+    fix = explanation(at, force_m_s2, wanted, up_axis)
+    x, y, z = at.position_m
+    wx, wy, wz = wanted.position_m
+    tilt_deg = math.degrees(angle_rad(quat_rotate(at.attitude, force_m_s2), _UP))
+    high_m, away_m = z - wz, math.dist((x, y), (wx, wy))
+    yaw_off_deg = math.degrees(wrap_rad(yaw_from_quat(at.attitude) - wanted.yaw_rad))
+
+    read, text = f"{tilt_deg:.1f} deg from the vertical", f"within {GRAVITY_MAX_DEG:g} deg"
+    if tilt_deg <= GRAVITY_MAX_DEG:
+        yield GRAVITY.good(read, text)
+    elif max(abs(high_m), away_m) <= wanted.tolerance_m:
+        yield GRAVITY.bad(read, text, fix or f"the rigid body's zero was set while it was tilted: {_RESET}")
+    else:
+        level = "calibration square level on the floor"
+        yield GRAVITY.bad(read, text, fix or f"set the ground plane anew in Motive ({level}), then {_RESET}")
+
+    read, text = f"z = {z:.3f} m", f"{wz:.2f} m (airframe.ground_clearance_m) within {HEIGHT_GOOD_M:g} m"
+    pivot = (
+        "in Motive, set the rigid body's pivot to the body's origin and the ground plane to the floor, "
+        "or correct airframe.ground_clearance_m"
+    )
+    if abs(high_m) <= HEIGHT_GOOD_M:
+        yield HEIGHT.good(read, text)
+    elif abs(high_m) <= wanted.tolerance_m:
+        yield HEIGHT.doubtful(read, text, fix or pivot)
+    else:
+        yield HEIGHT.bad(read, text, fix or pivot)
+
+    read, text = f"({x:.2f}, {y:.2f}) m, {away_m:.2f} m away", f"({wx:g}, {wy:g}) m within {wanted.tolerance_m:g} m"
+    if away_m <= wanted.tolerance_m:
+        yield PLACE.good(read, text)
+    else:
+        yield PLACE.bad(read, text, fix or "carry it there or change the mission's start.position_m")
+
+    read = f"{math.degrees(yaw_from_quat(at.attitude)):.0f} deg"
+    text = f"{math.degrees(wanted.yaw_rad):g} deg within {wanted.yaw_tolerance_deg:g} deg"
+    if abs(yaw_off_deg) <= wanted.yaw_tolerance_deg:
+        yield YAW.good(read, text)
+    else:
+        turned = (
+            f"if the nose truly points {abs(yaw_off_deg):.0f} deg off, turn the machine or change the mission's start.yaw_deg; "
+            f"if not, the rigid body's zero is turned by {yaw_off_deg:+.0f} deg: {_RESET}"
+        )
+        yield YAW.bad(read, text, fix or turned)
+
+
+def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str:
+    """Which exchange of axes makes everything right that is wrong at rest, as a line on what to do; empty: none does, or nothing is
+    wrong. The likelier ones first; what a machine at rest cannot tell apart is left to the hand test."""
+
+    def fits(position_m: Vec3, attitude: Quat) -> bool:
+        tilt = angle_rad(quat_rotate(attitude, force_m_s2), _UP)
+        turned = abs(math.degrees(wrap_rad(yaw_from_quat(attitude) - wanted.yaw_rad)))
+        near = math.dist(position_m, wanted.position_m) <= wanted.tolerance_m
+        return math.degrees(tilt) <= _EXPLAINED_DEG and near and turned <= wanted.yaw_tolerance_deg
+
+    p, q = at
+    if fits(p, q):
+        return ""
+    other, axes = ("y", Y_UP) if up_axis == "z" else ("z", Y_UP.inverse)
+    if fits(axes.inverse.vector(p), axes.inverse.rotation(q)):
+        return f"the stream looks {other}-up: set devices.mocap.up_axis: {other}"
+    others = sorted((axes for axes in ROTATIONS if axes != IDENTITY), key=_least_turned)
+    for axes in others:
+        if fits(p, quat_multiply(q, axes.quat)):
+            return f"the rigid body's zero was set while it was turned {_turn(axes)}: {_RESET}{_or_so(axes)}"
+    for axes in others:
+        if fits(axes.inverse.vector(p), quat_multiply(quat_conjugate(axes.quat), q)):
+            return f"the world looks turned {_turn(axes)}: {_plane(axes)}{_or_so(axes)}"
+    for axes in (*others, *MIRRORINGS):
+        # Who made the body in wrong axes still turned its nose along the stream's x.
+        nose = _nose(axes)
+        upright = quat_multiply(axes.inverse.rotation(q), nose)
+        if fits(axes.inverse.vector(p), upright):
+            if axes.determinant < 0:
+                return (
+                    f"the stream looks left-handed (its x, y, z are the true {', '.join(axes.names)}): take Motive's right-handed "
+                    "axes, and no axis conversion on the way"
+                )
+            return (
+                f"the stream's axes look exchanged (its x, y, z are the true {', '.join(axes.names)}): {_plane(axes)}"
+            )
+    return ""
+
+
+def _least_turned(axes: AxisMap) -> float:
+    return math.acos(min(1.0, abs(axes.quat[0])))
+
+
+def _nose(axes: AxisMap) -> Quat:
+    """The level true direction that is the stream's x, as a yaw; 0 if it is not level."""
+    if axes.index[0] == 2:
+        return (1.0, 0.0, 0.0, 0.0)
+    half = 0.5 * (math.atan2(axes.sign[0], 0.0) if axes.index[0] == 1 else math.atan2(0.0, axes.sign[0]))
+    return (math.cos(half), 0.0, 0.0, math.sin(half))
+
+
+def _turn(axes: AxisMap) -> str:
+    w, x, y, z = axes.quat
+    angle = 2.0 * math.degrees(math.atan2(math.sqrt(x * x + y * y + z * z), w))
+    parts = {"x": x, "y": y, "z": z}
+    turning = {name: part for name, part in parts.items() if abs(part) > 1e-9}
+    if len(turning) > 1:
+        return f"(its x, y, z look like the true {', '.join(axes.names)})"
+    ((name, part),) = turning.items()
+    return f"by {math.copysign(angle, part):+.0f} deg about {name}"
+
+
+def _or_so(axes: AxisMap) -> str:
+    """A turn about the vertical may be the truth."""
+    return "; unless it truly stands so: then put it as the mission says" if axes.vector(_UP) == _UP else ""
+
+
+def _plane(axes: AxisMap) -> str:
+    if axes.vector(_UP) == _UP:
+        return "set the ground plane in Motive with the calibration square's x along the room's x"
+    return (
+        "set devices.mocap.up_axis as Motive streams (Settings > Streaming > Up Axis), and the ground plane with z up"
+    )
+
+
+def _hand_test(passed: str, changed: str) -> Row:
+    if passed:
+        return HAND_TEST.good(passed, "passed with this set-up")
+    return HAND_TEST.bad(changed or "never passed", "passed with this set-up", "companion check --hand takes a minute")
+
+
+def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
+    """Was it at rest? Everything else relies on it."""
+    quarter = len(poses) // 4
+    first, last = poses[:quarter], poses[-quarter:]
+    moved_m = math.dist(
+        mean_vector([p.position_world_m for p in first]), mean_vector([p.position_world_m for p in last])
+    )
+    moved_deg = math.degrees(
+        turned_rad(mean_attitude([p.attitude_wxyz for p in first]), mean_attitude([p.attitude_wxyz for p in last]))
+    )
+    rate_deg_s = math.degrees(norm(mean_vector([state.angular_rate_body_rad_s for state in states])))
+    read = f"moved by {1e3 * moved_m:.1f} mm and {moved_deg:.1f} deg while it was watched, gyro {rate_deg_s:.1f} deg/s"
+    wanted = f"at most {1e3 * MOVED_MAX_M:g} mm, {MOVED_MAX_DEG:g} deg, {RATE_MAX_DEG_S:g} deg/s"
+    if moved_m > MOVED_MAX_M or moved_deg > MOVED_MAX_DEG:
+        return REST.bad(read, wanted, "hands off, and check again")
+    if rate_deg_s > RATE_MAX_DEG_S:
+        return REST.bad(read, wanted, "motion capture says that it stands: calibrate PX4's gyro")
+    return REST.good(read, wanted)
+
+
+def _noise(poses: list[MocapPose], at: Pose) -> Iterator[Row]:
+    away_mm = [1e3 * math.dist(pose.position_world_m, at.position_m) for pose in poses]
+    away_deg = [math.degrees(turned_rad(pose.attitude_wxyz, at.attitude)) for pose in poses]
+    fix = (
+        "refine the calibration, clean the lenses, cover what shines; give the rigid body more markers, asymmetric ones"
+    )
+    for check, away, unit, good, most, jump in (
+        (NOISE_POSITION, away_mm, "mm", NOISE_GOOD_MM, NOISE_MAX_MM, JUMP_MAX_MM),
+        (NOISE_ATTITUDE, away_deg, "deg", NOISE_GOOD_DEG, NOISE_MAX_DEG, JUMP_MAX_DEG),
+    ):
+        noise, worst = math.sqrt(sum(value * value for value in away) / len(away)), max(away)
+        read, wanted = f"{noise:.2g} {unit}, {worst:.2g} {unit} in the worst frame", f"{good:g} {unit}, {jump:g} {unit}"
+        if worst > jump or noise > most:
+            yield check.bad(read, wanted, fix)
+        elif noise > good:
+            yield check.doubtful(read, wanted, fix)
+        else:
+            yield check.good(read, wanted)
+
+
+def _accelerometer(force_m_s2: Vec3) -> Row:
+    size = norm(force_m_s2)
+    read, wanted = f"{size:.2f} m/s2", f"{GRAVITY_M_S2:g} within {GRAVITY_TOLERANCE_M_S2:g} m/s2"
+    if abs(size - GRAVITY_M_S2) <= GRAVITY_TOLERANCE_M_S2:
+        return ACCELEROMETER.good(read, wanted)
+    return ACCELEROMETER.bad(read, wanted, "calibrate PX4's accelerometer")
+
+
+def _px4(at: Pose, states: tuple[VehicleState, ...], vehicle: Vehicle) -> Iterator[Row]:
+    """PX4's own attitude beside motion capture's; the newest half of it, as its filter may just have begun."""
+    estimate = mean_attitude([state.attitude_wxyz for state in states[len(states) // 2 :]])
+    tilt_deg = math.degrees(angle_rad(quat_rotate(estimate, _UP), quat_rotate(at.attitude, _UP)))
+    read, wanted = f"{tilt_deg:.1f} deg apart", f"within {TILT_MAX_DEG:g} deg"
+    if tilt_deg <= TILT_MAX_DEG:
+        yield PX4_TILT.good(read, wanted)
+    else:
+        fix = "see gravity; if that is right, set PX4's level horizon (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF)"
+        yield PX4_TILT.bad(read, wanted, fix)
+    yaw_deg = math.degrees(wrap_rad(yaw_from_quat(estimate) - yaw_from_quat(at.attitude)))
+    most_deg = vehicle.safety.yaw_disagreement_deg
+    read, wanted = f"{yaw_deg:+.1f} deg apart", f"within {most_deg:g} deg (safety.yaw_disagreement_deg)"
+    if abs(yaw_deg) <= most_deg:
+        yield PX4_YAW.good(read, wanted)
+    else:
+        yield PX4_YAW.bad(read, wanted, "set EKF2_EV_CTRL to 11 and EKF2_MAG_TYPE to 5: companion px4 params --diff")

@@ -1,0 +1,80 @@
+"""The computer itself: room for the log, processor, real-time permission, recorder, broker. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from companion.preflight.checks import Check
+from companion.preflight.observations import Observations
+from companion.preflight.rows import Row
+
+DISK = Check(
+    "machine.disk",
+    "disk space",
+    "the log of the mission and of twice its length",
+    "a log that ends in the middle explains nothing; a full disk slows the whole computer down",
+)
+GOVERNOR = Check(
+    "machine.governor",
+    "processor",
+    "governor `performance` on every core, where it is told",
+    "a core that clocks down makes ticks late",
+    warns=True,
+)
+REALTIME = Check(
+    "machine.realtime",
+    "real-time permission",
+    "SCHED_FIFO",
+    "without it a busy computer makes ticks late",
+    warns=True,
+)
+RECORDER = Check(
+    "machine.recorder",
+    "recorder",
+    "the recorder process starts and opens a log",
+    "a flight without a log cannot be explained",
+)
+CHECKS = (DISK, GOVERNOR, REALTIME, RECORDER)
+
+LOG_BYTES_PER_S = 300_000
+"""Measured: 0.24 MB/s of flight.mcap."""
+REPORT_BYTES = 20_000_000
+DEFAULT_MISSION_S = 120.0
+GROUND_S = 30.0
+"""Before take-off and after landing."""
+
+
+def rows(o: Observations) -> Iterator[Row]:
+    """What was seen of the computer."""
+    machine = o.machine
+    if machine is not None:
+        if machine.disk_free_bytes is not None:
+            yield _disk(machine.disk_free_bytes, o.mission_s if o.mission_s is not None else DEFAULT_MISSION_S)
+        others = sorted({governor for governor in machine.governors if governor != "performance"})
+        if others:
+            fix = (
+                "cpupower frequency-set -g performance, as root; on a Pi, force_turbo=1 in config.txt does it for good"
+            )
+            yield GOVERNOR.bad(", ".join(others), "performance", fix)
+        else:
+            yield GOVERNOR.good("performance" if machine.governors else "no governor is told here", "performance")
+        if machine.realtime is None:
+            fix = "`@dialout - rtprio 60` in /etc/security/limits.conf, then log in again"
+            yield REALTIME.bad("refused: the flight runs at normal priority", "SCHED_FIFO", fix)
+        else:
+            yield REALTIME.good(machine.realtime, "SCHED_FIFO")
+    if o.recorder is not None:
+        if o.recorder:
+            yield RECORDER.bad(o.recorder, "it opens a log", "see the line itself; it names file and reason")
+        else:
+            yield RECORDER.good("opens a log", "it opens a log")
+
+
+def _disk(free_bytes: int, mission_s: float) -> Row:
+    once = LOG_BYTES_PER_S * (mission_s + GROUND_S) + REPORT_BYTES
+    twice = LOG_BYTES_PER_S * (2.0 * mission_s + GROUND_S) + REPORT_BYTES
+    read, wanted = f"{free_bytes / 1e6:.0f} MB free", f"{twice / 1e6:.0f} MB for a mission of {mission_s:.0f} s"
+    if free_bytes >= twice:
+        return DISK.good(read, wanted)
+    fix = "delete old flights, or name another disk with --out"
+    return (DISK.doubtful if free_bytes >= once else DISK.bad)(read, wanted, fix)

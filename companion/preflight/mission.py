@@ -1,0 +1,72 @@
+"""Can the mission be flown, is the arm as it says, does the machine stand in the room? Start place and yaw: `frames`. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from companion.config.loader import FlightConfig
+from companion.config.mission import Start
+from companion.config.vehicle import Room
+from companion.preflight.checks import Check
+from companion.preflight.observations import Observations
+from companion.preflight.rows import Row
+from companion.types import Vec2, Vec3
+
+PLAN = Check(
+    "mission.plan",
+    "mission",
+    "inside room and tether, within all limits; `fly` looks at it before it opens a device, exit 2",
+    "the flight would leave the room, pull at the tether or ask for more than the machine can",
+)
+ARM = Check(
+    "mission.arm",
+    "arm at the start",
+    "`start.arm_deg` of the mission within `start.arm_tolerance_deg`",
+    "the arm's first motion is planned from there",
+)
+ROOM = Check(
+    "mission.room",
+    "place in the room",
+    "body origin and rotors inside `room`",
+    "the walls of the room are all that keeps the rotors from the real ones",
+)
+CHECKS = (PLAN, ARM, ROOM)
+
+
+def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
+    """Plan, start pose and place."""
+    mission, vehicle = config.mission, config.vehicle
+    if o.plan is not None:
+        if o.plan:
+            yield PLAN.bad("; ".join(o.plan), "", "change the mission; companion check --plan-only tells quickly")
+        else:
+            length = f", {o.mission_s:.0f} s" if o.mission_s is not None else ""
+            yield PLAN.good(f"'{mission.name}' can be flown{length}")
+    if o.arm:
+        yield _arm(o.arm[-1].angle_rad, mission.start)
+    pose = next((pose for pose in reversed(o.mocap) if pose.tracking_valid), None)
+    if pose is not None:
+        yield _room(pose.position_world_m, vehicle.room, vehicle.airframe.radius_m)
+
+
+def _arm(angle_rad: Vec2, start: Start) -> Row:
+    first, second = (math.degrees(angle) for angle in angle_rad)
+    off_deg = max(abs(first - start.arm_deg[0]), abs(second - start.arm_deg[1]))
+    read = f"({first:.0f}, {second:.0f}) deg"
+    wanted = f"({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) deg within {start.arm_tolerance_deg:g} deg"
+    if off_deg <= start.arm_tolerance_deg:
+        return ARM.good(read, wanted)
+    return ARM.bad(read, wanted, "move it there by hand, or change start.arm_deg of the mission")
+
+
+def _room(position: Vec3, room: Room, radius_m: float) -> Row:
+    x, y, z = position
+    read = f"({x:.2f}, {y:.2f}, {z:.2f}) m"
+    spans = (room.x_m, room.y_m, room.z_m)
+    wanted = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in zip("xyz", spans, strict=True)) + " m"
+    reach = (radius_m, radius_m, 0.0)
+    inside = all(low + r <= p <= high - r for p, r, (low, high) in zip(position, reach, spans, strict=True))
+    if inside:
+        return ROOM.good(read, wanted)
+    return ROOM.bad(read, f"{wanted}, rotors ({radius_m:g} m) included", "carry it further in, or correct room")

@@ -1,0 +1,197 @@
+"""Motion capture as a stream: often, evenly, in time, without gaps, of our body. How its frames lie is judged in `frames`. Pure."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+from companion.config.vehicle import Vehicle
+from companion.preflight.checks import Check
+from companion.preflight.observations import MocapStream, Observations
+from companion.preflight.rows import Row
+from companion.types import MocapPose
+
+DEVICE = Check("mocap.device", "motion capture", "the server answers and streams", "without it PX4 has no position")
+RATE = Check(
+    "mocap.rate",
+    "mocap rate",
+    "90 % of `devices.mocap.rate_hz`; below `safety.mocap_rate_min_hz` refused",
+    "PX4's estimate becomes slow and noisy; in flight it counts as a fault",
+)
+JITTER = Check(
+    "mocap.jitter",
+    "mocap evenness",
+    "no frame later than 50 ms after the one before",
+    "EKF2 subtracts one fixed delay: frames that come in bursts are fused in the wrong place",
+    warns=True,
+)
+LATENCY = Check(
+    "mocap.latency",
+    "mocap latency",
+    "`safety.mocap_latency_warn_s`, and told by the server; `safety.mocap_timeout_s` refuses",
+    "EKF2_EV_DELAY says 5 ms: what is older is fused as if it were new",
+)
+LOST = Check(
+    "mocap.lost",
+    "mocap frames lost",
+    "0.5 %; above 5 % refused",
+    "a network that loses frames at rest loses more of them in flight",
+)
+TRACKED = Check(
+    "mocap.tracked",
+    "body tracked",
+    "in every frame; less than 95 % refused",
+    "a body that is lost at the start is lost in flight: PX4 then drifts",
+)
+BODY = Check(
+    "mocap.body",
+    "rigid body",
+    "`devices.mocap.rigid_body_id`, and nothing else that could be taken for it",
+    "another body's pose would be flown",
+    warns=True,
+)
+ERROR = Check(
+    "mocap.error",
+    "marker error",
+    "2 mm on average",
+    "bent or swapped markers turn the body's axes",
+    warns=True,
+)
+CLOCK = Check(
+    "mocap.clock",
+    "mocap clock against ours",
+    "frames by their number come steadily: rate within 1 %, wandering less than 20 ms",
+    "clocks that run apart, or a server that stops and catches up, make every age wrong",
+    warns=True,
+)
+CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, BODY, ERROR, CLOCK)
+
+RATE_GOOD = 0.9
+GAP_GOOD_S = 0.05
+LOST_GOOD, LOST_MAX = 0.005, 0.05
+TRACKED_MIN = 0.95
+ERROR_GOOD_M = 0.002
+CLOCK_GOOD, WANDER_GOOD_S = 0.01, 0.020
+
+
+def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
+    """What was seen of motion capture."""
+    failure, stream = o.failures.get("mocap"), o.mocap_stream
+    if failure is not None:
+        yield DEVICE.bad(failure, "", "")
+        return
+    if stream is None:
+        yield DEVICE.bad("was not looked at", "", "")
+        return
+    yield DEVICE.good(stream.application or "answers")
+    yield _rate(o, stream, vehicle)
+    if len(o.mocap) < 3:
+        return
+    yield _jitter(o.mocap, vehicle)
+    yield _latency(o.mocap, vehicle)
+    yield _lost(stream)
+    yield _tracked(o.mocap)
+    yield _body(stream, vehicle)
+    yield _error(o.mocap)
+    yield _clock(o.mocap, vehicle)
+
+
+def _rate(o: Observations, stream: MocapStream, vehicle: Vehicle) -> Row:
+    rate_hz, expected_hz = stream.frames / o.duration_s, vehicle.devices.mocap.rate_hz
+    least_hz = vehicle.safety.mocap_rate_min_hz
+    read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz:g} Hz"
+    if rate_hz >= RATE_GOOD * expected_hz:
+        return RATE.good(read, wanted)
+    fix = "set the camera rate in Motive or devices.mocap.rate_hz; look for a slow network or a busy computer"
+    return (RATE.doubtful if rate_hz >= least_hz else RATE.bad)(read, wanted, fix)
+
+
+def _jitter(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
+    gap_s = max(b.stamp_s - a.stamp_s for a, b in itertools.pairwise(poses))
+    read, wanted = f"longest gap {gap_s * 1e3:.0f} ms", f"{GAP_GOOD_S * 1e3:.0f} ms"
+    if gap_s <= max(GAP_GOOD_S, 2.5 / vehicle.devices.mocap.rate_hz):
+        return JITTER.good(read, wanted)
+    fix = "use a cable, not Wi-Fi; turn power saving of the network card off; see processor and real-time permission"
+    return JITTER.bad(read, wanted, fix)
+
+
+def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
+    limit_s, worst_s = vehicle.safety.mocap_latency_warn_s, vehicle.safety.mocap_timeout_s
+    wanted = f"{limit_s * 1e3:.0f} ms"
+    told_s = sorted(pose.latency_s for pose in poses if pose.latency_s is not None)
+    if not told_s:
+        return LATENCY.doubtful(
+            "the server does not tell it", wanted, "use NatNet 3.0 or 4.1 with cameras that stamp exposure"
+        )
+    high_s = told_s[int(0.99 * (len(told_s) - 1))]
+    read = f"{told_s[len(told_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"
+    if high_s <= limit_s:
+        return LATENCY.good(read, wanted)
+    fix = "lower Motive's load: fewer markers and bodies, no video, labelled markers off"
+    return (LATENCY.doubtful if high_s <= worst_s else LATENCY.bad)(read, wanted, fix)
+
+
+def _lost(stream: MocapStream) -> Row:
+    share = stream.lost / max(1, stream.frames + stream.lost)
+    read, wanted = f"{stream.lost} of {stream.frames + stream.lost} frames, {share:.1%}", f"{LOST_GOOD:.1%}"
+    if share <= LOST_GOOD:
+        return LOST.good(read, wanted)
+    fix = "use a cable to a network of its own; on Wi-Fi take unicast (devices.mocap.transport)"
+    return (LOST.doubtful if share <= LOST_MAX else LOST.bad)(read, wanted, fix)
+
+
+def _tracked(poses: tuple[MocapPose, ...]) -> Row:
+    share = sum(pose.tracking_valid for pose in poses) / len(poses)
+    read = f"{share:.1%} of the frames"
+    if share == 1.0:
+        return TRACKED.good(read, "all")
+    fix = "clean or move the markers, uncover them from the cameras, calibrate the volume"
+    return (TRACKED.doubtful if share >= TRACKED_MIN else TRACKED.bad)(read, "all", fix)
+
+
+def _body(stream: MocapStream, vehicle: Vehicle) -> Row:
+    number = vehicle.devices.mocap.rigid_body_id
+    name = f' "{stream.body_name}"' if stream.body_name else ""
+    if not stream.other_bodies:
+        return BODY.good(f"id {number}{name}, no other", f"id {number}")
+    others = ", ".join(map(str, stream.other_bodies))
+    fix = "make sure that this is the vehicle's; switch the others off in Motive, or give them another shape"
+    return BODY.bad(f"id {number}{name}, and others: {others}", f"id {number} alone", fix)
+
+
+def _error(poses: tuple[MocapPose, ...]) -> Row:
+    mean_m = sum(pose.marker_error_m for pose in poses) / len(poses)
+    read, wanted = f"{mean_m * 1e3:.1f} mm", f"{ERROR_GOOD_M * 1e3:.0f} mm"
+    if mean_m <= ERROR_GOOD_M:
+        return ERROR.good(read, wanted)
+    return ERROR.bad(read, wanted, "create the rigid body anew in Motive; fasten its markers; calibrate the volume")
+
+
+def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
+    """Least squares of arrival over frame number: its slope is the server's frame period by our clock, the rest is wandering."""
+    count, first = len(poses), poses[0]
+    n = [pose.frame_number - first.frame_number for pose in poses]
+    t = [pose.stamp_s - first.stamp_s for pose in poses]
+    mean_n, mean_t = sum(n) / count, sum(t) / count
+    spread = sum((a - mean_n) ** 2 for a in n)
+    period_s = sum((a - mean_n) * (b - mean_t) for a, b in zip(n, t, strict=True)) / spread if spread else 0.0
+    expected_hz = vehicle.devices.mocap.rate_hz
+    wanted = f"{1e3 / expected_hz:.3f} ms a frame, steady to {WANDER_GOOD_S * 1e3:.0f} ms"
+    if not period_s > 0.0:
+        return CLOCK.bad(
+            "the frame number stands still", wanted, "restart streaming in Motive; it is paused or plays a take"
+        )
+    # Late frames are jitter; what counts here is where the bulk of a tenth of the time lies.
+    off_s = sorted(_medians([b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True)]))
+    wander_s = off_s[-1] - off_s[0]
+    read = f"{period_s * 1e3:.3f} ms a frame, wanders by {wander_s * 1e3:.1f} ms"
+    if abs(period_s * expected_hz - 1.0) <= CLOCK_GOOD and wander_s <= WANDER_GOOD_S:
+        return CLOCK.good(read, wanted)
+    fix = "set devices.mocap.rate_hz to the camera rate; look for a server that stalls, or time synchronisation that steps"
+    return CLOCK.bad(read, wanted, fix)
+
+
+def _medians(values: list[float]) -> list[float]:
+    size = max(1, len(values) // 10)
+    parts = [sorted(values[i : i + size]) for i in range(0, len(values) - size + 1, size)]
+    return [part[len(part) // 2] for part in parts]

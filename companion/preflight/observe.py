@@ -1,0 +1,306 @@
+"""Watches the open devices for some seconds and writes down what they deliver. The only part of the preflight that does I/O."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TypeVar
+
+from companion.clock import Clock
+from companion.config.loader import FlightConfig
+from companion.devices import Edges, SomeEdges
+from companion.io.autopilot import MavsdkAutopilot
+from companion.io.dynamixel import usb_latency_ms
+from companion.io.edges import DeviceError
+from companion.preflight.observations import (
+    EstimatorReport,
+    ForceStream,
+    Machine,
+    MocapStream,
+    Observations,
+    StateCounts,
+    Waiting,
+)
+from companion.realtime import FLIGHT_PRIORITY, realtime_permitted
+from companion.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
+
+LOOK_PERIOD_S = 0.005
+"""As in flight: the servo bus is worked as hard as it will be."""
+READ_TIMEOUT_S = 0.003
+COUNT_PERIOD_S = 0.1
+TELL_PERIOD_S = 0.5
+GOVERNORS = Path("/sys/devices/system/cpu")
+
+Tell = Callable[[str, float], None]
+"""Shown to people: what is being looked at, and the share of the time that is over."""
+Unsettled = Callable[[Observations], Waiting | None]
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class _Counts:
+    """Counters of all edges at one time."""
+
+    t_s: float
+    mocap_frames: int = 0
+    mocap_numbers: int = 0
+    """Frame number of the newest pose."""
+    force_samples: int = 0
+    state: StateCounts = field(default_factory=lambda: StateCounts(0, 0, 0))
+    arm_cycles: int = 0
+    arm_missed: int = 0
+
+
+async def observe(
+    edges: Edges | SomeEdges,
+    config: FlightConfig,
+    clock: Clock,
+    *,
+    out: Path,
+    param_names: Iterable[str],
+    unsettled: Unsettled,
+    tell: Tell,
+    known: Observations | None = None,
+) -> Observations:
+    """Watch everything for `safety.preflight_s`, and on while something is worth waiting for.
+
+    Meanwhile PX4's version and parameters are read, and the servo bus is read as in flight, which keeps its watchdogs quiet.
+
+    Args:
+        edges: open; of what could not be opened only the failure is taken over.
+        config: the effective configuration.
+        clock: the flight clock.
+        out: folder for the files of the flight, for the disk's free space.
+        param_names: PX4's parameters to read.
+        unsettled: asked when the time is over, about the last `preflight_s`.
+        tell: progress.
+        known: what was found out elsewhere: plan, recorder, mission length, hand test.
+    """
+    watcher = _Watcher(edges, config, clock)
+    duration_s = config.vehicle.safety.preflight_s
+    base = known or Observations(0.0, 0.0)
+    failures = dict(edges.failures) if isinstance(edges, SomeEdges) else {}
+    base = replace(base, machine=machine_of(config, out), failures=failures)
+    async with asyncio.TaskGroup() as group:
+        asking = group.create_task(_ask(edges.autopilot, param_names)) if edges.autopilot is not None else None
+        edges.vision.watch = watcher.on_pose
+        try:
+            start_s = told_s = clock()
+            waiting: Waiting | None = None
+            tell(*_words(None, 0.0, duration_s))
+            while True:
+                await watcher.look()
+                elapsed_s = clock() - start_s
+                if clock() - told_s >= TELL_PERIOD_S:
+                    told_s = clock()
+                    tell(*_words(waiting, elapsed_s, duration_s))
+                if elapsed_s < duration_s or (asking is not None and not asking.done()):
+                    continue
+                seen = watcher.seen(base, duration_s)
+                if asking is not None:
+                    seen = _with_answers(seen, asking.result())
+                waiting = unsettled(seen)
+                if waiting is None or elapsed_s > duration_s + waiting.longest_s:
+                    return seen
+                again_s = clock() + TELL_PERIOD_S
+                while clock() < again_s:
+                    await watcher.look()
+        finally:
+            edges.vision.watch = None
+
+
+def _words(waiting: Waiting | None, elapsed_s: float, duration_s: float) -> tuple[str, float]:
+    if elapsed_s < duration_s:
+        return f"all devices ... {math.ceil(duration_s - elapsed_s)} s", elapsed_s / duration_s
+    if waiting is None:
+        return "PX4's parameters", 1.0
+    waited_s = elapsed_s - duration_s
+    left_s = max(0.0, waiting.longest_s - waited_s)
+    return f"waiting for: {waiting.what}, {left_s:.0f} s at most", min(1.0, waited_s / waiting.longest_s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Answers:
+    """What PX4 was asked."""
+
+    firmware: str | None
+    params: dict[str, float | int]
+    failure: str | None
+
+
+async def _ask(autopilot: MavsdkAutopilot, names: Iterable[str]) -> _Answers:
+    try:
+        firmware = await autopilot.firmware()
+        return _Answers(firmware, await autopilot.read_params(names), None)
+    except DeviceError as error:
+        return _Answers(None, {}, str(error))
+
+
+def _with_answers(seen: Observations, answers: _Answers) -> Observations:
+    if answers.failure is not None:
+        return replace(seen, failures={**seen.failures, "autopilot": answers.failure})
+    return replace(seen, firmware=answers.firmware, params=answers.params)
+
+
+class _Watcher:
+    """Collects what the edges deliver; old things are forgotten when somebody asks for the newest."""
+
+    def __init__(self, edges: Edges | SomeEdges, config: FlightConfig, clock: Clock) -> None:
+        self._edges = edges
+        self._device = config.vehicle.devices.mocap
+        self._clock = clock
+        self._poses: deque[MocapPose] = deque()
+        self._vehicle: deque[VehicleState] = deque()
+        self._status: deque[AutopilotStatus] = deque()
+        self._estimator: deque[EstimatorReport] = deque()
+        self._arm: deque[ArmState] = deque()
+        self._force: deque[ForceSample] = deque()
+        self._arm_cycles = self._arm_missed = 0
+        self._counts: deque[_Counts] = deque([self._count()])
+
+    def on_pose(self, pose: MocapPose) -> None:
+        """Every pose that arrives."""
+        self._poses.append(pose)
+
+    async def look(self) -> None:
+        """Take what is new, once; one bus cycle of the arm."""
+        edges = self._edges
+        if edges.arm is not None:
+            state = await edges.arm.read(READ_TIMEOUT_S)
+            if state is not None:
+                if not self._arm or state.stamp_s != self._arm[-1].stamp_s:
+                    self._arm.append(state)
+                    self._arm_cycles += 1
+                elif state.read_failures != self._arm[-1].read_failures:
+                    self._arm_missed += max(0, state.read_failures - self._arm[-1].read_failures)
+                    self._arm_cycles += 1
+                    self._arm[-1] = state
+        if edges.autopilot is not None:
+            _take(self._vehicle, edges.autopilot.vehicle())
+            _take(self._status, edges.autopilot.status())
+            _take(self._estimator, edges.autopilot.estimator())
+        if edges.force is not None:
+            _take(self._force, edges.force.latest())
+        now_s = self._clock()
+        if now_s - self._counts[-1].t_s >= COUNT_PERIOD_S:
+            self._counts.append(self._count())
+        await asyncio.sleep(LOOK_PERIOD_S)
+
+    def seen(self, base: Observations, duration_s: float) -> Observations:
+        """What came in the last `duration_s`, to a tenth of a second."""
+        now = self._count()
+        while len(self._counts) > 1 and self._counts[1].t_s <= now.t_s - duration_s:
+            self._counts.popleft()
+        first = self._counts[0]
+        edges, start_s = self._edges, first.t_s
+        _forget(self._poses, lambda pose: pose.stamp_s < start_s)
+        _forget(self._vehicle, lambda state: state.attitude_stamp_s < start_s)
+        _forget(self._estimator, lambda report: report.stamp_s < start_s)
+        _forget(self._arm, lambda state: state.stamp_s < start_s)
+        _forget(self._force, lambda sample: sample.stamp_s < start_s)
+        return replace(
+            base,
+            start_s=start_s,
+            duration_s=now.t_s - start_s,
+            vehicle=tuple(self._vehicle),
+            status=tuple(self._status),
+            estimator=tuple(self._estimator),
+            mocap=tuple(self._poses),
+            mocap_stream=self._mocap_stream(first, now),
+            arm=tuple(self._arm),
+            servos=edges.arm.servos if edges.arm is not None else (),
+            force=tuple(self._force),
+            state_counts=_between(first.state, now.state) if edges.autopilot is not None else None,
+            force_stream=self._force_stream(first, now),
+            arm_reads=(now.arm_cycles - first.arm_cycles, now.arm_missed - first.arm_missed)
+            if edges.arm is not None
+            else None,
+        )
+
+    def _count(self) -> _Counts:
+        edges = self._edges
+        frames = numbers = 0
+        if edges.mocap is not None:
+            health, latest = edges.mocap.health(), edges.mocap.latest()
+            frames = health.frames + health.superseded
+            numbers = latest.frame_number if latest is not None else 0
+        return _Counts(
+            self._clock(),
+            frames,
+            numbers,
+            edges.force.health().samples if edges.force is not None else 0,
+            edges.autopilot.counts() if edges.autopilot is not None else StateCounts(0, 0, 0),
+            self._arm_cycles,
+            self._arm_missed,
+        )
+
+    def _mocap_stream(self, first: _Counts, now: _Counts) -> MocapStream | None:
+        mocap = self._edges.mocap
+        if mocap is None:
+            return None
+        frames, info = now.mocap_frames - first.mocap_frames, mocap.server_info
+        own, bodies = self._device.rigid_body_id, mocap.bodies
+        application = ""
+        if info is not None:
+            version = ".".join(map(str, info.application_version)).removesuffix(".0").removesuffix(".0")
+            application = f"{info.application} {version}, NatNet {info.version}".strip()
+        return MocapStream(
+            frames=frames,
+            lost=max(0, now.mocap_numbers - first.mocap_numbers - frames),
+            application=application,
+            other_bodies=tuple(sorted(number for number in bodies if number != own)),
+            body_name=bodies.get(own, ""),
+        )
+
+    def _force_stream(self, first: _Counts, now: _Counts) -> ForceStream | None:
+        force = self._edges.force
+        if force is None:
+            return None
+        health = force.health()
+        product = f"{force.product_name}, firmware {force.firmware}" if force.firmware else force.product_name
+        return ForceStream(now.force_samples - first.force_samples, health.bad_sums, product, health.lost)
+
+
+def _take(kept: deque[_T], newest: _T | None) -> None:
+    """Add what is new; edges hand out the same record until another one has come."""
+    if newest is not None and (not kept or newest != kept[-1]):
+        kept.append(newest)
+
+
+def _forget(kept: deque[_T], old: Callable[[_T], bool]) -> None:
+    while kept and old(kept[0]):
+        kept.popleft()
+
+
+def _between(first: StateCounts, now: StateCounts) -> StateCounts:
+    return StateCounts(now.position - first.position, now.attitude - first.attitude, now.imu - first.imu)
+
+
+def machine_of(config: FlightConfig, out: Path) -> Machine:
+    """Disk, processor, permission and serial adapters of this computer."""
+    folder = next((path for path in (out, *out.absolute().parents) if path.is_dir()), Path())
+    try:
+        free_bytes: int | None = shutil.disk_usage(folder).free
+    except OSError:
+        free_bytes = None
+    governors = []
+    for core in range(os.cpu_count() or 1):
+        with contextlib.suppress(OSError):
+            text = (GOVERNORS / f"cpu{core}/cpufreq/scaling_governor").read_text(encoding="ascii")
+            governors.append(text.strip())
+    devices = config.vehicle.devices
+    return Machine(
+        disk_free_bytes=free_bytes,
+        governors=tuple(governors),
+        realtime=realtime_permitted(FLIGHT_PRIORITY),
+        arm_latency_ms=usb_latency_ms(devices.arm.port),
+        force_latency_ms=usb_latency_ms(devices.force.port),
+    )

@@ -1,0 +1,90 @@
+"""PX4's firmware and parameters against what this project needs of them. Pure: the table is `companion.px4.wanted`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+
+from companion.config.vehicle import Vehicle
+from companion.preflight.rows import Level, Row
+from companion.px4.wanted import WANTED, Value, Wanted
+
+KNOWN_GOOD = ((1, 16), (1, 18))
+"""Versions that missions were flown with, in simulation."""
+OLDEST = (1, 15)
+FIRMWARE_ID, UNREAD_ID = "px4.firmware", "px4.params"
+PARAM_ID = "px4.param."
+"""Followed by the parameter's name."""
+
+_FIRMWARE = re.compile(r"PX4 (\d+)\.(\d+)\.(\d+) (\w+)")
+_FIRMWARE_WHY = "parameters change their meaning between versions, and EKF2 its behaviour"
+_WRITE = "companion px4 params --write"
+
+
+def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) -> list[Row]:
+    """One row for the firmware, one per parameter.
+
+    Args:
+        firmware: as `MavsdkAutopilot.firmware` tells it; None: not known, no row.
+        params: PX4's parameters by name; one that PX4 does not have is absent.
+        vehicle: limits, room, thrust and the link's address.
+    """
+    found = [] if firmware is None else [firmware_row(firmware)]
+    if not params:
+        if firmware is not None:
+            why = "nobody knows how PX4 would behave"
+            found.append(
+                Row(UNREAD_ID, "PX4 parameters", False, "none was read", "", why, "check the link, then try again")
+            )
+        return found
+    return [*found, *_param_rows(params, vehicle)]
+
+
+def firmware_row(firmware: str) -> Row:
+    """`PX4 1.16.1 release (git ...)`: 1.16 and 1.18 are known good, older than 1.15 is refused, others are told."""
+    wanted = "1.16.x or 1.18.x, a release"
+
+    def row(ok: bool, level: Level = Level.WARN, fix: str = "") -> Row:
+        return Row(FIRMWARE_ID, "PX4 firmware", ok, firmware, wanted, _FIRMWARE_WHY, fix, level)
+
+    match = _FIRMWARE.match(firmware)
+    if match is None:
+        return row(False, fix="flash a release of PX4 1.16 or 1.18")
+    version, kind = (int(match[1]), int(match[2])), match[4]
+    if version < OLDEST:
+        return row(False, Level.REFUSE, "flash a release of PX4 1.16 or 1.18: parameters of this one have other names")
+    if version not in KNOWN_GOOD:
+        return row(False, fix="nothing here was flown with it: flash 1.16 or 1.18, or fly with care, tethered")
+    if kind != "release":
+        return row(False, fix=f"this is a build of kind {kind}: flash the release")
+    return row(True)
+
+
+def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
+    serial = vehicle.devices.autopilot.address.startswith("serial")
+    for wanted in WANTED:
+        if wanted.hardware and not serial:
+            continue
+        value = params.get(wanted.name)
+        text = wanted.text(vehicle)
+        row_id = PARAM_ID + wanted.name
+        if value is None:
+            fix = "check the firmware: PX4 1.16 and 1.18 have it"
+            yield Row(row_id, wanted.name, False, "PX4 does not have it", text, wanted.why, fix, Level.WARN)
+            continue
+        ok = wanted.accepts(value, vehicle)
+        yield Row(row_id, wanted.name, ok, text_of(value), text, wanted.why, "" if ok else fix_of(wanted), wanted.level)
+
+
+def fix_of(wanted: Wanted) -> str:
+    """What to do about a value that is not accepted."""
+    if wanted.fix:
+        fix = wanted.fix
+    else:
+        fix = f"set {wanted.name} to {text_of(wanted.value)} ({_WRITE})" if wanted.value is not None else ""
+    return f"{fix}, then reboot PX4" if wanted.reboot else fix
+
+
+def text_of(value: Value | None) -> str:
+    """A value as people write it: REAL32 to the digits that it has."""
+    return f"{value:.7g}" if isinstance(value, float) else f"{value}"

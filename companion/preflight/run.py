@@ -1,0 +1,74 @@
+"""A preflight from beginning to end: watch, judge, write down."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from companion.clock import Clock
+from companion.config.loader import FlightConfig
+from companion.devices import Edges, SomeEdges
+from companion.preflight import hand_record, judge
+from companion.preflight.observations import Observations
+from companion.preflight.observe import Tell, observe
+from companion.preflight.rows import Row, refusals
+
+SCHEMA_VERSION = 1
+FILE = "preflight.json"
+
+
+async def preflight(
+    edges: Edges | SomeEdges,
+    config: FlightConfig,
+    clock: Clock,
+    *,
+    out: Path,
+    tell: Tell,
+    known: Observations,
+    sitl: bool,
+) -> list[Row]:
+    """Watch the open devices and judge what came.
+
+    Args:
+        edges, config, clock, out, tell, known: as `companion.preflight.observe.observe` takes them.
+        sitl: in the simulated world no record of the hand test is asked for.
+    """
+    if not sitl and edges.mocap is not None and edges.mocap.server_info is not None:
+        passed, changed = _hand_test(config, edges.mocap.server_info.version)
+        known = replace(known, hand_test=passed, hand_test_changed=changed)
+    seen = await observe(
+        edges,
+        config,
+        clock,
+        out=out,
+        param_names=judge.param_names(),
+        unsettled=lambda o: judge.unsettled(o, config),
+        tell=tell,
+        known=known,
+    )
+    return judge.rows(seen, config)
+
+
+def _hand_test(config: FlightConfig, natnet_version: str) -> tuple[str, str]:
+    try:
+        tests = hand_record.load(hand_record.record_path())
+    except hand_record.RecordError as error:
+        return "", str(error)
+    return hand_record.on_record(hand_record.Setup.of(config.vehicle, natnet_version), tests)
+
+
+def as_json(rows: Sequence[Row]) -> dict[str, Any]:
+    """The contract of `companion check --json` and of `preflight.json`."""
+    return {"schema_version": SCHEMA_VERSION, "ok": not refusals(rows), "rows": [row.as_json() for row in rows]}
+
+
+def write(rows: Sequence[Row], out: Path) -> None:
+    """`preflight.json` of a flight's folder.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    (out / FILE).write_text(json.dumps(as_json(rows), indent=1), encoding="utf-8")

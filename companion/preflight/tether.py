@@ -1,0 +1,60 @@
+"""The safety tether as the vehicle file describes it, where the machine stands. Nothing measures it: people compare. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from companion.config.vehicle import Vehicle
+from companion.frames import quat_rotate
+from companion.preflight.checks import Check
+from companion.preflight.observations import Observations
+from companion.preflight.rows import Row
+
+LINE = Check(
+    "tether.line",
+    "tether as described",
+    "for people to compare with what hangs there",
+    "every distance to the taut sphere is computed from it",
+)
+STRENGTH = Check(
+    "tether.strength",
+    "tether strength",
+    "`tether.load_rating_n` holds the rotors at full command",
+    "a tether that breaks is none",
+)
+SLACK = Check(
+    "tether.slack",
+    "tether slack at the start",
+    "`tether.margin_m` or more, where the machine stands",
+    "a tether that is taut at the start pulls the machine over as it lifts",
+)
+CHECKS = (LINE, STRENGTH, SLACK)
+
+
+def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
+    """What can be told of the tether."""
+    tether, airframe = vehicle.tether, vehicle.airframe
+    x, y, z = tether.anchor_world_m
+    ax, ay, az = tether.attachment_body_m
+    yield LINE.good(
+        f"{tether.length_m:g} m, from the anchor at ({x:g}, {y:g}, {z:g}) m to ({ax:g}, {ay:g}, {az:g}) m of the body",
+        "compare with a tape measure",
+    )
+    read, wanted = f"{tether.load_rating_n:g} N", f"{airframe.thrust_max_n:g} N (airframe.thrust_max_n)"
+    if tether.load_rating_n >= airframe.thrust_max_n:
+        yield STRENGTH.good(read, wanted)
+    else:
+        yield STRENGTH.bad(read, wanted, "take a stronger tether, and correct tether.load_rating_n")
+    pose = next((pose for pose in reversed(o.mocap) if pose.tracking_valid), None)
+    if pose is None:
+        return
+    attachment = quat_rotate(pose.attitude_wxyz, tether.attachment_body_m)
+    tied_m = [p + a for p, a in zip(pose.position_world_m, attachment, strict=True)]
+    slack_m = tether.length_m - math.dist(tied_m, tether.anchor_world_m)
+    read, wanted = f"{slack_m:.2f} m", f"{tether.margin_m:g} m or more"
+    if slack_m >= tether.margin_m:
+        yield SLACK.good(read, wanted)
+    else:
+        fix = "carry the machine nearer to the anchor, or correct tether.length_m and tether.anchor_world_m"
+        yield SLACK.bad(read, wanted, fix)

@@ -1,0 +1,75 @@
+"""The hand test against the simulated machine and its hand, without wires."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.frames import (
+    attitude_enu_flu_from_ned_frd,
+    attitude_ned_frd_from_enu_flu,
+    enu_from_ned,
+    flu_from_frd,
+    ned_from_enu,
+)
+from companion.preflight.hand_test import HandSample
+from companion.types import MocapPose, VehicleState
+from sitl.autopilot.autopilot import Px4Stub, gains_from_params
+from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.estimator import Estimator
+from sitl.autopilot.params import Params
+from sitl.plant import Plant
+from sitl.server import start_of
+from sitl.servo_drive import ServoDrive
+from tests.support import CATCH
+
+TICK_S = 0.005
+
+
+def world(*overrides: str) -> FlightConfig:
+    """The catch mission's machine with its world set otherwise, nothing thrown, a hand that begins after 4 s."""
+    words = ["world.payload_kg=0", "world.hand_t_s=4", *(f"world.{text}" for text in overrides)]
+    return load_flight(CATCH, overrides=words)
+
+
+class Standing:
+    """Machine, PX4 stub and motion capture; what the companion would hear of them every 5 ms."""
+
+    def __init__(self, config: FlightConfig) -> None:
+        self.config = config
+        start = config.mission.start
+        params = Params()
+        self.px4 = Px4Stub(params, Estimator(), Cascade(gains_from_params(params)))
+        pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
+        drives = [ServoDrive() for _ in config.vehicle.arm.joints]
+        where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
+        self.plant = Plant(config.vehicle, config.world, self.px4, drives, where)
+        self._pose: MocapPose | None = None
+
+    def samples(self, until_s: float) -> Iterator[HandSample]:
+        """As `companion.preflight.hand_command` takes them."""
+        tick = 0
+        while self.plant.t_s < until_s:
+            tick += 1
+            while self.plant.t_s < tick * TICK_S - 1e-9:
+                self.plant.step(False)
+                for frame in self.plant.take_mocap():
+                    t_s, p, q = self.plant.t_s, frame.position_world_m, frame.attitude_wxyz
+                    self._pose = MocapPose(t_s, t_s - frame.exposure_t_s, frame.number, p, q, frame.valid, 0.0002)
+                    self.px4.on_vision(t_s, ned_from_enu(p), attitude_ned_frd_from_enu_flu(q))
+            yield HandSample(self.plant.t_s, self._pose, self._vehicle(), False)
+
+    def _vehicle(self) -> VehicleState | None:
+        estimate, t_s = self.px4.estimate, self.plant.t_s
+        if estimate is None:
+            return None
+        return VehicleState(
+            t_s,
+            t_s,
+            t_s,
+            enu_from_ned(estimate.position_ned_m),
+            enu_from_ned(estimate.velocity_ned_m_s),
+            attitude_enu_flu_from_ned_frd(estimate.attitude_ned_frd),
+            flu_from_frd(estimate.rates_frd_rad_s),
+            flu_from_frd(estimate.accel_frd_m_s2),
+        )

@@ -1,0 +1,194 @@
+"""What a preflight sees of a sound machine, 5 s of it, as plain records."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.frames import quat_from_euler_zyx
+from companion.preflight.observations import (
+    EstimatorReport,
+    ForceStream,
+    Machine,
+    MocapStream,
+    Observations,
+    ServoReport,
+    StateCounts,
+)
+from companion.px4 import wanted
+from companion.types import (
+    ArmState,
+    AutopilotStatus,
+    FlightMode,
+    ForceSample,
+    LandedState,
+    MocapPose,
+    Vec2,
+    VehicleState,
+)
+from tests.support import CATCH
+
+START_S, SPAN_S = 2.0, 5.0
+ARM_RAD: Vec2 = (math.radians(165.0), math.radians(140.0))
+PARAMS = {**{one.name: one.value for one in wanted.WANTED if one.value is not None}, wanted.HOVER: 0.49}
+FLAGS = 447
+"""As PX4 1.16 says it of a machine that stands and fuses motion capture, with a global origin."""
+
+
+@cache
+def config() -> FlightConfig:
+    return load_flight(CATCH)
+
+
+def wave(index: int, size: float) -> float:
+    """Something like noise, the same in every run."""
+    return size * ((index * 7 % 11) - 5) / 5.0
+
+
+def vehicle(count: int = 620) -> tuple[VehicleState, ...]:
+    states = []
+    for i in range(count):
+        t_s = START_S + (i + 1) * SPAN_S / count
+        position, attitude = (
+            (-1.0 + wave(i, 0.002), wave(i + 3, 0.002), 0.30),
+            quat_from_euler_zyx(0.0, 0.0, wave(i, 0.002)),
+        )
+        force = (wave(i, 0.05), wave(i + 1, 0.05), 9.81 + wave(i + 2, 0.05))
+        states.append(
+            VehicleState(
+                t_s, t_s, t_s, position, (0.0, 0.0, 0.0), attitude, (0.0, 0.0, wave(i, 0.01)), force, t_s + 40.0
+            )
+        )
+    return tuple(states)
+
+
+def estimator(**changes: float) -> tuple[EstimatorReport, ...]:
+    values = {
+        "flags": FLAGS,
+        "velocity_ratio": 0.0,
+        "position_horizontal_ratio": 0.02,
+        "position_vertical_ratio": 0.01,
+        "position_horizontal_accuracy_m": 0.004,
+        "position_vertical_accuracy_m": 0.005,
+        **changes,
+    }
+    return tuple(EstimatorReport(START_S + 0.2 * i, **values) for i in range(1, 26))  # type: ignore[arg-type]
+
+
+def mocap(count: int = 1000, **changes: object) -> tuple[MocapPose, ...]:
+    poses = []
+    for i in range(count):
+        values: dict[str, object] = {
+            "stamp_s": START_S + (i + 1) * SPAN_S / count + wave(i, 0.0005),
+            "latency_s": 0.006,
+            "frame_number": 5000 + i,
+            "position_world_m": (-1.0 + wave(i, 0.0004), wave(i + 5, 0.0004), 0.30),
+            "attitude_wxyz": quat_from_euler_zyx(0.0, 0.0, wave(i + 2, 0.001)),
+            "tracking_valid": True,
+            "marker_error_m": 0.0003,
+            **changes,
+        }
+        poses.append(MocapPose(**values))  # type: ignore[arg-type]
+    return tuple(poses)
+
+
+def arm(**changes: object) -> tuple[ArmState, ...]:
+    states = []
+    for i in range(700):
+        values: dict[str, object] = {
+            "stamp_s": START_S + (i + 1) * SPAN_S / 700,
+            "angle_rad": ARM_RAD,
+            "velocity_rad_s": (0.0, 0.0),
+            "torque_nm": (0.0, 0.0),
+            "hardware_error": (0, 0),
+            "temperature_c": (31.0, 33.0),
+            "read_failures": 0,
+            **changes,
+        }
+        states.append(ArmState(**values))  # type: ignore[arg-type]
+    return tuple(states)
+
+
+def servos(**changes: object) -> tuple[ServoReport, ...]:
+    """Two; the changes are the second one's."""
+    values: dict[str, object] = {
+        "model": 1030,
+        "firmware": 48,
+        "operating_mode": 0,
+        "return_delay_us": 0,
+        "current_limit_counts": 1193,
+        "watchdog_ms": 100,
+        "voltage_v": 12.1,
+    }
+    return ServoReport(servo_id=1, **values), ServoReport(servo_id=2, **{**values, **changes})  # type: ignore[arg-type]
+
+
+def force(
+    *, bias_n: float = 2.0, noise_n: float = 0.05, drift_n: float = 0.0, overload: bool = False
+) -> tuple[ForceSample, ...]:
+    return tuple(
+        ForceSample(
+            START_S + (i + 1) * SPAN_S / 1000,
+            (bias_n + wave(i, noise_n) + drift_n * i / 1000, wave(i + 1, noise_n), 0.7),
+            (0.0, 0.0, 0.0),
+            overload and i == 500,
+        )
+        for i in range(1000)
+    )
+
+
+def status(**changes: object) -> tuple[AutopilotStatus, ...]:
+    values: dict[str, object] = {
+        "heartbeat_stamp_s": START_S + SPAN_S - 0.4,
+        "armed": False,
+        "mode": FlightMode.HOLD,
+        "landed": LandedState.ON_GROUND,
+        "battery_voltage_v": 16.2,
+        "battery_remaining": 0.97,
+        **changes,
+    }
+    return (AutopilotStatus(**values),)  # type: ignore[arg-type]
+
+
+def machine(**changes: object) -> Machine:
+    values: dict[str, object] = {
+        "disk_free_bytes": 10**10,
+        "governors": ("performance",) * 4,
+        "realtime": "SCHED_FIFO 50",
+        "arm_latency_ms": 1,
+        "force_latency_ms": None,
+        **changes,
+    }
+    return Machine(**values)  # type: ignore[arg-type]
+
+
+def stream(**changes: object) -> MocapStream:
+    values: dict[str, object] = {"frames": 1000, "lost": 0, "application": "Motive 3.1, NatNet 4.1", **changes}
+    return MocapStream(**values)  # type: ignore[arg-type]
+
+
+@cache
+def sound() -> Observations:
+    """A machine in SITL: no hand test is asked for."""
+    return Observations(
+        START_S,
+        SPAN_S,
+        firmware="PX4 1.16.1 release (git 94cb2012)",
+        params=PARAMS,
+        vehicle=vehicle(),
+        status=status(),
+        estimator=estimator(),
+        mocap=mocap(),
+        mocap_stream=stream(),
+        arm=arm(),
+        servos=servos(),
+        force=force(),
+        machine=machine(),
+        state_counts=StateCounts(620, 1060, 1130),
+        force_stream=ForceStream(1000, 0, "RFT60-HA01, firmware V1.2.0"),
+        arm_reads=(700, 0),
+        mission_s=21.0,
+        plan=(),
+        recorder="",
+    )

@@ -1,0 +1,162 @@
+"""`companion check` and the preflight of `companion fly` over real wires: a sound world passes; what is spoiled in it is told by the
+right rows, and refuses.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
+from companion.preflight import frames, judge
+from companion.px4 import wanted
+from sitl.servo_bus import ServoBus
+from sitl.servo_model import ServoModel, ServoRefusal
+from sitl.servo_protocol import StatusError
+from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+
+OPERATING_MODE, MODE_POSITION = 11, 3
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    """With a state folder of its own: nobody's hand test counts."""
+    with sandbox_in(tmp_path, {"XDG_STATE_HOME": str(tmp_path / "state")}) as sandbox:
+        yield sandbox
+
+
+def rows_of(ended: Ended) -> dict[str, dict[str, Any]]:
+    document = json.loads(ended.out)
+    assert document["schema_version"] == 1
+    rows = {row["id"]: row for row in document["rows"]}
+    assert len(rows) == len(document["rows"])
+    assert document["ok"] == (not refusing(rows))
+    return rows
+
+
+def refusing(rows: dict[str, dict[str, Any]]) -> set[str]:
+    return {name for name, row in rows.items() if not row["ok"] and row["level"] == "refuse"}
+
+
+def test_a_sound_world_may_fly_and_every_row_is_told(sandbox: Sandbox) -> None:
+    ended = sandbox.run("check", CATCH, "--sitl", "--json")
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_OK, ""), ended
+    rows = rows_of(ended)
+    assert not refusing(rows)
+    # The simulated world has no port TELEM2, and nobody moves it by hand.
+    params = {f"px4.param.{one.name}" for one in wanted.WANTED if not one.hardware}
+    assert set(rows) == {check.id for check in judge.CHECKS} - {frames.HAND_TEST.id} | {"px4.firmware"} | params
+    assert all(row["read"] and row["why"] for row in rows.values())
+
+
+def test_what_is_spoiled_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
+    """Wrong joint angle, force bias and one parameter of PX4, in the world alone: the companion believes its files."""
+    spoiled = (
+        "mission.start.arm_deg=[140, 120]",
+        "world.force_bias_n=[30, 0, 0]",
+        "world.px4_params={COM_OBL_RC_ACT: 0}",
+    )
+    expected = {"mission.arm", "force.tare", "px4.param.COM_OBL_RC_ACT"}
+    with sandbox_in(tmp_path / "world") as around, World(around, CATCH, spoiled) as world:
+        ended = sandbox.run("check", CATCH, "--json", *world.addresses())
+        assert (ended.code, ended.err) == (EXIT_REFUSED, ""), ended
+        rows = rows_of(ended)
+        assert refusing(rows) == expected
+        assert "(140, 120) deg" in rows["mission.arm"]["read"]
+        assert rows["force.tare"]["read"].startswith("(30.0, ")
+        assert rows["px4.param.COM_OBL_RC_ACT"]["fix"].startswith("set COM_OBL_RC_ACT to 4")
+        assert rows["frames.hand_test"]["level"] == "warn" and not rows["frames.hand_test"]["ok"]
+
+        shown = sandbox.run("check", CATCH, *world.addresses())
+        assert shown.code == EXIT_REFUSED
+        assert "3 of " in shown.out and "the machine may not fly." in shown.out
+        assert "-> set COM_OBL_RC_ACT to 4" in shown.out
+
+        flown = sandbox.run("fly", CATCH, "--out", "out", *world.addresses())
+        assert flown.code == EXIT_REFUSED, flown
+        assert (world.armings, world.crashes) == (0, 0)
+    sandbox.assert_nobody_left()
+    assert len(flown.err_lines) == len(expected), flown.err
+    for start in (
+        "arm at the start: (140, 120) deg, wanted (165, 140)",
+        "force sensor tare: (",
+        "COM_OBL_RC_ACT: 0, wanted 4; set",
+    ):
+        assert [line for line in flown.err_lines if line.startswith(start)], (start, flown.err)
+    summary = read_summary(sandbox.cwd / "out")
+    assert (summary["outcome"], summary["events"]) == ("refused", [])
+    kept = json.loads((sandbox.cwd / "out/preflight.json").read_text(encoding="utf-8"))
+    assert kept["schema_version"] == 1 and kept["ok"] is False
+    assert {row["id"] for row in kept["rows"] if not row["ok"] and row["level"] == "refuse"} == expected
+    assert not (sandbox.cwd / "out/flight.mcap").exists()
+
+
+class StubbornServo(ServoModel):
+    """It stays in position mode: its EEPROM takes no other one."""
+
+    def __init__(self, servo_id: int) -> None:
+        super().__init__(servo_id)
+        super().write(OPERATING_MODE, bytes([MODE_POSITION]))
+
+    def write(self, address: int, data: bytes) -> None:
+        if address <= OPERATING_MODE < address + len(data):
+            raise ServoRefusal(StatusError.ACCESS)
+        super().write(address, data)
+
+
+def test_devices_that_do_not_open_are_rows_and_the_others_are_looked_at(sandbox: Sandbox, tmp_path: Path) -> None:
+    """No force sensor, and a servo that refuses its operating mode."""
+
+    async def check(world: World) -> Ended:
+        async with ServoBus([StubbornServo(1), StubbornServo(2)]) as bus:
+            options = world.addresses(arm={"port": bus.path}, force={"port": "/dev/ttyNONE"})
+            return await asyncio.to_thread(sandbox.run, "check", CATCH, "--json", *options)
+
+    with sandbox_in(tmp_path / "world") as around, World(around) as world:
+        ended = asyncio.run(check(world))
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_REFUSED, ended
+    rows = rows_of(ended)
+    assert refusing(rows) == {"arm.device", "force.device"}
+    assert "writing operating mode (register 11) was refused" in rows["arm.device"]["read"]
+    assert "/dev/ttyNONE: no such port" in rows["force.device"]["read"]
+    assert rows["px4.vision"]["ok"] and rows["mocap.rate"]["ok"] and rows["frames.gravity"]["ok"]
+
+
+def test_ctrl_c_during_the_preflight_of_a_flight_ends_it_with_nothing_armed(sandbox: Sandbox, tmp_path: Path) -> None:
+    longer = set_options(**{"vehicle.safety.preflight_s": 60.0})
+    with sandbox_in(tmp_path / "world") as around, World(around, HOVER) as world:
+        with sandbox.start("fly", HOVER, "--out", "out", *longer, *world.addresses()) as running:
+            running.wait_for("all devices ... ")
+            running.signal(signal.SIGINT)
+            ended = running.end()
+        assert (world.armings, world.crashes) == (0, 0)
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_ABORTED, ""), ended
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
+    assert not (sandbox.cwd / "out/preflight.json").exists()
+
+
+def test_ctrl_c_during_a_check_leaves_nothing(sandbox: Sandbox) -> None:
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        options = set_options(**{"vehicle.devices.force.port": os.ttyname(slave)})
+        with sandbox.start("check", HOVER, *options) as running:
+            assert os.read(master, 1)  # it speaks to the sensor
+            running.signal(signal.SIGINT)
+            ended = running.end()
+    finally:
+        os.close(slave)
+        os.close(master)
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.out, ended.err) == (EXIT_ABORTED, "", "companion check: interrupted\n"), ended

@@ -1,0 +1,259 @@
+"""The guided hand test on the simulated machine that a hand carries: sound set-ups pass, every spoiled one is refused and named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from companion.doc_tables import written
+from companion.frames import quat_rotate
+from companion.preflight import hand_judge
+from companion.preflight.axes import ALL, IDENTITY, MIRRORINGS, ROTATIONS, AxisMap
+from companion.preflight.hand_test import (
+    SILENCE_MAX_S,
+    STEP_TIMEOUT_S,
+    HandResult,
+    HandSample,
+    HandTest,
+    HandView,
+    Step,
+)
+from companion.preflight.rows import Row, refusals
+from companion.preflight.table import checks_table
+from companion.types import MocapPose, Quat, Vec3
+from sitl.hand import ROUND_S
+from tests.preflight.hand_rig import Standing, world
+from tests.support import ROOT
+
+END_S = 4.0 + ROUND_S
+
+
+@cache
+def samples(*overrides: str) -> tuple[HandSample, ...]:
+    """A whole round of the hand in a world set so."""
+    return tuple(Standing(world("hand=true", *overrides)).samples(END_S))
+
+
+def ran(course: Iterable[HandSample]) -> HandView:
+    test = HandTest()
+    view = None
+    for sample in course:
+        view = test.update(sample)
+        if view.result is not None or view.ended:
+            break
+    assert view is not None
+    return view
+
+
+def result(course: Iterable[HandSample]) -> HandResult:
+    view = ran(course)
+    assert view.result is not None, view
+    return view.result
+
+
+def failed(rows: Iterable[Row]) -> dict[str, str]:
+    """What to do, of each row that refuses."""
+    return {row.id: row.fix for row in refusals(rows)}
+
+
+def felt_otherwise(course: Iterable[HandSample], turn: Callable[[Vec3], Vec3]) -> list[HandSample]:
+    """The same course with PX4's IMU mounted otherwise."""
+    turned = []
+    for sample in course:
+        vehicle = sample.vehicle
+        if vehicle is not None:
+            vehicle = replace(
+                vehicle,
+                specific_force_body_m_s2=turn(vehicle.specific_force_body_m_s2),
+                angular_rate_body_rad_s=turn(vehicle.angular_rate_body_rad_s),
+            )
+        turned.append(replace(sample, vehicle=vehicle))
+    return turned
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
+    config = world("hand=true", f"seed={seed}")
+    measured = result(Standing(config).samples(END_S))
+    assert not failed(hand_judge.rows(measured, "z"))
+    # Far from the limits: what refuses is a wrong axis, not a shaking hand.
+    assert abs(hand_judge.yaw_offset_deg(measured.forward)) < 0.5 * hand_judge.YAW_MAX_DEG
+    assert hand_judge.best_axes(measured) == IDENTITY
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_biased_imu_and_slow_motion_capture_pass(seed: int) -> None:
+    knobs = ("mocap_rate_hz=60", "mocap_noise_m=0.001", "mocap_noise_deg=0.3", "mocap_latency_s=0.03", f"seed={seed}")
+    course = []
+    for sample in samples(*knobs):
+        vehicle = sample.vehicle
+        if vehicle is not None:
+            (fx, fy, fz), (wx, wy, wz) = vehicle.specific_force_body_m_s2, vehicle.angular_rate_body_rad_s
+            force, rate = (fx + 0.3, fy - 0.2, fz + 0.2), (wx + 0.02, wy - 0.02, wz + 0.03)
+            vehicle = replace(vehicle, specific_force_body_m_s2=force, angular_rate_body_rad_s=rate)
+        course.append(replace(sample, vehicle=vehicle))
+    assert not failed(hand_judge.rows(result(course), "z"))
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "row", "words"),
+    [
+        ('mocap_axes=["x","z","-y"]', "hand.lift", "the stream looks y-up: set devices.mocap.up_axis: y"),
+        (
+            'mocap_axes=["x","-z","y"]',
+            "hand.lift",
+            "the stream's axes are exchanged (its x, y, z look like the machine's x, -z, y)",
+        ),
+        (
+            'mocap_axes=["-z","y","x"]',
+            "hand.lift",
+            "the stream's axes are exchanged (its x, y, z look like the machine's -z, y, x)",
+        ),
+        ('mocap_axes=["x","z","y"]', "hand.lift", "the stream is left-handed (its x, y, z look like the true x, z, y)"),
+        ('mocap_axes=["x","-y","z"]', "hand.turn", "the stream is left-handed"),
+        ('mocap_axes=["y","x","z"]', "hand.turn", "the stream is left-handed"),
+        ('mocap_axes=["x","y","-z"]', "hand.lift", "the stream is left-handed"),
+        ("mocap_body_yaw_deg=90", "hand.forward", "deg to the left of the nose"),
+        ("mocap_body_yaw_deg=-90", "hand.forward", "deg to the right of the nose"),
+        ("mocap_body_yaw_deg=180", "hand.forward", "the rigid body's zero is turned"),
+        ("mocap_body_yaw_deg=20", "hand.forward", "the rigid body's zero is turned"),
+        ("mocap_body_yaw_deg=-20", "hand.forward", "the rigid body's zero is turned"),
+        ("mocap_body_tilt_deg=[90,0]", "hand.level", "the rigid body's axes are exchanged"),
+        ("mocap_body_tilt_deg=[0,12]", "hand.level", "the rigid body's zero was set while the machine was tilted"),
+    ],
+)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_spoiled_frame_is_refused_and_named(spoiled: str, row: str, words: str, seed: int) -> None:
+    refused = failed(hand_judge.rows(result(samples(spoiled, f"seed={seed}")), "z"))
+    assert row in refused
+    assert words in refused[row]
+
+
+def test_a_body_that_is_off_by_twenty_degrees_is_told_with_its_angle() -> None:
+    for off_deg in (-20.0, 20.0, 150.0):
+        measured = result(samples(f"mocap_body_yaw_deg={off_deg}"))
+        assert hand_judge.yaw_offset_deg(measured.forward) == pytest.approx(off_deg, abs=5.0)
+
+
+def test_a_z_up_stream_that_is_taken_for_y_up_is_named() -> None:
+    refused = failed(hand_judge.rows(result(samples('mocap_axes=["x","-z","y"]')), "y"))
+    assert refused["hand.lift"] == "the stream looks z-up: set devices.mocap.up_axis: z"
+
+
+@pytest.mark.parametrize("axes", ALL, ids=lambda axes: ",".join(axes.names))
+def test_each_of_the_48_body_frames_is_told_from_the_others(axes: AxisMap) -> None:
+    """Without the rule of how people make a rigid body: every exchange of its axes."""
+    measured = result(
+        replace(sample, pose=exchanged(sample.pose, axes)) if sample.pose is not None else sample
+        for sample in samples()
+    )
+    assert hand_judge.best_axes(measured) == axes
+    assert bool(failed(hand_judge.rows(measured, "z"))) is (axes != IDENTITY)
+
+
+def exchanged(pose: MocapPose, axes: AxisMap) -> MocapPose:
+    """World and body in other axes: A p, A R A'."""
+    position, attitude = axes.vector(pose.position_world_m), axes.rotation(pose.attitude_wxyz)
+    return replace(pose, position_world_m=position, attitude_wxyz=attitude)
+
+
+def test_axis_maps_are_what_they_say() -> None:
+    assert len(ROTATIONS) == len(MIRRORINGS) == 24
+    v: Vec3 = (1.0, 2.0, 3.0)
+    for axes in ROTATIONS:
+        assert quat_rotate(axes.quat, v) == pytest.approx(axes.vector(v))
+    for axes in ALL:
+        assert axes.inverse.vector(axes.vector(v)) == v
+        assert AxisMap.of(axes.names) == axes
+    q: Quat = (math.cos(0.3), 0.0, 0.0, math.sin(0.3))
+    assert AxisMap.of(("x", "-y", "z")).rotation(q) == (q[0], 0.0, 0.0, -q[3])
+
+
+def test_px4_mounted_the_wrong_way_round_is_told_from_wrong_motion_capture() -> None:
+    course = felt_otherwise(samples(), lambda v: (v[1], -v[0], v[2]))
+    refused = failed(hand_judge.rows(result(course), "z"))
+    assert "hand.told" in refused
+    assert "SENS_BOARD_ROT" in refused["hand.forward"]
+
+
+def doubled(pose: MocapPose) -> MocapPose:
+    x, y, z = pose.position_world_m
+    return replace(pose, position_world_m=(2.0 * x, 2.0 * y, 2.0 * z))
+
+
+def test_wrong_distances_are_told() -> None:
+    course = [replace(s, pose=doubled(s.pose)) if s.pose is not None else s for s in samples()]
+    assert set(failed(hand_judge.rows(result(course), "z"))) == {"hand.scale"}
+
+
+# -- how it ends without a result ----------------------------------------------------------------------------------------
+
+
+def test_it_ends_at_once_when_px4_is_armed() -> None:
+    view = ran(replace(sample, armed=sample.t_s > 6.0) for sample in samples())
+    assert view.ended.startswith("PX4 says that it is armed")
+    assert view.step is Step.LIFT
+    assert view.result is None
+
+
+def test_it_does_not_begin_when_px4_is_armed() -> None:
+    view = HandTest().update(replace(samples()[0], armed=True))
+    assert view.ended.startswith("PX4 says that it is armed")
+
+
+def test_it_ends_when_px4_does_not_say_whether_it_is_armed() -> None:
+    view = ran(replace(sample, armed=None if sample.t_s > 3.0 else False) for sample in samples())
+    assert view.ended.startswith(f"PX4 has not said for {SILENCE_MAX_S:g} s whether it is armed")
+
+
+def test_a_machine_that_nobody_lifts_is_told_after_the_time_limit() -> None:
+    standing = Standing(world()).samples(STEP_TIMEOUT_S + 10.0)
+    view = ran(standing)
+    assert view.ended.startswith(f"not within {STEP_TIMEOUT_S:g} s: take it by its legs")
+    assert "moved by 0 cm" in view.ended
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda sample: replace(sample, pose=None), "motion capture does not track the rigid body"),
+        (lambda sample: replace(sample, vehicle=None), "no state came from PX4"),
+        (
+            lambda sample: replace(sample, pose=sample.pose and replace(sample.pose, tracking_valid=False)),
+            "motion capture does not track the rigid body",
+        ),
+    ],
+)
+def test_a_silent_device_is_named(change: Callable[[HandSample], HandSample], words: str) -> None:
+    view = ran(change(sample) for sample in Standing(world()).samples(STEP_TIMEOUT_S + 1.0))
+    assert view.step is Step.STAND
+    assert words in view.ended
+
+
+def test_markers_that_are_covered_during_a_move_make_it_count_not() -> None:
+    test = HandTest()
+    notices = set()
+    for sample in samples():
+        covered = 5.0 < sample.t_s < 5.7
+        pose = replace(sample.pose, tracking_valid=False) if sample.pose and covered else sample.pose
+        view = test.update(replace(sample, pose=pose))
+        notices.add(view.notice)
+        assert view.result is None or view.step is Step.DONE
+    assert any("motion capture lost the rigid body" in notice for notice in notices)
+
+
+def test_a_pause_in_the_middle_of_the_round_is_not_taken_for_the_floor() -> None:
+    """Whoever joins while the machine is carried waits for the next time that it stands."""
+    course = tuple(Standing(world("hand=true")).samples(4.0 + 2 * ROUND_S + 6.0))
+    view = ran(sample for sample in course if sample.t_s > 6.5)
+    assert view.result is not None
+    assert not failed(hand_judge.rows(view.result, "z"))
+
+
+def test_the_docs_tell_every_row() -> None:
+    page = (ROOT / "docs/hand-test.md").read_text(encoding="utf-8")
+    assert written(page, {"hand": checks_table(hand_judge.CHECKS)}) == page

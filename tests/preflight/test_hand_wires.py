@@ -1,0 +1,179 @@
+"""The hand test over real wires: the world's hand, NatNet, MAVLink, a terminal."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import os
+import pty
+import signal
+import termios
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from companion.clock import flight_clock
+from companion.config.loader import FlightConfig, load_flight
+from companion.config.vehicle import MocapDevice
+from companion.devices import SomeEdges, VisionValve, open_what_opens
+from companion.io.mocap import NatNetMocap
+from companion.preflight import hand_judge, hand_record
+from companion.preflight.hand_command import run_hand_test
+from companion.preflight.rows import Row
+from companion.types import AutopilotRequest, FlightMode
+from tests.io.autopilot_peer import free_udp_port
+from tests.io.stub_rig import standing_stub
+from tests.io.test_autopilot_stub import companion
+from tests.support import CATCH, DEADLINE_S, Sandbox, World, sandbox_in
+
+FIRST_ROUND_S = 12.0
+
+
+@pytest.fixture(scope="module")
+def sandbox(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path_factory.mktemp("hand")) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def world(sandbox: Sandbox) -> Iterator[World]:
+    knobs = ["world.hand=true", f"world.hand_t_s={FIRST_ROUND_S}", "world.payload_kg=0"]
+    with World(sandbox, overrides=knobs) as made:
+        yield made
+
+
+@pytest.fixture
+def config(world: World) -> FlightConfig:
+    """Of a companion whose devices are the world's."""
+    return load_flight(CATCH, overrides=[word for word in world.addresses() if word != "--set"])
+
+
+def terminal() -> Console:
+    return Console(file=io.StringIO(), force_terminal=True, width=160)
+
+
+def text_of(console: Console) -> str:
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+async def over_wires(
+    config: FlightConfig,
+    console: Console,
+    record: Path | None = None,
+    beside: Callable[[], Coroutine[Any, Any, None]] | None = None,
+) -> list[Row]:
+    """The rows of a test on the world's wires; `beside` runs while it does."""
+    async with open_what_opens(config, flight_clock()) as edges:
+        assert not edges.failures
+        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+            if beside is not None:
+                group.create_task(beside())
+            return await run_hand_test(edges, config, console, record=record)
+
+
+async def said(console: Console, words: str) -> None:
+    """Until the console has been told something."""
+    async with asyncio.timeout(DEADLINE_S):
+        while words not in text_of(console):  # noqa: ASYNC110 - a console has no event
+            await asyncio.sleep(0.01)
+
+
+def test_any_key_ends_it_and_the_terminal_is_as_before(config: FlightConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    keyboard, tty = pty.openpty()
+    console = terminal()
+    try:
+        with open(tty, closefd=False) as stdin:
+            monkeypatch.setattr("sys.stdin", stdin)
+            before = termios.tcgetattr(tty)
+
+            async def press() -> None:
+                await said(console, "1/4")
+                assert termios.tcgetattr(tty) != before
+                os.write(keyboard, b" ")
+
+            rows = asyncio.run(over_wires(config, console, beside=press))
+            assert termios.tcgetattr(tty) == before
+    finally:
+        os.close(keyboard)
+        os.close(tty)
+    assert [(row.id, row.read, row.refuses) for row in rows] == [("hand.done", "ended by hand", True)]
+
+
+def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: FlightConfig) -> None:
+    console = terminal()
+
+    async def interrupt() -> None:
+        await said(console, "1/4")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    async def both() -> list[Row]:
+        before = signal.getsignal(signal.SIGINT)
+        rows = await over_wires(config, console, beside=interrupt)
+        assert signal.getsignal(signal.SIGINT) == before
+        return rows
+
+    (row,) = asyncio.run(both())
+    assert (row.id, row.read) == ("hand.done", "ended by hand")
+
+
+def test_a_whole_round_passes_and_is_kept(config: FlightConfig, tmp_path: Path) -> None:
+    console, path = terminal(), tmp_path / "state" / "hand-tests.json"
+    rows = asyncio.run(over_wires(config, console, path))
+    assert [row.id for row in rows] == [*(check.id for check in hand_judge.CHECKS), "hand.record"], rows
+    assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
+    for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
+        assert words in text_of(console)
+    setup = hand_record.Setup.of(config.vehicle, config.world.natnet_version)
+    passed, changed = hand_record.on_record(setup, hand_record.load(path))
+    assert passed.startswith("passed on 20")
+    assert not changed
+    (kept,) = json.loads(path.read_text(encoding="utf-8"))["passed"]
+    assert kept["measured"]["hand.turn"].startswith("felt +4")
+
+
+def test_it_is_refused_when_px4_is_armed() -> None:
+    config = load_flight(CATCH)
+
+    async def go() -> list[Row]:
+        port = free_udp_port()
+        async with standing_stub(port), companion(port) as half:
+            half.request = AutopilotRequest.OFFBOARD
+            await half.until(lambda status: status.mode is FlightMode.OFFBOARD, "OFFBOARD")
+            half.request = AutopilotRequest.ARM
+            await half.until(lambda status: status.armed, "ARM")
+            half.request = AutopilotRequest.NONE
+            mocap = NatNetMocap(MocapDevice(server="127.0.0.1", rigid_body_id=1), flight_clock(), lambda _: None)
+            edges = SomeEdges(VisionValve(), half.autopilot, mocap)
+            return await run_hand_test(edges, config, terminal())
+
+    (row,) = asyncio.run(go())
+    assert row.refuses
+    assert row.read.startswith("PX4 says that it is armed")
+
+
+def test_without_motion_capture_or_px4_it_says_which() -> None:
+    config = load_flight(CATCH)
+    (row,) = asyncio.run(run_hand_test(SomeEdges(VisionValve()), config, terminal()))
+    assert row.read == "motion capture is not open"
+
+
+def test_scripts_keep_their_standard_output(config: FlightConfig, capsys: pytest.CaptureFixture[str]) -> None:
+    async def interrupt() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    async def go() -> list[Row]:
+        async with open_what_opens(config, flight_clock()) as edges, asyncio.TaskGroup() as group:
+            # Tasks begin at the first await: the test listens by then.
+            group.create_task(interrupt())
+            return await run_hand_test(edges, config, Console(), True)
+
+    (row,) = asyncio.run(go())
+    assert row.read == "ended by hand"
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "hand test" in captured.err

@@ -1,0 +1,309 @@
+"""Every row of the preflight by records: a sound machine passes, and whatever can be wrong is told by its own row, with what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+
+from companion.config.loader import FlightConfig
+from companion.doc_tables import written
+from companion.preflight import frames, judge, px4
+from companion.preflight.observations import ForceStream, Observations, StateCounts
+from companion.preflight.rows import Level, Row
+from companion.preflight.table import ROOMS, tables
+from companion.types import VehicleState
+from tests.preflight import records as r
+from tests.support import ROOT
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is seen otherwise, and the row that tells it."""
+
+    row: str
+    read: str
+    """Part of what the row says that it read."""
+    fix: str
+    """Part of what it says is to be done; empty: the device's own line says it."""
+    seen: Mapping[str, Any]
+    level: Level = Level.REFUSE
+    vehicle: Mapping[str, Any] | None = None
+    """`airframe.thrust_max_n`: changed in the vehicle file."""
+    also: tuple[str, ...] = ()
+    """Rows that must fail with it."""
+
+
+def moved(x_m: float = 0.0, yaw_rad: float = 0.0, until: int = 620) -> tuple[VehicleState, ...]:
+    """PX4's state with the first ones elsewhere."""
+    q = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
+    return tuple(
+        replace(state, position_world_m=(-1.0 + x_m, 0.0, 0.3), attitude_wxyz=q) if i < until else state
+        for i, state in enumerate(r.vehicle())
+    )
+
+
+def gap(after: int, gap_s: float) -> Any:
+    return tuple(replace(p, stamp_s=p.stamp_s + (gap_s if i >= after else 0.0)) for i, p in enumerate(r.mocap()))
+
+
+def late(share: float, late_s: float) -> tuple[VehicleState, ...]:
+    every = round(1 / share)
+    return tuple(
+        replace(state, attitude_stamp_s=state.attitude_stamp_s + (late_s if i % every == 0 else 0.0))
+        for i, state in enumerate(r.vehicle())
+    )
+
+
+def unsteady_clock() -> Any:
+    """A server that stops for 60 ms a second and then catches up."""
+    return tuple(replace(p, stamp_s=p.stamp_s + 0.06 * (i // 500)) for i, p in enumerate(r.mocap()))
+
+
+def failure(device: str) -> Mapping[str, Any]:
+    return {"failures": {device: f"{device}: expected it, found nothing; plug it in"}}
+
+
+WARN = Level.WARN
+CASES = {
+    "no PX4": Case("px4.device", "expected it, found nothing; plug", "", failure("autopilot")),
+    "no heartbeat": Case("px4.heartbeat", "none came", "baud rate", {"status": ()}),
+    "old heartbeat": Case("px4.heartbeat", "3.0 s old", "cable", {"status": r.status(heartbeat_stamp_s=4.0)}),
+    "armed": Case("px4.disarmed", "armed", "disarm it", {"status": r.status(armed=True)}),
+    "slow state": Case("px4.rates", "position 60,", "MAV_x_RATE", {"state_counts": StateCounts(300, 1000, 1000)}, WARN),
+    "very slow state": Case("px4.rates", "IMU 20 Hz", "MAV_x_RATE", {"state_counts": StateCounts(600, 1000, 100)}),
+    "no position": Case("px4.rates", "position 0,", "fuses no", {"state_counts": StateCounts(0, 1000, 1000)}),
+    "late link": Case("px4.lag", "90 ms", "other traffic", {"vehicle": late(0.05, 0.09)}, WARN),
+    "no local position": Case("px4.vision", "no LOCAL_POSITION_NED", "EKF2_EV_CTRL", {"vehicle": ()}),
+    "no estimator status": Case("px4.vision", "no ESTIMATOR_STATUS", "EKF2_HGT_REF", {"estimator": ()}),
+    "estimate that has just come": Case("px4.vision", "only just come", "reboot", {"estimator": r.estimator()[12:]}),
+    "estimate that stopped": Case("px4.vision", "stopped coming", "reboot", {"vehicle": r.vehicle()[:300]}),
+    "no position flag": Case("px4.vision", "no good horizontal position", "EKF2_EV_CTRL", {"estimator": r.estimator(flags=439)}),
+    "no height flag": Case("px4.vision", "no good height", "EKF2_HGT_REF", {"estimator": r.estimator(flags=415)}),
+    "flag lost for a moment": Case(
+        "px4.vision",
+        "no good attitude",
+        "EKF2",
+        {"estimator": (*r.estimator()[:9], replace(r.estimator()[9], flags=446), *r.estimator()[10:])},
+    ),
+    "frozen ratios": Case(
+        "px4.vision", "ratios of position are 0", "EKF2_EV_CTRL",
+        {"estimator": r.estimator(position_horizontal_ratio=0.0, position_vertical_ratio=0.0)},
+    ),
+    "rejected": Case("px4.vision", "rejected", "EKF2", {"estimator": r.estimator(position_vertical_ratio=1.2)}),
+    "ratio unknown": Case(
+        "px4.vision", "ratios of position are 0", "EKF2",
+        {"estimator": r.estimator(position_horizontal_ratio=math.nan, position_vertical_ratio=math.nan)},
+    ),
+    "inaccurate": Case("px4.vision", "0.30 m", "EKF2", {"estimator": r.estimator(position_horizontal_accuracy_m=0.3)}),
+    "accuracy unknown": Case("px4.vision", "inf", "EKF2", {"estimator": r.estimator(position_vertical_accuracy_m=math.inf)}),
+    "apart": Case("px4.agrees", "0.2", "EKF2_EV_CTRL", {"vehicle": moved(x_m=0.2)}),
+    "turned": Case("px4.agrees", "20.", "body's axes", {"vehicle": moved(yaw_rad=math.radians(20))}, also=("frames.px4_yaw",)),
+    "wandering": Case("px4.steady", "0.06", "standing still", {"vehicle": moved(x_m=0.06, until=200)}),
+    "wandering yaw": Case("px4.steady", "4.", "gyros", {"vehicle": moved(yaw_rad=math.radians(4), until=200)}),
+    "never in time together": Case("px4.agrees", "no two of them", "rates", {"mocap": r.mocap(stamp_s=90.0)}),
+    "flat battery": Case("px4.battery", "25%", "charge", {"status": r.status(battery_remaining=0.25)}),
+    "battery of other cells": Case("px4.battery", "11.4 V", "cells", {"status": r.status(battery_voltage_v=11.4)}),
+    "battery unknown": Case("px4.battery", "97%", "BAT1_N_CELLS", {"status": r.status(battery_voltage_v=None)}, WARN),
+    "hover thrust doubtful": Case("px4.hover_thrust", "0.600", "hover fit", {"params": {**r.PARAMS, "MPC_THR_HOVER": 0.6}}, WARN),
+    "hover thrust wrong": Case(
+        "px4.hover_thrust", "0.750", "MPC_THR_HOVER", {"params": {**r.PARAMS, "MPC_THR_HOVER": 0.75}}, WARN,
+        also=("px4.param.MPC_THR_HOVER",),
+    ),
+    "a parameter": Case("px4.param.EKF2_EV_CTRL", "0", "set EKF2_EV_CTRL to 11", {"params": {**r.PARAMS, "EKF2_EV_CTRL": 0}}),
+    "old firmware of PX4": Case("px4.firmware", "PX4 1.13.3", "flash", {"firmware": "PX4 1.13.3 release (git 0)"}),
+    "hover thrust of the vehicle file": Case(
+        "px4.hover_thrust", "airframe.hover_thrust", "airframe.hover_thrust", {}, vehicle={"airframe.hover_thrust": 0.2}
+    ),
+    "no motion capture": Case("mocap.device", "expected it", "", failure("mocap")),
+    "slow": Case("mocap.rate", "120 Hz", "camera rate", {"mocap_stream": r.stream(frames=600)}, WARN),
+    "very slow": Case("mocap.rate", "40 Hz", "camera rate", {"mocap_stream": r.stream(frames=200)}),
+    "uneven": Case("mocap.jitter", "9", "Wi-Fi", {"mocap": gap(500, 0.09)}, WARN),
+    "late frames": Case("mocap.latency", "60.0 ms", "Motive's load", {"mocap": r.mocap(latency_s=0.06)}, WARN),
+    "very late frames": Case("mocap.latency", "200.0 ms", "Motive's load", {"mocap": r.mocap(latency_s=0.2)}),
+    "latency not told": Case("mocap.latency", "does not tell", "NatNet", {"mocap": r.mocap(latency_s=None)}, WARN),
+    "lost frames": Case("mocap.lost", "20 of 1020", "cable", {"mocap_stream": r.stream(lost=20)}, WARN),
+    "many lost frames": Case("mocap.lost", "100 of 1100", "cable", {"mocap_stream": r.stream(lost=100)}),
+    "seldom tracked": Case(
+        "mocap.tracked", "90.0%", "markers",
+        {"mocap": tuple(replace(p, tracking_valid=i % 10 != 0) for i, p in enumerate(r.mocap()))},
+    ),
+    "not always tracked": Case(
+        "mocap.tracked", "99.9%", "markers", {"mocap": (replace(r.mocap()[0], tracking_valid=False), *r.mocap()[1:])}, WARN
+    ),
+    "another body": Case("mocap.body", "others: 2, 7", "switch the others off", {"mocap_stream": r.stream(other_bodies=(2, 7))}, WARN),
+    "bent markers": Case("mocap.error", "4.0 mm", "calibrate", {"mocap": r.mocap(marker_error_m=0.004)}, WARN),
+    "stalling server": Case("mocap.clock", "wanders", "stalls", {"mocap": unsteady_clock()}, WARN),
+    "another frame rate": Case(
+        "mocap.clock", "5.000 ms", "rate_hz", {}, WARN, vehicle={"devices.mocap.rate_hz": 190.0}
+    ),
+    "paused": Case("mocap.clock", "stands still", "paused", {"mocap": r.mocap(frame_number=5)}, WARN),
+    "no arm": Case("arm.device", "expected it", "", failure("arm")),
+    "another servo": Case("arm.model", "id 2: model 1020", "servo_id", {"servos": r.servos(model=1020)}),
+    "old firmware": Case("arm.firmware", "48 and 37", "Wizard", {"servos": r.servos(firmware=37)}),
+    "two firmwares": Case("arm.firmware", "48 and 45", "Wizard", {"servos": r.servos(firmware=45)}, WARN),
+    "another mode": Case("arm.mode", "3 (position)", "another program", {"servos": r.servos(operating_mode=3)}),
+    "return delay": Case("arm.return_delay", "500 us", "start again", {"servos": r.servos(return_delay_us=500)}),
+    "no watchdog": Case("arm.watchdog", "0 ms", "power", {"servos": r.servos(watchdog_ms=0)}),
+    "weak servo": Case("arm.current_limit", "500 (1.75 N m)", "register 38", {"servos": r.servos(current_limit_counts=500)}),
+    "low supply": Case("arm.voltage", "12.1 V and 9.6 V", "12 V", {"servos": r.servos(voltage_v=9.6)}),
+    "warm": Case("arm.temperature", "66 degC", "cool", {"arm": r.arm(temperature_c=(30.0, 66.0))}, WARN),
+    "hot": Case("arm.temperature", "76 degC", "cool", {"arm": r.arm(temperature_c=(76.0, 40.0))}),
+    "servo error": Case("arm.error", "servo 2: overload", "power", {"arm": r.arm(hardware_error=(0, 32))}),
+    "let go": Case("arm.error", "watchdog", "loose cable", {"arm": r.arm(hardware_error=(128, 0))}),
+    "beyond a wall": Case(
+        "arm.angles", "(30, 140)", "zero_count", {"arm": r.arm(angle_rad=(math.radians(30), r.ARM_RAD[1]))}, also=("mission.arm",)
+    ),
+    "sinking arm": Case(
+        "arm.still", "moves by 5.0", "let go",
+        {"arm": (*r.arm(angle_rad=(math.radians(160), r.ARM_RAD[1]))[:9], *r.arm()[9:])},
+    ),
+    "loose cable": Case("arm.reads", "20 of 1000", "loose cable", {"arm_reads": (1000, 20)}, WARN),
+    "dead bus": Case("arm.reads", "0 of 0", "loose cable", {"arm_reads": (0, 0)}),
+    "arm's latency timer": Case("arm.usb_latency", "16 ms", "udev", {"machine": r.machine(arm_latency_ms=16)}, WARN),
+    "no force sensor": Case("force.device", "expected it", "", failure("force")),
+    "force port lost": Case("force.device", "was lost", "plug", {"force_stream": ForceStream(9, 0, "RFT60", "was lost")}),
+    "slow force": Case("force.rate", "150 Hz", "cable", {"force_stream": ForceStream(750, 0, "RFT60")}, WARN),
+    "very slow force": Case("force.rate", "50 Hz", "cable", {"force_stream": ForceStream(250, 0, "RFT60")}),
+    "disturbed": Case("force.checksums", "3 wrong", "shielded", {"force_stream": ForceStream(1000, 3, "RFT60")}, WARN),
+    "noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=0.7)}, WARN),
+    "very noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=5.0)}),
+    "overloaded": Case("force.overload", "1 of 1000", "load off", {"force": r.force(overload=True)}),
+    "leaning": Case("force.tare", "(13.7", "free the net", {"force": r.force(bias_n=14.0)}, WARN),
+    "leaning hard": Case("force.tare", "(29.7", "net_mass_kg", {"force": r.force(bias_n=30.0)}),
+    "touched": Case("force.still", "drifts by 2.", "touch", {"force": r.force(drift_n=3.0)}),
+    "force's latency timer": Case("force.usb_latency", "16 ms", "udev", {"machine": r.machine(force_latency_ms=16)}, WARN),
+    "weak tether": Case("tether.strength", "40 N", "stronger", {}, vehicle={"tether.load_rating_n": 40.0}),
+    "short tether": Case("tether.slack", "0.11 m", "nearer", {}, vehicle={"tether.length_m": 1.7}),
+    "mission that cannot be flown": Case("mission.plan", "leaves the room", "change the mission", {"plan": ("leaves the room",)}),
+    "arm elsewhere": Case("mission.arm", "(150, 140)", "by hand", {"arm": r.arm(angle_rad=(math.radians(150), r.ARM_RAD[1]))}),
+    "near the wall": Case("mission.room", "(-1.00,", "further in", {}, vehicle={"room.x_m": (-1.3, 2.2)}),
+    "little disk": Case("machine.disk", "40 MB", "--out", {"machine": r.machine(disk_free_bytes=40_000_000)}, WARN),
+    "full disk": Case("machine.disk", "20 MB", "delete", {"machine": r.machine(disk_free_bytes=20_000_000)}),
+    "slow processor": Case("machine.governor", "powersave", "cpupower", {"machine": r.machine(governors=("powersave",))}, WARN),
+    "normal priority": Case("machine.realtime", "refused", "limits.conf", {"machine": r.machine(realtime=None)}, WARN),
+    "no recorder": Case("machine.recorder", "no space", "names file", {"recorder": "no space"}),
+}  # fmt: skip
+NEVER_BAD = {"tether.line"}
+"""It only reports."""
+
+
+def config_with(changes: Mapping[str, Any] | None) -> FlightConfig:
+    config = r.config()
+    for key, value in (changes or {}).items():
+        data = config.model_dump()
+        part = data["vehicle"]
+        *path, last = key.split(".")
+        for name in path:
+            part = part[name]
+        part[last] = value
+        config = FlightConfig.model_validate(data)
+    return config
+
+
+def judged(case: Case) -> dict[str, Row]:
+    rows = judge.rows(replace(r.sound(), **case.seen), config_with(case.vehicle))
+    assert len({row.id for row in rows}) == len(rows)
+    return {row.id: row for row in rows}
+
+
+def failed(rows: Mapping[str, Row]) -> set[str]:
+    return {row.id for row in rows.values() if not row.ok}
+
+
+def test_a_sound_machine_passes_every_row() -> None:
+    rows = {row.id: row for row in judge.rows(r.sound(), r.config())}
+    assert not failed(rows), [row.line() for row in rows.values() if not row.ok]
+    assert set(rows) >= {check.id for check in judge.CHECKS} - {frames.HAND_TEST.id}
+    assert all(row.read and row.why and not row.fix for row in rows.values())
+    assert judge.unsettled(r.sound(), r.config()) is None
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_wrong_is_told_by_its_row(name: str) -> None:
+    case = CASES[name]
+    rows = judged(case)
+    row = rows[case.row]
+    assert not row.ok, row
+    assert row.level is case.level
+    assert case.read in row.read, row
+    assert case.fix in row.fix, row
+    assert bool(row.fix) == bool(case.fix)
+    assert set(case.also) <= failed(rows)
+    assert row.refuses == (case.level is Level.REFUSE)
+
+
+def test_every_row_can_fail() -> None:
+    here = {check.id for check in judge.CHECKS} - {check.id for check in frames.CHECKS}
+    told = {case.row for case in CASES.values()}
+    assert {row for row in told if not row.startswith(px4.PARAM_ID)} == (here - NEVER_BAD) | {px4.FIRMWARE_ID}
+
+
+# What is wrong in one place is told in one place.
+LONELY = ("old heartbeat", "armed", "slow state", "flat battery", "hover thrust doubtful",
+          "a parameter", "lost frames", "another body", "another mode",
+          "servo error", "loose cable", "leaning hard", "overloaded", "weak tether", "arm elsewhere", "full disk", "no recorder",
+          "frozen ratios", "wandering")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LONELY)
+def test_no_other_row_fails_with_it(name: str) -> None:
+    case = CASES[name]
+    assert failed(judged(case)) == {case.row}
+
+
+@pytest.mark.parametrize("device", ["autopilot", "mocap", "arm", "force"])
+def test_a_missing_device_is_one_row_and_the_others_are_looked_at(device: str) -> None:
+    gone = {
+        "autopilot": {
+            "firmware": None,
+            "params": {},
+            "vehicle": (),
+            "status": (),
+            "estimator": (),
+            "state_counts": None,
+        },
+        "mocap": {"mocap": (), "mocap_stream": None},
+        "arm": {"arm": (), "servos": (), "arm_reads": None},
+        "force": {"force": (), "force_stream": None},
+    }[device]
+    seen = replace(r.sound(), **failure(device), **gone)  # type: ignore[arg-type]
+    rows = judge.rows(seen, r.config())
+    refusing = {row.id for row in rows if row.refuses}
+    room = {"autopilot": "px4"}.get(device, device)
+    assert refusing == {f"{room}.device"}
+    assert len(rows) > 30
+
+
+def test_waiting_is_worth_it_only_for_what_settles() -> None:
+    young = replace(r.sound(), estimator=r.estimator(position_horizontal_accuracy_m=3.0))
+    waiting = judge.unsettled(young, r.config())
+    assert waiting is not None
+    assert (waiting.what, waiting.longest_s) == ("EKF2 fuses motion capture", judge.SETTLE_S)
+    hopeless = replace(young, failures={"arm": "gone"})
+    waiting = judge.unsettled(hopeless, r.config())
+    assert waiting is not None and waiting.longest_s == judge.BEGIN_S
+    flat = replace(r.sound(), status=r.status(battery_remaining=0.1))
+    assert judge.unsettled(flat, r.config()) is None
+
+
+def test_a_row_is_one_line_with_read_wanted_and_fix() -> None:
+    row = judged(CASES["flat battery"])["px4.battery"]
+    assert row.line() == "battery: 25%, 16.2 V, wanted 30%, 13.2 V; charge the battery"
+
+
+def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:
+    rows = judge.rows(Observations(0.0, 5.0), r.config())
+    assert {"px4.heartbeat", "px4.vision", "mocap.device", "force.device"} <= {row.id for row in rows if row.refuses}
+
+
+def test_the_docs_tell_every_row() -> None:
+    """Made by `python -m companion.preflight.table docs/preflight.md`."""
+    page = (ROOT / "docs/preflight.md").read_text(encoding="utf-8")
+    assert written(page, tables()) == page
+    told = {check.id for checks in ROOMS.values() for check in checks}
+    assert told == {check.id for check in judge.CHECKS}
+    assert all(f"| `{name}` |" in page for name in told)
