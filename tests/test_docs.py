@@ -35,7 +35,8 @@ LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
 # What a flight writes, or what a user is told to make: no files of the repository.
 MADE_LATER = {
     "flight.mcap", "flight.log", "flight.pid", "guardian.log", "guardian.pid", "summary.json", "report.html", "config.json",
-    "sitl_config.json", "sitl.log", "world.json", "preflight.json", "mine.yaml", "my_vehicle.yaml", "flights/", "compare.json", "compare.html",
+    "sitl_config.json", "sitl.log", "world.json", "preflight.json", "mine.yaml", "my_vehicle.yaml", "flights/",
+    "compare.json", "compare.html",
 }  # fmt: skip
 FOLDERS = ("companion", "sitl", "configs", "tests", "docs", "benchmarks")
 KNOWN_NAMES = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.*")}
