@@ -63,7 +63,9 @@ def _planned_s(count: int) -> float:
     return Plan.build(config.mission, config.vehicle).duration_s
 
 
-def fly(minutes: float, nice: int | None, lift_by: int, folder: Path, console: Console) -> int:
+def fly(
+    minutes: float, nice: int | None, lift_by: int, overrides: Sequence[str], folder: Path, console: Console
+) -> int:
     """Fly, and leave samples and logs in the folder; the flight's exit code."""
     count, planned_s = repetitions(minutes)
     folder.mkdir(parents=True)
@@ -71,6 +73,7 @@ def fly(minutes: float, nice: int | None, lift_by: int, folder: Path, console: C
         f"mission.repeat={count}",
         f"world.throws={count}",
         f"world.battery_life_s={BATTERY_MARGIN * planned_s:.0f}",
+        *overrides,
     ]
     before = [] if nice is None else ["nice", "-n", str(nice)]
     command = [
@@ -230,6 +233,10 @@ def main(argv: list[str] | None = None) -> int:
         default=0,
         help="to the real-time priorities that they claim, where others fly on the same machine",
     )
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
+        help="of the flight; e.g. wider time-outs on a machine that is held up as a whole now and then",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, help="folder for log and samples; must not exist")
     parser.add_argument("--read", type=Path, help="a folder of an earlier run: no flight")
     parser.add_argument("--json", type=Path, help="write the figures here as well")
@@ -244,7 +251,7 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.read is None:
         if folder.exists():
             parser.error(f"{folder} exists already; choose another --out")
-        code = fly(arguments.minutes, arguments.nice, arguments.lift, folder, console)
+        code = fly(arguments.minutes, arguments.nice, arguments.lift, arguments.overrides, folder, console)
         if code != 0:
             console.print(
                 f"the flight ended with exit code {code}; see {folder / 'fly.txt'}", highlight=False, soft_wrap=True

@@ -19,7 +19,8 @@ WORLD_PRIORITY = 40
 
 
 def claim_realtime(priority: int) -> str:
-    """Switch garbage collection off and ask for real-time scheduling of every thread of this process.
+    """Switch garbage collection off and ask for real-time scheduling of every thread of this process; not of its children, nor of
+    threads that come later.
 
     Returns:
         One line that says what was got. Without the permission (rtprio) the flight goes on at normal priority.
@@ -29,10 +30,11 @@ def claim_realtime(priority: int) -> str:
     gc.disable()
     sys.setswitchinterval(GIL_SWITCH_S)
     try:
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         # Every thread: the tick waits for the bus thread, and what MAVSDK's threads receive is what it flies on.
         for thread in Path("/proc/self/task").iterdir():
             with contextlib.suppress(ProcessLookupError):  # it has just ended
-                os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+                os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO); garbage collection off"
     return f"SCHED_FIFO {priority}; garbage collection off"

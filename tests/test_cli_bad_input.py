@@ -60,7 +60,6 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "mission is a directory": (("fly", ".", "--sitl"), (r"^\.: is a directory, expected a YAML file",)),
     "mission is binary": (("fly", "/bin/sh", "--sitl"), (r"^/bin/sh:1: not UTF-8",)),
     "missing vehicle": ((*FLY, "--vehicle", "nofile.yaml"), (r"^nofile\.yaml: no such file$",)),
-    "px4 comes later": (("fly", "mission.yaml", "--sitl=px4"), (r"^companion fly: --sitl=px4: .*use --sitl",)),
     "unknown world": (("fly", "mission.yaml", "--sitl=moon"), (r"^companion fly: --sitl=moon: expected",)),
     "bad preset": ((*FLY, "--preset", "papr"), (r"--preset papr: .*paper, recommended",)),
     "bad controller": ((*FLY, "--controller", "pid"), (r"--controller pid: .*available: adaptive",)),

@@ -25,7 +25,7 @@ from companion.exit_codes import EXIT_BAD_INPUT, EXIT_CODES
 from companion.safety.supervisor import HOLD_EXPIRED, RETRACT_DONE, RETRACT_EXPIRED
 from companion.safety.table import tables as safety_tables
 from companion.types import SafetyAction
-from sitl.autopilot.params import VEHICLE_DEFAULTS, Params
+from sitl.autopilot.params import Params
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "benchmarks/README.md", *(ROOT / "docs").rglob("*.md")])
@@ -160,9 +160,7 @@ def test_faults_match() -> None:
     assert set(told) == set(Fault.model_fields)
 
 
-def test_px4_parameters_match_those_that_the_stub_flies_with() -> None:
-    told = {codes(row[0])[0]: float(row[1]) for row in table(README, "parameter")}
-    assert told == {name: pytest.approx(VEHICLE_DEFAULTS[name]) for name in told}
+def test_the_stubs_parameters_are_counted() -> None:
     assert f"{len(Params())} of PX4's own" in text_of(SITL)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -21,3 +23,16 @@ def test_the_permission_is_tried_on_a_thread_of_its_own() -> None:
     assert schedulers() == before
     assert threading.active_count() == threads
     assert gc.isenabled()
+
+
+def test_children_of_a_process_at_real_time_priority_are_not() -> None:
+    ask = "import os; print(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)"
+    program = (
+        "import subprocess, sys; from companion.realtime import claim_realtime; got = claim_realtime(1);"
+        f"child = subprocess.run([sys.executable, '-c', {ask!r}], capture_output=True, text=True, check=True);"
+        "print(got, child.stdout, sep='|')"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    got, child = ended.stdout.split("|")
+    assert got.startswith(("SCHED_FIFO 1", "normal priority"))
+    assert int(child) == os.SCHED_OTHER

@@ -57,7 +57,7 @@ TEMPERATURE = Check(
 ERROR = Check(
     "arm.error",
     "servo hardware error",
-    "none (register 70)",
+    "none (register 70); a bus watchdog that let go is told",
     "a servo with an error gives no torque until it is rebooted",
 )
 ANGLES = Check(
@@ -175,7 +175,7 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
         yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
     elif (errors[0] | errors[1]) & WATCHDOG_BIT:
         fix = "look for a loose cable or supply, and for a computer that stalls"
-        yield ERROR.bad("a bus watchdog let go", "none", fix)
+        yield ERROR.doubtful("a bus watchdog let go", "none", fix)
     else:
         yield ERROR.good("none", "none")
     yield _angles(last, vehicle)

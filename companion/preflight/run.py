@@ -15,6 +15,7 @@ from companion.preflight import hand_record, judge
 from companion.preflight.observations import Observations
 from companion.preflight.observe import Tell, observe
 from companion.preflight.rows import Row, refusals
+from companion.realtime import FLIGHT_PRIORITY, claim_realtime
 
 SCHEMA_VERSION = 1
 FILE = "preflight.json"
@@ -30,7 +31,7 @@ async def preflight(
     known: Observations,
     sitl: bool,
 ) -> list[Row]:
-    """Watch the open devices and judge what came.
+    """Watch the open devices and judge what came, at the priority of a flight.
 
     Args:
         edges, config, clock, out, tell, known: as `companion.preflight.observe.observe` takes them.
@@ -39,6 +40,7 @@ async def preflight(
     if not sitl and edges.mocap is not None and edges.mocap.server_info is not None:
         passed, changed = _hand_test(config, edges.mocap.server_info.version)
         known = replace(known, hand_test=passed, hand_test_changed=changed)
+    claim_realtime(FLIGHT_PRIORITY)  # as in flight: else a busy computer is taken for a bad bus and a bad network
     seen = await observe(
         edges,
         config,

@@ -1,7 +1,8 @@
 """The PX4 stub's wire: MAVLink 2 over UDP on 127.0.0.1, an onboard link and optionally one to a ground station.
 
 As PX4 SITL does, a link sends to its remote port from the start, and from then on to whoever spoke first, for as long as PX4 runs;
-what others say is handled, too. Streams run on world time, driven by `pump`; what arrives is handled when it arrives.
+what others say is handled, too. A link without a remote port is a wire to be plugged in: it sends to whoever spoke last. Streams run
+on world time, driven by `pump`; what arrives is handled when it arrives.
 """
 
 from __future__ import annotations
@@ -22,8 +23,11 @@ from sitl.autopilot.streams import STREAMS, Schedule
 Message = Any
 
 _PARAMS_PER_PUMP = 4
-_GROUND_STATION_TIMEOUT_S = 5.0
+_GROUND_STATION_TIMEOUT_S = 2.5
+"""telemetry_status HEARTBEAT_TIMEOUT_US."""
 _STATUS_TEXT_BYTES = 50
+_TEXTS_KEPT, _TEXT_STALE_S = 8, 5.0
+"""Of the mavlink_log queue; the stream passes over what is older."""
 _CLOSE_DEADLINE_S = 1.0
 
 
@@ -60,6 +64,7 @@ class Link(asyncio.DatagramProtocol):
         self._stub = stub
         self._receiver = receiver
         self._partner = partner
+        self._loyal = partner is not None
         self._spoken_to_of_boot: float | None = None
         self._transport: asyncio.DatagramTransport | None = None
         system, component = stub.params.integer("MAV_SYS_ID"), stub.params.integer("MAV_COMP_ID")
@@ -67,6 +72,7 @@ class Link(asyncio.DatagramProtocol):
         self._decoder = _new_decoder()
         self._params_to_send: deque[str | None] = deque()
         self._ground_station_at_s: float | None = None
+        self._texts: deque[tuple[float, int, bytes]] = deque(maxlen=_TEXTS_KEPT)
         self._text_id = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -101,7 +107,7 @@ class Link(asyncio.DatagramProtocol):
             if message.get_type() == "BAD_DATA":
                 continue
             self.messages_in += 1
-            if self._spoken_to_of_boot != self._stub.booted_at_s:
+            if not self._loyal or self._spoken_to_of_boot != self._stub.booted_at_s:
                 self._spoken_to_of_boot, self._partner = self._stub.booted_at_s, (addr[0], addr[1])
             self._receiver.handle(self, message)
 
@@ -131,21 +137,28 @@ class Link(asyncio.DatagramProtocol):
         self._params_to_send = deque([None, *self._stub.params])
 
     def saw_ground_station(self) -> None:
-        """PX4 sends STATUSTEXT only on links where a ground station is alive."""
+        """PX4 sends STATUSTEXT only on links where a ground station is alive, then also what it has said a moment ago."""
         self._ground_station_at_s = self._stub.t_s
+        self._send_texts()
 
     def status_text(self, severity: int, text: str) -> None:
-        """STATUSTEXT, in chunks when it is long."""
-        if self._ground_station_at_s is None:
+        """STATUSTEXT, in chunks when it is long; once a ground station is there."""
+        self._texts.append((self._stub.t_s, severity, text.encode()))
+        self._send_texts()
+
+    def _send_texts(self) -> None:
+        """MavlinkStreamStatustext::send: every text counts, from id 0 on, one that needs no chunks too."""
+        seen_s, now_s = self._ground_station_at_s, self._stub.t_s
+        if seen_s is None or now_s - seen_s > _GROUND_STATION_TIMEOUT_S:
             return
-        if self._stub.t_s - self._ground_station_at_s > _GROUND_STATION_TIMEOUT_S:
-            return
-        data = text.encode()
-        chunks = [data[i : i + _STATUS_TEXT_BYTES] for i in range(0, len(data), _STATUS_TEXT_BYTES)]
-        if len(chunks) > 1:
-            self._text_id = self._text_id % 65535 + 1
-        for i, chunk in enumerate(chunks):
-            self.send(mavlink.MAVLink_statustext_message(severity, chunk, self._text_id if len(chunks) > 1 else 0, i))
+        while self._texts:
+            said_s, severity, data = self._texts.popleft()
+            if now_s - said_s >= _TEXT_STALE_S:
+                continue
+            for chunk, start in enumerate(range(0, len(data), _STATUS_TEXT_BYTES)):
+                part = data[start : start + _STATUS_TEXT_BYTES]
+                self.send(mavlink.MAVLink_statustext_message(severity, part, self._text_id, chunk))
+            self._text_id = (self._text_id + 1) % 65536
 
     def pump(self, t_s: float) -> None:
         """Send the streams that are due at world time `t_s` and a portion of the parameter list."""
@@ -247,7 +260,8 @@ class MavlinkServer:
         while notices:
             notice = notices.popleft()
             for link in self._links:
-                link.status_text(int(notice.severity), notice.text)
+                # The tab tells ground stations that the same comes as an event too, which the stub does not send.
+                link.status_text(int(notice.severity), f"{notice.text}\t")
         for link in self._links:
             link.pump(t_s)
 

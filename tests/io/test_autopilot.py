@@ -363,20 +363,59 @@ def test_a_command_that_nobody_answers_is_told() -> None:
     asyncio.run(fly())
 
 
-def test_statustext_is_passed_on() -> None:
+def test_statustexts_become_lines_each_told_once() -> None:
     async def fly() -> None:
         port = free_udp_port()
         with Px4Peer(port) as peer:
             async with edge(port) as autopilot:
-                peer.say(
-                    mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, b"Preflight Fail: no vision")
-                )
                 said: list[str] = []
+
+                def text(severity: int, data: bytes, identity: int, chunk: int = 0) -> None:
+                    peer.say(mavlink.MAVLink_statustext_message(severity, data, identity, chunk))
+
+                critical, info = mavlink.MAV_SEVERITY_CRITICAL, mavlink.MAV_SEVERITY_INFO
+                # The first after PX4's boot has the id 0 and chunks all the same.
+                text(critical, b"Arming denied: Resolve system health failures firs", 0, 0)
+                text(critical, b"t\t", 0, 1)
+                text(info, b"GCS connection regained\t", 1)
+                for identity in range(2, 5):
+                    text(critical, b"Preflight Fail: heading estimate not stable", identity)
+                text(critical, b"exactly fifty characters, which may be a beginning", 5)
                 await eventually(
-                    lambda: said.extend(autopilot.take_messages()) or bool(said),  # type: ignore[func-returns-value]
-                    "the STATUSTEXT",
+                    lambda: said.extend(autopilot.take_messages()) or len(said) >= 3,  # type: ignore[func-returns-value]
+                    "three texts",
                 )
-            assert said == ["PX4 critical: Preflight Fail: no vision"]
+            assert said == [
+                "PX4 critical: Arming denied: Resolve system health failures first",
+                "PX4 critical: Preflight Fail: heading estimate not stable",
+                "PX4 critical: exactly fifty characters, which may be a beginning",
+            ]
+
+    asyncio.run(fly())
+
+
+def test_px4_sees_a_ground_station_for_as_long_as_it_is_not_armed() -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+
+            def beats() -> int:
+                return sum(message.type == mavlink.MAV_TYPE_GCS for message in peer.of("HEARTBEAT"))
+
+            async with edge(port) as autopilot:
+                await eventually(lambda: beats() >= 2, "a ground station's heartbeats")
+                peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+                await eventually(lambda: (s := autopilot.status()) is not None and s.armed, "armed")
+                at_arming, heard = beats(), len(peer.of("HEARTBEAT"))
+                await eventually(
+                    lambda: len(peer.of("HEARTBEAT")) >= heard + 2, "two of the companion's own heartbeats, 1 Hz"
+                )
+                assert beats() <= at_arming + 1  # one may have been under way
+                peer.base_mode &= ~mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+                await eventually(lambda: beats() >= at_arming + 3, "heartbeats after disarming")
+            left = beats()
+            assert peer.packets_so_far() > 0
+            assert beats() == left
 
     asyncio.run(fly())
 

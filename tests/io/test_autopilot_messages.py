@@ -79,8 +79,8 @@ def test_a_request_repeated_in_every_tick_is_one_command_until_it_is_answered() 
     assert desk.pending() == 1
     desk.answer(ARM, "denied", 2.5)
     assert desk.claim(ARM, 2.5)
-    assert desk.take_messages() == ["ARM refused: denied"]
-    assert desk.take_messages() == []
+    assert desk.take_messages(2.5) == ["ARM refused: denied"]
+    assert desk.take_messages(2.5) == []
 
 
 def test_a_refused_request_waits_half_a_second_from_command_to_command() -> None:
@@ -97,7 +97,7 @@ def test_an_accepted_request_waits_for_the_heartbeat_that_shows_it() -> None:
     desk.answer(ARM, None, 0.01)
     assert not desk.claim(ARM, SETTLE_S)
     assert desk.claim(ARM, 0.01 + SETTLE_S)
-    assert desk.take_messages() == []
+    assert desk.take_messages(2.0) == []
 
 
 def test_land_never_waits_for_another_kind() -> None:
@@ -114,11 +114,18 @@ def test_a_lost_answer_does_not_block_the_request_for_ever() -> None:
     assert desk.claim(LAND, 0.0)
     assert not desk.claim(LAND, ANSWER_DEADLINE_S - 0.001)
     assert desk.claim(LAND, ANSWER_DEADLINE_S)
-    assert desk.take_messages() == ["LAND: no answer within 3 s, asking again"]
+    assert desk.take_messages(ANSWER_DEADLINE_S) == ["LAND: no answer within 3 s, asking again"]
 
 
 def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:
     desk = RequestDesk()
     for number in range(500):
-        desk.note(str(number))
-    assert desk.take_messages() == [str(number) for number in range(300, 500)]
+        desk.hear({"severity": 2, "text": str(number), "id": number, "chunk_seq": 0}, 0.0)
+    assert desk.take_messages(0.0) == [f"PX4 critical: {number}" for number in range(300, 500)]
+
+
+def test_a_text_that_may_go_on_is_told_when_messages_are_taken_later() -> None:
+    desk = RequestDesk()
+    desk.hear({"severity": 2, "text": "x" * 50, "id": 1, "chunk_seq": 0}, 0.0)
+    assert desk.take_messages(0.1) == []
+    assert desk.take_messages(1.0) == [f"PX4 critical: {'x' * 50}"]

@@ -90,23 +90,29 @@ def test_a_flight_on_the_floor_offboard_arm_land_disarm() -> None:
             half.request = AutopilotRequest.NONE
             await half.until(lambda status: status.landed is LandedState.ON_GROUND, "on the ground")
             # The stub disarms only once its land detector is sure; until then it says so, and is asked again.
-            assert set(half.said) <= {"DISARM refused: temporarily rejected (MAV_RESULT 1)"}
+            assert set(half.said) <= {
+                "DISARM refused: temporarily rejected (MAV_RESULT 1)",
+                "PX4 critical: Disarming denied: not landed",
+            }
 
     asyncio.run(fly())
 
 
-def test_arming_without_a_setpoint_stream_is_refused_and_said() -> None:
+def test_arming_without_a_setpoint_stream_is_refused_and_said_in_px4s_words() -> None:
     async def fly() -> None:
         port = free_udp_port()
         device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
         async with standing_stub(port) as stub, MavsdkAutopilot(device, flight_clock()) as autopilot:
             said: list[str] = []
             async with asyncio.timeout(30.0):
-                while not said:
+                while len(set(said)) < 2:
                     autopilot.request(AutopilotRequest.ARM)
                     said += autopilot.take_messages()
                     await asyncio.sleep(0.01)
-            assert said[0].startswith("ARM refused: ")
+            assert set(said) == {
+                "ARM refused: temporarily rejected (MAV_RESULT 1)",
+                "PX4 critical: Arming denied: Resolve system health failures first",
+            }
             assert not stub.armed
 
     asyncio.run(fly())

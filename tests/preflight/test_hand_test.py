@@ -75,7 +75,7 @@ def felt_otherwise(course: Iterable[HandSample], turn: Callable[[Vec3], Vec3]) -
     return turned
 
 
-@pytest.mark.parametrize("seed", range(50))
+@pytest.mark.parametrize("seed", range(8))
 def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
     config = world("hand=true", f"seed={seed}")
     measured = result(Standing(config).samples(END_S))
@@ -126,7 +126,7 @@ def test_a_biased_imu_and_slow_motion_capture_pass(seed: int) -> None:
         ("mocap_body_tilt_deg=[0,12]", "hand.level", "the rigid body's zero was set while the machine was tilted"),
     ],
 )
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1])
 def test_a_spoiled_frame_is_refused_and_named(spoiled: str, row: str, words: str, seed: int) -> None:
     refused = failed(hand_judge.rows(result(samples(spoiled, f"seed={seed}")), "z"))
     assert row in refused

@@ -153,7 +153,7 @@ CASES = {
     "warm": Case("arm.temperature", "66 degC", "cool", {"arm": r.arm(temperature_c=(30.0, 66.0))}, WARN),
     "hot": Case("arm.temperature", "76 degC", "cool", {"arm": r.arm(temperature_c=(76.0, 40.0))}),
     "servo error": Case("arm.error", "servo 2: overload", "power", {"arm": r.arm(hardware_error=(0, 32))}),
-    "let go": Case("arm.error", "watchdog", "loose cable", {"arm": r.arm(hardware_error=(128, 0))}),
+    "let go": Case("arm.error", "watchdog", "loose cable", {"arm": r.arm(hardware_error=(128, 0))}, WARN),
     "beyond a wall": Case(
         "arm.angles", "(30, 140)", "zero_count", {"arm": r.arm(angle_rad=(math.radians(30), r.ARM_RAD[1]))}, also=("mission.arm",)
     ),

@@ -80,8 +80,8 @@ def test_arming_rules(state: NavState, health: Health, reason: str | None) -> No
         assert [notice.text for notice in it.notices] == ["Armed by external command"]
     else:
         assert result is Result.TEMPORARILY_REJECTED
-        assert it.notices[0].text == f"Preflight Fail: {reason}"
-        assert it.notices[1].text.startswith("Arming denied")
+        assert it.arming_problem(health) == reason
+        assert [notice.text for notice in it.notices] == ["Arming denied: Resolve system health failures first"]
 
 
 def test_a_forced_arm_from_outside_still_runs_the_checks() -> None:

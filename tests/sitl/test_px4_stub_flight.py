@@ -93,7 +93,7 @@ def test_nothing_turns_while_disarmed_and_nothing_lifts_during_spool_up() -> Non
 def test_hold_needs_a_global_origin_but_take_off_does_not() -> None:
     rig = ready()
     assert rig.arm() is Result.TEMPORARILY_REJECTED
-    assert "No valid global position estimate" in rig.texts()[0]
+    assert rig.stub.arming_problem() == "No valid global position estimate"
     rig.stub.set_origin(Origin(47.0, 8.0, 0.0))
     assert rig.arm() is Result.ACCEPTED
 
@@ -111,7 +111,8 @@ def test_offboard_needs_a_stream_then_follows_attitude_and_thrust() -> None:
     rig = ready()
     rig.mode(6)
     assert rig.arm() is Result.TEMPORARILY_REJECTED
-    assert rig.texts()[0] == "Preflight Fail: No offboard signal"
+    assert rig.stub.arming_problem() == "No offboard signal"
+    assert rig.texts() == ["Arming denied: Resolve system health failures first"]
     stream(rig, 0.2, AttitudeTarget(LEVEL, 0.0))
     assert rig.arm() is Result.ACCEPTED
     stream(rig, 1.0, AttitudeTarget(LEVEL, HOVER * 1.1))

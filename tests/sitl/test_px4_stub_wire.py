@@ -117,6 +117,24 @@ def test_the_partner_is_whoever_spoke_first_until_px4_restarts_and_links_are_sep
     asyncio.run(scenario())
 
 
+def test_a_link_without_a_remote_port_sends_to_whoever_spoke_last() -> None:
+    async def scenario() -> None:
+        rig = Rig()
+        with Peer() as first, Peer() as second:
+            async with MavlinkServer(rig.stub, Ports(0, 0), None) as server:
+                for number, peer in enumerate((first, second), 1):
+                    peer.heartbeat(server.onboard_port, mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
+                    await run_until_handled(rig, server, peer, number)
+                first.drain()
+                first.received.clear()
+                await run(rig, server, second, 1.0)
+                first.drain()
+                assert not first.received
+                assert second.types()["ODOMETRY"] > 20
+
+    asyncio.run(scenario())
+
+
 def test_the_whole_parameter_list_arrives_once() -> None:
     async def scenario() -> None:
         rig = Rig()
@@ -159,9 +177,36 @@ def test_statustext_needs_a_ground_station_on_the_link(kind: int, texts: bool) -
         if not texts:
             assert not chunks
             return
-        long = [chunk for chunk in chunks if chunk.id]
-        assert "".join(chunk.text for chunk in long) == "Arming denied: Resolve system health failures first"
-        assert [chunk.chunk_seq for chunk in long] == [0, 1]
+        assert "".join(chunk.text for chunk in chunks) == "Arming denied: Resolve system health failures first\t"
+        assert [(chunk.id, chunk.chunk_seq) for chunk in chunks] == [(0, 0), (0, 1)]
+
+    asyncio.run(scenario())
+
+
+def test_what_was_said_a_moment_ago_is_told_to_a_ground_station_that_comes() -> None:
+    async def scenario() -> None:
+        rig = Rig()
+
+        def arm() -> None:
+            message = mavlink.MAVLink_command_long_message(
+                1, 1, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0
+            )
+            peer.send(message, server.onboard_port)
+
+        with Peer() as peer:
+            async with MavlinkServer(rig.stub, Ports(0, 0)) as server:
+                arm()
+                await run_until_handled(rig, server, peer, 1)
+                await run(rig, server, peer, 5.1)  # now it is stale
+                arm()
+                await run_until_handled(rig, server, peer, 2)
+                await run(rig, server, peer, 1.0)
+                assert "STATUSTEXT" not in peer.types()
+                peer.heartbeat(server.onboard_port, mavlink.MAV_TYPE_GCS)
+                await run_until_handled(rig, server, peer, 3)
+                await run(rig, server, peer, 0.1)
+        chunks = [message for message in peer.received if message.get_type() == "STATUSTEXT"]
+        assert [(chunk.id, chunk.chunk_seq) for chunk in chunks] == [(0, 0), (0, 1)]
 
     asyncio.run(scenario())
 
