@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -78,6 +79,9 @@ class Row:
     mode_s: float | None = None
     failsafe_s: float | None = None
     disarmed_s: float | None = None
+    drift_m: float | None = None
+    """From where the fault met it to where it stands, horizontally."""
+    worst_tilt_deg: float | None = None
 
 
 def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
@@ -87,7 +91,7 @@ def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
     command = [sys.executable, "-m", "companion.cli", "fly", str(MISSION), f"--sitl={autopilot}", "--out", str(folder)]
     command += ["--set", *case.overrides, f"world.seed={run}"]
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with open(folder.with_suffix(".txt"), "wb") as output:
+    with open(folder.with_name(f"{folder.name}.txt"), "wb") as output:
         subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, timeout=TIMEOUT_S, check=False)
 
 
@@ -104,6 +108,8 @@ def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
         "latency_p50_ms": latency["p50"], "latency_p99_ms": latency["p99"], "modes": "",
     }  # fmt: skip
     witness = json.loads((folder / WITNESS).read_text(encoding="utf-8")) if (folder / WITNESS).exists() else None
+    if case.fault and witness is not None and witness["course"]:
+        known |= _course_of(witness["course"])
     if autopilot == "px4":
         log = Px4Log.read(newest(folder))
         known["modes"] = log.modes()
@@ -114,6 +120,13 @@ def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
         if case.fault and witness is not None and witness["fault_begun_s"] is not None:
             known |= _after_fault_of_the_stub(witness)
     return Row(**known)
+
+
+def _course_of(course: list[Any]) -> dict[str, Any]:
+    """The world's own word (`sitl.faults.Sample`)."""
+    (_, begin_m, *_), (_, end_m, *_) = course[0], course[-1]
+    tilts_rad = [tilt_rad for _, _, tilt_rad, *_ in course]
+    return {"drift_m": math.dist(begin_m[:2], end_m[:2]), "worst_tilt_deg": math.degrees(max(tilts_rad))}
 
 
 def _modes_of(folder: Path) -> str:
@@ -157,8 +170,8 @@ def markdown(rows: Sequence[Row]) -> str:
     lines += [
         "",
         "| fault | autopilot | ended as it must | last setpoint, s | longest gap in vision, s | next mode | after, s "
-        "| PX4's own failsafe, s | disarmed, s |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| PX4's own failsafe, s | disarmed, s | drift, m | largest tilt, deg |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for case in CASES:
         for autopilot in AUTOPILOTS:
@@ -193,6 +206,8 @@ def _fault_line(case: Case, autopilot: str, rows: Sequence[Row]) -> str:
         _spread([row.mode_s for row in rows], 1.0, 3),
         _spread([row.failsafe_s for row in rows], 1.0, 2),
         _spread([row.disarmed_s for row in rows], 1.0, 1),
+        _spread([row.drift_m for row in rows], 1.0, 2),
+        _spread([row.worst_tilt_deg for row in rows], 1.0, 0),
     )
     return f"| {' | '.join(cells)} |"
 

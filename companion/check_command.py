@@ -21,6 +21,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from companion.campaign_command import wide_console
 from companion.children import LaunchError
 from companion.clock import flight_clock
 from companion.config.loader import FlightConfig
@@ -94,7 +95,7 @@ def run(arguments: argparse.Namespace, config: FlightConfig, problems: Plans) ->
     if task.json:
         print(json.dumps(preflight.as_json(rows)))
     else:
-        show(Console(file=cast("IO[str]", SteadyStream(sys.stdout))), rows, task)
+        show(wide_console(), rows, task)
     return EXIT_REFUSED if refusals(rows) else EXIT_OK
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,8 +91,9 @@ class Px4Log:
                 "PX4's log: expected the package pyulog, found none; pip install 'companion[test]'"
             ) from None
         try:
-            log = ulog.ULog(str(path), _TOPICS)
-        except (OSError, TypeError, ValueError, KeyError) as error:
+            with open(path, "rb") as file:  # by name pyulog would leave a damaged one open
+                log = ulog.ULog(file, _TOPICS)
+        except (OSError, TypeError, ValueError, LookupError, struct.error, ulog.exceptions.ULogException) as error:
             raise Px4Error(f"{path}: expected a ULog of PX4, found something that cannot be read ({error})") from None
         topics = {data.name: data.data for data in log.data_list if data.multi_id == 0}
         missing = [name for name in ("vehicle_status", "vehicle_local_position") if name not in topics]

@@ -246,7 +246,8 @@ class Px4Process:
     def _last_complaint(self) -> str:
         said = _tail(self.log)
         complaints = [line.strip() for line in said if "ERROR" in line or "PANIC" in line or "No such" in line]
-        return f" ({complaints[-1][:160]})" if complaints and self._process.returncode != 0 else ""
+        # Of one that a signal ended the last words are not the cause.
+        return f" ({complaints[-1][:160]})" if complaints and self._process.returncode > 0 else ""
 
 
 def _before_exec() -> None:

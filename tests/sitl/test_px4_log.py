@@ -1,0 +1,63 @@
+"""What is read from PX4's own log: modes, and times after a fault on PX4's clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.px4_link import Px4Error
+from sitl.px4_log import AfterFault, Change, Px4Log, newest
+
+FAULT_S = 20.0
+
+
+def log(*changes: Change, vision_s: tuple[float, ...] = (), setpoint_s: tuple[float, ...] = ()) -> Px4Log:
+    return Px4Log(changes, np.array(vision_s), np.array(setpoint_s), np.zeros(0), np.zeros((0, 3)), {})
+
+
+HOLD = Change(2.0, "HOLD", armed=False, failsafe=False)
+OFFBOARD = Change(10.0, "OFFBOARD", armed=True, failsafe=False)
+LAND = Change(20.14, "LAND", armed=True, failsafe=False)
+DISARMED = Change(23.5, "OFFBOARD", armed=False, failsafe=False)
+
+
+def test_a_takeover_is_told_in_seconds_since_the_fault() -> None:
+    vision = (*np.arange(19.0, 20.0, 0.005), *np.arange(20.1, 23.0, 0.005))
+    setpoints = (*np.arange(19.0, 20.002, 0.005), *np.arange(20.144, 23.0, 0.004))
+    found = log(HOLD, OFFBOARD, LAND, DISARMED, vision_s=vision, setpoint_s=setpoints).after(FAULT_S)
+    assert found.last_setpoint_s == pytest.approx(0.0, abs=1e-6), "those of PX4's own landing do not count"
+    assert found.vision_gap_s == pytest.approx(0.105)
+    assert found.mode == "LAND"
+    assert found.mode_s == pytest.approx(0.14)
+    assert found.failsafe_s is None
+    assert found.disarmed_s == pytest.approx(3.5)
+
+
+def test_px4s_own_failsafe_is_told_from_a_command() -> None:
+    failsafe = Change(20.6, "LAND", armed=True, failsafe=True)
+    assert log(OFFBOARD, failsafe).after(FAULT_S).failsafe_s == pytest.approx(0.6)
+
+
+def test_what_never_happened_is_none() -> None:
+    assert log(HOLD, OFFBOARD).after(FAULT_S) == AfterFault(None, None, None, None, None, None)
+
+
+def test_modes_are_those_that_flew() -> None:
+    assert log(HOLD, OFFBOARD, LAND, DISARMED).modes() == "OFFBOARD, LAND"
+
+
+def test_no_log_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(Px4Error, match="expected a log of PX4 in px4/log, found none; was it flown with --sitl=px4"):
+        newest(tmp_path)
+
+
+def test_a_file_that_is_none_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog")
+    file = tmp_path / "flight.ulg"
+    file.write_bytes(b"no ulog")
+    with pytest.raises(Px4Error, match="expected a ULog of PX4"):
+        Px4Log.read(file)
+    with pytest.raises(Px4Error, match="expected a ULog of PX4"):
+        Px4Log.read(tmp_path / "missing.ulg")
