@@ -392,6 +392,12 @@ class FastFlight:
                 for number, (drive, goal) in enumerate(zip(self._drives, counts, strict=True), start=1):
                     if lost is None or lost.servo != number:
                         drive.set_goal_current(goal)
+        elif faulty and self.plant.world.t_s - self._goal_s > self._watchdog_s and not self.faults.packet_lost():
+            # As the bus thread does with a goal that nobody renews; a servo that is lost has its own watchdog.
+            lost = self.faults.active.get("servo_loss")
+            for number, drive in enumerate(self._drives, start=1):
+                if lost is None or lost.servo != number:
+                    drive.set_goal_current(0)
         if request is not _NO_REQUEST:
             if faulty:
                 self._link.send(lambda: self._request(request))

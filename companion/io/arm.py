@@ -200,7 +200,8 @@ class DynamixelArm:
             if tripped:
                 sent = (0, 0)
                 self._try(bus.restart_watchdogs)
-            elif sent != (0, 0) and time.monotonic() - self._goal_handed_s > watchdog_s:
+            elif self._goal_handed_s > 0.0 and time.monotonic() - self._goal_handed_s > watchdog_s:
+                # Again and again: nobody answers a sync write, and our reads keep the servos' watchdogs content.
                 sent = (0, 0)
                 self._try(lambda: bus.write_currents((0, 0)))
 
