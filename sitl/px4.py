@@ -243,8 +243,7 @@ class RealPx4:
             self._relay.down, self._relay.delay_s = down, delay_s
 
     def skip(self, paused_s: float) -> None:
-        """A sample that comes late, as PX4 sees it."""
-        self._link.clock_ahead_s += paused_s
+        """It has no clock but the world's, and a gap in its samples would throw its estimate off: it falls behind, and is seen to."""
 
     def noticed(self) -> Noticed:
         """What arrives at PX4 only its own log shows."""

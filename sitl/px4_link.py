@@ -64,7 +64,7 @@ class HilSensors:
         self._number = 0
 
     def message(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> Any:
-        """HIL_SENSOR at the sample's time; height above the floor and attitude (world ENU, body FLU) are the true ones."""
+        """HIL_SENSOR at the sample's world time; height above the floor and attitude (world ENU, body FLU) are the true ones."""
         gauss = self._random.gauss
         fields = _ACCEL_AND_GYRO
         field: Vec3 = (0.0, 0.0, 0.0)
@@ -109,8 +109,6 @@ class SimulatorLink:
         self.unanswered = 0
         """Samples that PX4 left without an answer, in all."""
         self.connections = 0
-        self.clock_ahead_s = 0.0
-        """Of PX4's clock before the world's, beside `CLOCK_ORIGIN_S`."""
         self._listener = listener
         self._sensors = sensors
         self._server: asyncio.Server | None = None
@@ -120,6 +118,8 @@ class SimulatorLink:
         self._answer = asyncio.Event()
         self._change = asyncio.Event()
         self._silent_s = 0.0
+        self._rests = False
+        """Disarmed and without an answer: in OFFBOARD without setpoints, as after a flight, PX4 computes no controls."""
 
     async def __aenter__(self) -> Self:
         self._server = await asyncio.get_running_loop().create_server(lambda: _Peer(self), sock=self._listener)
@@ -170,9 +170,9 @@ class SimulatorLink:
         """One sample to PX4; nothing happens while there is none. `answered` waits for what it makes of it."""
         if self._peer is None:
             return
-        sample = imu._replace(t_s=imu.t_s + self.clock_ahead_s) if self.clock_ahead_s else imu
-        message = self._sensors.message(sample, height_m, attitude_wxyz)
-        self._waits_for_us = int(message.time_usec) if self.answers else None  # a PX4 that boots does not answer yet
+        message = self._sensors.message(imu, height_m, attitude_wxyz)
+        # A PX4 that boots does not answer yet; one that rests does not answer for a while.
+        self._waits_for_us = int(message.time_usec) if self.answers and not self._rests else None
         self._peer.write(message.pack(self._encoder))
         self._encoder.seq = (self._encoder.seq + 1) % 256
 
@@ -182,10 +182,11 @@ class SimulatorLink:
         return self._waits_for_us is not None
 
     async def answered(self) -> None:
-        """Until PX4 has answered the last sample, or is gone. After `ANSWER_PATIENCE_S` the sample is given up.
+        """Until PX4 has answered the last sample, or is gone. After `ANSWER_PATIENCE_S` the sample is given up; a PX4 that is not armed
+        is then not waited for any more until it answers again.
 
         Raises:
-            Px4Error: nothing was answered for `ANSWER_DEADLINE_S`.
+            Px4Error: an armed PX4 has answered nothing for `ANSWER_DEADLINE_S`.
         """
         while self._waits_for_us is not None:
             self._answer.clear()
@@ -196,6 +197,7 @@ class SimulatorLink:
                 self.unanswered += 1
                 self._silent_s += ANSWER_PATIENCE_S
                 self._waits_for_us = None
+                self._rests = not self.armed
                 if self._silent_s >= ANSWER_DEADLINE_S:
                     raise Px4Error(
                         f"PX4: expected an answer to every HIL_SENSOR (lockstep), found none for {ANSWER_DEADLINE_S:g} s; "
@@ -212,6 +214,7 @@ class SimulatorLink:
         self.connections += 1
         self.answers = 0
         self._silent_s = 0.0
+        self._rests = False
         self._change.set()
         return True
 
@@ -230,6 +233,7 @@ class SimulatorLink:
         if message.get_type() != "HIL_ACTUATOR_CONTROLS":
             return
         self.answers += 1
+        self._rests = False
         if self.answers == 1:
             self._change.set()
         self.armed = bool(message.mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -136,6 +136,8 @@ def print_tables(console: Console, growth: Sequence[Growth], flight: Sequence[Mi
 
 def draw(samples: Sequence[Sample], flight: Sequence[Minute], empty: Sequence[Minute], path: Path) -> None:
     """Memory and lateness over time, as a PNG."""
+    from matplotlib.ticker import NullFormatter
+
     from companion.analysis.plot_style import INK, dress, new_figure, write_png
 
     colours = {
@@ -162,8 +164,9 @@ def draw(samples: Sequence[Sample], flight: Sequence[Minute], empty: Sequence[Mi
             values = [float(getattr(minute, value)) for minute in minutes]
             late.plot(middle, values, color=colour, ls=dash, lw=1.3, label=f"{name} {value}")
     late.set_yscale("log")
-    for formatted in (late.yaxis.set_major_formatter, late.yaxis.set_minor_formatter):
-        formatted("{x:g}")
+    late.set_yticks([0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0])
+    late.yaxis.set_major_formatter("{x:g}")
+    late.yaxis.set_minor_formatter(NullFormatter())
     late.set_ylabel("tick lateness [ms]")
     late.set_xlabel("minute of the flight")
     for ax in (memory, late):

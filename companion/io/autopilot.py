@@ -7,6 +7,7 @@ The hot path (`send_attitude`, `send_vision`) is one synchronous native call eac
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable
@@ -75,7 +76,7 @@ class MavsdkAutopilot:
         self._device = device
         self._clock = clock
         self._desk = RequestDesk()
-        self._inbox = Inbox(clock, self._desk)
+        self._inbox = Inbox(clock, self._desk, self._on_heartbeat)
         self._calls = NativeCalls(device.address)
         self._mavsdk: Any = None
         self._connection: Any = None
@@ -85,6 +86,7 @@ class MavsdkAutopilot:
         self._info: Any = None
         self._params: ParamTransfer | None = None
         self._open = False
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._system_id = 0
         self._own_ids = (0, 0)
         self._local_port = 0
@@ -97,6 +99,7 @@ class MavsdkAutopilot:
         """
         address = self._device.address
         check_address(address)
+        self._loop = asyncio.get_running_loop()
         self._restore_log = quiet_native_log()
         try:
             configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
@@ -204,8 +207,8 @@ class MavsdkAutopilot:
         self._direct.send_command_async(command, answered)
 
     def take_messages(self) -> list[str]:
-        """Refusals and STATUSTEXTs since the last call, oldest first."""
-        return self._desk.take_messages()
+        """Refusals and STATUSTEXTs since the last call, oldest first; texts as `autopilot_texts` tells them."""
+        return self._desk.take_messages(self._clock())
 
     async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
         """Values of PX4's parameters by name, int or float as PX4 stores them; a name that PX4 does not have is left out.
@@ -281,6 +284,21 @@ class MavsdkAutopilot:
         if not self._open:
             fix = "enter the edge first"
             raise device_error(self._device.address, "an open link", "a closed one", fix)
+
+    def _on_heartbeat(self) -> None:
+        """A thread of MAVSDK's."""
+        assert self._loop is not None
+        with contextlib.suppress(RuntimeError):  # the loop is closed: MAVSDK hung and was left behind
+            self._loop.call_soon_threadsafe(self._show_ground_station)
+
+    def _show_ground_station(self) -> None:
+        """Answer the heartbeat of a PX4 that is not armed as a ground station does: PX4 says why it refuses only where it sees one.
+
+        Not while it is armed: there the loss of the real one must be noticed, whatever NAV_DLL_ACT makes of it.
+        """
+        status = self._inbox.status()
+        if self._open and status is not None and not status.armed:
+            self._send("HEARTBEAT", messages.GROUND_STATION_HEARTBEAT_JSON)
 
     def _send(self, name: str, fields_json: str) -> bool:
         try:

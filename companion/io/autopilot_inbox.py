@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -32,9 +34,10 @@ ESTIMATOR_RATE_HZ = 5.0
 class Inbox:
     """Written by MAVSDK's threads, one assignment each; a tuple is replaced as a whole, so a reader never sees half of it."""
 
-    def __init__(self, clock: Clock, desk: RequestDesk) -> None:
+    def __init__(self, clock: Clock, desk: RequestDesk, after_heartbeat: Callable[[], None]) -> None:
         self._clock = clock
         self._desk = desk
+        self._after_heartbeat = after_heartbeat
         self._position: tuple[float, Vec3, Vec3] | None = None
         self._attitude: tuple[float, Quat, int] | None = None
         self._rates: Vec3 | None = None
@@ -61,10 +64,11 @@ class Inbox:
         telemetry.subscribe_imu(self._on_imu)
         telemetry.subscribe_landed_state(self._on_landed)
         telemetry.subscribe_battery(self._on_battery)
-        telemetry.subscribe_status_text(self._on_status_text)
         # System.is_connected turns false seconds late; HEARTBEAT itself is the evidence, and carries armed and mode.
         direct.subscribe_message("HEARTBEAT", self._on_heartbeat)
         direct.subscribe_message("ESTIMATOR_STATUS", self._on_estimator)
+        # Telemetry.status_text cuts the first long text after PX4's boot in two and keeps one of exactly 50 characters back.
+        direct.subscribe_message("STATUSTEXT", self._on_status_text)
 
     def vehicle(self) -> VehicleState | None:
         """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
@@ -143,13 +147,15 @@ class Inbox:
     def _on_battery(self, value: Any, _: Any) -> None:
         self._battery = (value.voltage_v, value.remaining_percent)
 
-    def _on_status_text(self, value: Any, _: Any) -> None:
-        self._desk.note(f"PX4 {value.type.name.lower()}: {value.text}")
+    def _on_status_text(self, message: Any, _: Any) -> None:
+        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
+            self._desk.hear(json.loads(message.fields_json), self._clock())
 
     def _on_heartbeat(self, message: Any, _: Any) -> None:
         # A gimbal or camera behind the same system id has a heartbeat of its own.
         if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
             self._heartbeat = (self._clock(), message.fields_json)
+            self._after_heartbeat()
 
     def _on_estimator(self, message: Any, _: Any) -> None:
         if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:

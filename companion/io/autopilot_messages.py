@@ -32,6 +32,10 @@ from companion.types import (
 GPS_GLOBAL_ORIGIN_ID = 49
 ESTIMATOR_STATUS_ID = 230
 _REQUEST_MESSAGE, _SET_MESSAGE_INTERVAL = 512, 511
+GROUND_STATION_HEARTBEAT_JSON = (
+    '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
+)
+"""HEARTBEAT: MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE."""
 
 MAV_COMP_ID_AUTOPILOT1 = 1
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1

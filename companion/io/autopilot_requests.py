@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from companion.io.autopilot_texts import Texts
 from companion.types import AutopilotRequest
 
 RETRY_S = 0.5
@@ -35,6 +38,7 @@ class RequestDesk:
         self._lock = threading.Lock()
         self._kinds: dict[AutopilotRequest, _Kind] = {}
         self._messages: deque[str] = deque(maxlen=_MESSAGES_KEPT)
+        self._texts = Texts()
 
     def claim(self, request: AutopilotRequest, now_s: float) -> bool:
         """True: send this request's command now, and report by `answer`. `now_s` is on the flight clock."""
@@ -62,22 +66,22 @@ class RequestDesk:
             if refusal is None:
                 kind.not_before_s = now_s + SETTLE_S
             else:
-                self._messages.append(f"{request.name} refused: {refusal}")
+                self._messages.extend(self._texts.once(f"{request.name} refused: {refusal}", now_s))
 
-    def note(self, text: str) -> None:
-        """Keep a line that the autopilot said by itself (STATUSTEXT); whatever is in it, it stays one line."""
-        line = "".join(character if character.isprintable() else "?" for character in text)
+    def hear(self, statustext: Mapping[str, Any], now_s: float) -> None:
+        """Keep what the autopilot said by itself, once it is complete (`Texts.take`)."""
         with self._lock:
-            self._messages.append(line)
+            self._messages.extend(self._texts.take(statustext, now_s))
 
     def pending(self) -> int:
         """How many commands still wait for their answer."""
         with self._lock:
             return sum(kind.pending for kind in self._kinds.values())
 
-    def take_messages(self) -> list[str]:
+    def take_messages(self, now_s: float) -> list[str]:
         """Everything said since the last call, oldest first; the newest 200 lines are kept."""
         with self._lock:
+            self._messages.extend(self._texts.overdue(now_s))
             messages = list(self._messages)
             self._messages.clear()
             return messages

@@ -245,7 +245,7 @@ class Px4Stub:
     def _refusal(self, command: int, params: Command7) -> str | None:
         """What a fault makes PX4 say to a command; None: nothing."""
         if self.refuses_offboard and command == Command.DO_SET_MODE and params[1] == NavState.OFFBOARD.value[0]:
-            return "Switching to mode 'Offboard' is currently not possible"
+            return "Switching to Offboard is currently not available"
         if self.refuses_arming and command == Command.COMPONENT_ARM_DISARM and params[0] == 1.0:
             return "Arming denied: Resolve system health failures first"
         return None

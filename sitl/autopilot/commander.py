@@ -122,12 +122,11 @@ class Commander:
         return True
 
     def arm(self, t_s: float, health: Health) -> bool:
-        """Arm on an external command. False: refused, with the reasons in `notices`."""
+        """Arm on an external command. False: refused; `arming_problem` knows why."""
         if self.armed:
             return True
-        reason = self.arming_problem(health)
-        if reason is not None:
-            self._say(Severity.CRITICAL, f"Preflight Fail: {reason}")
+        if self.arming_problem(health) is not None:
+            # What a mode requires and lacks PX4 tells by event only; texts of its own have the health checks alone.
             self._say(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
             return False
         self.armed = True
@@ -241,7 +240,7 @@ class Commander:
     def _wish_or_reject(self, state: NavState, health: Health) -> Result:
         if self.change_mode(state, health):
             return Result.ACCEPTED
-        self._say(Severity.CRITICAL, f"Switching to mode '{_MODE_NAMES.get(state, state.name)}' denied")
+        self._say(Severity.CRITICAL, f"Switching to {_MODE_NAMES[state]} is currently not available")
         return Result.TEMPORARILY_REJECTED
 
     def _offboard_timeout_s(self) -> float:

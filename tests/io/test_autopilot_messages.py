@@ -9,6 +9,7 @@ import pytest
 
 from companion.io import autopilot_messages as messages
 from companion.io.autopilot_requests import ANSWER_DEADLINE_S, RETRY_S, SETTLE_S, RequestDesk
+from companion.io.autopilot_texts import SAME_TEXT_S
 from companion.types import AttitudeSetpoint, AutopilotRequest, FlightMode, LandedState
 
 ARM, LAND, NONE = AutopilotRequest.ARM, AutopilotRequest.LAND, AutopilotRequest.NONE
@@ -91,6 +92,14 @@ def test_a_refused_request_waits_half_a_second_from_command_to_command() -> None
     assert desk.claim(ARM, RETRY_S)
 
 
+def test_the_same_refusal_is_told_again_only_after_a_while() -> None:
+    desk = RequestDesk()
+    for t_s in (0.0, 1.0, SAME_TEXT_S):
+        assert desk.claim(ARM, t_s)
+        desk.answer(ARM, "denied", t_s)
+    assert desk.take_messages(SAME_TEXT_S) == ["ARM refused: denied"] * 2
+
+
 def test_an_accepted_request_waits_for_the_heartbeat_that_shows_it() -> None:
     desk = RequestDesk()
     assert desk.claim(ARM, 0.0)
@@ -121,11 +130,11 @@ def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:
     desk = RequestDesk()
     for number in range(500):
         desk.hear({"severity": 2, "text": str(number), "id": number, "chunk_seq": 0}, 0.0)
-    assert desk.take_messages(0.0) == [f"PX4 critical: {number}" for number in range(300, 500)]
+    assert desk.take_messages(0.0) == [f"critical: {number}" for number in range(300, 500)]
 
 
 def test_a_text_that_may_go_on_is_told_when_messages_are_taken_later() -> None:
     desk = RequestDesk()
     desk.hear({"severity": 2, "text": "x" * 50, "id": 1, "chunk_seq": 0}, 0.0)
     assert desk.take_messages(0.1) == []
-    assert desk.take_messages(1.0) == [f"PX4 critical: {'x' * 50}"]
+    assert desk.take_messages(1.0) == [f"critical: {'x' * 50}"]

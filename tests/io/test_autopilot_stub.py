@@ -92,7 +92,7 @@ def test_a_flight_on_the_floor_offboard_arm_land_disarm() -> None:
             # The stub disarms only once its land detector is sure; until then it says so, and is asked again.
             assert set(half.said) <= {
                 "DISARM refused: temporarily rejected (MAV_RESULT 1)",
-                "PX4 critical: Disarming denied: not landed",
+                "critical: Disarming denied: not landed",
             }
 
     asyncio.run(fly())
@@ -111,7 +111,7 @@ def test_arming_without_a_setpoint_stream_is_refused_and_said_in_px4s_words() ->
                     await asyncio.sleep(0.01)
             assert set(said) == {
                 "ARM refused: temporarily rejected (MAV_RESULT 1)",
-                "PX4 critical: Arming denied: Resolve system health failures first",
+                "critical: Arming denied: Resolve system health failures first",
             }
             assert not stub.armed
 

@@ -18,7 +18,7 @@ def said(text: str, identity: int = 0, chunk: int = 0, severity: int = CRITICAL)
 
 def test_a_short_text_is_told_at_once_and_without_its_tab() -> None:
     assert Texts().take(said("Preflight Fail: no heading reference\t"), 0.0) == [
-        "PX4 critical: Preflight Fail: no heading reference"
+        "critical: Preflight Fail: no heading reference"
     ]
 
 
@@ -26,7 +26,7 @@ def test_a_short_text_is_told_at_once_and_without_its_tab() -> None:
 def test_chunks_are_one_line(identity: int) -> None:
     texts = Texts()
     assert texts.take(said(LONG[:50], identity, 0), 0.0) == []
-    assert texts.take(said(LONG[50:] + "\t", identity, 1), 0.01) == [f"PX4 critical: {LONG}"]
+    assert texts.take(said(LONG[50:] + "\t", identity, 1), 0.01) == [f"critical: {LONG}"]
     assert texts.overdue(10.0) == []
 
 
@@ -34,20 +34,20 @@ def test_a_text_of_exactly_one_chunk_is_told_after_a_while() -> None:
     texts = Texts()
     assert texts.take(said(LONG[:50], 3), 1.0) == []
     assert texts.overdue(1.0 + CHUNK_PATIENCE_S - 0.01) == []
-    assert texts.overdue(1.0 + CHUNK_PATIENCE_S) == [f"PX4 critical: {LONG[:50]}"]
+    assert texts.overdue(1.0 + CHUNK_PATIENCE_S) == [f"critical: {LONG[:50]}"]
     assert texts.overdue(10.0) == []
 
 
 def test_another_text_ends_one_that_was_cut_off() -> None:
     texts = Texts()
     assert texts.take(said(LONG[:50], 3), 0.0) == []
-    assert texts.take(said("and so on\t", 4), 0.1) == [f"PX4 critical: {LONG[:50]}", "PX4 critical: and so on"]
+    assert texts.take(said("and so on\t", 4), 0.1) == [f"critical: {LONG[:50]}", "critical: and so on"]
 
 
 def test_a_chunk_that_does_not_follow_is_no_part_of_the_text() -> None:
     texts = Texts()
     assert texts.take(said(LONG[:50], 3, 0), 0.0) == []
-    assert texts.take(said("third", 3, 2), 0.1) == [f"PX4 critical: {LONG[:50]}", "PX4 critical: third"]
+    assert texts.take(said("third", 3, 2), 0.1) == [f"critical: {LONG[:50]}", "critical: third"]
 
 
 def test_the_same_text_is_told_again_only_after_a_while() -> None:
@@ -55,7 +55,7 @@ def test_the_same_text_is_told_again_only_after_a_while() -> None:
     assert len(texts.take(said("again\t"), 0.0)) == 1
     assert [texts.take(said("again"), t_s) for t_s in (0.5, 5.0, SAME_TEXT_S - 0.01)] == [[]] * 3
     assert len(texts.take(said("another"), 5.0)) == 1
-    assert texts.take(said("again\t"), SAME_TEXT_S) == ["PX4 critical: again"]
+    assert texts.take(said("again\t"), SAME_TEXT_S) == ["critical: again"]
 
 
 def test_information_is_not_told_and_whatever_is_in_a_text_it_is_one_line() -> None:
@@ -63,5 +63,5 @@ def test_information_is_not_told_and_whatever_is_in_a_text_it_is_one_line() -> N
     assert texts.take(said("Takeoff detected\t", severity=INFO), 0.0) == []
     assert texts.take(said("no MAV_SEVERITY", severity=200), 0.0) == []
     assert texts.take(said("\t"), 0.0) == []
-    assert texts.take(said("a\n b\x1b[31m", severity=NOTICE), 0.0) == ["PX4 notice: a b?[31m"]
-    assert texts.take(said("low battery", severity=WARNING), 0.0) == ["PX4 warning: low battery"]
+    assert texts.take(said("a\n b\x1b[31m", severity=NOTICE), 0.0) == ["notice: a b?[31m"]
+    assert texts.take(said("low battery", severity=WARNING), 0.0) == ["warning: low battery"]

@@ -42,6 +42,19 @@ async def boot(link: SimulatorLink, i: int = 0) -> int:
     return i
 
 
+async def until_answered(link: SimulatorLink, i: int) -> None:
+    """It is in lockstep again: a sample is waited for, and answered."""
+    async with asyncio.timeout(DEADLINE_S):
+        while True:
+            i += 1
+            link.send(sample(i), 0.3, LEVEL)
+            waited = link.pending
+            await link.answered()
+            if waited:
+                return
+            await asyncio.sleep(PERIOD_S)
+
+
 async def until_it_fails(link: SimulatorLink, i: int) -> None:
     async with asyncio.timeout(DEADLINE_S):
         while True:
@@ -70,16 +83,24 @@ def test_each_sample_is_answered_before_the_next_one_and_the_answer_is_its_own()
     asyncio.run(scenario())
 
 
-def test_a_world_that_was_held_up_does_not_hold_up_px4s_clock() -> None:
+def test_a_px4_that_rests_on_the_ground_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Disarmed in OFFBOARD without setpoints PX4 sends no controls at all."""
+    monkeypatch.setattr(px4_link, "ANSWER_PATIENCE_S", 0.05)
+    monkeypatch.setattr(px4_link, "ANSWER_DEADLINE_S", 0.1)
+    rests = range(100, 200)
+
+    def answer(message: object) -> list[float] | None:
+        number = round((message.time_usec - px4_link.clock_us(0.0)) / 4000)  # type: ignore[attr-defined]
+        return None if number in rests else [0.5] * 4
+
     async def scenario() -> None:
         async with link() as under_test:
-            with await connected(under_test, lambda _: [0.0] * 4) as peer:
-                first = await boot(under_test)
-                under_test.clock_ahead_s += 0.1
-                under_test.send(sample(first), 0.3, LEVEL)
-                await under_test.answered()
-                before, after = (message.time_usec for message in peer.sensors[-2:])
-                assert after - before == 104_000
+            with await asyncio.to_thread(LockstepPeer, under_test.port, answer, 0):
+                for i in range(await boot(under_test), 300):
+                    under_test.send(sample(i), 0.3, LEVEL)
+                    await under_test.answered()
+                assert under_test.unanswered == 1, "one sample's patience, then none until it answers again"
+                await until_answered(under_test, 300)
 
     asyncio.run(scenario())
 
