@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 
 from companion.config.world import World as WorldConfig
+from companion.px4.wanted import WANTED, simulated_values
 from sitl.autopilot.params import PX4_DEFAULTS, VEHICLE_DEFAULTS, Value
 from sitl.model import ROTOR_ARM_M, ROTORS, YAW_TORQUE_PER_THRUST_M
 
@@ -20,16 +21,12 @@ ROLL_PITCH_SHARE = 1.0 / math.sqrt(2.0)
 """Of a roll or pitch command that reaches each rotor of a quad-x: PX4 scales its allocation matrix so
 (ControlAllocationPseudoInverse::updateControlAllocationMatrixScale)."""
 
-OF_THIS_MOTION_CAPTURE: Mapping[str, Value] = {
-    "EKF2_EV_DELAY": 10.0, "EKF2_DELAY_MAX": 50.0, "EKF2_TAU_POS": 0.1, "EKF2_TAU_VEL": 0.1, "EKF2_ASP_DELAY": 5.0,
-    "EKF2_GPS_DELAY": 5.0,
-}  # fmt: skip
-"""Measured on 1.16.1. Exposure to fusion takes 10 ms: 5 ms of latency, the wires, and half a period each of lockstep and of EKF2. With
-its defaults EKF2 looks 0.2 s back and brings its output to now with a time constant of 0.25 s: that output wanders by 3 to 4 mm
-(standard deviation), though the innovations are 0.5 mm. So it wanders by 1 mm. EKF2 raises EKF2_DELAY_MAX to the longest delay of any
-sensor, fitted or not."""
-NOT_EVERYWHERE = frozenset({"EKF2_GPS_DELAY"})
-"""Versions differ: 1.18 has none of these."""
+OF_THIS_MOTION_CAPTURE: Mapping[str, Value] = {"EKF2_EV_DELAY": 10.0}
+"""ms, measured on 1.16.1: exposure to fusion takes 5 ms of latency, the wires, and half a period each of lockstep and of EKF2. The stub
+has the latency alone, for which the 5 of configs/px4/indoor_mocap.params are right."""
+
+NOT_EVERYWHERE = frozenset(wanted.name for wanted in WANTED if wanted.only)
+"""Versions of PX4 differ: not each has all of these."""
 
 _GAINS = (
     "MC_ROLL_P", "MC_PITCH_P", "MC_YAW_P", "MC_YAW_WEIGHT", "MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX", "MC_YAWRATE_P",
@@ -61,6 +58,7 @@ def parameters(config: WorldConfig, hover_command: float) -> dict[str, Value]:
     gains = {name: PX4_DEFAULTS[name] for name in _GAINS}
     mixed = {name: PX4_DEFAULTS[name] / ROLL_PITCH_SHARE for name in _MIXED_GAINS}
     return {
+        **simulated_values(),
         **VEHICLE_DEFAULTS,
         **OF_THIS_MOTION_CAPTURE,
         **BEFORE_BOOT,

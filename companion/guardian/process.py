@@ -161,13 +161,19 @@ class Guardian:
                 return f"{words.HANGS} (silent for {watch.silent_s * 1e3:.0f} ms)"
             if now_s - told_s >= words.READY_PERIOD_S:
                 told_s = now_s
-                self._beats.tell(self._trouble(now_s))
+                self._beats.tell(self._trouble(now_s, last))
 
-    def _trouble(self, now_s: float) -> str | None:
-        """Why the guardian could not land the vehicle now."""
+    def _trouble(self, now_s: float, last: Beat | None) -> str | None:
+        """Why the guardian could not land the vehicle now, or not as well as the flight process.
+
+        In the air nothing is wrong with a guardian that sees no motion capture as long as the flight process sees none either: it would
+        land without, as the flight process does.
+        """
         if self._problem is not None or self._mocap is None:
             return self._problem
         if now_s - self._mocap.tracked_s <= MOCAP_FRESH_S:
+            return None
+        if last is not None and last.lifting and now_s - last.origin_s - last.pose_stamp_s > MOCAP_FRESH_S:
             return None
         mocap = self._settings.mocap
         wrong = f" ({self._mocap.trouble})" if self._mocap.trouble else ""

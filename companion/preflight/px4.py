@@ -68,6 +68,8 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
         value = params.get(wanted.name)
         text = wanted.text(vehicle)
         row_id = PARAM_ID + wanted.name
+        if value is None and wanted.only:
+            continue
         if value is None:
             fix = "check the firmware: PX4 1.16 and 1.18 have it"
             yield Row(row_id, wanted.name, False, "PX4 does not have it", text, wanted.why, fix, Level.WARN)

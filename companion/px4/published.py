@@ -31,7 +31,8 @@ def indoor_mocap_text() -> str:
             above = ["", f"== {title} =="] if index == 0 else []
             reboot = " Takes effect after a reboot." if wanted.reboot else ""
             also = f" Accepted: {wanted.text()}." if wanted.ok or wanted.limits else ""
-            comments[wanted.name] = above + textwrap.wrap(f"{wanted.name}: {wanted.why}.{also}{reboot}", _WIDTH)
+            only = f" PX4 {wanted.only} only." if wanted.only else ""
+            comments[wanted.name] = above + textwrap.wrap(f"{wanted.name}: {wanted.why}.{also}{reboot}{only}", _WIDTH)
     heading = [
         "PX4 1.16 and 1.18, a quadrotor indoors on motion capture, without GPS.",
         "",
@@ -68,9 +69,8 @@ def table_markdown() -> str:
             if not wanted.file and wanted.value is not None:
                 value += " without a radio"
             reboot = "yes" if wanted.reboot else ""
-            lines.append(
-                f"| `{wanted.name}` | {value} | {wanted.text()} | {wanted.level.value} | {reboot} | {wanted.why} |"
-            )
+            name = f"`{wanted.name}` ({wanted.only} only)" if wanted.only else f"`{wanted.name}`"
+            lines.append(f"| {name} | {value} | {wanted.text()} | {wanted.level.value} | {reboot} | {wanted.why} |")
         lines.append("")
     return "\n".join(lines).rstrip()
 

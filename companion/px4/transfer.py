@@ -54,7 +54,7 @@ class Comparison:
 
     differences: tuple[Difference, ...]
     absent: tuple[str, ...]
-    """In the file, but PX4 does not have them."""
+    """In the file, but PX4 does not have them; those of another version of PX4 (`Wanted.only`) do not count."""
     absent_port: tuple[str, ...]
     """The same, of a serial port that this PX4 does not have: a simulator, or a board without TELEM2. Nothing is wrong with that."""
 
@@ -82,7 +82,7 @@ def compare(wanted: Mapping[str, Value], found: Mapping[str, Value]) -> Comparis
                 differences.append(Difference(name, found[name], value))
         elif name in BY_NAME and BY_NAME[name].hardware:
             absent_port.append(name)
-        else:
+        elif name not in BY_NAME or not BY_NAME[name].only:
             absent.append(name)
     return Comparison(tuple(differences), tuple(absent), tuple(absent_port))
 

@@ -12,16 +12,18 @@ import zlib
 from collections.abc import Iterator, Mapping
 
 from companion.px4.defaults import PX4_DEFAULTS as PX4_DEFAULTS
-from companion.px4.wanted import simulated_values
+from companion.px4.wanted import BY_NAME, simulated_values
 
 MAV_PARAM_TYPE_INT32 = 6
 MAV_PARAM_TYPE_REAL32 = 9
 HASH_CHECK = "_HASH_CHECK"
+VERSION = "1.16"
+"""Whose names and defaults these are."""
 
 Value = int | float
 
 VEHICLE_DEFAULTS: Mapping[str, Value] = {
-    **simulated_values(),
+    **{name: value for name, value in simulated_values().items() if BY_NAME[name].only in ("", VERSION)},
     "BAT1_CAPACITY": 5200.0,
     "MPC_TKO_SPEED": 0.6,
     "MPC_XY_CRUISE": 1.0,

@@ -154,7 +154,9 @@ class Rig:
         for opened in (self.beats, self.channel, self.recorder):
             opened.close()
 
-    def beat(self, *, lifting: bool = True, pilot: bool = False, goodbye: bool = False) -> None:
+    def beat(
+        self, *, lifting: bool = True, pilot: bool = False, goodbye: bool = False, pose_age_s: float = 0.0
+    ) -> None:
         """One tick of the flight process."""
         self.tick += 1
         t_s = time.monotonic() - self.origin_s
@@ -170,7 +172,7 @@ class Rig:
             own_system=OWN_IDS[0],
             own_component=OWN_IDS[1],
             local_port=self.port,
-            pose_stamp_s=t_s,
+            pose_stamp_s=t_s - pose_age_s,
             position_world_m=POSITION_M,
         )
         self.beats.send(words.pack(beat))

@@ -13,6 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.frames import ned_from_enu, wrap_rad
+from companion.guardian.beat import PROBLEM, READY
 from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
 
@@ -196,6 +197,29 @@ def test_it_is_not_ready_without_a_body_of_its_own(tmp_path: Path) -> None:
             return b"sees no rigid body" in said[-1]
 
         wait_until(blind, lambda: f"{said} {rig.log.read_text()}")
+
+
+def test_in_the_air_it_is_no_worse_than_a_flight_process_that_sees_nothing_either(tmp_path: Path) -> None:
+    with Rig(tmp_path, timeout_s=0.5) as rig:
+        rig.beat_until_ready()
+        rig.cameras.tracked = False
+
+        def until(kind: bytes, *, lifting: bool, pose_age_s: float) -> None:
+            heard: list[bytes] = []
+
+            def said() -> bool:
+                rig.beat(lifting=lifting, pose_age_s=pose_age_s)
+                try:
+                    heard.append(rig.beats.recv(1024))
+                except BlockingIOError:
+                    return False
+                return heard[-1][:1] == kind
+
+            wait_until(said, lambda: f"{kind!r} was never said: {heard[-3:]} {rig.log.read_text()}")
+
+        until(PROBLEM, lifting=True, pose_age_s=0.0)
+        until(READY, lifting=True, pose_age_s=1.0)
+        until(PROBLEM, lifting=False, pose_age_s=1.0)
 
 
 _BUGS = """

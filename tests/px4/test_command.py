@@ -142,3 +142,10 @@ def test_a_comparison_knows_values_as_px4_stores_them() -> None:
     assert comparison.same
     assert comparison.absent_port == ("MAV_1_CONFIG",)
     assert not compare({"A": 0.1, "C": 1}, {"A": 0.1}).same
+
+
+def test_a_parameter_of_another_version_is_left_out() -> None:
+    comparison = compare({"A": 1, "SENS_GPS0_DELAY": 5}, {"A": 1})
+    assert comparison.same
+    assert comparison.absent == ()
+    assert not compare({"SENS_GPS0_DELAY": 5}, {"SENS_GPS0_DELAY": 110}).same, "where it is, it counts"

@@ -16,7 +16,7 @@ from companion.io.autopilot import MavsdkAutopilot
 from companion.preflight.px4 import firmware_row, rows
 from companion.preflight.rows import Level, Row
 from companion.px4.defaults import PX4_DEFAULTS
-from companion.px4.wanted import HOVER, WANTED, names, simulated_values
+from companion.px4.wanted import HOVER, WANTED, file_values, names, simulated_values
 from tests.io.autopilot_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 
@@ -32,6 +32,8 @@ SPOILED = [
     ("EKF2_MAG_TYPE", 0, True, "set EKF2_MAG_TYPE to 5"),
     ("EKF2_EV_DELAY", 100.0, True, "set EKF2_EV_DELAY to 5"),
     ("EKF2_EVP_NOISE", 0.5, False, "set EKF2_EVP_NOISE to 0.01"),
+    ("EKF2_DELAY_MAX", 200.0, False, "set EKF2_DELAY_MAX to 50 (companion px4 params --write), then reboot PX4"),
+    ("EKF2_TAU_VEL", 0.25, False, "set EKF2_TAU_VEL to 0.1"),
     ("SYS_HAS_MAG", 1, True, "then reboot PX4"),
     ("COM_OF_LOSS_T", 1.0, True, "set COM_OF_LOSS_T to 0.5"),
     ("COM_OBL_RC_ACT", 0, True, "set COM_OBL_RC_ACT to 4"),
@@ -100,6 +102,22 @@ def test_a_parameter_that_px4_does_not_have_is_told() -> None:
     assert (row.title, row.read, row.level) == ("EKF2_EV_QMIN", "PX4 does not have it", Level.WARN)
 
 
+@pytest.mark.parametrize(
+    "other", [("EKF2_GPS_DELAY",), ("SENS_GPS0_DELAY", "SENS_GPS1_DELAY")], ids=["has 1.18's", "has 1.16's"]
+)
+def test_a_parameter_of_another_version_is_not_missed(other: tuple[str, ...]) -> None:
+    params = {name: value for name, value in good().items() if name not in other}
+    assert len(params) < len(good())
+    assert wrong(params) == []
+    assert not {row.title for row in rows(FIRMWARE, params, vehicle())} & set(other)
+
+
+def test_ekf2s_horizon_is_written_after_what_raises_it() -> None:
+    order = list(file_values())
+    raises = {"EKF2_EV_DELAY", "EKF2_ASP_DELAY", "EKF2_GPS_DELAY", "SENS_GPS0_DELAY", "SENS_GPS1_DELAY"}
+    assert raises <= set(order[: order.index("EKF2_DELAY_MAX")])
+
+
 def test_the_serial_port_counts_on_a_serial_link_only() -> None:
     serial = vehicle("vehicle.devices.autopilot.address=serial:///dev/ttyAMA0:921600")
     found = {row.title: row for row in wrong({**good(), "MAV_1_RATE": 0, "MAV_1_MODE": 2, "MAV_1_CONFIG": 102}, serial)}
@@ -140,7 +158,7 @@ def test_types_and_names_are_those_of_px4() -> None:
         if wanted.value is not None:
             assert wanted.accepts(wanted.value, vehicle()), wanted.name
     assert {wanted.name for wanted in WANTED if wanted.name not in PX4_DEFAULTS} == {
-        wanted.name for wanted in WANTED if wanted.hardware
+        wanted.name for wanted in WANTED if wanted.hardware or wanted.only == "1.18"
     }
 
 
