@@ -16,7 +16,6 @@ from companion.config.loader import load_flight
 from companion.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from companion.launcher import Launcher
 from companion.types import Outcome
-from sitl.flight_faults import SIGNALS
 from tests.support import CATCH, HOVER, Sandbox, read_summary, sandbox_in
 
 OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
@@ -41,7 +40,7 @@ def hooked(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.flight
-@pytest.mark.parametrize("kind", list(SIGNALS))
+@pytest.mark.parametrize("kind", ["hold_gil", "stall_loop"])  # killed and stopped: test_px4.py
 def test_at_the_catch_the_guardian_lands(sandbox: Sandbox, kind: str) -> None:
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
     with sandbox.start("fly", CATCH, "--sitl", "--out", "out", "--set", fault) as running:
@@ -50,8 +49,7 @@ def test_at_the_catch_the_guardian_lands(sandbox: Sandbox, kind: str) -> None:
     out = sandbox.cwd / "out"
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
     assert len(ended.err_lines) == 1, ended.err
-    how = "was ended by SIGKILL" if kind == "kill_flight" else "hung and was killed"
-    assert ended.err.startswith(f"flight: the flight process {how}; the guardian landed the vehicle")
+    assert ended.err.startswith("flight: the flight process hung and was killed; the guardian landed the vehicle")
     summary = read_summary(out)
     assert summary["outcome"] == "aborted"
     ids = events_of(summary)
