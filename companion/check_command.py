@@ -7,10 +7,11 @@ import asyncio
 import contextlib
 import json
 import shutil
+import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Self, cast
@@ -126,7 +127,32 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
             mission_s=None if plan else Plan.build(config.mission, config.vehicle).duration_s,
             recorder=_recorder(config, scratch),
         )
-        return asyncio.run(_look(task, config, known, line, people))
+        rows = asyncio.run(_unless_interrupted(_look(task, config, known, line, people)))
+        if rows is None:
+            raise KeyboardInterrupt
+        return rows
+
+
+async def _unless_interrupted(look: Coroutine[Any, Any, list[Row]]) -> list[Row] | None:
+    """None after Ctrl-C, whatever became of the cancellation on its way through the devices that were being opened."""
+    interrupted = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    looking = asyncio.ensure_future(look)
+
+    def interrupt() -> None:
+        interrupted.set()
+        looking.cancel()
+
+    loop.add_signal_handler(signal.SIGINT, interrupt)
+    try:
+        await asyncio.wait((looking,))
+    finally:
+        loop.remove_signal_handler(signal.SIGINT)
+    if interrupted.is_set():
+        if not looking.cancelled():
+            looking.exception()  # seen; it is not what ended the check
+        return None
+    return looking.result()
 
 
 async def _look(task: Task, config: FlightConfig, known: Observations, line: _Line, people: Console) -> list[Row]:

@@ -12,7 +12,6 @@ import os
 import select
 import signal
 import socket
-import sys
 import time
 import traceback
 from collections.abc import Iterator
@@ -310,8 +309,8 @@ class Guardian:
 
 def _say(text: str) -> None:
     """One line of guardian.log; a full disk under it costs the line, not the landing."""
-    with contextlib.suppress(OSError, ValueError):
-        print(text, file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):
+        os.write(2, text.encode() + b"\n")  # unbuffered: what cannot be written must not be tried again at the end
 
 
 def main(argv: list[str] | None = None) -> int:
