@@ -164,7 +164,7 @@ def _interrupts(stop: Callable[[], None]) -> Iterator[None]:
 
 def versions() -> dict[str, str]:
     """Of the packages that a campaign's figures depend on."""
-    from companion.recorder_process import versions as of_flight
+    from companion.recording.versions import versions as of_flight
 
     found = of_flight()
     for package in ("mujoco", "joblib", "distributed"):

@@ -199,7 +199,8 @@ def test_ladder_matches() -> None:
 
 
 def test_channels_match() -> None:
-    source = text_of(ROOT / "companion/recorder_process.py")
+    rooms = [ROOT / "companion/recorder_process.py", *sorted((ROOT / "companion/recording").glob("*.py"))]
+    source = "".join(text_of(path) for path in rooms)
     made = set(re.findall(r'(?:Channel|_json_channel)\("(/\w+)"', source))
     assert {codes(row[0])[0] for row in table(LOG, "channel")} == made
     metadata = set(re.findall(r'metadata\("(\w+)"', source + text_of(ROOT / "companion/app.py")))

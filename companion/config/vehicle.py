@@ -19,6 +19,7 @@ from companion.config.base import (
     Vector3,
     refuse,
 )
+from companion.config.ground import Ground
 
 
 class Airframe(Model):
@@ -305,6 +306,7 @@ class Vehicle(Model):
     room: Room
     devices: Devices
     safety: Safety = Safety()
+    ground: Ground = Ground()
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:

@@ -12,3 +12,5 @@ CLOSE = 3
 """Nothing more comes; the number is that of packets offered before."""
 UNNUMBERED = -1
 """Number of a packet that the guardian sends: it does not count them."""
+ACK = 4
+"""What came of a command: nonce, operator, command, accepted, text, time on the flight clock, phase, action."""

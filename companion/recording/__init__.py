@@ -1,0 +1,1 @@
+"""The inside of the recorder process: disk, log, channel."""
