@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
+from tests.browser import missing
 from tests.support import DEADLINE_S, ROOT
 
 LOOPBACK = ROOT / "configs/mosquitto/loopback.conf"
@@ -27,10 +26,11 @@ def free_port() -> int:
 
 
 def mosquitto() -> str:
-    """Path of the broker; without it the test is skipped with a reason (`make test` installs it where it can)."""
+    """Path of the broker; `make test` installs it where it can."""
     found = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
     if found is None:
-        pytest.skip("mosquitto is not installed: apt install mosquitto")
+        missing("a broker", "mosquitto")
+        raise AssertionError
     return found
 
 

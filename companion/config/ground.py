@@ -52,6 +52,16 @@ def _a_broker(url: str) -> str:
     return url
 
 
+_STATION = re.compile(r"udpout://[^:/?\s]+:(?P<port>\d{1,5})")
+
+
+def _a_station(address: str) -> str:
+    match = _STATION.fullmatch(address)
+    if match is None or not 0 < int(match["port"]) <= 65535:
+        raise ValueError(f"expected udpout://HOST:PORT (QGroundControl listens on 14550), got {address!r:.60}")
+    return address
+
+
 class Mqtt(Model):
     """The broker that telemetry goes to and commands come from."""
 
@@ -79,7 +89,7 @@ class Ground(Model):
     """Name of the vehicle in topics; absent: the vehicle's name."""
     mqtt: Mqtt | None = Mqtt()
     """null: no telemetry, no commands over MQTT."""
-    qgroundcontrol: str | None = None
+    qgroundcontrol: Annotated[str, AfterValidator(_a_station)] | None = None
     """MAVLink is forwarded to and from here: udpout://HOST:14550; absent: not forwarded."""
 
     @model_validator(mode="after")

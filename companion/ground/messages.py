@@ -366,6 +366,8 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
         return from_jsonable(cls, data)
     except RecordError as error:
         raise MessageError(str(error)) from None
+    except RecursionError:  # nested so deeply that the refusal cannot even quote it
+        raise MessageError("nested too deeply") from None
 
 
 def _parsed(payload: bytes) -> Any:

@@ -1,0 +1,293 @@
+"""Files that hold secrets of the ground stations: operators with their keys, and a login at a broker. Readable by their owner alone.
+
+    version: 1
+    operators:
+      - name: anna
+        key: base64 of 32 random bytes
+        may: all        # or safer: hold, land and abort only
+
+The vehicle's file has everybody who may command it; a ground computer's has those who sit at it. A user who has neither gets a file
+of his own at the first use, which vehicle and ground station of one computer share.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import contextlib
+import getpass
+import os
+import re
+import secrets
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Literal, Self, TypeVar
+
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from companion.config.base import Model, refuse
+from companion.config.document import ConfigError, problem_lines
+from companion.config.explain import validate
+from companion.config.yaml_strict import read_document
+from companion.ground.messages import CommandName
+
+OPERATOR_NAME = re.compile(r"[A-Za-z0-9_.-]{1,40}")
+KEY_BYTES = 32
+OPERATORS_MAX = 100
+SAFER = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
+
+M = TypeVar("M", bound=Model)
+
+
+class May(StrEnum):
+    """What an operator may ask for."""
+
+    SAFER = "safer"
+    """Hold, land, abort."""
+    ALL = "all"
+
+
+def _a_name(name: str) -> str:
+    if OPERATOR_NAME.fullmatch(name) is None:
+        raise ValueError("expected 1 to 40 letters, digits, '_', '-' or '.'")
+    return name
+
+
+# What is wrong with a secret is said without showing it.
+def _a_text(value: object) -> object:
+    if not isinstance(value, str):
+        raise ValueError("expected text; put it in quotes")
+    return value
+
+
+def _a_key(text: str) -> str:
+    try:
+        size = len(base64.b64decode(text, validate=True))
+    except (binascii.Error, ValueError):
+        raise ValueError(f"expected base64 of {KEY_BYTES} random bytes") from None
+    if size != KEY_BYTES:
+        raise ValueError(f"expected base64 of {KEY_BYTES} random bytes; these are {size}")
+    return text
+
+
+class OperatorEntry(Model):
+    """One operator of the file."""
+
+    name: Annotated[str, AfterValidator(_a_name)]
+    key: Annotated[str, AfterValidator(_a_key), BeforeValidator(_a_text), Field(repr=False)]
+    """base64 of 32 random bytes"""
+    may: Literal["safer", "all"] = "all"
+    """safer: hold, land and abort; all: resume and start too"""
+
+
+class OperatorsFile(Model):
+    """The file as it is written."""
+
+    version: Literal[1]
+    operators: tuple[OperatorEntry, ...]
+
+    @model_validator(mode="after")
+    def _everybody_once(self) -> Self:
+        problems: list[tuple[tuple[str | int, ...], str]] = []
+        if not 0 < len(self.operators) <= OPERATORS_MAX:
+            problems.append((("operators",), f"expected 1 to {OPERATORS_MAX} of them, found {len(self.operators)}"))
+        for index, entry in enumerate(self.operators):
+            before = self.operators[:index]
+            if any(other.name == entry.name for other in before):
+                problems.append((("operators", index, "name"), f"{entry.name} is in the file twice; remove one"))
+            elif any(_decoded(other.key) == _decoded(entry.key) for other in before):
+                text = "another operator has the same key: nobody could tell who commanded; give each a key of its own"
+                problems.append((("operators", index, "key"), text))
+        refuse("operators", problems)
+        return self
+
+
+class Login(Model):
+    """A login at a broker."""
+
+    username: Annotated[str, Field(min_length=1, max_length=100)]
+    password: Annotated[str, BeforeValidator(_a_text), Field(repr=False)]
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Operator:
+    """Who may command."""
+
+    name: str
+    key: bytes
+    may: May = May.ALL
+
+    def __repr__(self) -> str:
+        return f"Operator({self.name}, {self.may})"
+
+
+class Operators:
+    """The operators of one file; immutable, and shows no key."""
+
+    def __init__(self, operators: Sequence[Operator], source: str) -> None:
+        self._by_name = {operator.name: operator for operator in operators}
+        self.source = source
+        """File, as the user wrote it."""
+
+    def __repr__(self) -> str:
+        return f"Operators({', '.join(self.names)})"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """In the order of the file."""
+        return tuple(self._by_name)
+
+    def key(self, name: str) -> bytes:
+        """The 32 bytes of an operator.
+
+        Raises:
+            ConfigError: no such operator; names those that there are.
+        """
+        operator = self._by_name.get(name)
+        if operator is None:
+            raise ConfigError([f"{self.source}: no operator {name!r:.60}; there are: {', '.join(self.names)}"])
+        return operator.key
+
+    def find(self, name: str) -> bytes | None:
+        """The key, or None if there is no such operator."""
+        operator = self._by_name.get(name)
+        return None if operator is None else operator.key
+
+    def may(self, name: str, command: CommandName) -> bool:
+        """Whether an operator may ask for this."""
+        operator = self._by_name.get(name)
+        return operator is not None and (operator.may is May.ALL or command in SAFER)
+
+
+def load_operators(path: str | Path | None = None) -> Operators:
+    """Read an operators file.
+
+    Args:
+        path: the file, ``~`` for the home folder; None: the user's own, made with one operator if it is not there.
+
+    Raises:
+        ConfigError: one line per problem: not there, others can read it, not as it should be, cannot be made.
+    """
+    if path is None:
+        path = own_file()
+        if not path.exists():
+            _make_own(path)
+    parsed = _read(OperatorsFile, path)
+    operators = [Operator(entry.name, _decoded(entry.key), May(entry.may)) for entry in parsed.operators]
+    return Operators(operators, str(path))
+
+
+def load_login(path: str | Path) -> Login:
+    """Read a login file.
+
+    Raises:
+        ConfigError: one line per problem: not there, others can read it, not as it should be.
+    """
+    return _read(Login, path)
+
+
+def own_file() -> Path:
+    """Where this user's operators are: ``$XDG_CONFIG_HOME/companion/operators.yaml``, by default below ``~/.config``.
+
+    Raises:
+        ConfigError: the user has no home folder.
+    """
+    named = os.environ.get("XDG_CONFIG_HOME", "")
+    if named.startswith("/"):  # others count as not set: XDG Base Directory Specification
+        return Path(named) / "companion/operators.yaml"
+    try:
+        return Path.home() / ".config/companion/operators.yaml"
+    except RuntimeError:
+        raise ConfigError(
+            ["operators: this user has no home folder; name a file (operators_file, --operators)"]
+        ) from None
+
+
+def new_key() -> bytes:
+    """A key for an operator."""
+    return secrets.token_bytes(KEY_BYTES)
+
+
+def operators_text(operators: Sequence[Operator]) -> str:
+    """The file's text."""
+    lines = [
+        "# Keys of operators: whoever has one commands the vehicle. Keep it to yourself: chmod 600.",
+        "version: 1",
+        "operators:",
+    ]
+    for operator in operators:
+        key = base64.b64encode(operator.key).decode("ascii")
+        # In quotes: a name may look like a number.
+        lines += [f'  - name: "{operator.name}"', f'    key: "{key}"', f"    may: {operator.may.value}"]
+    return "\n".join(lines) + "\n"
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a new file of mode 0600; it appears whole or not at all.
+
+    Raises:
+        FileExistsError: it is there already; left as it is.
+        OSError: it cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    try:
+        with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.link(beside, path)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            beside.unlink()
+
+
+def _make_own(path: Path) -> None:
+    """One operator, of the user's own name. Of several processes that try at once, the first one's file is everybody's."""
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            write_private(path, operators_text([Operator(user_name(), new_key())]).encode())
+    except OSError as error:
+        reason = error.strerror or error
+        raise ConfigError(
+            [f"{path}: cannot be made: {reason}; name another file (operators_file, --operators)"]
+        ) from None
+
+
+def user_name() -> str:
+    """This user's name, as an operator's; what an operator's name cannot have becomes '-'."""
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):  # a user id without a name
+        name = ""
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", name)[:40] or "operator"
+
+
+def _read(model: type[M], path: str | Path) -> M:
+    """A file that its owner alone may read, as a model."""
+    shown = str(path)
+    try:
+        expanded = Path(path).expanduser()
+        mode = stat.S_IMODE(expanded.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        raise ConfigError([f"{shown}: no such file"]) from None
+    except RuntimeError:
+        raise ConfigError([f"{shown}: '~' is not known: this user has no home folder"]) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ConfigError([f"{shown}: not readable: {reason}"]) from None
+    if mode & 0o077 and not expanded.is_dir():
+        raise ConfigError([f"{shown}: holds secrets and is open to others (mode {mode:04o}); chmod 600 {shown}"])
+    document = read_document(expanded, shown)
+    built = validate(model, document)
+    if built is None:
+        # What was found instead is not quoted: it may be the secret.
+        raise ConfigError([line.split(", got ")[0] for line in problem_lines(document.problems)])
+    return built
+
+
+def _decoded(key: str) -> bytes:
+    return base64.b64decode(key, validate=True)

@@ -1,0 +1,36 @@
+"""A real browser for tests of pages: Debian's chromium, driven by Playwright."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import pytest
+
+ARGUMENTS = (
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+)
+"""It starts as root and speaks to nobody but the page's own server."""
+
+
+def missing(what: str, package: str) -> None:
+    """Skip with a reason; on a CI machine fail: `make test` installs it there, and a missing step must not hide.
+
+    Raises:
+        pytest.skip.Exception: it is not there, and need not be.
+    """
+    reason = f"{what} is not installed: apt install {package}"
+    if os.environ.get("CI"):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+def chromium() -> str:
+    """Path of the browser."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        found = shutil.which(name)
+        if found is not None:
+            return found
+    missing("a browser", "chromium")
+    raise AssertionError

@@ -1,0 +1,276 @@
+"""`companion broker`: a folder whole or not at all, secrets where they belong, and what a broker lets a login do."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import shutil
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from companion.cli import _parser, main
+from companion.config.ground import Ground
+from companion.ground import broker_setup
+from companion.ground.certificates import hosts_of, make_authority, make_server
+from companion.ground.keys import load_login, load_operators
+from tests.broker import free_port, loopback_broker
+from tests.ground.test_broker import WANTED, Site, running
+
+ROOMS = ["vehicles/tarot", "vehicles/second", "operators/anna", "operators/bert", "viewers/wall"]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    """Made once; no test changes it."""
+    folder = tmp_path_factory.mktemp("made") / "site"
+    broker_setup.make(folder, WANTED, datetime.datetime.now(datetime.UTC))
+    return Site(folder, None, 0, 0)  # type: ignore[arg-type]
+
+
+def test_init_says_what_to_copy_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "a site"
+    words = ["--host", "gcs.lab", "10.0.0.2", "--operator", "anna", "--viewer", "wall", "--vehicle", "tarot", "second"]
+    assert main(["broker", "init", str(folder), *words]) == 0
+    told = capsys.readouterr().out
+    for room in ("vehicles/tarot", "vehicles/second", "operators/anna", "viewers/wall"):
+        assert f"copy {folder}/{room} " in told or f"copy {folder}/{room}." in told
+    section = (
+        told[told.index("  ground:") : told.index("operators_file: ")]
+        + "operators_file: /etc/companion/operators.yaml\n"
+    )
+    ground = Ground.model_validate(yaml.safe_load(section)["ground"])
+    assert ground.topic == "tarot"
+    assert ground.mqtt is not None
+    assert str(ground.mqtt.address) == "mqtts://gcs.lab:8883"
+    for path in folder.rglob("login.yaml"):
+        assert load_login(path).password not in told
+    monitors = [line.split()[1:] for line in told.splitlines() if line.startswith("  companion monitor")]
+    assert len(monitors) == 2
+    for monitor in monitors:
+        assert _parser().parse_known_args(monitor)[1] == []
+    assert set(hosts_of((folder / "server.pem").read_bytes())) == {
+        "gcs.lab",
+        "10.0.0.2",
+        "localhost",
+        "127.0.0.1",
+        "::1",
+    }
+
+
+def test_init_without_options_makes_one_of_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["broker", "init", str(tmp_path / "site")]) == 0
+    assert len(list((tmp_path / "site").rglob("login.yaml"))) == 3
+    assert (tmp_path / "site/vehicles/tarot650-2r/operators.yaml").is_file()
+
+
+def test_secrets_are_private_and_go_to_whom_they_belong(site: Site) -> None:
+    for path in site.folder.rglob("*"):
+        if path.is_file():
+            assert stat.S_IMODE(path.stat().st_mode) == 0o600, path
+    assert stat.S_IMODE(site.folder.stat().st_mode) == 0o700
+    everybody = load_operators(site.folder / "vehicles/tarot/operators.yaml")
+    assert everybody.names == ("anna", "bert")
+    for name in everybody.names:
+        own = load_operators(site.folder / "operators" / name / "operators.yaml")
+        assert own.names == (name,)
+        assert own.key(name) == everybody.key(name)
+    assert not (site.folder / "viewers/wall/operators.yaml").exists()
+    passwords = {room: load_login(site.folder / room / "login.yaml").password for room in ROOMS}
+    assert len(set(passwords.values())) == len(ROOMS)
+    for path in site.folder.iterdir():
+        if path.is_file():
+            assert not any(password in path.read_text() for password in passwords.values()), path
+
+
+def test_no_password_is_on_a_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tool = shutil.which("mosquitto_passwd")
+    assert tool is not None
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    wrapper = tmp_path / "mosquitto_passwd"
+    wrapper.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/words\nenv >> {tmp_path}/words\nexec {tool} "$@"\n')
+    wrapper.chmod(0o700)
+    broker_setup.make(tmp_path / "site", WANTED, datetime.datetime.now(datetime.UTC))
+    words = (tmp_path / "words").read_text()
+    assert words.startswith("-U ")
+    for room in ROOMS:
+        assert load_login(tmp_path / "site" / room / "login.yaml").password not in words
+
+
+@pytest.mark.parametrize("inside", ["file", "folder"])
+def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str], inside: str) -> None:
+    folder = tmp_path / "site"
+    if inside == "file":
+        folder.write_text("mine")
+    else:
+        (folder / "mine").mkdir(parents=True)
+    assert main(["broker", "init", str(folder)]) == 2
+    assert capsys.readouterr().err == (
+        f"{folder}: is there already, nothing was changed; choose another, or --renew-certificates\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
+BAD = {
+    "name with a slash": (["--operator", "../anna"], "--operator '../anna': expected 1 to 40 letters"),
+    "parent folder": (["--viewer", ".."], "--viewer '..': expected 1 to 40 letters"),
+    "wildcard": (["--vehicle", "+"], "--vehicle '+': expected 1 to 40 letters"),
+    "line end": (["--operator", "anna\nuser eve"], "--operator 'anna\\nuser eve': expected 1 to 40 letters"),
+    "twice": (["--operator", "anna", "--viewer", "anna"], "anna: named twice; every vehicle and person needs a name"),
+    "host": (["--host", "no host"], "--host 'no host': expected a name or an address"),
+    "days": (["--days", "0"], "argument --days: expected a number of days from 1 to 3000, got '0'"),
+    "users with renewal": (["--renew-certificates", "--viewer", "eve"], "--renew-certificates makes no users"),
+    "renewal of nothing": (
+        ["--renew-certificates"],
+        "ca.pem: No such file or directory; expected a folder of broker init",
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "line"), BAD.values(), ids=BAD)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], line: str
+) -> None:
+    try:
+        code = main(["broker", "init", str(tmp_path / "site"), *words])
+    except SystemExit as left:
+        code = int(str(left.code))
+    told = capsys.readouterr().err
+    assert code == 2
+    assert told.count("\n") == 1
+    assert line in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_mosquitto_passwd_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert main(["broker", "init", str(tmp_path / "site")]) == 3
+    assert capsys.readouterr().err == ("companion broker init: mosquitto_passwd is not there: apt install mosquitto\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_cryptography_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import companion.ground
+
+    for name in ("broker_setup", "certificates"):
+        monkeypatch.delitem(sys.modules, f"companion.ground.{name}")
+        monkeypatch.delattr(companion.ground, name)
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    assert main(["broker", "init", str(tmp_path / "site")]) == 3
+    assert capsys.readouterr().err == (
+        "companion broker init: certificates need cryptography: pip install 'companion[ground]'\n"
+    )
+
+
+def test_renewed_certificate_is_trusted_by_the_same_people(
+    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "site"
+    shutil.copytree(site.folder, folder)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert main(["broker", "init", str(folder), "--renew-certificates", "--days", "20"]) == 0
+    assert "gcs.lab" in capsys.readouterr().out
+    after = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert before.keys() == after.keys()
+    assert {path.name for path in before if before[path] != after[path]} == {"server.pem", "server.key"}
+    assert stat.S_IMODE((folder / "server.key").stat().st_mode) == 0o600
+    config = folder / "mosquitto.conf"
+    config.write_text(config.read_text().replace(str(site.folder), str(folder)))
+    with running(folder, tmp_path) as renewed:
+        room = site.folder / "operators/anna"
+        words = ["--login", str(room / "login.yaml"), "--ca", str(room / "ca.pem")]
+        assert main(["broker", "check", f"mqtts://127.0.0.1:{renewed.tls_port}", *words]) == 0
+    assert main(["broker", "init", str(folder), "--renew-certificates", "--host", "other.lab"]) == 0
+    assert set(hosts_of((folder / "server.pem").read_bytes())) == {"other.lab", *broker_setup.LOCAL_HOSTS}
+
+
+def test_renewal_by_a_wrong_or_old_authority_is_refused(
+    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "site"
+    shutil.copytree(site.folder, folder)
+    now = datetime.datetime.now(datetime.UTC)
+    (folder / "ca.key").write_bytes(make_authority(now).key)
+    assert main(["broker", "init", str(folder), "--renew-certificates"]) == 2
+    assert "the key is not that of the certificate" in capsys.readouterr().err
+    old = make_authority(now - datetime.timedelta(days=3640))
+    (folder / "ca.key").write_bytes(old.key)
+    (folder / "ca.pem").write_bytes(old.certificate)
+    assert main(["broker", "init", str(folder), "--renew-certificates"]) == 2
+    assert "the authority ends on" in capsys.readouterr().err
+    assert (folder / "server.pem").read_bytes() == (site.folder / "server.pem").read_bytes()
+    assert make_server(old, ["a"], 5, now).certificate
+
+
+# --- check --------------------------------------------------------------------------------------------------------------------------
+
+
+def rights(out: str) -> dict[str, tuple[str, str]]:
+    rows = [
+        line.split() for line in out.splitlines() if len(line.split()) == 3 and line.split()[1] in ("yes", "no", "?")
+    ]
+    return {topic: (read, write) for topic, read, write in rows}
+
+
+VIEWED = ("state", "scene", "preflight", "events", "stream", "ack")
+EXPECTED = {
+    "viewers/wall": ([], "?", "no", ("?", "no")),
+    "operators/anna": ([], "?", "no", ("no", "yes")),
+    "vehicles/tarot": (["--vehicle", "tarot"], "no", "yes", ("?", "no")),
+}
+
+
+@pytest.mark.parametrize("tls", [False, True])
+@pytest.mark.parametrize("room", EXPECTED)
+def test_check_finds_what_a_login_may_do(
+    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str], room: str, tls: bool
+) -> None:
+    words, read, write, command = EXPECTED[room]
+    words = [*words, "--login", str(site.folder / room / "login.yaml")]
+    with running(site.folder, tmp_path) as made:
+        if tls:
+            words += ["--ca", str(site.folder / room / "ca.pem")]
+        url = f"mqtts://localhost:{made.tls_port}" if tls else f"mqtt://127.0.0.1:{made.plain_port}"
+        assert main(["broker", "check", url, *words]) == 0
+    out = capsys.readouterr().out
+    assert ("TLSv1.3" in out) == tls
+    assert rights(out) == {**dict.fromkeys(VIEWED, (read, write)), "command": command}
+
+
+def test_check_of_the_loopback_profile_may_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with loopback_broker(tmp_path) as broker:
+        assert main(["broker", "check", broker.url]) == 0
+    out = capsys.readouterr().out
+    assert "connected as anybody (no login), not encrypted" in out
+    assert rights(out) == dict.fromkeys((*VIEWED, "command"), ("yes", "yes"))
+
+
+def test_check_says_why_it_does_not_get_in(site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    login = str(site.folder / "operators/anna/login.yaml")
+    other = tmp_path / "other.pem"
+    other.write_bytes(make_authority(datetime.datetime.now(datetime.UTC)).certificate)
+
+    def told(*words: str) -> str:
+        code = main(["broker", "check", *words])
+        err = capsys.readouterr().err
+        assert err.count("\n") == 1
+        return f"{code} {err}"
+
+    with running(site.folder, tmp_path) as made:
+        plain, tls = f"mqtt://127.0.0.1:{made.plain_port}", f"mqtts://127.0.0.1:{made.tls_port}"
+        assert "refuses us without a login: Not authorized; see --login" in told(plain)
+        assert "3 " in told(tls, "--login", login, "--ca", str(other))
+        assert "the broker's certificate is not trusted" in told(tls, "--login", login, "--ca", str(other))
+        assert "no TLS there" in told(f"mqtts://127.0.0.1:{made.plain_port}", "--ca", str(site.folder / "ca.pem"))
+        assert "the broker ended the connection" in told(f"mqtt://127.0.0.1:{made.tls_port}", "--login", login)
+    assert "Connection refused; is the broker running there?" in told(f"mqtt://127.0.0.1:{free_port()}")
+    assert told("http://here").startswith("2 ")
+    assert told(plain, "--vehicle", "#").startswith("2 --vehicle '#'")
+    assert told(plain, "--login", str(tmp_path / "none.yaml")).startswith("2 ")

@@ -1,0 +1,339 @@
+"""Who is believed: everything that a message on the command topic can be, and what the vehicle makes of it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.ground.commands import (
+    AHEAD_MAX_S,
+    ANSWERS_PER_S,
+    LIMITS,
+    NONCES_MAX,
+    Accepted,
+    FlightClock,
+    Reason,
+    Refused,
+    Verdict,
+    Verifier,
+    canonical,
+    make_command,
+    sign,
+)
+from companion.ground.keys import May, Operator, Operators, new_key
+from companion.ground.messages import COMMAND_MAX_BYTES, Command, CommandName, encode
+
+VEHICLE, SESSION, NOW_T_S = "tarot", "f3a9", 100.0
+ANNA, BERT, VIEWER = new_key(), new_key(), new_key()
+OPERATORS = Operators([Operator("anna", ANNA), Operator("bert", BERT, May.SAFER)], "operators.yaml")
+SAFE = [CommandName.HOLD, CommandName.LAND, CommandName.ABORT]
+OTHERS = [CommandName.RESUME, CommandName.START]
+
+
+def verifier() -> Verifier:
+    return Verifier(OPERATORS, VEHICLE, SESSION)
+
+
+def made(
+    name: CommandName = CommandName.HOLD,
+    t_s: float = NOW_T_S,
+    operator: str = "anna",
+    key: bytes = ANNA,
+    vehicle: str = VEHICLE,
+    session: str = SESSION,
+) -> Command:
+    return make_command(name, vehicle, session, operator, key, round(t_s * 1000))
+
+
+def reason_of(verdict: Verdict) -> Reason | None:
+    return None if isinstance(verdict, Accepted) else verdict.reason
+
+
+def judged(
+    payload: bytes, judge: Verifier | None = None, retained: bool = False, now_t_s: float = NOW_T_S
+) -> Reason | None:
+    """Why it is refused, or None; text is fit for a log and a terminal."""
+    verdict = (judge or verifier()).check(payload, retained, now_t_s)
+    if isinstance(verdict, Refused):
+        assert verdict.text.isprintable()
+        assert 0 < len(verdict.text) <= 200
+    return reason_of(verdict)
+
+
+def changed(of: Command, /, **values: Any) -> bytes:
+    data = json.loads(encode(of))
+    data.update(values)
+    return json.dumps(data).encode()
+
+
+@pytest.mark.parametrize("name", CommandName)
+def test_genuine_command_is_accepted_as_it_was_made(name: CommandName) -> None:
+    command = made(name)
+    assert verifier().check(encode(command), False, NOW_T_S) == Accepted(command)
+
+
+def test_json_of_another_hand_is_accepted() -> None:
+    """Spaces and order of the fields are the sender's: what they say is signed."""
+    data = json.loads(encode(made()))
+    payload = json.dumps(dict(reversed(data.items())), indent=1).encode()
+    assert judged(payload) is None
+
+
+def test_signed_text_is_as_documented() -> None:
+    command = Command(1, "tarot", "f3a9", "anna", CommandName.LAND, 12345, "0" * 32, "")
+    assert canonical(command) == b"companion command 1\n1\ntarot\nf3a9\nanna\nland\n12345\n" + b"0" * 32 + b"\n"
+    # Of the same text and key, made with: openssl dgst -sha256 -mac HMAC -macopt hexkey:00...
+    assert sign(command, bytes(32)).mac == "0f3e9d15e98b2e81ef5b452458e1e0638e7eb81d2f1c0d854f00f14682d50ba5"
+
+
+@pytest.mark.parametrize("field", [field.name for field in fields(Command) if field.type not in ("int", "CommandName")])
+def test_signed_fields_cannot_be_shifted_into_each_other(field: str) -> None:
+    command = replace(made(), **{field: "a\nb"})  # type: ignore[arg-type]
+    if field == "mac":
+        assert judged(encode(command)) is Reason.MALFORMED
+    else:
+        with pytest.raises(ValueError, match=field):
+            sign(command, ANNA)
+
+
+UNSIGNED = {
+    "unsigned": (changed(made(), mac=""), Reason.MALFORMED),
+    "mac of another text": (changed(made(), mac="0" * 64), Reason.BAD_SIGNATURE),
+    "mac missing": (
+        json.dumps({k: v for k, v in json.loads(encode(made())).items() if k != "mac"}).encode(),
+        Reason.MALFORMED,
+    ),
+    "viewer signs as anna": (encode(made(key=VIEWER)), Reason.BAD_SIGNATURE),
+    "operator signs as another": (encode(made(key=BERT)), Reason.BAD_SIGNATURE),
+    "viewer signs as himself": (encode(made(operator="viewer", key=VIEWER)), Reason.UNKNOWN_OPERATOR),
+    "wrong vehicle": (encode(made(vehicle="other")), Reason.WRONG_VEHICLE),
+    "re-addressed": (changed(made(vehicle="other"), vehicle=VEHICLE), Reason.BAD_SIGNATURE),
+    "hold made a start": (changed(made(), command="start"), Reason.BAD_SIGNATURE),
+    "made fresh again": (changed(made(t_s=10.0), t_ms=100_000), Reason.BAD_SIGNATURE),
+    "another nonce": (changed(made(), nonce="1" * 32), Reason.BAD_SIGNATURE),
+    "brought into this session": (changed(made(session="old"), session=SESSION), Reason.BAD_SIGNATURE),
+    "no such command": (changed(made(), command="explode"), Reason.MALFORMED),
+    "unknown field": (changed(made(), sudo=True), Reason.MALFORMED),
+    "later version": (changed(made(), v=2), Reason.WRONG_VERSION),
+    "very late version": (changed(made(), v=10**400), Reason.WRONG_VERSION),
+    "version is true": (changed(made(), v=True), Reason.MALFORMED),
+    "version is 1.0": (changed(made(), v=1.0), Reason.MALFORMED),
+    "time is text": (changed(made(), t_ms="100000"), Reason.MALFORMED),
+    "time is endless": (changed(made(), t_ms=10**400), Reason.MALFORMED),
+    "half a character": (changed(made(), operator="\ud800"), Reason.MALFORMED),
+    "upper case mac": (changed(made(), mac="A" * 64), Reason.MALFORMED),
+    "empty": (b"", Reason.MALFORMED),
+    "null": (b"null", Reason.MALFORMED),
+    "list": (b"[]", Reason.MALFORMED),
+    "binary": (b"\x00\xff\xfe", Reason.MALFORMED),
+    "terminal codes": (b'{"v":1,"\\u001b[2J\\n":1}', Reason.MALFORMED),
+    "largest": (b" " * COMMAND_MAX_BYTES, Reason.MALFORMED),
+    "oversized": (b" " * (COMMAND_MAX_BYTES + 1), Reason.OVERSIZED),
+    "genuine but oversized": (encode(made()) + b" " * COMMAND_MAX_BYTES, Reason.OVERSIZED),
+}
+
+
+@pytest.mark.parametrize(("payload", "reason"), UNSIGNED.values(), ids=UNSIGNED)
+def test_refused_and_never_answered(payload: bytes, reason: Reason) -> None:
+    verdict = verifier().check(payload, False, NOW_T_S)
+    assert isinstance(verdict, Refused)
+    assert verdict.reason is reason
+    assert verdict.command is None
+    assert judged(payload) is reason
+
+
+def test_retained_is_refused_though_genuine() -> None:
+    judge, payload = verifier(), encode(made())
+    assert judged(payload, judge, retained=True) is Reason.RETAINED
+    assert judged(payload, judge) is None
+
+
+def test_unsigned_floods_do_not_stop_a_genuine_command() -> None:
+    """Whatever somebody without a key sends, all of an operator's commands pass: garbage, copies, old ones, foreign ones."""
+    judge = verifier()
+    old = [encode(made(t_s=NOW_T_S - 60.0)) for _ in range(50)]
+    first = encode(made(CommandName.START))
+    assert judged(first, judge) is None
+    for number in range(2000):
+        assert judged(first, judge) is Reason.REPLAYED
+        assert judged(old[number % 50], judge) is Reason.STALE
+        assert judged(first, judge, retained=True) is Reason.RETAINED
+        assert judged(UNSIGNED["viewer signs as anna"][0], judge) is Reason.BAD_SIGNATURE
+    for name in CommandName:
+        assert judged(encode(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
+
+
+@pytest.mark.parametrize("name", CommandName)
+def test_freshness_at_its_edges(name: CommandName) -> None:
+    age_max_s = LIMITS[name].age_max_s
+    assert age_max_s == (5.0 if name in SAFE else 2.0)
+    assert judged(encode(made(name, NOW_T_S - age_max_s + 0.001))) is None
+    assert judged(encode(made(name, NOW_T_S - age_max_s - 0.001))) is Reason.STALE
+    assert judged(encode(made(name, NOW_T_S + AHEAD_MAX_S - 0.001))) is None
+    assert judged(encode(made(name, NOW_T_S + AHEAD_MAX_S + 0.001))) is Reason.FROM_THE_FUTURE
+
+
+@given(
+    st.lists(st.floats(0.0, 20.0), min_size=1, max_size=40), st.sampled_from(list(CommandName)), st.floats(-1.0, 6.0)
+)
+def test_a_recorded_command_is_followed_once_at_most(times_t_s: list[float], name: CommandName, age_s: float) -> None:
+    """Whenever copies of it come, with the clock's steps in any order."""
+    judge, payload = verifier(), encode(made(name, NOW_T_S - age_s))
+    followed = [t_s for t_s in times_t_s if judged(payload, judge, now_t_s=NOW_T_S + t_s) is None]
+    assert len(followed) <= 1
+
+
+def test_clock_that_is_set_back_revives_nothing() -> None:
+    judge, payload = verifier(), encode(made())
+    assert judged(payload, judge) is None
+    assert judged(encode(made(t_s=200.0)), judge, now_t_s=200.0) is None
+    assert judged(payload, judge, now_t_s=NOW_T_S) is Reason.STALE
+
+
+def test_command_of_an_earlier_flight_is_refused() -> None:
+    assert judged(encode(made(session="f3a8"))) is Reason.WRONG_SESSION
+
+
+def test_operator_for_safety_only() -> None:
+    for name in CommandName:
+        expected = None if name in SAFE else Reason.NOT_ALLOWED
+        assert judged(encode(made(name, operator="bert", key=BERT))) is expected
+
+
+@pytest.mark.parametrize("name", CommandName)
+def test_rate_is_limited_per_command_and_operator(name: CommandName) -> None:
+    judge, per_s = verifier(), LIMITS[name].per_s
+    assert per_s == (20 if name in SAFE else 1)
+    for _ in range(per_s):
+        assert judged(encode(made(name)), judge) is None
+    assert judged(encode(made(name)), judge) is Reason.TOO_MANY
+    for other in CommandName:
+        if other is not name:
+            assert judged(encode(made(other)), judge) is None
+    assert judged(encode(made(CommandName.HOLD, operator="bert", key=BERT)), judge) is None
+    assert judged(encode(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
+
+
+def test_what_was_one_too_many_cannot_be_sent_again_later() -> None:
+    judge, late = verifier(), encode(made(CommandName.START))
+    assert judged(encode(made(CommandName.START)), judge) is None
+    assert judged(late, judge) is Reason.TOO_MANY
+    assert judged(late, judge, now_t_s=NOW_T_S + 1.5) is Reason.REPLAYED
+
+
+def test_memory_is_bounded_and_forgets() -> None:
+    judge = verifier()
+    for number in range(3 * NONCES_MAX):
+        expected = None if number < 20 else Reason.TOO_MANY
+        assert judged(encode(made()), judge) is expected
+    assert max(map(len, judge._nonces.values())) == NONCES_MAX
+    assert judged(encode(made(operator="bert", key=BERT)), judge) is None, "another operator is not touched"
+    assert judged(encode(made(t_s=106.0)), judge, now_t_s=106.0) is None
+    assert sum(map(len, judge._nonces.values())) == 1
+
+
+def test_well_signed_and_refused_is_answered_but_no_flood_of_it() -> None:
+    judge = verifier()
+    stale = made(t_s=0.0)
+    answers = [judge.check(encode(stale), False, NOW_T_S) for _ in range(1000)]
+    assert {reason_of(answer) for answer in answers} == {Reason.STALE}
+    assert [answer.command for answer in answers if isinstance(answer, Refused) and answer.command] == [
+        stale
+    ] * ANSWERS_PER_S
+    again = judge.check(encode(stale), False, NOW_T_S + 1.0)
+    assert isinstance(again, Refused)
+    assert again.command == stale
+
+
+@given(st.data())
+def test_any_changed_byte_is_refused(data: st.DataObject) -> None:
+    payload = bytearray(encode(made(data.draw(st.sampled_from(list(CommandName))))))
+    where = data.draw(st.integers(0, len(payload) - 1))
+    payload[where] ^= data.draw(st.integers(1, 255))
+    assert judged(bytes(payload)) is not None
+
+
+@given(st.data())
+def test_any_changed_byte_of_the_key_is_refused(data: st.DataObject) -> None:
+    key = bytearray(ANNA)
+    key[data.draw(st.integers(0, len(key) - 1))] ^= data.draw(st.integers(1, 255))
+    assert judged(encode(made(key=bytes(key)))) is Reason.BAD_SIGNATURE
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=10), inner, max_size=5),
+)
+
+
+@given(st.binary(max_size=2000))
+def test_random_bytes_are_refused(payload: bytes) -> None:
+    assert judged(payload) is not None
+
+
+@given(st.dictionaries(st.sampled_from([field.name for field in fields(Command)]), JSON, max_size=8))
+def test_random_json_in_our_fields_is_refused(values: dict[str, Any]) -> None:
+    command = made()
+    original = json.loads(encode(command))
+    expected = None if values.items() <= original.items() and "v" not in values else "any"
+    got = judged(changed(command, **values))
+    assert (got is None) == (expected is None)
+
+
+def test_deep_json_is_refused_at_every_depth() -> None:
+    """At some depth the parser still goes down and the message that quotes it does not; wherever that is on this interpreter."""
+    limit = sys.getrecursionlimit()
+    try:
+        for allowed in (limit, 400):
+            sys.setrecursionlimit(allowed)
+            for depth in range(1, 490):
+                nested = b"[" * depth + b"]" * depth
+                assert judged(nested) is Reason.MALFORMED
+                assert judged(b'{"v":1,"vehicle":' + nested + b"}") is Reason.MALFORMED
+                assert judged(b'{"v":' + nested + b"}") is Reason.MALFORMED
+                whole = changed(made(), vehicle=0).replace(b'"vehicle": 0', b'"vehicle": ' + nested)
+                assert judged(whole) in (Reason.MALFORMED, Reason.OVERSIZED)
+    finally:
+        sys.setrecursionlimit(limit)
+
+
+def test_flight_clock_follows_the_fastest_message() -> None:
+    clock = FlightClock()
+    assert clock.now_ms(50.0) is None
+    clock.heard(10.0, 50.0)
+    assert clock.now_ms(50.0) == 10_000
+    clock.heard(10.0, 53.0)  # three seconds late: the clock is not set back
+    assert clock.now_ms(53.0) == 13_000
+    clock.heard(13.5, 53.25)
+    assert clock.now_ms(53.25) == 13_500
+    assert clock.now_ms(60.25) == 20_500, "it goes on when nothing is heard"
+
+
+def test_flight_clock_forgets_what_was_long_ago() -> None:
+    """A vehicle whose clock goes slower than ours is followed."""
+    clock = FlightClock()
+    for number in range(4000):
+        clock.heard(number * 0.999, float(number))
+    now_ms = clock.now_ms(3999.0)
+    assert now_ms is not None
+    assert 3999 * 999 <= now_ms <= 3999 * 999 + 11
+    assert len(clock._heard) <= FlightClock.LATELY_S + 1
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 3.0)), min_size=1, max_size=100))
+def test_flight_clock_is_never_early_and_no_later_than_the_fastest(steps: list[tuple[float, float]]) -> None:
+    clock, now_s, sent = FlightClock(), 0.0, []
+    for step_s, delay_s in steps:
+        now_s += step_s
+        sent.append((now_s, delay_s))
+        clock.heard(now_s - delay_s, now_s)
+    fastest_s = min(delay_s for at_s, delay_s in sent if at_s >= now_s - FlightClock.LATELY_S)
+    now_ms = clock.now_ms(now_s)
+    assert now_ms is not None
+    assert abs(now_ms / 1000.0 - (now_s - fastest_s)) < 0.002
