@@ -16,32 +16,29 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Coroutine, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
 
 from companion import status
+from companion.before_flight import Checked, Refused, check_before_flight, with_hover_thrust
 from companion.clock import Clock, flight_clock
 from companion.config.loader import FlightConfig
 from companion.core import NOMINAL_DT_S, FlightCore
 from companion.devices import Edges, open_edges
 from companion.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
 from companion.flight_guard import FlightGuard
+from companion.ground.effect import effect_of
 from companion.guardian.client import GuardianClient
 from companion.hand_over import hand_over, unflown
-from companion.io.autopilot import MavsdkAutopilot
 from companion.io.edges import DeviceError
 from companion.io.recorder import RecorderProcess, epoch_offset_ns
-from companion.mission.plan import Plan
-from companion.preflight import run as preflight
-from companion.preflight.observations import Observations
-from companion.preflight.rows import refusals
+from companion.operator import GivenUp, Operator
 from companion.realtime import FLIGHT_PRIORITY, claim_realtime
 from companion.safety.rules import REATTACHED
 from companion.ticker import Ticker
 from companion.types import (
     AutopilotRequest,
     Event,
+    GroundCommand,
     Inputs,
     OperatorCommand,
     Outcome,
@@ -54,75 +51,6 @@ from companion.types import (
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.003
-_HOVER_PARAM = "MPC_THR_HOVER"
-
-_T = TypeVar("_T")
-
-
-class GivenUp(Exception):
-    """A landing was asked for before the flight began."""
-
-
-class Refused(Exception):
-    """The preflight refuses; `lines` say why, one each."""
-
-    def __init__(self, lines: list[str]) -> None:
-        super().__init__("; ".join(lines))
-        self.lines = lines
-
-
-class Operator:
-    """What the people on the ground want: the launcher's messages and the signals sent to this process."""
-
-    def __init__(self, channel: socket.socket) -> None:
-        self._channel = channel
-        self._land = asyncio.Event()
-
-    @property
-    def command(self) -> OperatorCommand:
-        """A landing that was asked for stays asked for."""
-        return OperatorCommand.LAND if self._land.is_set() else OperatorCommand.NONE
-
-    @contextlib.contextmanager
-    def attention(self) -> Iterator[None]:
-        """While inside, the channel and the signals are listened to."""
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            loop.add_signal_handler(number, self._land.set)
-        loop.add_reader(self._channel, self._listen)
-        try:
-            yield
-        finally:
-            loop.remove_reader(self._channel)
-
-    async def unless_land(self, opening: Coroutine[Any, Any, _T]) -> _T:
-        """The result of `opening`, which is cancelled when a landing is asked for.
-
-        Raises:
-            GivenUp: a landing was asked for first.
-        """
-        task = asyncio.ensure_future(opening)
-        land = asyncio.ensure_future(self._land.wait())
-        try:
-            await asyncio.wait((task, land), return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            land.cancel()
-            task.cancel()  # does nothing to one that is done
-            await asyncio.wait((task, land))  # an edge that is opening takes itself back, within a deadline of its own
-        if task.cancelled():
-            raise GivenUp
-        return task.result()
-
-    def _listen(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                message = status.receive(self._channel)
-                if message is None:  # nobody watches any more
-                    asyncio.get_running_loop().remove_reader(self._channel)
-                    self._land.set()
-                    return
-                if message.get("type") == "land":
-                    self._land.set()
 
 
 class Flight:
@@ -147,16 +75,27 @@ class Flight:
         self._core = FlightCore(config)
         self._missed = 0
         self._period_s = NOMINAL_DT_S
+        self._ground: str | None = None
+        """What the launcher was last told of the way to the ground stations."""
 
     async def run(self) -> Outcome:
         """Tick until the core says that it is over."""
         ticker = Ticker(self._period_s, self._clock)
         tick = 0
+        before: Outputs | None = None
+        if self._edges.ground is not None:
+            self._tell_forwarding(self._clock(), self._edges.ground.line)
         while True:
             now = await ticker.next()
-            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s)
+            command, asked = self._operator.next()
+            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, command)
+            if asked is not None:
+                self._answer(asked, before, outputs)
+            before = outputs
             self._missed += now.lateness_s > self._period_s
             self._report(tick, outputs, sent)
+            if self._edges.ground is not None:
+                self._edges.ground.tell(inputs, outputs)
             if self._guardian is not None:
                 self._guardian.tick(inputs, outputs)
             if outputs.outcome is not None:
@@ -165,7 +104,9 @@ class Flight:
                 return Outcome.ABORTED
             tick += 1
 
-    async def _tick(self, tick: int, start_s: float, lateness_s: float) -> tuple[Inputs, Outputs, Sent]:
+    async def _tick(
+        self, tick: int, start_s: float, lateness_s: float, command: OperatorCommand
+    ) -> tuple[Inputs, Outputs, Sent]:
         edges = self._edges
         arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S) if edges.arm is not None else None
         joint_read_s = self._clock()
@@ -177,7 +118,7 @@ class Flight:
             mocap=edges.mocap.latest() if edges.mocap is not None else None,
             arm=arm_state,
             force=edges.force.latest() if edges.force is not None else None,
-            command=self._operator.command,
+            command=command,
             recorder_dropped=self._recorder.client.dropped,
             guardian_ready=self._guardian.ready if self._guardian is not None else None,
         )
@@ -204,7 +145,20 @@ class Flight:
             current_sent_s=current_s,
         )
         self._recorder.client.record(inputs, outputs, sent)
+        if commands := self._recorder.client.take_commands():
+            for asked in self._operator.ask(commands):
+                self._tell_asker(asked, False, "too many commands at once", outputs)
         return inputs, outputs, sent
+
+    def _answer(self, asked: GroundCommand, before: Outputs | None, after: Outputs) -> None:
+        """Tell the one who commanded, the log and the launcher what came of it."""
+        self._tell_asker(asked, *effect_of(asked.command, before, after), after)
+
+    def _tell_asker(self, asked: GroundCommand, accepted: bool, text: str, after: Outputs) -> None:
+        about = (asked.nonce, asked.operator, asked.command)
+        self._recorder.client.ack(*about, accepted, text, after.t_s, after.phase, after.action)
+        message = {"operator": asked.operator, "command": asked.command.value, "accepted": accepted, "text": text}
+        status.send(self._channel, {"type": "command", "t_s": after.mission_t_s, **message})
 
     def _goes_on(self, outputs: Outputs) -> bool:
         """Whether PX4, armed when its link was opened, still is: else there is nothing to land, and no reason to fly a mission."""
@@ -227,7 +181,24 @@ class Flight:
         for text in self._edges.autopilot.take_messages():
             self._recorder.client.text(outputs.t_s, Severity.WARNING, "px4", text)
             status.send(self._channel, {"type": "px4", "text": text})
+        if self._edges.ground is not None:
+            for text in self._edges.ground.take_messages():
+                self._tell_forwarding(outputs.t_s, text)
+        self._tell_ground()
         status.send(self._channel, self._status(tick, outputs, sent))
+
+    def _tell_forwarding(self, t_s: float, text: str) -> None:
+        self._recorder.client.text(t_s, Severity.INFO, "ground", text)
+        status.send(self._channel, {"type": "ground", "text": text})
+
+    def _tell_ground(self) -> None:
+        """How the way to the ground stations is, when that changes."""
+        client = self._recorder.client
+        gone = client.gone and client.ground is not None
+        ground = "no telemetry and no commands any more: the recorder is gone; Ctrl-C lands" if gone else client.ground
+        if ground != self._ground:
+            self._ground = ground
+            status.send(self._channel, {"type": "ground", "text": ground})
 
     def _tell(self, tick: int, outputs: Outputs, event: Event) -> None:
         message = {
@@ -291,13 +262,14 @@ async def fly(
     clock = flight_clock(origin_s)
     client = GuardianClient(guardian_channel, clock) if guardian_channel is not None else None
     operator = Operator(channel)
+    checked: Checked | None = None
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(operator.attention())
         edges = await operator.unless_land(stack.enter_async_context(open_edges(config, clock)))
         if edges.found_armed:  # it flies, perhaps: nothing is waited for
             config = unflown(config)
         else:
-            await operator.unless_land(check_before_flight(edges, config, clock, out, channel, sitl))
+            checked = await operator.unless_land(check_before_flight(edges, config, clock, out, channel, sitl))
             config = await operator.unless_land(with_hover_thrust(config, edges.autopilot))
             if client is not None:
                 await operator.unless_land(client.wait_ready())
@@ -312,6 +284,7 @@ async def fly(
                     "law": config.controller.law,
                     "preset": config.controller.preset,
                 },
+                simulated=sitl,
             )
         except DeviceError as error:
             if not edges.found_armed:
@@ -323,14 +296,14 @@ async def fly(
         try:
             if not edges.found_armed:
                 recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
+            if checked is not None:
+                checked.tell(recorder.client)
             guardian = FlightGuard(client, edges.autopilot.identity(), origin_s) if client is not None else None
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
             flight = Flight(config, edges, recorder, channel, operator, clock, guardian)
-            status.send(
-                channel,
-                {"type": "started", "recorder_pid": recorder.process.pid, "realtime": claim_realtime(FLIGHT_PRIORITY)},
-            )
+            got = str(claim_realtime(FLIGHT_PRIORITY))
+            status.send(channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got})
             try:
                 outcome = await flight.run()
             except Exception:  # whatever broke in here, the vehicle may be in the air
@@ -349,54 +322,6 @@ async def fly(
         recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}
         status.send(channel, {"type": "result", "outcome": outcome.value, "recorder": recorded})
     return outcome
-
-
-async def check_before_flight(
-    edges: Edges, config: FlightConfig, clock: Clock, out: Path, channel: socket.socket, sitl: bool
-) -> None:
-    """The preflight, told to the launcher and written to `preflight.json`.
-
-    Raises:
-        DeviceError: `preflight.json` cannot be written.
-        Refused: a row refuses.
-    """
-
-    def tell(text: str, share: float) -> None:
-        status.send(channel, {"type": "preflight_progress", "text": text, "share": share})
-
-    # A path takes seconds to plan, once in a process: here, where motion capture goes on flowing meanwhile.
-    plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
-    known = Observations(0.0, 0.0, mission_s=plan.duration_s)
-    rows = await preflight.preflight(edges, config, clock, out=out, tell=tell, known=known, sitl=sitl)
-    status.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
-    try:
-        preflight.write(rows, out)
-    except OSError as error:
-        raise DeviceError(
-            f"{out / preflight.FILE}: cannot be written: {error.strerror}; choose another --out"
-        ) from None
-    if refused := refusals(rows):
-        raise Refused([row.line() for row in refused])
-
-
-async def with_hover_thrust(config: FlightConfig, autopilot: MavsdkAutopilot) -> FlightConfig:
-    """The effective configuration: hover thrust from PX4 unless the vehicle file gives it.
-
-    Raises:
-        DeviceError: the parameter cannot be read or makes no sense.
-    """
-    airframe = config.vehicle.airframe
-    if airframe.hover_thrust is not None:
-        return config
-    value = float(await autopilot.read_param(_HOVER_PARAM))
-    if not 0.1 <= value <= 0.8:
-        raise DeviceError(
-            f"autopilot: {_HOVER_PARAM} = {value:.3f} is no hover thrust of this machine, expected 0.1 to 0.8;"
-            f" set it in PX4 or give airframe.hover_thrust"
-        )
-    airframe = airframe.model_copy(update={"hover_thrust": value})
-    vehicle = config.vehicle.model_copy(update={"airframe": airframe})
-    return config.model_copy(update={"vehicle": vehicle})
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -18,8 +18,10 @@ from companion.mission.sequencer import Stage
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
 from companion.safety.monitors import Monitors, Situation
+from companion.safety.rules import OPERATOR_START
 from companion.safety.supervisor import (
     HOLD_EXPIRED,
+    RESUME,
     RETRACT_DONE,
     RETRACT_EXPIRED,
     LadderTimes,
@@ -30,6 +32,7 @@ from companion.safety.tether import TetherWatch
 from companion.types import (
     ControlLog,
     Inputs,
+    OperatorCommand,
     Outcome,
     Outputs,
     PhaseKind,
@@ -46,6 +49,8 @@ HOLD_ABOVE_M = 0.3
 # Members of an enum are looked up by code of their own; the tick needs these.
 _PLAN, _SPOOL, _TOUCHDOWN = Stage.PLAN, Stage.SPOOL, Stage.TOUCHDOWN
 _HOLD, _RETRACT = SafetyAction.HOLD, SafetyAction.RETRACT
+_ASKED_TO_HOLD = OperatorCommand.HOLD
+_BY_PEOPLE = ("operator_land", "operator_abort", "called_off")
 _EXPIRED = {HOLD_EXPIRED: "nobody ended the hold", RETRACT_EXPIRED: "the way back took too long"}
 
 
@@ -158,6 +163,9 @@ class FlightCore:
         self._watch_tether(i)
         if events:
             stages.events += events
+            stages.start_asked = any(event.id == OPERATOR_START.id for event in events)
+        if inputs.command is _ASKED_TO_HOLD and stage in seq.BEFORE_LIFT:
+            self._hold_on_ground(i)
         before = self._ladder
         action = before.action
         if action is _RETRACT and stages.course is not None and stages.course.left_s(i.t_s) <= 0.0:
@@ -168,16 +176,21 @@ class FlightCore:
 
     def _climb(self, i: Inputs, before: SupervisorState) -> None:
         """The ladder after what happened, and what is to be done if it went up or down."""
-        ladder = self._ladder = update(before, self._stages.events, i.t_s, self._times)
+        stages, standing = self._stages, None
+        if before.action is _HOLD and any(event.id == RESUME for event in stages.events):
+            standing = self._monitors.standing()
+        ladder = self._ladder = update(before, stages.events, i.t_s, self._times, standing)
         if ladder.action is before.action:
+            if standing is not None:
+                stages.tell(i, "resume_refused", Severity.WARNING, SafetyAction.NOMINAL, standing)
             return
         if ladder.cause in _EXPIRED:
             severity = Severity.CRITICAL
-            self._stages.tell(i, ladder.cause, severity, SafetyAction.LAND, _EXPIRED[ladder.cause])
+            stages.tell(i, ladder.cause, severity, SafetyAction.LAND, _EXPIRED[ladder.cause])
         if ladder.action.rank > before.action.rank:
             self._react(i)
-        elif self._stages.course is not None:  # people let it go on
-            self._stages.course.resume(i.t_s)
+        elif stages.course is not None:  # people let it go on
+            stages.course.resume(i.t_s)
             self._monitors.forget()
 
     def _react(self, i: Inputs) -> None:
@@ -189,7 +202,7 @@ class FlightCore:
             stages.reattach(i)
         elif stage in seq.BEFORE_LIFT:
             if action.rank >= SafetyAction.LAND.rank:
-                by_people = self._ladder.cause in ("operator_land", "operator_abort")
+                by_people = self._ladder.cause in _BY_PEOPLE
                 stages.stand_down(i, Outcome.ABORTED if by_people else Outcome.REFUSED)
         elif stages.pilot_flies:
             return
@@ -210,6 +223,14 @@ class FlightCore:
                 self._retract(i)
             else:
                 self._land(i)
+
+    def _hold_on_ground(self, i: Inputs) -> None:
+        """There it means not to lift. One that waits for its start does that already."""
+        stages = self._stages
+        waits = stages.waits_for_start and stages.stage in (Stage.WAIT, Stage.READY)
+        if not waits and not self._armed_by_others:
+            text = "a stop was asked for before take-off; it stays on the ground"
+            stages.tell(i, "called_off", Severity.INFO, SafetyAction.LAND, text)
 
     def _hold(self, i: Inputs) -> None:
         """Come to rest and stay; a landing goes on, and near the floor it becomes one."""
@@ -291,7 +312,7 @@ class FlightCore:
 
     def _command(self, dt_s: float, i: Inputs) -> tuple[Reference | None, Command]:
         stages, stage = self._stages, self._stages.stage
-        if stage in (Stage.WAIT, Stage.DONE):
+        if stage in (Stage.WAIT, Stage.READY, Stage.DONE):
             return None, Command()
         if stage is Stage.STAND_DOWN and self._armed_by_others:
             return None, dataclasses.replace(self._pilot.wait(i), attitude=None)

@@ -39,6 +39,12 @@ class FlightStages:
         self._sinking = Sinking()
         self._settled = SettledEstimate()
         self._tare_start_s: float | None = None
+        self.waits_for_start = config.mission.start.takeoff == "by_operator"
+        self._was_ready = False
+        """It had everything once: what it lost since may come back for as long as people wait."""
+        self._unready = "nothing has been looked at yet"
+        """What keeps it from being ready, in words; while it waits on the ground."""
+        self._looked_s = 0.0
         self._landing: AutopilotLanding | None = None
         self._plan: Plan | None = None
         self._stage_s: float | None = None
@@ -51,6 +57,8 @@ class FlightStages:
         self.outcome: Outcome | None = None
         self.zero_thrust = False
         """The landing by PX4 wants level setpoints without thrust."""
+        self.start_asked = False
+        """People said `start` in this tick."""
         self.events: list[Event] = []
         """What happened in this tick, from whomever."""
 
@@ -59,6 +67,7 @@ class FlightStages:
     def begin_tick(self, i: Inputs) -> None:
         """Nothing has happened yet in this tick."""
         self.events = []
+        self.start_asked = False
         if self._stage_s is None:
             self._stage_s = i.t_s
 
@@ -116,7 +125,7 @@ class FlightStages:
             segment = self.course.segment(t_s)
             return (f"abort: {segment.name}" if self.aborting else segment.name), segment.kind
         if stage in (Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND):
-            return stage.value, PhaseKind.LANDING
+            return (seq.PILOT_FLIES if self.pilot_flies else stage.value), PhaseKind.LANDING
         done = stage in (Stage.DISARM, Stage.DONE, Stage.STAND_DOWN)
         return stage.value, PhaseKind.DONE if done else PhaseKind.GROUND
 
@@ -149,6 +158,10 @@ class FlightStages:
                 self._fly(i)
             case Stage.WAIT:
                 self._wait(i, elapsed)
+                if self.start_asked:
+                    self._decline_start(i)
+            case Stage.READY:
+                self._ready(i)
             case Stage.OFFBOARD:
                 # After a landing PX4 is in OFFBOARD already, but it arms only on a stream of setpoints.
                 if seq.in_offboard(i.status) and elapsed > seq.STREAM_BEFORE_OFFBOARD_S:
@@ -195,37 +208,102 @@ class FlightStages:
 
     def _wait(self, i: Inputs, elapsed_s: float) -> None:
         """On the ground: until every input is there and PX4 demonstrably follows motion capture, for as long as the tare takes."""
+        overdue = elapsed_s > seq.WAIT_TIMEOUT_S and not self._was_ready
         missing = missing_inputs(i)
         problem = _nothing_from(missing) if missing else unfused(i)
         if problem is not None:
+            self._unready = problem
             self._tare_start_s = None
             self._settled.forget()
-            if elapsed_s > seq.WAIT_TIMEOUT_S:
+            if overdue:
                 self._refuse(i, "inputs_missing" if missing else "vision_not_fused", problem)
             return
-        assert i.vehicle is not None and i.arm is not None and i.mocap is not None
         if self._tare_start_s is None:
-            self._tare_start_s = i.t_s
-        self._pilot.collect_tare(i)
-        self._settled.take(i.t_s, i.vehicle, i.mocap)
+            self._begin_tare(i)
+        self._weigh(i)
+        assert self._tare_start_s is not None
         if i.t_s - self._tare_start_s < seq.TARE_S:
+            self._unready = "the force sensor is still being weighed"
             return
         wanders = self._settled.problem(i.t_s)
         if wanders is not None:
-            if elapsed_s > seq.WAIT_TIMEOUT_S:
+            self._unready = wanders
+            if overdue:
                 self._refuse(i, "estimate_unsteady", wanders)
             return
         self._pilot.finish_tare()
-        mission, vehicle, position = self._config.mission, self._config.vehicle, i.vehicle.position_world_m
-        yaw = euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2]
-        problems = check_start(mission, vehicle, position, yaw, i.arm.angle_rad)
-        for problem in problems:
-            self.tell(i, "start_refused", Severity.CRITICAL, SafetyAction.NOMINAL, problem)
-        if problems:
+        problems = self._misplaced(i)
+        if not problems:
+            self._is_ready(i)
+        elif self._was_ready:  # somebody moved it; they may put it back
+            self._unready = problems[0]
+        else:
+            for problem in problems:
+                self.tell(i, "start_refused", Severity.CRITICAL, SafetyAction.NOMINAL, problem)
             self.stand_down(i, Outcome.REFUSED)
+
+    def _is_ready(self, i: Inputs) -> None:
+        if not self.waits_for_start:
+            self._take_off(i)
             return
-        self._plan = Plan.build(mission, vehicle, position, yaw, i.arm.angle_rad)
+        self._was_ready = True
+        self._unready = "it has become ready just now; say it again"
+        self._looked_s = i.t_s
+        self._begin_tare(i)
+        self.enter(Stage.READY, i)
+
+    def _ready(self, i: Inputs) -> None:
+        """Everything is there; until people say `start`, or something is lost again."""
+        missing = missing_inputs(i)
+        problem = _nothing_from(missing) if missing else unfused(i)
+        if problem is None:
+            assert self._tare_start_s is not None
+            self._weigh(i)
+            if i.t_s - self._tare_start_s >= seq.TARE_S:
+                self._pilot.finish_tare()
+                self._begin_tare(i)
+            if self.start_asked or i.t_s - self._looked_s >= seq.LOOK_AGAIN_S:
+                self._looked_s = i.t_s
+                problem = self._settled.problem(i.t_s) or next(iter(self._misplaced(i)), None)
+        else:
+            self._settled.forget()
+        if problem is not None:
+            self._unready = problem
+            self._tare_start_s = None
+            self.tell(i, "not_ready", Severity.WARNING, SafetyAction.NOMINAL, f"not ready any more: {problem}")
+            self.enter(Stage.WAIT, i)
+            if self.start_asked:
+                self._decline_start(i)
+        elif self.start_asked:
+            self._take_off(i)
+
+    def _begin_tare(self, i: Inputs) -> None:
+        self._pilot.begin_tare()
+        self._tare_start_s = i.t_s
+
+    def _weigh(self, i: Inputs) -> None:
+        assert i.vehicle is not None and i.mocap is not None
+        self._pilot.collect_tare(i)
+        self._settled.take(i.t_s, i.vehicle, i.mocap)
+
+    def _misplaced(self, i: Inputs) -> list[str]:
+        """How it does not stand as the mission says."""
+        assert i.vehicle is not None and i.arm is not None
+        yaw = euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2]
+        position = i.vehicle.position_world_m
+        return check_start(self._config.mission, self._config.vehicle, position, yaw, i.arm.angle_rad)
+
+    def _take_off(self, i: Inputs) -> None:
+        """From where it stands now."""
+        assert i.vehicle is not None and i.arm is not None
+        yaw = euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2]
+        position = i.vehicle.position_world_m
+        self._plan = Plan.build(self._config.mission, self._config.vehicle, position, yaw, i.arm.angle_rad)
         self.enter(Stage.OFFBOARD, i)
+
+    def _decline_start(self, i: Inputs) -> None:
+        text = self._unready if self.waits_for_start else "this flight takes off by itself as soon as it can"
+        self.tell(i, "start_declined", Severity.WARNING, SafetyAction.NOMINAL, text)
 
     def _refuse(self, i: Inputs, event_id: str, text: str) -> None:
         self.tell(i, event_id, Severity.CRITICAL, SafetyAction.NOMINAL, text)

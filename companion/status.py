@@ -1,6 +1,7 @@
 """The local channel between the launcher and the flight process: short JSON messages on a SOCK_SEQPACKET pair.
 
-Flight to launcher: `status` (10 a second), `event`, `px4`, `started`, `refused`, `result`. Launcher to flight: `land`. The flight never
+Flight to launcher: `status` (10 a second), `event`, `px4`, `command` (one that came over the air, and what it did), `ground` (how the
+way to the ground stations is), `started`, `refused`, `result`. Launcher to flight: `land`. The flight never
 waits for the launcher: a full channel loses the message. A launcher that is gone (end of file) means that nobody watches: the flight
 lands.
 """

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from companion.mission.sequencer import Stage
 from companion.preflight.rows import Level, Row
 from companion.status import Message
 
@@ -122,6 +123,8 @@ class FlightDisplay:
                 self._phase = message["phase"]
                 if not self._console.is_terminal:
                     self._console.print(f"  t {message['mission_t_s']:6.2f} s  {escape(self._phase)}")
+                if self._phase == Stage.READY.value:
+                    self.say("everything is ready; take off with: companion command start (Ctrl-C stands down)")
         elif kind == "event" and message.get("source") == "sitl":
             if message["kind"] in ("missed", "crashed"):
                 self._line(
@@ -138,6 +141,12 @@ class FlightDisplay:
             self._preflight(message["rows"])
         elif kind == "px4":
             self._line("PX4", message["text"], "yellow")
+        elif kind == "command":
+            style = "cyan" if message["accepted"] else "yellow"
+            words = f"{message['operator']} commanded {message['command']}: {message['text']}"
+            self._line(f"t {message['t_s']:6.2f} s", words, style)
+        elif kind == "ground":
+            self._line("ground", message["text"], "cyan")
 
     def _preflight(self, rows: list[Message]) -> None:
         """Rows that refuse are told at the end, as the reason of the refusal."""

@@ -113,9 +113,21 @@ class OperatorCommand(Enum):
 
     NONE = "none"
     HOLD = "hold"
-    RESUME = "resume"  # go on after a HOLD; nothing else is taken back by it
+    RESUME = "resume"  # go on after a HOLD, if what held it is gone; nothing else is taken back by it
+    START = "start"  # take off, for a flight that waits for it
     LAND = "land"
     ABORT = "abort"  # land at once, the arm folds; recorded as what it is
+
+
+@dataclass(frozen=True, slots=True)
+class GroundCommand:
+    """A command that came over the air, verified by the recorder process; in `Inputs` only what was asked for goes on."""
+
+    command: OperatorCommand
+    operator: str
+    """Name of the one whose key signed it."""
+    nonce: str
+    """The answer names it."""
 
 
 @quick

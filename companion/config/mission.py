@@ -115,6 +115,8 @@ class Start(Model):
     yaw_tolerance_deg: Positive = 15.0
     arm_deg: Vector2
     arm_tolerance_deg: Positive = 10.0
+    takeoff: Literal["at_once", "by_operator"] = "at_once"
+    """at_once: as soon as everything is ready; by_operator: then it waits on the ground until a person commands `start`."""
 
 
 class Limits(Model):

@@ -76,6 +76,10 @@ class Pilot:
         """Thrust of the last command that the law gave, as a share of hover thrust."""
         return self._thrust_sent / self._hover.value
 
+    def begin_tare(self) -> None:
+        """Weigh the net anew; until that is finished the tare stays as it is."""
+        self._sensing.begin_tare()
+
     def collect_tare(self, i: Inputs) -> None:
         """Add this tick's force sample, at rest, to the tare; the arm is to be held where it is."""
         if i.vehicle is not None and i.arm is not None and i.force is not None:

@@ -27,6 +27,10 @@ class ForceSensing:
         self._last_stamp_s: float | None = None
         self.bias_sensor_n: Vec3 | None = None
 
+    def begin_tare(self) -> None:
+        """What was collected counts no more; the bias stays until it is fixed again."""
+        self._sum, self._count = [0.0, 0.0, 0.0], 0
+
     def collect(self, sample: ForceSample, attitude_wxyz: Quat, arm_rad: Vec2) -> None:
         """Add one sample at rest to the tare; a sample seen before is not counted twice."""
         if sample.stamp_s == self._last_stamp_s:

@@ -1,5 +1,7 @@
 """The flight process's side of the recorder: a bounded channel that never waits, and the recorder process's life.
 
+On the same channel the recorder tells what it hears: that the disk is full, commands from the ground, how its telemetry is.
+
 The channel is a Unix SOCK_SEQPACKET pair; packets are `marshal` data of one interpreter (`companion.record`). When it is full the
 packet is dropped and counted. When the recorder is dead everything is counted as dropped and the flight goes on. When the flight
 is killed, what it had sent is still in the socket: the recorder writes it, closes the log and exits.
@@ -21,13 +23,15 @@ from pathlib import Path
 from typing import Any
 
 from companion.io.edges import DeviceError
-from companion.io.packets import CLOSE, METADATA, TEXT, TICK
+from companion.io.packets import ACK, CLOSE, METADATA, TEXT, TICK
 from companion.record import pack_plain, plain
-from companion.types import Inputs, Outputs, Sent, Severity
+from companion.types import GroundCommand, Inputs, OperatorCommand, Outputs, SafetyAction, Sent, Severity
 
 _BUFFER_BYTES = 8 * 2**20
-# The recorder tells of a full disk on the same socket; half a second at 200 Hz is soon enough to look.
-_LISTEN_EVERY = 100
+_HEARD_MAX_BYTES = 4096
+_HEARD_PER_TICK = 16
+"""More at once waits for the next tick."""
+_COMMANDS = {command.value: command for command in OperatorCommand if command is not OperatorCommand.NONE}
 _SO_SNDBUFFORCE = 32
 
 
@@ -38,6 +42,7 @@ class RecorderClient:
         samples: ticks handed over.
         dropped: packets that did not fit into the channel or found no recorder.
         error: why recording stopped, in the recorder's words (a full disk, a dead recorder), or None.
+        ground: how its telemetry is, in the recorder's words (`connected to mqtt://...`), or None: it has not said.
     """
 
     def __init__(self, channel: socket.socket | int) -> None:
@@ -49,14 +54,54 @@ class RecorderClient:
         self.samples = 0
         self.dropped = 0
         self.error: str | None = None
+        self.ground: str | None = None
+        self._commands: list[GroundCommand] = []
 
     def record(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> bool:
-        """Hand one tick over. False: it was dropped (and counted)."""
-        if self._offered % _LISTEN_EVERY == 0:
-            self._listen()
+        """Hand one tick over, and hear what the recorder has to say. False: the tick was dropped (and counted)."""
         taken = self._send((TICK, self._offered, plain(inputs), plain(outputs), plain(sent)))
         self.samples += taken
+        try:
+            heard = self._socket.recv(_HEARD_MAX_BYTES)
+        except OSError:  # nothing, nearly always; or nobody, which sending finds out
+            return taken
+        self._hear(heard)
         return taken
+
+    @property
+    def gone(self) -> bool:
+        """There is no recorder process any more."""
+        return self._dead
+
+    def take_commands(self) -> list[GroundCommand]:
+        """Commands that have come since the last call, in their order: signed, fresh, for this flight, all of it verified."""
+        commands = self._commands
+        if commands:
+            self._commands = []
+        return commands
+
+    def ack(
+        self,
+        nonce: str,
+        operator: str,
+        command: OperatorCommand,
+        accepted: bool,
+        text: str,
+        t_s: float,
+        phase: str,
+        action: SafetyAction,
+    ) -> bool:
+        """What came of a command.
+
+        Args:
+            nonce, operator, command: of the command, as `take_commands` gave it.
+            accepted: it did something, or what it asks for is done already.
+            text: what was done, or why nothing was.
+            t_s: flight clock of the tick in which it was judged.
+            phase, action: of that tick's `Outputs`.
+        """
+        what = (nonce, operator, command.value, accepted, text, t_s, phase, action.value)
+        return self._send((ACK, self._offered, *what))
 
     def text(self, t_s: float, severity: Severity, source: str, text: str) -> bool:
         """A line for people in the log's `/log` channel; `t_s` on the flight clock."""
@@ -94,13 +139,29 @@ class RecorderClient:
         self.dropped += 1
         return False
 
-    def _listen(self) -> None:
-        if self._dead:
+    def _hear(self, heard: bytes) -> None:
+        """A message, and those right behind it; no bytes: the end."""
+        left = _HEARD_PER_TICK
+        with contextlib.suppress(OSError):
+            while heard:
+                self._take(heard)
+                left -= 1
+                if not left:
+                    return
+                heard = self._socket.recv(_HEARD_MAX_BYTES)
+
+    def _take(self, heard: bytes) -> None:
+        try:
+            message = json.loads(heard)
+        except (ValueError, RecursionError):
             return
-        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-            message = self._socket.recv(4096)
-            if message:
-                self.error = str(json.loads(message)["error"])
+        match message:
+            case {"error": str(error)}:
+                self.error = error
+            case {"command": str(name), "operator": str(operator), "nonce": str(nonce)} if name in _COMMANDS:
+                self._commands.append(GroundCommand(_COMMANDS[name], operator, nonce))
+            case {"ground": str(text)}:
+                self.ground = text
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +183,7 @@ class RecorderProcess:
         config_json: effective configuration, stored as it is.
         epoch_offset_ns: wall clock (ns since 1970) at zero of the flight clock; see `epoch_offset_ns`.
         metadata: more key-value pairs for the log's `flight` metadata record (controller, mission, ...).
+        simulated: the devices are those of the simulated world; ground stations are told.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], client: RecorderClient, path: Path) -> None:
@@ -139,6 +201,7 @@ class RecorderProcess:
         config_json: str,
         epoch_offset_ns: int,
         metadata: Mapping[str, str] | None = None,
+        simulated: bool = False,
         deadline_s: float = 15.0,
     ) -> RecorderProcess:
         """Start it and wait until the log is open. Blocks for some 0.3 s: not for the control tick.
@@ -157,6 +220,7 @@ class RecorderProcess:
                     *(sys.executable, "-m", "companion.recorder_process"),
                     *("--fd", str(theirs.fileno()), "--out", str(path), "--config", str(config_fd)),
                     *("--epoch-offset-ns", str(epoch_offset_ns), "--metadata", json.dumps(dict(metadata or {}))),
+                    *(("--simulated",) if simulated else ()),
                 ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,

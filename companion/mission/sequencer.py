@@ -1,6 +1,7 @@
 """The flight's sequence on top of the plan: wait, offboard, arm, spool up, fly the plan, touch down, disarm. Pure; time is an argument.
 
 WAIT -> OFFBOARD -> ARM -> SPOOL -> PLAN -> TOUCHDOWN -> DISARM -> DONE
+WAIT <-> READY -> OFFBOARD, where people say when
 in the air, at any time:  -> PLAN (a landing from here)  or  -> AUTOPILOT_LAND, both ending in DONE
 before SPOOL, at any time: -> STAND_DOWN -> DONE
 """
@@ -13,6 +14,9 @@ from companion.types import AutopilotStatus, FlightMode, LandedState
 
 WAIT_TIMEOUT_S = 15.0
 TARE_S = 1.0
+"""The force sensor is weighed for so long; a flight that waits for its start does so over and over."""
+LOOK_AGAIN_S = 0.1
+"""A flight that waits for its start judges estimate and place so often."""
 STREAM_BEFORE_OFFBOARD_S = 0.8
 OFFBOARD_TIMEOUT_S = 8.0
 ARM_TIMEOUT_S = 10.0
@@ -30,6 +34,7 @@ class Stage(Enum):
     """Stages of a flight."""
 
     WAIT = "wait"
+    READY = "waits for start"
     OFFBOARD = "offboard"
     ARM = "arm"
     SPOOL = "spool up"
@@ -41,12 +46,14 @@ class Stage(Enum):
     DONE = "done"
 
 
-BEFORE_LIFT = frozenset({Stage.WAIT, Stage.OFFBOARD, Stage.ARM})
-BEFORE_ARMING = frozenset({Stage.WAIT, Stage.OFFBOARD})
+BEFORE_LIFT = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD, Stage.ARM})
+BEFORE_ARMING = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD})
 """Whoever armed PX4 now, the companion did not."""
 LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
 """Stages in which PX4 must be in OFFBOARD, by the companion's belief."""
+PILOT_FLIES = "a pilot flies"
+"""Name of the phase in which nothing is sent because somebody else has the vehicle."""
 PEOPLE_CHOOSE = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
 """Modes that only people choose: theirs is the machine, nothing is sent against them."""
 

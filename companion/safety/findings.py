@@ -10,7 +10,9 @@ from companion.safety.rules import BY_PEOPLE, REATTACHED, RULES, Rule
 from companion.types import ControlLog, Event, SafetyAction, Severity, TetherState
 
 QUIET_S = 1.0
-"""What comes and goes is told again only after it was gone for so long."""
+"""What comes and goes is told again only after it was gone for so long; until then it stands."""
+_Found = tuple[Rule, str, tuple[object, ...]]
+"""By which rule, a text with braces, and what belongs into them."""
 
 
 @dataclass(slots=True)
@@ -60,10 +62,10 @@ class Findings:
         self._hold_s = {
             rule.id: float(getattr(safety, rule.hold) if isinstance(rule.hold, str) else rule.hold) for rule in RULES
         }
-        self._now: dict[str, tuple[Rule, str, tuple[object, ...]]] = {}
+        self._now: dict[str, _Found] = {}
         self._since: dict[str, float] = {}
-        self._told: dict[str, tuple[SafetyAction, float]] = {}
-        """With which action, and when it was last seen."""
+        self._told: dict[str, tuple[SafetyAction, float, _Found]] = {}
+        """With which action, when it was last seen, and what was found then."""
 
     def found(self, rule: Rule, text: str, *values: object) -> None:
         """A finding of this tick; the text's braces are filled in only when it is told."""
@@ -72,6 +74,15 @@ class Findings:
     def forget(self) -> None:
         """Tell again what is still there: somebody took back what was done about it."""
         self._told = {id_: told for id_, told in self._told.items() if told[1] == math.inf}
+
+    def standing(self) -> str | None:
+        """In words, why the vehicle must hold, or worse: the gravest finding of that kind that is not gone; None: there is none."""
+        gravest: SafetyAction | None = None
+        words = None
+        for action, _, (_, text, values) in self._told.values():
+            if action.rank >= SafetyAction.HOLD.rank and (gravest is None or action.rank > gravest.rank):
+                gravest, words = action, text.format(*values)
+        return words
 
     def events(self, t_s: float, airborne: bool) -> tuple[Event, ...]:
         """Events that begin in this tick; the next tick's collection starts empty."""
@@ -85,22 +96,23 @@ class Findings:
         self._now = {}
         self._since = {id_: since_s for id_, since_s in self._since.items() if id_ in now}
         events = []
-        for id_, (rule, text, values) in now.items():
+        for id_, found in now.items():
+            rule, text, values = found
             action = rule.air if airborne else rule.ground
             if action is None:
                 continue
             began_s = self._since.setdefault(id_, t_s)
             told = self._told.get(id_)
             if told is not None and told[0] is action:
-                self._told[id_] = (action, max(told[1], t_s))
+                self._told[id_] = (action, max(told[1], t_s), found)
             elif t_s - began_s >= self._hold_s[id_]:
-                self._told[id_] = (action, t_s if rule.clears else math.inf)
+                self._told[id_] = (action, t_s if rule.clears else math.inf, found)
                 events.append(Event(t_s, id_, _severity(rule, action, airborne), action, text.format(*values)))
         self._drop_gone(t_s)
         return tuple(events)
 
     def _drop_gone(self, t_s: float) -> None:
-        gone = [id_ for id_, (_, seen_s) in self._told.items() if t_s - seen_s > QUIET_S or id_ in BY_PEOPLE]
+        gone = [id_ for id_, (_, seen_s, _) in self._told.items() if t_s - seen_s > QUIET_S or id_ in BY_PEOPLE]
         for id_ in gone:
             del self._told[id_]
 

@@ -19,6 +19,7 @@ from companion.safety.rules import (
     OPERATOR_HOLD,
     OPERATOR_LAND,
     OPERATOR_RESUME,
+    OPERATOR_START,
     REATTACHED,
     RECORDER_DROPS,
 )
@@ -30,9 +31,11 @@ AWAKE_STEP_MAX_S = 0.02
 """A tick counts for no more than this in the age of inputs."""
 MOVING_M_S, MOVING_RAD_S = 0.03, 0.05
 """Above the noise of a machine that stands: what it measures must change."""
+# What is asked for lasts one tick; what lasts longer counts once.
 _ASKED = {
     OperatorCommand.HOLD: (OPERATOR_HOLD, "a stop was asked for"),
     OperatorCommand.RESUME: (OPERATOR_RESUME, "going on was asked for"),
+    OperatorCommand.START: (OPERATOR_START, "take-off was asked for"),
     OperatorCommand.LAND: (OPERATOR_LAND, "landing was asked for"),
     OperatorCommand.ABORT: (OPERATOR_ABORT, "an abort was asked for"),
 }
@@ -69,6 +72,10 @@ class Monitors:
     def forget(self) -> None:
         """Tell again what is still there: a HOLD was taken back."""
         self._findings.forget()
+
+    def standing(self) -> str | None:
+        """In words, what the vehicle must hold for, as of the last tick; None: nothing, or gone for a second."""
+        return self._findings.standing()
 
     def check(self, inputs: Inputs, situation: Situation) -> tuple[Event, ...]:
         """Events that begin in this tick."""

@@ -350,7 +350,18 @@ TETHER_SEPARATED = _rule(
 
 OPERATOR_HOLD = _rule("operator_hold", Part.PEOPLE, "a stop was asked for", (), 0.0, None, _HOLD)
 OPERATOR_RESUME = _rule("operator_resume", Part.PEOPLE, "going on was asked for", (), 0.0, None, SafetyAction.NOMINAL)
-OPERATOR_LAND = _rule("operator_land", Part.PEOPLE, "Ctrl-C, or the launcher is gone", (), 0.0, _LAND, _LAND)
+OPERATOR_START = _rule(
+    "operator_start", Part.PEOPLE, "take-off was asked for", (), 0.0, SafetyAction.NOMINAL, SafetyAction.NOMINAL
+)
+OPERATOR_LAND = _rule(
+    "operator_land",
+    Part.PEOPLE,
+    "a landing was asked for: a command, Ctrl-C, or the launcher is gone",
+    (),
+    0.0,
+    _LAND,
+    _LAND,
+)
 OPERATOR_ABORT = _rule("operator_abort", Part.PEOPLE, "an abort was asked for", (), 0.0, _LAND, _LAND)
 
 BY_PEOPLE = frozenset(rule.id for rule in RULES if rule.part is Part.PEOPLE)

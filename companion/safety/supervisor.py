@@ -2,7 +2,7 @@
 
 NOMINAL -> WARN -> HOLD -> RETRACT -> LAND -> AUTOPILOT_LAND -> TERMINATE. An event carries the rung it asks for; the ladder goes to the
 highest rung asked for. Of itself it only goes on upwards: a HOLD that lasts too long becomes a LAND, and so does a RETRACT. The one way
-down is people's: `operator_resume` ends a HOLD, and nothing else.
+down is people's: `operator_resume` ends a HOLD, and nothing else, and only if nothing stands that it must hold for.
 """
 
 from __future__ import annotations
@@ -43,12 +43,22 @@ class SupervisorState:
     since_s: float = 0.0
 
 
-def update(state: SupervisorState, events: Iterable[Event], t_s: float, times: LadderTimes) -> SupervisorState:
-    """The ladder after these events, at this time. The same object if nothing changes."""
+def update(
+    state: SupervisorState, events: Iterable[Event], t_s: float, times: LadderTimes, standing: str | None = None
+) -> SupervisorState:
+    """The ladder after these events, at this time. The same object if nothing changes.
+
+    Args:
+        state: where it stands.
+        events: of this tick.
+        t_s: flight clock.
+        times: how long rungs may last.
+        standing: what the vehicle must hold for now, in words; None: nothing, and people may let it go on.
+    """
     for event in events:
         if event.action.rank > state.action.rank:
             state = SupervisorState(event.action, event.id, event.t_s)
-        elif event.id == RESUME and state.action is SafetyAction.HOLD:
+        elif event.id == RESUME and state.action is SafetyAction.HOLD and standing is None:
             state = SupervisorState(SafetyAction.NOMINAL, event.id, event.t_s)
     if state.action is SafetyAction.HOLD and t_s - state.since_s > times.hold_max_s:
         return SupervisorState(SafetyAction.LAND, HOLD_EXPIRED, t_s)

@@ -18,11 +18,13 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 
 from companion.io.edges import DeviceError
+from companion.io.packets import ACK
 from companion.io.recorder import RecorderClient, RecorderProcess, epoch_offset_ns
-from companion.record import differences, from_jsonable
+from companion.record import differences, from_jsonable, unpack_plain
 from companion.types import (
     AutopilotRequest,
     Event,
+    GroundCommand,
     Inputs,
     MocapPose,
     OperatorCommand,
@@ -275,3 +277,115 @@ def test_epoch_offset_is_the_wall_clock_at_zero_of_the_flight_clock() -> None:
     before_ns = time.time_ns()
     offset_ns = epoch_offset_ns(10.0)
     assert before_ns <= offset_ns + 10_000_000_000 <= time.time_ns()
+
+
+# -- what the recorder tells -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def channel() -> Iterator[tuple[RecorderClient, socket.socket]]:
+    """The flight's end, and the recorder's as a bare socket."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    client = RecorderClient(ours)
+    with theirs:
+        yield client, theirs
+    client.close()
+
+
+def say(recorder: socket.socket, **message: object) -> None:
+    recorder.send(json.dumps(message).encode())
+
+
+def test_commands_are_heard_in_the_tick_in_which_they_are_there(channel: tuple[RecorderClient, socket.socket]) -> None:
+    client, recorder = channel
+    say(recorder, command="hold", operator="anna", nonce="a1")
+    say(recorder, command="land", operator="bob", nonce="b2")
+    client.record(*tick(0))
+    assert client.take_commands() == [
+        GroundCommand(OperatorCommand.HOLD, "anna", "a1"),
+        GroundCommand(OperatorCommand.LAND, "bob", "b2"),
+    ]
+    client.record(*tick(1))
+    assert client.take_commands() == []
+
+
+def test_more_than_fit_into_a_tick_wait_for_the_next_and_none_is_lost(
+    channel: tuple[RecorderClient, socket.socket],
+) -> None:
+    client, recorder = channel
+    for number in range(40):
+        say(recorder, command="hold", operator="anna", nonce=str(number))
+    heard = []
+    for k in range(3):
+        client.record(*tick(k))
+        heard.append([int(asked.nonce) for asked in client.take_commands()])
+    assert [len(nonces) for nonces in heard] == [16, 16, 8]
+    assert [number for nonces in heard for number in nonces] == list(range(40))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"no json",
+        b"\xff\xfe",
+        b"[1, 2]",
+        b"null",
+        b'{"command": "hold"}',
+        b'{"command": "none", "operator": "anna", "nonce": "1"}',
+        b'{"command": "fall", "operator": "anna", "nonce": "1"}',
+        b'{"command": ["hold"], "operator": "anna", "nonce": "1"}',
+        b'{"command": "hold", "operator": null, "nonce": "1"}',
+        b'{"error": 7}',
+        b'{"ground": {}}',
+        b"[" * 4000,
+    ],
+)
+def test_what_cannot_be_understood_is_nothing(channel: tuple[RecorderClient, socket.socket], message: bytes) -> None:
+    client, recorder = channel
+    recorder.send(message)
+    say(recorder, ground="connected")
+    client.record(*tick(0))
+    assert (client.take_commands(), client.error, client.ground) == ([], None, "connected")
+
+
+def test_an_error_and_the_way_to_the_ground_are_known_the_newest_counts(
+    channel: tuple[RecorderClient, socket.socket],
+) -> None:
+    client, recorder = channel
+    say(recorder, ground="connected to mqtt://127.0.0.1:1883")
+    say(recorder, error="recorder: full")
+    say(recorder, ground="not connected")
+    client.record(*tick(0))
+    assert (client.ground, client.error, client.gone) == ("not connected", "recorder: full", False)
+
+
+def test_an_answer_is_a_packet_in_its_turn(channel: tuple[RecorderClient, socket.socket]) -> None:
+    client, recorder = channel
+    client.record(*tick(0))
+    client.ack("a1", "anna", OperatorCommand.HOLD, True, "holding", 1.25, "hold", SafetyAction.HOLD)
+    recorder.recv(2**20)
+    assert unpack_plain(recorder.recv(2**20)) == (
+        *(ACK, 1, "a1", "anna", "hold", True, "holding", 1.25, "hold", "hold"),
+    )
+
+
+def test_answers_count_as_packets_and_are_in_the_log_for_people(recorder: RecorderProcess) -> None:
+    offer(recorder, range(10))
+    recorder.client.ack("a1", "anna", OperatorCommand.LAND, True, "landing", 0.05, "hold", SafetyAction.LAND)
+    offer(recorder, range(10, 20))
+    report = recorder.finish(DEADLINE_S)
+    assert (report.samples, report.dropped, report.error) == (20, 0, None)
+    with recorder.path.open("rb") as file:
+        lines = [m.data for _, _, m in make_reader(file).iter_messages(topics=["/log"])]
+    assert [line for line in lines if b"anna" in line and b"landing" in line]
+
+
+def test_without_a_recorder_there_are_no_commands_and_it_is_known(recorder: RecorderProcess) -> None:
+    offer(recorder, range(3))
+    assert not recorder.client.gone
+    recorder.process.kill()
+    recorder.process.wait(DEADLINE_S)
+    recorder.client.record(*tick(3))
+    recorder.client.ack("a1", "anna", OperatorCommand.LAND, True, "landing", 0.0, "", SafetyAction.NOMINAL)
+    assert recorder.client.gone
+    assert recorder.client.take_commands() == []

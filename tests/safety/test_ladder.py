@@ -72,6 +72,12 @@ def test_going_on_in_the_tick_of_something_graver_changes_nothing() -> None:
         assert update(state, events, 2.0, TIMES).action is SafetyAction.LAND
 
 
+@pytest.mark.parametrize("now", SafetyAction)
+def test_nobody_lets_it_go_on_while_something_stands(now: SafetyAction) -> None:
+    state = SupervisorState(now, "before", 1.0)
+    assert update(state, [event(RESUME, SafetyAction.NOMINAL)], 2.0, TIMES, "too little tether left") is state
+
+
 any_event = st.sampled_from(EVENTS).map(lambda pair: event(*pair))
 
 

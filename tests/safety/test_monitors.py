@@ -201,6 +201,7 @@ FAULTS: dict[str, Fault] = {
     "tether_separated": Fault(situation=lambda: tethered(separated=True)),
     "operator_hold": Fault(lambda i: replace(i, command=OperatorCommand.HOLD)),
     "operator_resume": Fault(lambda i: replace(i, command=OperatorCommand.RESUME)),
+    "operator_start": Fault(lambda i: replace(i, command=OperatorCommand.START)),
     "operator_land": Fault(lambda i: replace(i, command=OperatorCommand.LAND)),
     "operator_abort": Fault(lambda i: replace(i, command=OperatorCommand.ABORT)),
 }
@@ -385,6 +386,27 @@ def test_what_is_still_there_after_a_hold_was_taken_back_is_told_again() -> None
     monitors.forget()
     after = watched(VEHICLE, inputs[100:200], flying(), monitors)
     assert [[event.id for event in events] for events in (before, after)] == [["geofence_near"], ["geofence_near"]]
+
+
+def test_what_stands_is_known_until_it_was_gone_for_a_second() -> None:
+    monitors = Monitors(VEHICLE)
+    near = after_a_moment(at(1.6, 0.0, 1.0, vx=0.8), sound=0)[:100]
+    watched(VEHICLE, near, flying(), monitors)
+    assert "outside the room" in (monitors.standing() or "")
+    watched(VEHICLE, [healthy(k) for k in range(100, 295)], flying(), monitors)
+    assert "outside the room" in (monitors.standing() or "")
+    watched(VEHICLE, [healthy(k) for k in range(295, 310)], flying(), monitors)
+    assert monitors.standing() is None
+
+
+def test_a_warning_and_peoples_own_words_are_no_reason_to_hold() -> None:
+    monitors = Monitors(VEHICLE)
+    warm = put("arm", temperature_c=(70.0, 35.0))
+    events = watched(VEHICLE, [warm(healthy(k)) for k in range(150)], flying(), monitors)
+    asked = [replace(warm(healthy(150)), command=OperatorCommand.HOLD)]
+    events += watched(VEHICLE, asked, flying(), monitors)
+    assert [event.id for event in events] == ["servo_warm", "operator_hold"]
+    assert monitors.standing() is None
 
 
 def test_people_may_ask_for_the_same_again() -> None:
