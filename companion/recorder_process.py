@@ -1,8 +1,10 @@
 """The recorder process: reads ticks from the flight's channel and writes an MCAP log; outlives the flight to close the log.
 
-Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``. For viewers, typed and thinned out: ``/tf``,
-``/reference``, ``/log``. Metadata records: ``companion`` (log format, epoch offset, versions), ``config`` (effective configuration as
-JSON), ``flight`` (given by the caller) and at the end ``recorder`` (counts).
+Where the vehicle file names a broker it is the ground's desk as well: telemetry out, signed commands in (`companion.io.telemetry`).
+
+Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; for viewers, typed and thinned out:
+`companion.recording.viewer_channels`. Metadata records: ``companion`` (log format, epoch offset, versions), ``config`` (effective
+configuration as JSON), ``flight``, ``plan``, ``preflight`` (given by the caller) and at the end ``recorder`` (counts).
 
 Every chunk of the file holds whole ticks and is appended in one piece: the file can be read up to its last moment even when this
 process is killed.
@@ -21,7 +23,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from companion.io.packets import CLOSE, METADATA, TEXT, TICK, UNNUMBERED
+from companion.io.packets import ACK, CLOSE, METADATA, TEXT, TICK, UNNUMBERED
+from companion.io.telemetry import Telemetry, wanted
 from companion.record import fingerprint, unpack_plain
 from companion.recording.channel import FLUSH_PERIOD_S, Channel
 from companion.recording.disk import Disk
@@ -31,6 +34,8 @@ from companion.types import Inputs, Outputs, Sent
 
 LOG_FORMAT = "1"
 SYNC_PERIOD_S = 1.0
+FAREWELL_S = 1.5
+"""For telemetry's last words, after the log is closed."""
 
 
 class Recorder:
@@ -40,6 +45,7 @@ class Recorder:
         self._channel = channel
         self._writer = writer
         self._disk = disk
+        self.telemetry: Telemetry | None = None
         self._expected = 0
         self._told = False
         self._in_chunk = 0
@@ -65,10 +71,17 @@ class Recorder:
                 synced_s = now_s
                 self._disk.sync()
         self._flush()
+        if self.telemetry is not None:
+            self.telemetry.end(in_order=self._closed)
         if self._disk.error is None:
-            self._writer.metadata("recorder", {"samples": str(self.samples), "dropped": str(self.dropped)})
+            told = self.telemetry.counts if self.telemetry is not None else {}
+            self._writer.metadata("recorder", {"samples": str(self.samples), "dropped": str(self.dropped), **told})
         self._writer.close()
         self._flush()
+
+    def state(self) -> tuple[int, str | None]:
+        """Records lost, and why nothing is recorded any more; for another thread."""
+        return self.dropped, self.error
 
     def _take(self, packet: bytes) -> None:
         kind, number, *rest = unpack_plain(packet)
@@ -87,11 +100,19 @@ class Recorder:
                 self._writer.text(*rest)
             elif kind == METADATA:
                 self._writer.metadata(*rest)
+            elif kind == ACK:
+                self._answered(*rest)
         except (ValueError, TypeError, LookupError, OverflowError, RuntimeError) as error:
             self.dropped += 1
             self.error = (
                 self.error or f"recorder: packet {number} could not be written: {type(error).__name__}: {error}"
             )
+
+    def _answered(
+        self, nonce: str, operator: str, command: str, accepted: bool, text: str, t_s: float, phase: str, action: str
+    ) -> None:
+        severity = "info" if accepted else "warning"
+        self._writer.text(t_s, severity, "ground", f"{command} of {operator}: {text} ({nonce})")
 
     def _flush(self) -> None:
         """Close the chunk; only what the disk took counts as recorded."""
@@ -105,7 +126,7 @@ class Recorder:
                 self._told = True
                 self.error = self._disk.error
                 print(self.error, file=sys.stderr, flush=True)
-                self._channel.tell(self.error)
+                self._channel.say({"error": self.error})
         self._in_chunk = 0
 
 
@@ -136,6 +157,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--config", required=True, help="effective configuration (JSON): a file or an open descriptor")
     parser.add_argument("--epoch-offset-ns", type=int, required=True, help="wall clock at zero of the flight clock")
     parser.add_argument("--metadata", type=json.loads, default={}, help="JSON object of strings")
+    parser.add_argument("--simulated", action="store_true", help="the devices are those of the simulated world")
     parser.add_argument("--chunk-bytes", type=int, default=2**19, help="largest size of an MCAP chunk")
     return parser.parse_args(argv)
 
@@ -170,11 +192,22 @@ def main(argv: list[str] | None = None) -> int:
         channel = Channel(flight)
         signal.signal(signal.SIGTERM, lambda *_: channel.stop())
         recorder = Recorder(channel, writer, disk)
+        telemetry: Telemetry | None = None
+        if wanted(config_json):
+            telemetry = recorder.telemetry = Telemetry(
+                config_json, simulated=arguments.simulated, flight=channel, recorder_state=recorder.state
+            )
+            channel.copy_to = telemetry.offer
+            telemetry.start()
+        channel.start()
         _say({"ready": True})
         recorder.run()
     disk.close()
     _say({"samples": recorder.samples, "dropped": recorder.dropped, "error": recorder.error})
-    return 0 if recorder.error is None else 1
+    code = 0 if recorder.error is None else 1
+    if telemetry is not None and not telemetry.ended(FAREWELL_S):
+        os._exit(code)  # a thread that waits for an unreachable broker would hold us for seconds
+    return code
 
 
 if __name__ == "__main__":

@@ -1,0 +1,63 @@
+"""What a picture of the machine in its room is drawn from, of a flight's configuration. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from companion.config.loader import FlightConfig
+from companion.ground.messages import VERSION, Scene
+from companion.mission.plan import _name as phase_name
+from companion.types import Vec2, Vec3
+
+PATH_POINTS_MAX = 300
+
+
+def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = (), *, mission_s: float = 0.0) -> Scene:
+    """The scene of a flight.
+
+    Args:
+        config: effective configuration.
+        session: of the flight.
+        path_world_m: planned path, evenly in time; of more than `PATH_POINTS_MAX` points so many are taken, evenly.
+        mission_s: planned duration; 0: not planned yet.
+    """
+    vehicle = config.vehicle
+    room, tether, safety, airframe, arm = vehicle.room, vehicle.tether, vehicle.safety, vehicle.airframe, vehicle.arm
+    first, second = arm.joints
+    return Scene(
+        v=VERSION,
+        session=session,
+        room_min_world_m=(room.x_m[0], room.y_m[0], room.z_m[0]),
+        room_max_world_m=(room.x_m[1], room.y_m[1], room.z_m[1]),
+        anchor_world_m=tether.anchor_world_m,
+        tether_length_m=tether.length_m,
+        tether_margin_m=tether.margin_m,
+        attachment_body_m=tether.attachment_body_m,
+        radius_m=airframe.radius_m,
+        ground_clearance_m=airframe.ground_clearance_m,
+        shoulder_body_m=arm.shoulder_body_m,
+        link_lengths_m=arm.link_lengths_m,
+        net_radius_m=vehicle.tool.net_radius_m,
+        joint_min_rad=_radians((first.angle_deg[0], second.angle_deg[0])),
+        joint_max_rad=_radians((first.angle_deg[1], second.angle_deg[1])),
+        tilt_abort_rad=math.radians(safety.tilt_abort_deg),
+        tracking_warn_m=safety.tracking_error_warn_m,
+        tracking_abort_m=safety.tracking_error_abort_m,
+        mission_s=mission_s,
+        path_world_m=thinned(path_world_m),
+        phases=tuple(map(phase_name, config.mission.phases)),
+    )
+
+
+def thinned(path_world_m: Sequence[Vec3]) -> tuple[Vec3, ...]:
+    """At most `PATH_POINTS_MAX` points, evenly, the first and the last among them."""
+    count = len(path_world_m)
+    if count <= PATH_POINTS_MAX:
+        return tuple(path_world_m)
+    last = PATH_POINTS_MAX - 1
+    return tuple(path_world_m[round(k * (count - 1) / last)] for k in range(PATH_POINTS_MAX))
+
+
+def _radians(pair_deg: Vec2) -> Vec2:
+    return (math.radians(pair_deg[0]), math.radians(pair_deg[1]))

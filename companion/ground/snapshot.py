@@ -1,0 +1,398 @@
+"""Ticks of a flight as the messages that people see: 20 times a second how it is, and what happened. Pure: time is an argument.
+
+``e_p`` is as in `companion.analysis.metrics`: the pose against the reference of the moment at which it was taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+from companion.config.loader import FlightConfig
+from companion.ground.lights import UNKNOWN_S, Ages, Lights, Look
+from companion.ground.messages import (
+    EVENTS_KEPT,
+    VERSION,
+    ControlView,
+    EventLine,
+    Events,
+    Stream,
+    TetherView,
+    Timing,
+)
+from companion.types import (
+    ControlLog,
+    Inputs,
+    Outputs,
+    Quat,
+    Reference,
+    SafetyAction,
+    Sent,
+    TetherState,
+    Vec3,
+)
+
+WAITS_FOR_START = "waits for start"
+"""`Outputs.phase` of a flight that is ready and waits for the command."""
+PERIOD_S = 0.005
+"""Of the control loop: a tick that begins later than this is missed (`companion.core.NOMINAL_DT_S`)."""
+MOCAP_FRESH_S = 0.1
+"""An older pose is not graded (`companion.analysis.log.MOCAP_FRESH_S`)."""
+TEXT_MAX = 300
+"""Characters of an event's text: `EVENTS_KEPT` of them fit into one message, whatever they are."""
+_TEXT_MAX_BYTES = 1600
+"""The same in JSON, where a character may take twelve bytes."""
+_LIGHTS_S = 1.0
+"""The lights show the worst of so long: what lasts a tick is to be seen."""
+
+T = TypeVar("T", bound=tuple[float, ...])
+
+
+class StreamMaker:
+    """Takes every tick, makes a `Stream` of the newest now and then, and keeps the newest events."""
+
+    def __init__(self, config: FlightConfig, session: str) -> None:
+        self._session = session
+        self._lights = Lights(config.vehicle)
+        self._newest: tuple[Inputs, Outputs, Sent] | None = None
+        self._now = Ages()
+        self._worst = _Worst()
+        self._past: deque[tuple[float, Ages]] = deque()
+        self._frames_s: deque[float] = deque()
+        self._first_frame_s: float | None = None
+        self._missed = 0
+        self._seq = 0
+        self.events: deque[EventLine] = deque(maxlen=EVENTS_KEPT)
+        """The newest, oldest first."""
+        self.count = 0
+        """Of all events."""
+
+    @property
+    def ticks_seen(self) -> bool:
+        """There is something to make a `Stream` of."""
+        return self._newest is not None
+
+    @property
+    def newest_outputs(self) -> Outputs | None:
+        """Of the newest tick."""
+        return self._newest[1] if self._newest is not None else None
+
+    def take(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> None:
+        """The next tick."""
+        before = self._newest
+        self._newest = (inputs, outputs, sent)
+        self._now.take(inputs, sent.lateness_s)
+        self._missed += sent.lateness_s > PERIOD_S
+        mocap = inputs.mocap
+        fresh = mocap is not None and (
+            before is None or before[0].mocap is None or before[0].mocap.stamp_s != mocap.stamp_s
+        )
+        if mocap is not None and fresh:
+            if self._first_frame_s is None:
+                self._first_frame_s = mocap.stamp_s
+            self._frames_s.append(mocap.stamp_s)
+        self._worst.take(before, inputs, sent, fresh)
+        for event in outputs.events:
+            self._add(
+                EventLine(
+                    event.t_s,
+                    outputs.mission_t_s,
+                    event.id,
+                    event.severity.value,
+                    event.action.value,
+                    shortened(event.text),
+                )
+            )
+
+    def tell(self, t_s: float, severity: str, source: str, text: str, *, instead: bool = False) -> None:
+        """A line that is no event of the core: what PX4 or the guardian says, and what the ground was told.
+
+        Args:
+            t_s: flight clock.
+            severity: a value of `companion.types.Severity`.
+            source: who says it; the line's id.
+            text: cut to `TEXT_MAX` characters.
+            instead: of the last line of the same source, if it is still kept: what repeats for ever is to push out nothing else.
+        """
+        mission_t_s = self._newest[1].mission_t_s if self._newest is not None else 0.0
+        if instead:
+            kept = [line for line in self.events if line.id != source]
+            self.events.clear()
+            self.events.extend(kept)
+        self._add(EventLine(t_s, mission_t_s, source, severity, SafetyAction.NOMINAL.value, shortened(text)))
+
+    def events_record(self) -> Events:
+        """All of them that are kept."""
+        return Events(VERSION, self._session, self.count, tuple(map(_finite_line, self.events)))
+
+    def make(self, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Stream:
+        """How it is now, with the worst timings since the message before.
+
+        Args:
+            wall_s: seconds since 1970.
+            dropped: records that the recorder itself knows to be lost.
+            recorder_error: why it records no more.
+
+        Raises:
+            LookupError: no tick was taken yet.
+        """
+        if self._newest is None:
+            raise LookupError("no tick yet")
+        i, o, _ = self._newest
+        lost = max(dropped, i.recorder_dropped)
+        ages = self._ages_of_the_last_second(i.t_s)
+        look = Look(i, o, ages, self._mocap_rate_hz(i.t_s), self._missed, lost, recorder_error)
+        timing = self._worst.timing(self._missed, lost)
+        self._now, self._worst = Ages(), _Worst()
+        self._seq += 1
+        pose_from, position, attitude, age_s = _pose(i, o)
+        reference, status = o.reference, i.status
+        setpoint = o.attitude
+        return Stream(
+            v=VERSION,
+            session=self._session,
+            seq=self._seq,
+            wall_s=round(wall_s, 3),
+            t_s=_number(i.t_s, 4) or 0.0,
+            mission_t_s=_number(o.mission_t_s, 4) or 0.0,
+            phase=o.phase,
+            kind=o.phase_kind.value,
+            progress=_number(o.progress, 5) or 0.0,
+            action=o.action.value,
+            armed=status.armed if status is not None else None,
+            mode=status.mode.value if status is not None else None,
+            landed=status.landed.value if status is not None else None,
+            pose_from=pose_from,
+            position_world_m=_rounded(position, 4),
+            attitude_wxyz=_rounded(attitude, 5),
+            velocity_world_m_s=_rounded(i.vehicle.velocity_world_m_s, 4) if i.vehicle is not None else None,
+            arm_rad=_rounded(i.arm.angle_rad, 5) if i.arm is not None else None,
+            reference_world_m=_rounded(reference.position_world_m, 4) if reference is not None else None,
+            reference_yaw_rad=_number(reference.yaw_rad, 5) if reference is not None else None,
+            reference_arm_rad=_rounded(reference.arm_rad, 5) if reference is not None else None,
+            e_p_m=_number(_position_error_m(position, age_s, reference), 5),
+            e_q_deg=_number(_angle_deg(attitude, setpoint.attitude_wxyz), 4) if setpoint is not None else None,
+            thrust=_number(setpoint.thrust, 5) if setpoint is not None else None,
+            battery_v=_number(status.battery_voltage_v, 3) if status is not None else None,
+            battery_remaining=_number(status.battery_remaining, 4) if status is not None else None,
+            tether=_tether(o.tether),
+            control=_control(o.control),
+            timing=timing,
+            lights=self._lights.judge(look),
+            bent_by=o.bent_by,
+            waits_for_start=o.phase == WAITS_FOR_START,
+        )
+
+    def _add(self, line: EventLine) -> None:
+        self.events.append(line)
+        self.count += 1
+
+    def _ages_of_the_last_second(self, t_s: float) -> Ages:
+        past = self._past
+        past.append((t_s, self._now))
+        while past[0][0] < t_s - _LIGHTS_S:
+            past.popleft()
+        worst = Ages()
+        for _, ages in past:
+            worst.merge(ages)
+        return worst
+
+    def _mocap_rate_hz(self, t_s: float) -> float | None:
+        frames, first_s = self._frames_s, self._first_frame_s
+        while frames and not frames[0] >= t_s - 1.0:
+            frames.popleft()
+        return float(len(frames)) if first_s is not None and t_s - first_s > 1.0 else None
+
+
+class _Worst:
+    """The worst durations of some ticks, s."""
+
+    def __init__(self) -> None:
+        self._lateness_s = self._core_s = 0.0
+        self._mocap_s = self._setpoint_s = self._joint_s = UNKNOWN_S
+
+    def take(self, before: tuple[Inputs, Outputs, Sent] | None, i: Inputs, sent: Sent, fresh: bool) -> None:
+        """One tick; durations as in `companion.analysis.timing.Stopwatch`."""
+        self._lateness_s = max(self._lateness_s, sent.lateness_s)
+        self._core_s = max(self._core_s, sent.core_s - sent.joint_read_s)
+        if i.mocap is not None:
+            self._mocap_s = max(self._mocap_s, i.t_s - i.mocap.stamp_s + (i.mocap.latency_s or 0.0))
+            if fresh and before is not None and sent.attitude_sent:
+                self._setpoint_s = max(self._setpoint_s, sent.setpoint_sent_s - i.mocap.stamp_s)
+        if before is None or before[2].arm_torque_sent_nm is None:
+            return
+        earlier, now = before[0].arm, i.arm
+        if earlier is None or now is None or now.written_s is None:
+            return
+        if now.written_s >= before[2].core_s and now.stamp_s > earlier.stamp_s:
+            self._joint_s = max(self._joint_s, now.written_s - earlier.stamp_s)
+
+    def timing(self, missed: int, dropped: int) -> Timing:
+        """As a message says it."""
+        return Timing(
+            lateness_ms=_ms(self._lateness_s) or 0.0,
+            mocap_age_ms=_ms(self._mocap_s),
+            mocap_to_setpoint_ms=_ms(self._setpoint_s),
+            joint_read_to_write_ms=_ms(self._joint_s),
+            core_ms=_ms(self._core_s) or 0.0,
+            missed=missed,
+            dropped=dropped,
+        )
+
+
+def replay(
+    rows: Iterable[tuple[Inputs, Outputs, Sent]],
+    config: FlightConfig,
+    session: str,
+    epoch_offset_s: float,
+    rate_hz: float = 20.0,
+    max_records: int = 12000,
+    max_events: int = 2000,
+) -> tuple[list[Stream], Events]:
+    """A logged flight as the messages that people would have seen.
+
+    Args:
+        rows: ticks in order, such as `companion.analysis.log.FlightLog.rows()` gives.
+        config: of the flight.
+        session: any name for it.
+        epoch_offset_s: wall clock at zero of the flight clock.
+        rate_hz: of the records; half, a quarter, ... of it where a long flight would give more than `max_records`.
+        max_records: at least 2.
+        max_events: the newest so many are kept.
+
+    Returns:
+        Records in order, the first tick's and the last tick's among them; and the events of the whole flight.
+    """
+    maker = StreamMaker(config, session)
+    maker.events = deque(maxlen=max_events)
+    period_s = 1.0 / rate_hz
+    records: list[Stream] = []
+    due_s = -math.inf
+    untold: float | None = None
+    for inputs, outputs, sent in rows:
+        maker.take(inputs, outputs, sent)
+        untold = inputs.t_s
+        if not inputs.t_s < due_s - 1e-6:
+            due_s = due_s + period_s if due_s + period_s > inputs.t_s else inputs.t_s + period_s
+            records.append(maker.make(epoch_offset_s + inputs.t_s))
+            untold = None
+            if len(records) >= max_records:
+                records = _halved(records)
+                period_s *= 2.0
+                due_s = inputs.t_s + period_s
+    if untold is not None:
+        records.append(maker.make(epoch_offset_s + untold))
+    return records, maker.events_record()
+
+
+def _halved(records: list[Stream]) -> list[Stream]:
+    """Every second one, the first and the last among them, with the worst timings of those between."""
+    kept = [records[0]]
+    between: list[Timing] = []
+    for index, record in enumerate(records[1:], 1):
+        if index % 2 and index != len(records) - 1:
+            between.append(record.timing)
+            continue
+        kept.append(dataclasses.replace(record, timing=_worst_of([*between, record.timing])))
+        between = []
+    return kept
+
+
+def _worst_of(timings: Sequence[Timing]) -> Timing:
+    def worst(name: str) -> float | None:
+        return max((v for t in timings if (v := getattr(t, name)) is not None), default=None)
+
+    last = timings[-1]
+    return Timing(
+        lateness_ms=worst("lateness_ms") or 0.0,
+        mocap_age_ms=worst("mocap_age_ms"),
+        mocap_to_setpoint_ms=worst("mocap_to_setpoint_ms"),
+        joint_read_to_write_ms=worst("joint_read_to_write_ms"),
+        core_ms=worst("core_ms") or 0.0,
+        missed=last.missed,
+        dropped=last.dropped,
+    )
+
+
+def _pose(i: Inputs, o: Outputs) -> tuple[str | None, Vec3 | None, Quat | None, float]:
+    """Source, position, attitude, and how long ago the vehicle was there, s."""
+    mocap = i.mocap
+    if mocap is not None and mocap.tracking_valid and o.mocap_trusted and i.t_s - mocap.stamp_s <= MOCAP_FRESH_S:
+        age_s = i.t_s - mocap.stamp_s + (mocap.latency_s or 0.0)
+        return "mocap", mocap.position_world_m, mocap.attitude_wxyz, age_s
+    if i.vehicle is not None:
+        v = i.vehicle
+        return "px4", v.position_world_m, v.attitude_wxyz, i.t_s - v.position_stamp_s
+    return None, None, None, 0.0
+
+
+def _position_error_m(position: Vec3 | None, age_s: float, reference: Reference | None) -> float | None:
+    if position is None or reference is None:
+        return None
+    at, speed = reference.position_world_m, reference.velocity_world_m_s
+    return math.dist(position, [p - age_s * v for p, v in zip(at, speed, strict=True)])
+
+
+def _angle_deg(a: Quat | None, b: Quat) -> float | None:
+    if a is None:
+        return None
+    cos_half = abs(sum(x * y for x, y in zip(a, b, strict=True)))
+    return math.degrees(2.0 * math.acos(min(1.0, cos_half))) if math.isfinite(cos_half) else None
+
+
+def _tether(state: TetherState | None) -> TetherView | None:
+    if state is None:
+        return None
+    numbers = _rounded((state.slack_m, state.stop_slack_m, state.pull_n, state.turns), 4)
+    return None if numbers is None else TetherView(*numbers, state.taut, state.snagged)
+
+
+def _control(control: ControlLog | None) -> ControlView | None:
+    if control is None:
+        return None
+    h_hat, tau = _rounded(control.h_hat, 5), _rounded(control.tau, 4)
+    force = _rounded(control.force_ext_world_n, 4)
+    single = _rounded((control.rho, control.hover_thrust), 5)
+    if h_hat is None or tau is None or force is None or single is None:
+        return None
+    return ControlView(
+        rho=single[0],
+        h_hat=h_hat,
+        tau=tau[0:3],
+        arm_torque_nm=tau[6:8],
+        force_ext_world_n=force,
+        hover_thrust=single[1],
+        saturated=any(control.saturated),
+        payload_estimate_kg=_number(control.payload_estimate_kg, 4),
+    )
+
+
+def shortened(text: str) -> str:
+    """Cut to what a message has room for."""
+    text = text[:TEXT_MAX]
+    return text if len(json.dumps(text)) <= _TEXT_MAX_BYTES else text[: _TEXT_MAX_BYTES // 12]
+
+
+def _finite_line(line: EventLine) -> EventLine:
+    if math.isfinite(line.t_s) and math.isfinite(line.mission_t_s):
+        return line
+    return dataclasses.replace(line, t_s=_number(line.t_s, 4) or 0.0, mission_t_s=_number(line.mission_t_s, 4) or 0.0)
+
+
+def _number(value: float | None, digits: int) -> float | None:
+    """What is no number is not known."""
+    return round(value, digits) if value is not None and math.isfinite(value) else None
+
+
+def _rounded(values: T | None, digits: int) -> T | None:
+    if values is None or not all(map(math.isfinite, values)):
+        return None
+    return type(values)(round(value, digits) for value in values)
+
+
+def _ms(duration_s: float) -> float | None:
+    return _number(duration_s * 1e3, 3)

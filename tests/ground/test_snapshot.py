@@ -1,0 +1,380 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jsonschema
+import pytest
+
+from companion import core
+from companion.analysis import log
+from companion.analysis.timing import timing_of
+from companion.config.loader import load_flight
+from companion.frames import quat_from_euler_zyx, quat_multiply
+from companion.ground import snapshot
+from companion.ground.lights import NAMES
+from companion.ground.messages import EVENTS_KEPT, MESSAGE_MAX_BYTES, Events, Light, Stream, Topic, decode, encode
+from companion.ground.schemas import schema_of
+from companion.ground.snapshot import TEXT_MAX, StreamMaker, replay
+from companion.types import (
+    AttitudeSetpoint,
+    Event,
+    Inputs,
+    Outputs,
+    SafetyAction,
+    Sent,
+    Severity,
+    TetherState,
+    VehicleState,
+)
+from tests.analysis.synthetic_flight import synthetic_flight
+from tests.support import CATCH, position_error_m
+
+Row = tuple[Inputs, Outputs, Sent]
+CONFIG = load_flight(CATCH)
+SAFETY = CONFIG.vehicle.safety
+ROWS: list[Row] = list(synthetic_flight(end_s=9.0))
+IN_FLIGHT = ROWS[1500]
+
+
+def changed(row: Row, **values: Any) -> Row:
+    """The row with fields replaced, by path: `mocap__latency_s=0.3`, `outputs__phase="x"`."""
+
+    def put(record: Any, path: list[str], value: Any) -> Any:
+        if not path:
+            return value
+        return dataclasses.replace(record, **{path[0]: put(getattr(record, path[0]), path[1:], value)})
+
+    parts: dict[str, Any] = {"inputs": row[0], "outputs": row[1], "sent": row[2]}
+    for name, value in values.items():
+        path = name.split("__")
+        if path[0] not in parts:
+            path = ["inputs", *path]
+        parts[path[0]] = put(parts[path[0]], path[1:], value)
+    return parts["inputs"], parts["outputs"], parts["sent"]
+
+
+def stream_of(*rows: Row) -> Stream:
+    maker = StreamMaker(CONFIG, "s")
+    for row in rows:
+        maker.take(*row)
+    return maker.make(1.7e9)
+
+
+def light_of(stream: Stream, name: str) -> tuple[Light, str]:
+    found = {health.name: health for health in stream.lights}
+    return found[name].light, found[name].text
+
+
+def test_constants_are_those_of_loop_and_metrics() -> None:
+    assert snapshot.PERIOD_S == core.NOMINAL_DT_S
+    assert snapshot.MOCAP_FRESH_S == log.MOCAP_FRESH_S
+
+
+def test_a_message_is_the_tick_that_it_is_made_of() -> None:
+    inputs, outputs, _ = IN_FLIGHT
+    stream = stream_of(IN_FLIGHT)
+    assert inputs.mocap is not None and inputs.arm is not None and outputs.reference is not None
+    assert stream.position_world_m == pytest.approx(inputs.mocap.position_world_m, abs=6e-5)
+    assert stream.attitude_wxyz == pytest.approx(inputs.mocap.attitude_wxyz, abs=6e-6)
+    assert stream.arm_rad == pytest.approx(inputs.arm.angle_rad, abs=6e-6)
+    assert stream.reference_world_m == pytest.approx(outputs.reference.position_world_m, abs=6e-5)
+    assert (stream.phase, stream.kind, stream.action) == (outputs.phase, "flight", "nominal")
+    assert (stream.pose_from, stream.armed, stream.mode) == ("mocap", True, "offboard")
+    assert stream.control is not None and outputs.control is not None
+    assert stream.control.tau == pytest.approx(outputs.control.tau[0:3], abs=6e-5)
+    assert stream.control.arm_torque_nm == pytest.approx(outputs.control.tau[6:8], abs=6e-5)
+    assert not stream.waits_for_start
+    assert decode(Stream, encode(stream)) == stream
+    jsonschema.Draft202012Validator(schema_of(Topic.STREAM)).validate(json.loads(encode(stream)))
+
+
+def test_the_position_error_is_that_of_the_metrics_also_of_an_old_frame_in_motion() -> None:
+    moving = changed(
+        IN_FLIGHT,
+        outputs__reference__velocity_world_m_s=(1.0, -0.5, 0.25),
+        mocap__stamp_s=IN_FLIGHT[0].t_s - 0.03,
+        mocap__latency_s=0.02,
+    )
+    for row in (*ROWS[300::100], moving):
+        if row[1].reference is not None:
+            assert stream_of(row).e_p_m == pytest.approx(position_error_m(row[0], row[1]), abs=6e-6)
+    at_the_tick = math.dist(moving[0].mocap.position_world_m, moving[1].reference.position_world_m)  # type: ignore[union-attr]
+    assert abs((stream_of(moving).e_p_m or 0.0) - at_the_tick) > 0.02
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+def test_the_attitude_error_is_the_angle_to_the_setpoint(axis: tuple[float, float, float]) -> None:
+    attitude = quat_from_euler_zyx(0.1, -0.2, 2.0)
+    half = math.radians(7.0) / 2.0
+    turned = quat_multiply(attitude, (math.cos(half), *(math.sin(half) * a for a in axis)))  # type: ignore[arg-type]
+    for sign in (1.0, -1.0):  # both quaternions are the same attitude
+        setpoint = AttitudeSetpoint(tuple(sign * c for c in turned), 0.5)  # type: ignore[arg-type]
+        stream = stream_of(changed(IN_FLIGHT, mocap__attitude_wxyz=attitude, outputs__attitude=setpoint))
+        assert stream.e_q_deg == pytest.approx(7.0, abs=1e-3)
+
+
+def _states(t_s: float) -> VehicleState:
+    state = IN_FLIGHT[0].vehicle
+    assert state is not None
+    return dataclasses.replace(state, position_world_m=(0.5, 0.5, 0.5), position_stamp_s=t_s)
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        {"mocap": None},
+        {"mocap__stamp_s": IN_FLIGHT[0].t_s - 0.11},
+        {"mocap__tracking_valid": False},
+        {"outputs__mocap_trusted": False},
+    ],
+)
+def test_without_motion_capture_the_pose_is_that_of_px4_and_says_so(loss: dict[str, Any]) -> None:
+    stream = stream_of(changed(IN_FLIGHT, vehicle=_states(IN_FLIGHT[0].t_s), **loss))
+    assert (stream.pose_from, stream.position_world_m) == ("px4", (0.5, 0.5, 0.5))
+    reference = IN_FLIGHT[1].reference
+    assert reference is not None
+    assert stream.e_p_m == pytest.approx(math.dist((0.5, 0.5, 0.5), reference.position_world_m), abs=6e-6)
+
+
+def test_with_nothing_known_everything_is_none_and_all_lights_of_devices_are_off() -> None:
+    row = changed(
+        ROWS[0], vehicle=None, status=None, mocap=None, arm=None, force=None, outputs__reference=None, outputs__attitude=None
+    )  # fmt: skip
+    stream = stream_of(row)
+    assert [health.name for health in stream.lights] == list(NAMES)
+    assert (stream.pose_from, stream.position_world_m, stream.e_p_m, stream.e_q_deg) == (None, None, None, None)
+    lights = {health.name: health.light for health in stream.lights}
+    assert {name for name, light in lights.items() if light is not Light.OFF} == {"loop", "recorder"}
+    with pytest.raises(LookupError):
+        StreamMaker(CONFIG, "s").make(0.0)
+
+
+BAD_NUMBERS = [math.nan, math.inf, -math.inf, 1e308]
+
+
+@pytest.mark.parametrize("bad", BAD_NUMBERS)
+def test_numbers_that_are_none_make_a_message_that_every_parser_reads(bad: float) -> None:
+    def spoilt(value: Any) -> Any:
+        if isinstance(value, float):
+            return bad
+        if isinstance(value, tuple):
+            return tuple(map(spoilt, value))
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return dataclasses.replace(
+                value, **{f.name: spoilt(getattr(value, f.name)) for f in dataclasses.fields(value)}
+            )
+        return value
+
+    event = Event(1.0, "e", Severity.INFO, SafetyAction.NOMINAL, "text")
+    tether = TetherState(1.0, 1.0, 1.0, 0.1, 0.5, 0.0, 0.0, False, False, False)
+    row = changed(IN_FLIGHT, outputs__events=(event,), outputs__tether=tether)
+    maker = StreamMaker(CONFIG, "s")
+    maker.take(*IN_FLIGHT)
+    maker.take(*(spoilt(record) for record in row))
+
+    def no_constants(text: str) -> Any:
+        raise AssertionError(text)
+
+    for topic, record in ((Topic.STREAM, maker.make(1.7e9)), (Topic.EVENTS, maker.events_record())):
+        data = json.loads(encode(record), parse_constant=no_constants)
+        jsonschema.Draft202012Validator(schema_of(topic)).validate(data)
+
+
+def test_timings_are_the_worst_since_the_message_before() -> None:
+    maker = StreamMaker(CONFIG, "s")
+    timings = []
+    for k, row in enumerate(ROWS):
+        maker.take(*row)
+        if k % 10 == 9 or k == len(ROWS) - 1:
+            timings.append(maker.make(0.0).timing)
+    whole = timing_of(ROWS)
+    for name, values_s in (
+        ("lateness_ms", whole.lateness_s),
+        ("mocap_to_setpoint_ms", whole.mocap_to_setpoint_s),
+        ("joint_read_to_write_ms", whole.joint_read_to_write_s),
+    ):
+        told = [value for timing in timings if (value := getattr(timing, name)) is not None]
+        assert max(told) == pytest.approx(values_s.max() * 1e3, abs=1e-3)
+    assert len({timing.lateness_ms for timing in timings}) > 100
+
+
+def test_late_ticks_and_lost_records_are_counted() -> None:
+    maker = StreamMaker(CONFIG, "s")
+    for k in range(100):
+        maker.take(*changed(ROWS[k], sent__lateness_s=0.0051 if k % 20 == 3 else 0.0049))
+    stream = maker.make(0.0, dropped=3)
+    assert (stream.timing.missed, stream.timing.dropped) == (5, 3)
+    assert light_of(stream, "recorder") == (Light.WARN, "3 records lost")
+    maker.take(*changed(ROWS[100], recorder_dropped=7))
+    assert maker.make(0.0, dropped=3).timing.dropped == 7
+    assert light_of(maker.make(0.0, recorder_error="the disk is full"), "recorder") == (Light.BAD, "the disk is full")
+
+
+def test_the_newest_events_are_kept_and_all_are_counted() -> None:
+    maker = StreamMaker(CONFIG, "s")
+    for k in range(EVENTS_KEPT + 30):
+        event = Event(0.1 * k, f"e{k}", Severity.WARNING, SafetyAction.HOLD, f"text {k}")
+        maker.take(*changed(ROWS[k], outputs__events=(event,), outputs__mission_t_s=0.05 * k))
+    record = maker.events_record()
+    assert record.count == EVENTS_KEPT + 30
+    assert [line.id for line in record.lines] == [f"e{k}" for k in range(30, EVENTS_KEPT + 30)]
+    assert record.lines[0].mission_t_s == pytest.approx(1.5)
+    assert (record.lines[-1].severity, record.lines[-1].action) == ("warning", "hold")
+    assert decode(Events, encode(record)) == record
+
+
+def test_what_repeats_for_ever_pushes_no_event_out() -> None:
+    maker = StreamMaker(CONFIG, "s")
+    maker.tell(1.0, "warning", "px4", "something once")
+    for k in range(5 * EVENTS_KEPT):
+        maker.tell(2.0 + k, "warning", "noise", f"the {k}th", instead=True)
+    assert [line.text for line in maker.events] == ["something once", f"the {5 * EVENTS_KEPT - 1}th"]
+    assert maker.count == 5 * EVENTS_KEPT + 1
+
+
+def test_the_longest_events_fit_into_a_message() -> None:
+    maker = StreamMaker(CONFIG, "s")
+    for _ in range(EVENTS_KEPT):
+        maker.tell(1e5 / 3, "critical", "x" * 40, "\N{PILE OF POO}\x00" * TEXT_MAX)
+    assert len(encode(maker.events_record())) <= MESSAGE_MAX_BYTES
+
+
+def tether(**values: Any) -> dict[str, Any]:
+    state = TetherState(2.0, 1.0, 0.9, 0.1, 0.5, 0.0, 0.0, False, False, False)
+    return {"outputs__tether": dataclasses.replace(state, **values)}
+
+
+def old(device: str, limit_s: float) -> Callable[[float], dict[str, Any]]:
+    """That device, so old in shares of the limit."""
+    stamps = {
+        "vehicle": ("position_stamp_s", "attitude_stamp_s", "imu_stamp_s"),
+        "status": ("heartbeat_stamp_s",),
+    }.get(device, ("stamp_s",))
+    return lambda share: {f"{device}__{stamp}": IN_FLIGHT[0].t_s - share * limit_s for stamp in stamps}
+
+
+AGES = [
+    ("PX4", old("vehicle", SAFETY.vehicle_timeout_s)),
+    ("PX4", old("status", 2.0 * SAFETY.heartbeat_timeout_s)),
+    ("motion capture", old("mocap", SAFETY.mocap_timeout_s)),
+    ("arm", old("arm", SAFETY.arm_timeout_s)),
+    ("force sensor", old("force", SAFETY.force_timeout_s)),
+]
+
+
+@pytest.mark.parametrize(("name", "aged"), AGES)
+def test_a_light_turns_with_the_age_of_its_device(name: str, aged: Callable[[float], dict[str, Any]]) -> None:
+    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.1))), name)[0] is Light.OK
+    assert light_of(stream_of(changed(IN_FLIGHT, **aged(1.1))), name)[0] is Light.BAD
+
+
+@pytest.mark.parametrize("name_aged", [AGES[0], *AGES[2:]])
+def test_a_light_warns_from_half_its_limit_on(name_aged: tuple[str, Callable[[float], dict[str, Any]]]) -> None:
+    name, aged = name_aged
+    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.7))), name)[0] is Light.WARN
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "light", "text"),
+    [
+        ("PX4", {}, Light.OK, "4 ms old, OFFBOARD, armed"),
+        ("PX4", {"status": None}, Light.BAD, "no heartbeat"),
+        ("estimate", {"vehicle__position_world_m": (9.0, 0.0, 1.0)}, Light.BAD, "cm"),
+        ("estimate", {"vehicle__attitude_wxyz": quat_from_euler_zyx(0.0, 0.0, 0.3)}, Light.BAD, "17."),
+        ("estimate", {"mocap__tracking_valid": False}, Light.OFF, "nothing to compare with"),
+        ("motion capture", {"mocap__tracking_valid": False}, Light.BAD, "not seen"),
+        ("motion capture", {"outputs__mocap_trusted": False}, Light.BAD, "not believed"),
+        ("motion capture", {"mocap__latency_s": 0.06}, Light.WARN, "60 ms late"),
+        ("motion capture", {"mocap__latency_s": 0.2}, Light.BAD, "200 ms late"),
+        ("arm", {}, Light.OK, "31 / 30 degC"),
+        ("arm", {"arm__temperature_c": (30.0, SAFETY.servo_warn_c)}, Light.WARN, "/ 65 degC"),
+        ("arm", {"arm__temperature_c": (SAFETY.servo_max_c, 30.0)}, Light.BAD, "75 / 30 degC"),
+        ("arm", {"arm__hardware_error": (0, 32)}, Light.BAD, "servo 2: overload"),
+        ("arm", {"arm__hardware_error": (128, 0)}, Light.WARN, "watchdog"),
+        ("arm", {"arm__read_failures": SAFETY.arm_read_failures_max}, Light.WARN, "without an answer"),
+        ("force sensor", {"force__overload": True}, Light.WARN, "overloaded"),
+        ("loop", {"sent__lateness_s": 0.06}, Light.WARN, "60.0 ms late at worst, 1 ticks missed"),
+        ("loop", {"sent__lateness_s": 0.4}, Light.BAD, "400.0 ms"),
+        ("guardian", {}, Light.OFF, "none"),
+        ("guardian", {"guardian_ready": True}, Light.OK, "stands by"),
+        ("guardian", {"guardian_ready": False}, Light.BAD, "dead"),
+        ("battery", {}, Light.OK, "15.8 V, 90 %"),
+        ("battery", {"status__battery_remaining": 0.25}, Light.WARN, "25 %"),
+        ("battery", {"status__battery_remaining": 0.15}, Light.BAD, "15 %"),
+        ("battery", {"status__battery_voltage_v": 13.0}, Light.BAD, "13.0 V"),
+        ("battery", {"status__battery_voltage_v": None, "status__battery_remaining": None}, Light.OFF, "not say"),
+        ("tether", {}, Light.OFF, "not measured"),
+        ("tether", tether(), Light.OK, "1.00 m left"),
+        ("tether", tether(stop_slack_m=0.2), Light.WARN, "m left"),
+        ("tether", tether(stop_slack_m=0.05), Light.BAD, "0.05 m where it could stop"),
+        ("tether", tether(clearance_m=0.0), Light.WARN, "cm from rotors"),
+        ("tether", tether(turns=-1.6), Light.BAD, "-1.6 turns"),
+        ("tether", tether(taut=True, pull_n=12.0), Light.BAD, "taut: pulls with 12 N"),
+        ("tether", tether(snagged=True), Light.BAD, "snagged"),
+        ("tether", tether(separated=True), Light.BAD, "holds the machine no more"),
+    ],
+)
+def test_a_light_turns_at_the_limit_of_the_vehicle_file(
+    name: str, values: dict[str, Any], light: Light, text: str
+) -> None:
+    found = light_of(stream_of(changed(IN_FLIGHT, **values)), name)
+    assert found[0] is light and text in found[1], found
+
+
+def test_the_rate_of_motion_capture_is_counted_and_judged() -> None:
+    maker = StreamMaker(CONFIG, "s")
+    rows = [changed(row, mocap__stamp_s=0.025 * (row[0].tick // 5)) for row in ROWS[:500]]  # 40 Hz
+    for row in rows[:100]:
+        maker.take(*row)
+    assert "Hz" not in light_of(maker.make(0.0), "motion capture")[1]
+    for row in rows[100:]:
+        maker.take(*row)
+    light, text = light_of(maker.make(0.0), "motion capture")
+    assert light is Light.WARN and ("40 Hz" in text or "41 Hz" in text)
+
+
+def test_a_fault_of_one_tick_is_to_be_seen_for_a_second() -> None:
+    maker = StreamMaker(CONFIG, "s")
+    lights = []
+    for k, row in enumerate(ROWS[:600]):
+        maker.take(*changed(row, sent__lateness_s=0.06 if k == 200 else 0.0))
+        if k % 10 == 9:
+            lights.append((row[0].t_s, light_of(maker.make(0.0), "loop")[0]))
+    seen_s = [t_s for t_s, light in lights if light is Light.WARN]
+    assert 0.9 < seen_s[-1] - seen_s[0] < 1.1
+
+
+def test_a_flight_that_waits_for_its_start_says_so() -> None:
+    assert stream_of(changed(ROWS[0], outputs__phase="waits for start")).waits_for_start
+
+
+def test_a_log_is_replayed_at_the_rate_of_the_stream_from_its_first_tick_to_its_last() -> None:
+    records, events = replay(iter(ROWS), CONFIG, "log", 1.7e9)
+    assert [records[0].t_s, records[-1].t_s] == pytest.approx([ROWS[0][0].t_s, ROWS[-1][0].t_s])
+    steps_s = [b.t_s - a.t_s for a, b in itertools.pairwise(records)]
+    assert steps_s[:-1] == pytest.approx([0.05] * (len(steps_s) - 1), abs=1e-6)
+    assert [record.seq for record in records] == list(range(1, len(records) + 1))
+    assert records[-1].wall_s == pytest.approx(1.7e9 + ROWS[-1][0].t_s, abs=1e-3)
+    assert [line.id for line in events.lines] == [e.id for row in ROWS for e in row[1].events]
+    assert {record.session for record in records} == {events.session} == {"log"}
+
+
+@pytest.mark.parametrize("max_records", [2, 3, 50, 199, 200, 201, 202])
+def test_a_long_log_is_replayed_at_a_lower_rate_and_keeps_its_worst_moment(max_records: int) -> None:
+    late = [changed(row, sent__lateness_s=0.123) if row[0].tick == 777 else row for row in ROWS]
+    records, events = replay(iter(late), CONFIG, "log", 0.0, max_records=max_records)
+    assert len(records) <= max_records + 1  # the last tick is added at the end
+    assert [records[0].t_s, records[-1].t_s] == pytest.approx([ROWS[0][0].t_s, ROWS[-1][0].t_s])
+    assert max(record.timing.lateness_ms for record in records) == pytest.approx(123.0)
+    assert events.count == sum(len(row[1].events) for row in ROWS)
+    steps_s = [b.t_s - a.t_s for a, b in itertools.pairwise(records)][:-1]
+    assert not steps_s or max(steps_s) < 2.5 * (ROWS[-1][0].t_s / max_records)
+
+
+def test_an_empty_log_is_replayed_to_nothing() -> None:
+    assert replay(iter(()), CONFIG, "log", 0.0)[0] == []
