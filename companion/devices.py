@@ -13,6 +13,7 @@ from companion.io.arm import DynamixelArm
 from companion.io.autopilot import MavsdkAutopilot
 from companion.io.edges import DeviceError
 from companion.io.force_torque import RobotousForceTorque
+from companion.io.ground_station import GroundStation, check_address
 from companion.io.mocap import NatNetMocap
 from companion.mission.sequencer import is_armed
 from companion.types import MocapPose
@@ -45,6 +46,8 @@ class Edges:
     """PX4 was armed when its link was opened."""
     failures: tuple[str, ...] = ()
     """Of devices that such a landing goes without: the edges' own lines."""
+    ground: GroundStation | None = None
+    """None: nothing is forwarded, because nobody asked for it or the vehicle was found armed."""
 
 
 @dataclass(slots=True)
@@ -68,8 +71,11 @@ async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]
 
     Raises:
         DeviceError: PX4 is not there, or it is not armed and another device is not there or not as it must be; the first such one.
-            All are closed again.
+            All are closed again. So is the address of a ground station that is none, and that before anything is opened.
     """
+    ground_address = config.vehicle.ground.qgroundcontrol
+    if ground_address is not None:
+        check_address(ground_address)
     some = SomeEdges(VisionValve())
     async with contextlib.AsyncExitStack() as stack:
         problem: DeviceError | None = None
@@ -91,13 +97,20 @@ async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]
                 failures.append(str(error))
             except TimeoutError:
                 failures.append(f"arm {config.vehicle.devices.arm.port}: not open within {ARM_PATIENCE_S:g} s")
+            if ground_address is not None:
+                failures.append(
+                    f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded in a flight found under way"
+                )
             yield Edges(some.vision, autopilot, some.mocap, some.arm, None, armed, tuple(failures))
             return
         if problem is not None:
             raise problem
         some.force = await stack.enter_async_context(_force(config, clock))
+        ground = None
+        if ground_address is not None:
+            ground = await stack.enter_async_context(GroundStation(ground_address, autopilot))
         some.arm = await stack.enter_async_context(_arm(config, clock))
-        yield Edges(some.vision, autopilot, some.mocap, some.arm, some.force)
+        yield Edges(some.vision, autopilot, some.mocap, some.arm, some.force, ground=ground)
 
 
 @contextlib.asynccontextmanager
@@ -158,7 +171,8 @@ def _mocap(config: FlightConfig, clock: Clock, some: SomeEdges) -> NatNetMocap:
 
 
 def _autopilot(config: FlightConfig, clock: Clock) -> MavsdkAutopilot:
-    return MavsdkAutopilot(config.vehicle.devices.autopilot, clock)
+    forwarding = config.vehicle.ground.qgroundcontrol is not None
+    return MavsdkAutopilot(config.vehicle.devices.autopilot, clock, forwarding=forwarding)
 
 
 def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm:

@@ -32,6 +32,7 @@ from companion.io.autopilot_link import (
     check_address,
     device_error,
     first_autopilot,
+    pin_udp,
     quiet_native_log,
     udp_ports,
 )
@@ -70,16 +71,23 @@ class MavsdkAutopilot:
     setpoint at 20 Hz from a C++ thread for as long as the process lives, so PX4's offboard-loss failsafe would never fire for a hung
     companion; it also takes Euler angles only. Here nothing leaves unless the flight loop sends it. The price was measured: 0.03 to
     0.06 ms more from datagram to wire (p50; 0.1 ms at p99), of a tick of 5 ms. benchmarks/wire_latency.py measures both.
+
+    Args:
+        device: its address.
+        clock: the flight clock.
+        forwarding: a second connection is wanted, see `forward_to`.
     """
 
-    def __init__(self, device: AutopilotDevice, clock: Clock) -> None:
+    def __init__(self, device: AutopilotDevice, clock: Clock, *, forwarding: bool = False) -> None:
         self._device = device
+        self._forwarding = forwarding
         self._clock = clock
         self._desk = RequestDesk()
         self._inbox = Inbox(clock, self._desk, self._on_heartbeat)
         self._calls = NativeCalls(device.address)
         self._mavsdk: Any = None
         self._connection: Any = None
+        self._second: Any = None
         self._restore_log: Callable[[], None] | None = None
         self._direct: Any = None
         self._mocap: Any = None
@@ -107,7 +115,8 @@ class MavsdkAutopilot:
             ports = udp_ports()
             self._mavsdk = Mavsdk(configuration)
             self._connection = await self._calls.run(
-                "the connection to open", _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address
+                *("the connection to open", _CONNECT_DEADLINE_S, add_connection),
+                *(self._mavsdk, address, self._forwarding),
             )
             system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
@@ -138,6 +147,31 @@ class MavsdkAutopilot:
     def identity(self) -> LinkIdentity:
         """Who speaks to whom on the open link."""
         return LinkIdentity(self._system_id, *self._own_ids, self._local_port)
+
+    async def forward_to(self, port: int) -> int:
+        """Forward between PX4 and that UDP port of 127.0.0.1; the port of 127.0.0.1 that MAVSDK speaks from to it.
+
+        MAVSDK takes what comes from there for as good as what comes from PX4: only `ground_relay` may be at the other end, and
+        nobody else is heard.
+
+        Raises:
+            DeviceError: the connection cannot be opened, or not be kept to that one partner.
+        """
+        self._require_open()
+        assert self._forwarding, "made without forwarding"
+        address = f"udpout://127.0.0.1:{port}"
+        before = udp_ports()
+        expected = "the connection for forwarding to open"
+        self._second = await self._calls.run(expected, _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address, True)
+        new = udp_ports() - before
+        try:
+            own_port = new.pop() if len(new) == 1 else 0
+            pin_udp(own_port, ("127.0.0.1", port))
+        except OSError as error:
+            self._drop_second()
+            fix = "mount /proc, or fly without ground.qgroundcontrol"
+            raise device_error(address, "MAVSDK's socket in /proc", error.strerror or str(error), fix) from None
+        return own_port
 
     def vehicle(self) -> VehicleState | None:
         """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
@@ -313,8 +347,14 @@ class MavsdkAutopilot:
         if self._connection is not None:
             self._mavsdk.remove_connection(self._connection)  # takes 0.2 ms; from here on nothing can leave
             self._connection = None
+        self._drop_second()
         # Shielded: a second Ctrl-C must not leave MAVSDK half destroyed.
         await asyncio.shield(asyncio.get_running_loop().run_in_executor(None, self._tear_down))
+
+    def _drop_second(self) -> None:
+        if self._second is not None:
+            self._mavsdk.remove_connection(self._second)
+            self._second = None
 
     def _tear_down(self) -> None:
         deadline_s = time.monotonic() + _CLOSE_DEADLINE_S

@@ -17,6 +17,7 @@ from typing import Any
 from mavsdk import Autopilot as AutopilotKind
 from mavsdk import ConnectionResult, Mavsdk, log_subscribe, log_unsubscribe
 from mavsdk.exceptions import ConnectionError as MavsdkConnectionError
+from mavsdk.mavsdk import ForwardingOption
 
 from companion.io.edges import DeviceError
 
@@ -81,14 +82,20 @@ def _check_bindable(address: str, host: str, port: int, kind: socket.SocketKind)
             raise device_error(address, f"a local address in {host}", error.strerror or str(error), fix) from None
 
 
-def add_connection(mavsdk: Mavsdk, address: str) -> Any:
+def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> Any:
     """Open the connection; the handle that `Mavsdk.remove_connection` takes. Blocks while a TCP connection is made.
+
+    Args:
+        mavsdk: the instance.
+        address: checked.
+        forwarding: what arrives goes out on the other connections that forward, and the other way round.
 
     Raises:
         DeviceError: MAVSDK could not open it.
     """
     try:
-        return mavsdk.add_any_connection_with_handle(address)
+        option = ForwardingOption.ON if forwarding else ForwardingOption.OFF
+        return mavsdk.add_any_connection_with_handle_and_forwarding(address, option)
     except MavsdkConnectionError as error:
         found = str(error).removeprefix("Connection failed: ").lower().replace("_", " ")
         if ConnectionResult.BAUDRATE_UNKNOWN.name in str(error):
@@ -130,13 +137,33 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
 
 def udp_ports() -> set[int]:
     """Local ports of the UDP sockets that this process holds; empty where /proc does not tell."""
+    return set(_udp_sockets())
+
+
+def pin_udp(local_port: int, peer: tuple[str, int]) -> None:
+    """Let the UDP socket of this process on that port hear `peer` alone: the kernel throws away what comes from anywhere else.
+
+    MAVSDK binds a `udpout` connection to all addresses and listens to everybody who finds its port.
+
+    Raises:
+        OSError: the socket is not found, or cannot be connected.
+    """
+    descriptor = _udp_sockets().get(local_port)
+    if descriptor is None:
+        raise OSError(errno.ENOENT, "no such socket")
+    with socket.socket(fileno=os.dup(descriptor)) as twin:
+        twin.connect(peer)
+
+
+def _udp_sockets() -> dict[int, int]:
+    """Descriptors of this process's UDP (IPv4) sockets by local port."""
     try:
-        own = {link for name in os.listdir("/proc/self/fd") if (link := _link_of(name)) is not None}
+        own = {link: int(name) for name in os.listdir("/proc/self/fd") if (link := _link_of(name)) is not None}
         table = Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]
     except OSError:
-        return set()
+        return {}
     rows = (line.split() for line in table)
-    return {int(row[1].rpartition(":")[2], 16) for row in rows if f"socket:[{row[9]}]" in own}
+    return {int(row[1].rpartition(":")[2], 16): own[link] for row in rows if (link := f"socket:[{row[9]}]") in own}
 
 
 def _link_of(descriptor: str) -> str | None:

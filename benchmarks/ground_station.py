@@ -1,0 +1,326 @@
+"""What a MAVLink ground station costs the flight: setpoints and motion capture on their way to PX4, with and without one.
+
+    python benchmarks/ground_station.py [--seconds 4] [--rounds 5] [--json FILE]
+
+Three processes beside the relay: the flight's side (asyncio at 200 Hz through `MavsdkAutopilot` and `GroundStation`), a room that sends
+pose datagrams and plays PX4 (600 telemetry messages a second), and the ground station. The first two claim real-time priority, as a
+flight does, where that is permitted. The conditions take turns, so that what else the machine does falls on all of them. Both figures
+are taken where PX4 is: time between two SET_ATTITUDE_TARGETs, and pose datagram sent to VISION_POSITION_ESTIMATE received.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import json
+import multiprocessing
+import os
+import socket
+import statistics
+import struct
+import sys
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+from rich.console import Console
+from rich.table import Table
+
+from companion.config.vehicle import AutopilotDevice
+from companion.io.autopilot import MavsdkAutopilot
+from companion.io.ground_station import VALUES_EVERY, GroundStation
+from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.ticker import Ticker
+from companion.types import (
+    AttitudeSetpoint,
+    AutopilotRequest,
+    Event,
+    Inputs,
+    MocapPose,
+    OperatorCommand,
+    Outputs,
+    PhaseKind,
+    SafetyAction,
+    Severity,
+    TetherState,
+)
+
+RATE_HZ = 200.0
+FLOOD_HZ = 1000.0
+CONDITIONS = ("off", "absent", "present", "flood", "rubbish", "forged")
+_DEADLINE_S = 30.0
+_POSE = struct.Struct("<d")
+_LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.2)
+_WARM_UP_S = 1.0
+
+
+@dataclass(slots=True)
+class Samples:
+    """Of one condition, in s."""
+
+    period_s: list[float] = field(default_factory=list)
+    vision_s: list[float] = field(default_factory=list)
+    tell_s: list[float] = field(default_factory=list)
+    to_px4: int = 0
+    """Messages of the ground station that reached PX4."""
+    relay_cpu: float = 0.0
+    """Share of a core."""
+
+
+def free_udp_port() -> int:
+    """One that was free a moment ago."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def room(parent: Connection, autopilot_port: int, mocap_port: int) -> None:
+    """PX4 and motion capture; runs until told to stop, then reports what arrived."""
+    out, into = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
+    into.robust_parsing = True
+    beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16, 4, 3)
+    streams = (
+        mavlink.MAVLink_local_position_ned_message(1, *[0.0] * 6),
+        mavlink.MAVLink_attitude_quaternion_message(1, 1.0, *[0.0] * 6),
+        mavlink.MAVLink_highres_imu_message(1, 0.0, 0.0, -9.81, *[0.0] * 10, 0xFFFF),
+    )
+    claim_realtime(FLIGHT_PRIORITY)
+    setpoints_s: list[float] = []
+    vision_s: list[float] = []
+    from_ground = 0
+    beat_s, due_s = 0.0, time.monotonic()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.bind(("127.0.0.1", 0))
+        remote = ("127.0.0.1", autopilot_port)
+
+        def say(message: Any) -> None:
+            wire.sendto(message.pack(out), remote)
+            out.seq = (out.seq + 1) % 256
+
+        while not parent.poll():
+            now_s = time.monotonic()
+            if now_s >= beat_s:
+                say(beat)
+                beat_s = now_s + 0.25
+            if now_s >= due_s:
+                due_s = max(due_s + 1.0 / RATE_HZ, now_s - 0.02)
+                wire.sendto(_POSE.pack(time.monotonic()), ("127.0.0.1", mocap_port))
+                for message in streams:
+                    say(message)
+            wire.settimeout(max(1e-4, min(beat_s, due_s) - time.monotonic()))
+            try:
+                data = wire.recv(4096)
+            except TimeoutError:
+                continue
+            now_s = time.monotonic()
+            for message in into.parse_buffer(data) or []:
+                kind = message.get_type()
+                if message.get_srcSystem() != 1:
+                    from_ground += 1
+                elif kind == "SET_ATTITUDE_TARGET":
+                    setpoints_s.append(now_s)
+                elif kind == "VISION_POSITION_ESTIMATE":
+                    vision_s.append(now_s - message.usec * 1e-6)
+                elif kind == "COMMAND_LONG":
+                    say(mavlink.MAVLink_command_ack_message(message.command, 0, 0, 0, 1, message.get_srcComponent()))
+    start_s = setpoints_s[0] + _WARM_UP_S if setpoints_s else 0.0
+    times_s = [t for t in setpoints_s if t >= start_s]
+    warm = round(_WARM_UP_S * RATE_HZ)
+    parent.send(([b - a for a, b in itertools.pairwise(times_s)], vision_s[warm:], from_ground))
+
+
+def ground(parent: Connection, port: int, condition: str) -> None:
+    """The ground station: heartbeats, and whatever the condition floods with."""
+    encoder = mavlink.MAVLink(None, srcSystem=1 if condition == "forged" else 255, srcComponent=1)
+    station = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(station)
+    noise = {
+        "flood": mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1).pack(encoder),
+        "forged": mavlink.MAVLink_attitude_quaternion_message(1, 0.0, 1.0, *[0.0] * 5).pack(encoder),
+        "rubbish": bytes(range(256)),
+    }.get(condition)
+    partner: Any = None
+    beat_s, due_s = 0.0, time.monotonic()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.bind(("127.0.0.1", port))
+        while not parent.poll():
+            now_s = time.monotonic()
+            if partner is not None and now_s >= beat_s:
+                beat_s = now_s + 1.0
+                wire.sendto(beat, partner)
+            if noise is not None and partner is not None and now_s >= due_s:
+                due_s = max(due_s + 1.0 / FLOOD_HZ, now_s - 0.02)
+                wire.sendto(noise, partner)
+            wire.settimeout(max(1e-4, (due_s if noise is not None else now_s + 0.01) - time.monotonic()))
+            try:
+                _, partner = wire.recvfrom(65535)
+            except TimeoutError:
+                continue
+
+
+def _said(tick: int, t_s: float) -> tuple[Inputs, Outputs]:
+    """What a busy flight has to tell: an event and a phase every quarter of a second, each with the values."""
+    events: tuple[Event, ...] = ()
+    if tick % VALUES_EVERY == 0:
+        text = "tether: 0.12 m of slack where the machine could stop, want 0.30 m"
+        events = (Event(t_s, "tether_short", Severity.WARNING, SafetyAction.HOLD, text),)
+    inputs = Inputs(tick, t_s, None, None, None, None, None, OperatorCommand.NONE, 0)
+    tether = TetherState(1.5, 0.75, 0.5, 0.0, 1.0, 0.0, 0.0, False, False, False)
+    outputs = Outputs(
+        *(tick, t_s, 0.0, f"phase{tick // VALUES_EVERY}", PhaseKind.FLIGHT, 0.25, None, _LEVEL, None),
+        *(AutopilotRequest.NONE, SafetyAction.NOMINAL, events, None, None),
+        tether=tether,
+    )
+    return inputs, outputs
+
+
+class _Mocap(asyncio.DatagramProtocol):
+    def __init__(self, autopilot: MavsdkAutopilot) -> None:
+        self._autopilot = autopilot
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        (sent_s,) = _POSE.unpack(data)
+        pose = MocapPose(sent_s, 0.0, 0, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), True, 0.0)
+        self._autopilot.send_vision(pose)
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+async def flight(port: int, mocap: socket.socket, address: str | None, seconds: float, into: Samples) -> None:
+    """The flight's side of one run."""
+    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+    loop = asyncio.get_running_loop()
+    async with MavsdkAutopilot(device, time.monotonic, forwarding=address is not None) as autopilot:
+        transport, _ = await loop.create_datagram_endpoint(lambda: _Mocap(autopilot), sock=mocap)
+        station = GroundStation(address, autopilot) if address is not None else None
+        if station is not None:
+            await station.__aenter__()
+        claim_realtime(FLIGHT_PRIORITY)
+        try:
+            ticker = Ticker(1.0 / RATE_HZ, time.monotonic)
+            pid = station.relay_pid if station is not None else None
+            cpu_s, start_s = (_cpu_s(pid) if pid is not None else 0.0), time.monotonic()
+            for tick in range(round((seconds + _WARM_UP_S) * RATE_HZ)):
+                await ticker.next()
+                autopilot.send_attitude(_LEVEL)
+                if station is not None:
+                    said = _said(tick, time.monotonic() - start_s)
+                    begun_s = time.perf_counter()
+                    station.tell(*said)
+                    into.tell_s.append(time.perf_counter() - begun_s)
+                    if tick % 20 == 0:
+                        station.take_messages()
+            if pid is not None:
+                into.relay_cpu = (_cpu_s(pid) - cpu_s) / (time.monotonic() - start_s)
+        finally:
+            if station is not None:
+                await station.__aexit__(None, None, None)
+            transport.close()
+
+
+def run(condition: str, seconds: float, into: Samples) -> None:
+    """One condition once."""
+    spawn = multiprocessing.get_context("spawn")
+    port, ground_port = free_udp_port(), free_udp_port()
+    mocap = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    mocap.bind(("127.0.0.1", 0))
+    mocap.setblocking(False)
+    here, there = spawn.Pipe()
+    processes = [(here, spawn.Process(target=room, args=(there, port, mocap.getsockname()[1])))]
+    if condition not in ("off", "absent"):
+        ours, theirs = spawn.Pipe()
+        processes.append((ours, spawn.Process(target=ground, args=(theirs, ground_port, condition))))
+    for _, process in processes:
+        process.start()
+    try:
+        address = None if condition == "off" else f"udpout://127.0.0.1:{ground_port}"
+        asyncio.run(flight(port, mocap, address, seconds, into))
+        here.send("stop")
+        if not here.poll(_DEADLINE_S):
+            raise RuntimeError("PX4's end of the wire does not answer")
+        period_s, vision_s, to_px4 = here.recv()
+    finally:
+        for pipe, process in processes:
+            pipe.send("stop")
+            process.join(5.0)
+            if process.is_alive():
+                process.terminate()
+                process.join()
+    into.period_s, into.vision_s, into.to_px4 = period_s, vision_s, to_px4
+
+
+def figures(rounds: list[list[float]], scale: float) -> dict[str, float] | None:
+    """Median over the rounds of each round's percentile, and the largest of all; None: no samples."""
+    ordered = [sorted(samples) for samples in rounds if samples]
+    if not ordered:
+        return None
+    found = {
+        name: scale * statistics.median(samples[round(part * (len(samples) - 1))] for samples in ordered)
+        for name, part in {"p1": 0.01, "p50": 0.5, "p99": 0.99}.items()
+    }
+    return found | {"max": scale * max(samples[-1] for samples in ordered), "samples": sum(map(len, ordered))}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit 0: measured; 1: it could not be, said in one line."""
+    parser = argparse.ArgumentParser(description="What a MAVLink ground station costs the flight.")
+    parser.add_argument(
+        "--seconds", type=float, default=4.0, help="of each condition in each round (default %(default)s)"
+    )
+    parser.add_argument("--rounds", type=int, default=5, help="(default %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
+    options = parser.parse_args(arguments)
+    measured: dict[str, list[Samples]] = {condition: [] for condition in CONDITIONS}
+    try:
+        for _ in range(options.rounds):
+            for condition in CONDITIONS:
+                measured[condition].append(Samples())
+                run(condition, options.seconds, measured[condition][-1])
+    except (RuntimeError, OSError) as error:
+        print(f"ground_station: {error}", file=sys.stderr)
+        return 1
+    rows = {
+        condition: {
+            "period_ms": figures([samples.period_s for samples in rounds], 1e3),
+            "vision_ms": figures([samples.vision_s for samples in rounds], 1e3),
+            "tell_us": figures([samples.tell_s[VALUES_EVERY::VALUES_EVERY] for samples in rounds], 1e6),
+            "relay_cpu_percent": 100.0 * max((samples.relay_cpu for samples in rounds), default=0.0),
+            "to_px4": sum(samples.to_px4 for samples in rounds),
+        }
+        for condition, rounds in measured.items()
+    }
+    table = Table(
+        title=f"{RATE_HZ:g} Hz, {options.rounds} x {options.seconds:g} s each; floods of {FLOOD_HZ:g} a second"
+    )
+    heads = ("ground station", "setpoint period ms: p1, p50, p99, max", "mocap -> PX4 ms: p50, p99, max")
+    for title in (*heads, "tell us: p50, p99", "relay, % of a core", "reached PX4"):
+        table.add_column(title)
+    for condition, row in rows.items():
+        period, vision, tell = row["period_ms"], row["vision_ms"], row["tell_us"]
+        table.add_row(
+            condition,
+            _cell(period, ("p1", "p50", "p99", "max"), ".2f"),
+            _cell(vision, ("p50", "p99", "max"), ".2f"),
+            _cell(tell, ("p50", "p99"), ".0f"),
+            f"{row['relay_cpu_percent']:.1f}",
+            str(row["to_px4"]),
+        )
+    Console(width=150).print(table)
+    if options.json is not None:
+        options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+def _cell(found: Any, names: tuple[str, ...], form: str) -> str:
+    return "" if found is None else "  ".join(format(found[name], form) for name in names)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
