@@ -1,29 +1,37 @@
 """Packets of the flight process as messages of one MCAP file.
 
-Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``. For viewers, typed and thinned out: ``/tf``,
-``/reference``, ``/log``.
+Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; ``/events``, a message each. For viewers, typed and
+thinned out: those of `companion.recording.viewer_channels`, and ``/log``. Every message is stamped with the wall clock of its tick: log
+time, publish time and the header's are one.
 """
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import foxglove
-from foxglove.channels import FrameTransformChannel, LogChannel, PoseInFrameChannel
+from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
-from foxglove.messages import FrameTransform, Log, LogLevel, Pose, PoseInFrame, Quaternion, Timestamp, Vector3
+from foxglove.messages import Log, LogLevel
 
-from companion.frames import quat_from_euler_zyx
+from companion.ground.messages import EventLine
 from companion.record import json_schema, json_text, jsonable_from_plain
 from companion.recording.disk import Disk
+from companion.recording.viewer_channels import ViewerChannels, timestamp
 from companion.types import Inputs, Outputs, Sent
 
-VIEWER_PERIOD_S = 0.02
 _LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}
+_STAMP_MAX_NS = 2**32 * 1_000_000_000 - 1
+"""Seconds of a header's time stamp have 32 bits."""
 
 
 class LogWriter:
-    """Turns packets into messages of one MCAP file."""
+    """Turns packets into messages of one MCAP file.
+
+    Attributes:
+        viewer_error: why the viewers' messages of a tick were left out, for the first such tick; None: they never were.
+    """
 
     def __init__(self, disk: Disk, epoch_offset_ns: int, *, chunk_bytes: int) -> None:
         self._epoch_offset_ns = epoch_offset_ns
@@ -35,11 +43,11 @@ class LogWriter:
         self._inputs = self._json_channel("/inputs", Inputs)
         self._outputs = self._json_channel("/outputs", Outputs)
         self._sent = self._json_channel("/sent", Sent)
-        self._tf = FrameTransformChannel("/tf", context=self._context)
-        self._reference = PoseInFrameChannel("/reference", context=self._context)
+        self._events = self._json_channel("/events", EventLine)
         self._log = LogChannel("/log", context=self._context)
-        self._viewer_due_s = -1.0e9
+        self._viewers = ViewerChannels(self._context)
         self._unflushed_bytes = 0
+        self.viewer_error: str | None = None
 
     @property
     def chunk_is_full(self) -> bool:
@@ -57,22 +65,32 @@ class LogWriter:
         for channel, text in zip((self._inputs, self._outputs, self._sent), texts, strict=True):
             channel.log(text, log_time=stamp_ns)
             self._unflushed_bytes += len(text)
-        for event in outputs["events"]:
-            self.text(event["t_s"], event["severity"], event["id"], event["text"])
-        if not 0.0 <= inputs["t_s"] - self._viewer_due_s < VIEWER_PERIOD_S:
-            self._viewer_due_s = inputs["t_s"]
-            self._viewers(stamp_ns, inputs, outputs)
+        # The tick is recorded; whatever may be wrong with it, it is not to count as lost because of its pictures.
+        try:
+            for event in outputs["events"]:
+                self._event(stamp_ns, outputs["mission_t_s"], event)
+            self._viewers.tick(inputs["t_s"], stamp_ns, inputs, outputs)
+        except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
+            if self.viewer_error is None:
+                self.viewer_error = f"tick {inputs['tick']}: {type(error).__name__}: {error}"
+                self._line(stamp_ns, "warning", "recorder", f"no viewer messages of {self.viewer_error}")
 
     def text(self, t_s: float, severity: str, source: str, text: str) -> None:
         """One line of the `/log` channel."""
-        stamp_ns = self._stamp_ns(t_s)
-        level = _LEVELS.get(severity, LogLevel.Unknown)
-        self._log.log(Log(timestamp=_timestamp(stamp_ns), level=level, message=text, name=source), log_time=stamp_ns)
-        self._unflushed_bytes += len(text) + 1
+        self._line(self._stamp_ns(t_s), severity, source, text)
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """One metadata record."""
+        """One metadata record. Of `config` and `plan` the viewers' picture is made, as far as it can be."""
         self._mcap.write_metadata(name, values)
+        if name in ("config", "plan"):
+            try:
+                content = json.loads(values.get("json", "null"))
+            except (ValueError, RecursionError):
+                content = None
+            if name == "config":
+                self._viewers.configure(content)
+            else:
+                self._viewers.plan(content)
 
     def flush(self) -> None:
         """Write the open chunk, if it holds anything."""
@@ -87,41 +105,25 @@ class LogWriter:
     def _json_channel(self, topic: str, cls: type) -> foxglove.Channel:
         return foxglove.Channel(topic, schema=json_schema(cls), context=self._context)
 
-    def _viewers(self, stamp_ns: int, inputs: dict[str, Any], outputs: dict[str, Any]) -> None:
-        pose = inputs.get("mocap") or inputs.get("vehicle")
-        if pose is not None:
-            transform = FrameTransform(
-                timestamp=_timestamp(stamp_ns),
-                parent_frame_id="world",
-                child_frame_id="body",
-                translation=_vector(pose["position_world_m"]),
-                rotation=_quaternion(pose["attitude_wxyz"]),
-            )
-            self._tf.log(transform, log_time=stamp_ns)
-        reference = outputs.get("reference")
-        if reference is not None:
-            where = Pose(
-                position=_vector(reference["position_world_m"]),
-                orientation=_quaternion(quat_from_euler_zyx(0.0, 0.0, reference["yaw_rad"])),
-            )
-            self._reference.log(
-                PoseInFrame(timestamp=_timestamp(stamp_ns), frame_id="world", pose=where), log_time=stamp_ns
-            )
+    def _event(self, stamp_ns: int, mission_t_s: float, event: dict[str, Any]) -> None:
+        line = {"t_s": event["t_s"], "mission_t_s": mission_t_s, **event}
+        self._events.log(json_text(line).encode(), log_time=stamp_ns)
+        self._line(stamp_ns, event["severity"], event["id"], event["text"])
+
+    def _line(self, stamp_ns: int, severity: str, source: str, text: str) -> None:
+        level = _LEVELS.get(severity, LogLevel.Unknown)
+        line = Log(timestamp=timestamp(stamp_ns), level=level, message=_clean(text), name=_clean(source))
+        self._log.log(line, log_time=stamp_ns)
+        self._unflushed_bytes += len(text) + 1
 
     def _stamp_ns(self, t_s: float) -> int:
         try:
-            return max(0, self._epoch_offset_ns + round(t_s * 1e9))
+            stamp_ns = self._epoch_offset_ns + round(t_s * 1e9)
         except (ValueError, OverflowError):  # not finite: a sick tick is worth recording too
-            return max(0, self._epoch_offset_ns)
+            stamp_ns = self._epoch_offset_ns
+        return min(max(0, stamp_ns), _STAMP_MAX_NS)
 
 
-def _timestamp(stamp_ns: int) -> Timestamp:
-    return Timestamp(stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
-
-
-def _vector(xyz: Any) -> Vector3:
-    return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
-
-
-def _quaternion(wxyz: Any) -> Quaternion:
-    return Quaternion(w=wxyz[0], x=wxyz[1], y=wxyz[2], z=wxyz[3])
+def _clean(text: str) -> str:
+    """Text that UTF-8 can hold: what came over a wire may have half characters in it."""
+    return text.encode("utf-8", "replace").decode()
