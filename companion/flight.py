@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,8 @@ TICKS_MAX = 60_000
 """Of a longer flight (5 minutes at 200 Hz) fewer ticks are graded and drawn: all ticks of an hour would take 6 GB."""
 
 
-def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: Console) -> int:
-    """Fly, then write summary and report; returns the exit code."""
+def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
+    """Fly, then write summary and, if wanted, the report; returns the exit code."""
     where = config.vehicle.name if sitl is None else "SITL" if sitl == "stub" else "a real PX4 in SITL"
     title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
     display = FlightDisplay(console, title)
@@ -48,16 +47,16 @@ def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: C
         except OSError as error:
             tell(f"{out}: summary.json cannot be written: {error.strerror}")
             return result.exit_code
-    report = None
-    if log is not None:
+    page = None
+    if log is not None and report:
         try:
             with console.status("writing the report"):
-                report = report_of(log, summary, out)
+                page = report_of(log, summary, out)
         except KeyboardInterrupt:
             tell(f"report given up; make it with: companion report {out / 'flight.mcap'}")
         except OSError as error:
             tell(f"{out}: the report cannot be written: {error.strerror}")
-    print_result(console, summary, out, report)
+    print_result(console, summary, out, page)
     return result.exit_code
 
 
@@ -78,7 +77,7 @@ def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[Fli
         "recorder": result.recorder,
     }
     summary = summarise(log, **about) if log is not None else empty_summary(**about)
-    summary["autopilot"] = _autopilot(log, result.world)
+    summary["autopilot"] = autopilot_of(log, result.world)
     logged = {event["id"] for event in summary["events"]}
     summary["events"] += [event for event in result.events if event["id"] not in logged]
     summary["events"] += result.guardian_events
@@ -86,7 +85,7 @@ def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[Fli
     return log, summary
 
 
-def _autopilot(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]:
+def autopilot_of(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]:
     """Who flew: kind (stub or px4), version, and what else the world knows; on the vehicle by what PX4 said."""
     firmware = None if log is None else log.metadata.get("autopilot", {}).get("firmware")
     return {"kind": "px4", "version": firmware, "firmware": firmware, **world.get("autopilot", {})}
@@ -99,30 +98,3 @@ def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None
     except ImportError:
         return None
     return write_report(log, summary, out)
-
-
-def report_again(path: Path, out: Path) -> Path | None:
-    """`companion report`: summary and report of a log; what only the flight knew is taken from the summary beside the log.
-
-    Raises:
-        LogError: the file is no log.
-    """
-    log = FlightLog.read(path, ticks_max=TICKS_MAX)
-    before = path.parent / "summary.json"
-    known = json.loads(before.read_text(encoding="utf-8")) if before.exists() else {}
-    recorded = [outputs.outcome for outputs in log.outputs if outputs.outcome is not None]
-    summary = summarise(
-        log,
-        outcome=known.get("outcome") or (recorded or [Outcome.LOST])[-1].value,
-        controller=log.config["controller"]["law"],
-        preset=log.config["controller"]["preset"],
-        payload_kg=known.get("payload_kg"),
-        recorder=known.get("recorder"),
-    )
-    summary["autopilot"] = known.get("autopilot") or _autopilot(log, {})
-    # The guardian acts after the last tick: its events are no outputs of the core.
-    recorded_ids = {event["id"] for event in summary["events"]}
-    summary["events"] += [event for event in known.get("events", ()) if event["id"] not in recorded_ids]
-    out.mkdir(parents=True, exist_ok=True)
-    write_summary(summary, out / "summary.json")
-    return report_of(log, summary, out)
