@@ -1,0 +1,139 @@
+"""`companion command hold|land|abort|resume|start`: one signed command to one vehicle, and what came of it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import time
+from typing import Any
+
+from companion.config.document import ConfigError
+from companion.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.ground.access import broker_access
+from companion.ground.link import BrokerRefused
+from companion.ground.messages import CommandName, Topic
+from companion.ground.orders import INSTEAD, Failed, Sent, signer_of, told
+from companion.ground.station import Station
+from companion.ground.tasks import until_first
+from companion.ground.watch import Vehicle
+from companion.monitor_command import add_broker_options, vehicle_option
+from companion.terminal import tell
+
+FOUND_S = 5.0
+"""For the broker, and for a first word of the vehicle."""
+_HELP = {
+    CommandName.HOLD: "come to rest and stay",
+    CommandName.LAND: "land",
+    CommandName.ABORT: "give the mission up and land at once",
+    CommandName.RESUME: "go on after a hold, if the supervisor agrees",
+    CommandName.START: "take off; for flights that wait for it",
+}
+
+
+def add_parser(commands: Any) -> None:
+    """Add `command` to the sub-parsers of `companion`."""
+    command = commands.add_parser(
+        "command",
+        help="command a vehicle from the ground: hold, land, abort, resume, start",
+        description="Send one signed command and wait for the vehicle's answer. Exit code 0: done, 3: refused, 5: no answer. "
+        + "; ".join(f"{name.value}: {text}" for name, text in _HELP.items())
+        + ".",
+    )
+    command.add_argument("name", choices=[name.value for name in CommandName], metavar="NAME", help="see above")
+    add_broker_options(command)
+    command.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Command; returns the exit code."""
+    only = vehicle_option(arguments)
+    access = broker_access(arguments.broker, arguments.login, arguments.ca)
+    signer = signer_of(access, arguments.operators, arguments.operator)
+    if isinstance(signer, str):
+        raise ConfigError([f"companion command: {signer}"])
+    teller = _Commander(CommandName(arguments.name), only)
+    station = Station(
+        access,
+        signer,
+        None,  # all: whoever misspelt a name sees the others
+        lambda heard: teller.changed.set(),
+        lambda connected, text: teller.changed.set(),
+        topics=(Topic.STATE, Topic.ACK, Topic.STREAM),
+        in_order=True,
+    )
+    try:
+        asyncio.run(until_first(station.run(), teller.command(station)))
+    except BrokerRefused as error:
+        tell(f"companion command: {error}")
+        return EXIT_REFUSED
+    return teller.code
+
+
+class _Commander:
+    def __init__(self, command: CommandName, only: str | None) -> None:
+        self._command = command
+        self._only = only
+        self.changed = asyncio.Event()
+        self.code = EXIT_LOST
+        self._sent = False
+
+    async def command(self, station: Station) -> None:
+        """Find the vehicle, command it, tell what came of it."""
+        try:
+            async with asyncio.timeout(FOUND_S):
+                vehicle = await self._found(station)
+        except TimeoutError:
+            self._end(EXIT_LOST, f"{self._why_nobody(station)}; {INSTEAD}")
+            return
+        if vehicle is None:
+            return
+        ack = await station.orders.give(vehicle, self._command, self._hear)
+        if ack is None:
+            self.code = EXIT_LOST if self._sent else EXIT_REFUSED
+        elif ack.accepted:
+            self.code = EXIT_OK
+            print(f"{vehicle}: {told(ack)}", flush=True)
+        else:
+            self._end(EXIT_REFUSED, f"{vehicle}: {told(ack)}")
+
+    async def _found(self, station: Station) -> str | None:
+        """The one vehicle that is meant; None: there are several, and that was told.
+
+        What is retained comes before the link says that it is connected (`Station`, in_order): until then nobody is missing.
+        """
+        while True:
+            self.changed.clear()
+            known = station.watch.vehicles
+            if station.link.connected:
+                names = [self._only] if self._only is not None else station.watch.there(time.monotonic())
+                if len(names) > 1:
+                    self._end(
+                        EXIT_BAD_INPUT, f"there are several vehicles ({', '.join(names)}); say which: --vehicle NAME"
+                    )
+                    return None
+                if names and names[0] in known and (known[names[0]].stream is not None or known[names[0]].ended):
+                    return names[0]
+            await self.changed.wait()
+
+    def _why_nobody(self, station: Station) -> str:
+        if not station.link.connected:
+            return station.link.text
+        there = [f"{name} ({_presence(vehicle)})" for name, vehicle in sorted(station.watch.vehicles.items())]
+        whom = "a vehicle" if self._only is None else repr(self._only)
+        return f"nothing heard from {whom} at the broker within {FOUND_S:g} s" + (
+            f"; known: {', '.join(there)}" if there else ""
+        )
+
+    def _hear(self, note: Sent | Failed) -> None:
+        if isinstance(note, Sent):
+            self._sent = True
+        else:
+            tell(f"companion command: {note.vehicle}: {note.command.value}: {note.text}")
+
+    def _end(self, code: int, text: str) -> None:
+        self.code = code
+        tell(f"companion command: {text}")
+
+
+def _presence(vehicle: Vehicle) -> str:
+    return vehicle.state.presence.value if vehicle.state is not None else "state unknown"

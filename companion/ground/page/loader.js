@@ -1,0 +1,16 @@
+// A worker that fetches a log and hands it over in pieces, so that the page stays alive however long it is.
+
+const PIECE = 300;
+
+self.addEventListener("message", async (event) => {
+  try {
+    const response = await fetch(event.data.url);
+    if (!response.ok) throw new Error(`the monitor answers ${response.status}`);
+    const { streams, ...head } = await response.json();
+    self.postMessage({ kind: "head", head, count: streams.length });
+    for (let k = 0; k < streams.length; k += PIECE) self.postMessage({ kind: "streams", streams: streams.slice(k, k + PIECE) });
+    self.postMessage({ kind: "end" });
+  } catch (error) {
+    self.postMessage({ kind: "failed", text: String(error.message ?? error) });
+  }
+});

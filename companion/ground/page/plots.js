@@ -1,0 +1,114 @@
+// The plots: what they show, and one time cursor through all of them.
+
+import { StripChart } from "./chart.js";
+import { degrees, norm } from "./format.js";
+
+export const WINDOW_S = 30;
+const AHEAD_S = 10; // of a log the page knows what comes
+
+const ANGLES = ["α₁", "α₂"];
+const joint = (field, index) => (record) => degrees(record[field]?.[index]);
+const joints = (scene) => [0, 1].flatMap((index) => [
+  { value: degrees(scene.joint_max_rad[index]), label: `${ANGLES[index]} wall`, level: "bad" },
+  { value: degrees(scene.joint_min_rad[index]), label: `${ANGLES[index]} wall`, level: "bad" },
+]);
+
+/** Every plot, from top to bottom. */
+export const PLOTS = [
+  {
+    title: "Position error ‖e_p‖, m", digits: 3, floor: 0, span: 0.02,
+    series: [{ label: "", unit: "", colour: "1", value: (r) => r.e_p_m }],
+    limits: (scene) => [{ value: scene.tracking_warn_m, label: "warn", level: "warn" }, { value: scene.tracking_abort_m, label: "abort", level: "bad" }],
+  },
+  {
+    title: "Attitude error ‖e_q‖, °", digits: 1, floor: 0, span: 2,
+    series: [{ label: "", unit: "", colour: "1", value: (r) => r.e_q_deg }],
+    limits: (scene) => [{ value: degrees(scene.tilt_abort_rad), label: "tilt abort", level: "bad" }],
+  },
+  {
+    title: "Arm, °", digits: 0, span: 20,
+    series: [
+      { label: "α₁", unit: "", colour: "1", value: joint("arm_rad", 0) },
+      { label: "ref", unit: "", colour: "1", dashed: true, value: joint("reference_arm_rad", 0) },
+      { label: "α₂", unit: "", colour: "2", value: joint("arm_rad", 1) },
+      { label: "ref", unit: "", colour: "2", dashed: true, value: joint("reference_arm_rad", 1) },
+    ],
+    limits: joints,
+  },
+  {
+    title: "Thrust", digits: 3, span: 0.08,
+    series: [
+      { label: "sent", unit: "", colour: "1", value: (r) => r.thrust },
+      { label: "hover", unit: "", colour: "2", dashed: true, value: (r) => r.control?.hover_thrust },
+    ],
+    limits: () => [{ value: 1, label: "full", level: "bad" }],
+  },
+  {
+    title: "Adaptation", digits: 4, floor: 0, span: 0.002, spanRight: 0.002,
+    series: [
+      { label: "ρ", unit: "", colour: "1", value: (r) => r.control?.rho },
+      { label: "‖H‖", unit: "", colour: "4", right: true, value: (r) => norm(r.control?.h_hat) },
+    ],
+  },
+  {
+    title: "Tether", digits: 2, floor: 0, span: 0.5, spanRight: 5,
+    series: [
+      { label: "slack", unit: "m", colour: "3", value: (r) => r.tether?.slack_m },
+      { label: "pull", unit: "N", colour: "2", right: true, value: (r) => r.tether?.pull_n },
+    ],
+    limits: (scene) => [{ value: scene.tether_margin_m, label: "margin", level: "warn" }, { value: 0, label: "taut", level: "bad" }],
+  },
+  {
+    title: "Latency, ms", digits: 1, floor: 0, span: 5,
+    series: [
+      { label: "late", unit: "", colour: "1", value: (r) => r.timing.lateness_ms },
+      { label: "mocap age", unit: "", colour: "3", value: (r) => r.timing.mocap_age_ms },
+      { label: "to setpoint", unit: "", colour: "4", value: (r) => r.timing.mocap_to_setpoint_ms },
+    ],
+  },
+];
+
+/** Window of time for a vehicle: {from, to, now}. */
+export function windowOf(vehicle) {
+  const now = vehicle.stream?.t_s ?? 0;
+  if (!vehicle.replayed) return { from: now - WINDOW_S, to: now, now };
+  const first = vehicle.records[0]?.t_s ?? 0;
+  const last = Math.max(vehicle.records.at(-1)?.t_s ?? 0, first + WINDOW_S);
+  const to = Math.min(last, Math.max(first + WINDOW_S, now + AHEAD_S));
+  return { from: to - WINDOW_S, to, now };
+}
+
+export class Plots {
+  constructor(parent, changed) {
+    this.charts = PLOTS.map((spec) => new StripChart(spec));
+    this._cursor = null; // share of the window under the pointer
+    this._parent = parent;
+    parent.append(...this.charts.map((chart) => chart.element));
+    for (const chart of this.charts) {
+      chart.canvas.addEventListener("pointermove", (event) => {
+        this._cursor = Math.max(0, Math.min(1, chart.timeAt(event.offsetX, 0, 1)));
+        changed();
+      });
+      for (const name of ["pointerleave", "pointercancel"]) {
+        chart.canvas.addEventListener(name, () => {
+          this._cursor = null;
+          changed();
+        });
+      }
+    }
+  }
+
+  draw(vehicle) {
+    const span = vehicle ? windowOf(vehicle) : { from: 0, to: WINDOW_S, now: 0 };
+    const shown = {
+      ...span,
+      records: vehicle?.records ?? [],
+      scene: vehicle?.scene ?? null,
+      events: vehicle?.replayed ? vehicle.events?.lines ?? [] : vehicle?.eventLines() ?? [],
+      origin: vehicle?.takeoff_s ?? null,
+      cursor: this._cursor === null ? null : span.from + this._cursor * (span.to - span.from),
+    };
+    const columns = getComputedStyle(this._parent).gridTemplateColumns.split(" ").length;
+    this.charts.forEach((chart, index) => chart.draw(shown, { named: index === 0, labelled: columns > 1 || index === this.charts.length - 1 }));
+  }
+}

@@ -1,0 +1,152 @@
+"""What a ground station knows of the vehicles: the newest record of each kind, and which clock each flight goes by. No I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from companion.config.ground import VEHICLE_NAME
+from companion.ground.commands import FlightClock
+from companion.ground.messages import (
+    RECORDS,
+    Events,
+    MessageError,
+    Preflight,
+    Presence,
+    Scene,
+    State,
+    Stream,
+    Topic,
+    decode,
+    vehicle_of,
+)
+
+HEARD_TOPICS = (Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS, Topic.STREAM, Topic.ACK)
+VEHICLES_MAX = 64
+"""More are not remembered: whoever was silent longest is forgotten."""
+LIVE_S = 1.0
+"""A vehicle whose stream is younger is there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """One record that a vehicle sent."""
+
+    vehicle: str
+    topic: Topic
+    record: Any
+    age_s: float | None = None
+    """Of a `Stream`: by how much it took longer than the quickest of the last ones. Else None."""
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """What is known of one vehicle. Mutable; `Watch` alone changes it."""
+
+    name: str
+    session: str | None = None
+    state: State | None = None
+    scene: Scene | None = None
+    preflight: Preflight | None = None
+    events: Events | None = None
+    stream: Stream | None = None
+    stream_heard_s: float | None = None
+    """Monotonic clock of this computer."""
+    heard_s: float = 0.0
+    clock: FlightClock = field(default_factory=FlightClock)
+
+    def stream_age_s(self, now_s: float) -> float | None:
+        """Since the newest stream message came; None: none has come in this session."""
+        return None if self.stream_heard_s is None else now_s - self.stream_heard_s
+
+    def live(self, now_s: float) -> bool:
+        """Its stream comes in."""
+        age_s = self.stream_age_s(now_s)
+        return age_s is not None and age_s < LIVE_S
+
+    @property
+    def ended(self) -> bool:
+        """Its flight is over, and said so."""
+        return self.state is not None and self.state.presence is Presence.ENDED and self.state.session == self.session
+
+
+class Watch:
+    """Takes every message of a broker; keeps what is one, counts what is none."""
+
+    def __init__(self, only: str | None = None) -> None:
+        self._only = only
+        self.vehicles: dict[str, Vehicle] = {}
+        self.rubbish = 0
+        """Messages that were thrown away."""
+        self.rubbish_text: str | None = None
+        """Topic and fault of the last one."""
+
+    def take(self, topic: str, payload: bytes, retained: bool, now_s: float) -> Heard | None:
+        """The record that a message holds, remembered; None if it is none of ours.
+
+        Args:
+            topic: full name.
+            payload: as it came.
+            retained: the broker kept it: it may be of any age.
+            now_s: monotonic clock of this computer.
+        """
+        try:
+            named = vehicle_of(topic)
+            if named is None or named[1] not in HEARD_TOPICS or VEHICLE_NAME.fullmatch(named[0]) is None:
+                raise MessageError("not a topic of a vehicle")
+            name, kind = named
+            if self._only is not None and name != self._only:
+                return None
+            if not payload and retained:
+                return None  # MQTT's way to say that nothing is retained any more
+            record: Any = decode(RECORDS[kind], payload)
+            if isinstance(record, State) and record.vehicle != name:
+                raise MessageError(f"is of vehicle {record.vehicle!r:.60}")
+        except MessageError as error:
+            self.rubbish += 1
+            self.rubbish_text = f"{topic!r:.80}: {error}"
+            return None
+        return self._remember(self._vehicle(name, now_s), kind, record, retained, now_s)
+
+    def there(self, now_s: float) -> list[str]:
+        """Names of the vehicles that are there: in flight by their word, or heard a moment ago."""
+        return sorted(
+            name
+            for name, known in self.vehicles.items()
+            if known.live(now_s)
+            or (known.state is not None and known.state.presence in (Presence.FLYING, Presence.SILENT))
+        )
+
+    def _vehicle(self, name: str, now_s: float) -> Vehicle:
+        known = self.vehicles.get(name)
+        if known is None:
+            if len(self.vehicles) >= VEHICLES_MAX:
+                del self.vehicles[min(self.vehicles.values(), key=lambda vehicle: vehicle.heard_s).name]
+            known = self.vehicles[name] = Vehicle(name)
+        known.heard_s = now_s
+        return known
+
+    def _remember(self, known: Vehicle, kind: Topic, record: Any, retained: bool, now_s: float) -> Heard | None:
+        if isinstance(record, (State, Stream)) and record.session != known.session:
+            if known.session is None or not retained:
+                known.session = record.session
+                known.stream = known.stream_heard_s = None
+                known.clock = FlightClock()
+        age_s = None
+        match record:
+            case State():
+                known.state = record
+            case Scene():
+                known.scene = record
+            case Preflight():
+                known.preflight = record
+            case Events():
+                known.events = record
+            case Stream():
+                if retained:
+                    return None  # nobody keeps a stream: of unknown age, it would look alive
+                known.stream, known.stream_heard_s = record, now_s
+                known.clock.heard(record.t_s, now_s)
+                flight_ms = known.clock.now_ms(now_s)
+                age_s = None if flight_ms is None else max(0.0, flight_ms / 1e3 - record.t_s)
+        return Heard(known.name, kind, record, age_s)

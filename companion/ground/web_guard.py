@@ -1,0 +1,103 @@
+"""Who may talk to the monitor's web server. Pure; what browsers send is not believed.
+
+Loopback alone keeps nobody out: any web page that a person has open may talk to http://127.0.0.1, by its own name (DNS rebinding) or
+across origins (a WebSocket asks nobody). So the Host header must name this computer, the Origin of a WebSocket must be this server,
+and commands need a token that only the person who started the monitor was shown.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import re
+import secrets
+import socket
+from urllib.parse import urlsplit
+
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+"""Of every answer."""
+MESSAGE_MAX_BYTES = 1024
+"""From a page to the server."""
+MESSAGES_PER_S, MESSAGES_BURST = 10.0, 20.0
+_HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
+
+
+def new_token() -> str:
+    """128 random bits."""
+    return secrets.token_urlsafe(16)
+
+
+def same_token(given: object, token: str) -> bool:
+    """In a time that tells nothing."""
+    return isinstance(given, str) and hmac.compare_digest(given.encode("utf-8", "replace"), token.encode())
+
+
+def is_loopback(host: str) -> bool:
+    """A name or address that only this computer reaches."""
+    if host.lower() == "localhost":
+        return True
+    address = _address(host)
+    return address is not None and address.is_loopback
+
+
+def host_allowed(host_header: str | None, listens_on: str) -> bool:
+    """Whether a Host header names this server.
+
+    Args:
+        host_header: as it came.
+        listens_on: the --host given. Where it stands for every address (0.0.0.0, ::), any address and this computer's own name will
+            do: an attacker's page can only come by a name.
+    """
+    match = None if host_header is None else _HOST.fullmatch(host_header)
+    if match is None:
+        return False
+    name = match["name"].strip("[]").lower()
+    if is_loopback(name) or name == listens_on.lower():
+        return True
+    everywhere = _address(listens_on)
+    if everywhere is None or not everywhere.is_unspecified:
+        return False
+    return _address(name) is not None or name in {socket.gethostname().lower(), socket.getfqdn().lower()}
+
+
+def origin_allowed(origin: str | None, host_header: str | None, *, tls: bool) -> bool:
+    """Whether a WebSocket is asked for by a page of this server itself. Programs that are no browsers must say so, too."""
+    if origin is None or host_header is None:
+        return False
+    try:
+        parts = urlsplit(origin)
+    except ValueError:
+        return False
+    return (parts.scheme, parts.netloc.lower()) == ("https" if tls else "http", host_header.lower())
+
+
+class Bucket:
+    """Allows `MESSAGES_PER_S` on average and `MESSAGES_BURST` at once."""
+
+    def __init__(self, now_s: float) -> None:
+        self._full_s = now_s
+
+    def take(self, now_s: float) -> bool:
+        """One message; False: too many."""
+        full_s = max(self._full_s, now_s) + 1.0 / MESSAGES_PER_S
+        if full_s - now_s > MESSAGES_BURST / MESSAGES_PER_S + 1e-6:
+            return False
+        self._full_s = full_s
+        return True
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None

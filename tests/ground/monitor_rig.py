@@ -1,0 +1,148 @@
+"""The monitor's real server in the test's own event loop, and viewers of it over real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import datetime
+import ipaddress
+import json
+from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from companion.ground.access import broker_access
+from companion.ground.keys import Operator, Operators
+from companion.ground.orders import Signer
+from companion.ground.page_server import Monitor, Serving, serve_live
+from tests.support import DEADLINE_S
+
+ANNA = Operator("anna", b"a" * 32)
+OPERATORS = Operators([ANNA], "operators.yaml")
+SIGNER = Signer(ANNA.name, ANNA.key)
+
+
+def play(scene: Coroutine[Any, Any, None]) -> None:
+    """Run a test's coroutine; whatever it waits for has a deadline."""
+
+    async def bounded() -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            await scene
+
+    asyncio.run(bounded())
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Look again and again, until `play`'s deadline."""
+    while not condition():  # noqa: ASYNC110 - nobody tells
+        await asyncio.sleep(0.01)
+
+
+@contextlib.asynccontextmanager
+async def monitor_at(
+    url: str, signer: Signer | str = SIGNER, *, serving: Serving | None = None, only: str | None = None
+) -> AsyncIterator[Monitor]:
+    """The monitor of a broker, on a free port."""
+    served: list[Monitor] = []
+    listening = asyncio.Event()
+
+    def on_listening(monitor: Monitor) -> None:
+        served.append(monitor)
+        listening.set()
+
+    serving = serving or Serving("127.0.0.1", 0)
+    work = asyncio.ensure_future(serve_live(serving, broker_access(url, None, None), signer, only, on_listening))
+    try:
+        ready = asyncio.ensure_future(listening.wait())
+        await asyncio.wait([work, ready], return_when=asyncio.FIRST_COMPLETED)
+        ready.cancel()
+        if work.done():
+            work.result()
+        yield served[0]
+    finally:
+        work.cancel()
+        await asyncio.wait([work])
+
+
+def base_of(monitor: Monitor) -> str:
+    return monitor.url.split("#")[0]
+
+
+def token_of(monitor: Monitor) -> str:
+    return monitor.url.partition("#token=")[2]
+
+
+class Viewer:
+    """A page, as far as the server can tell."""
+
+    def __init__(self, ws: aiohttp.ClientWebSocketResponse) -> None:
+        self.ws = ws
+        self.heard: list[dict[str, Any]] = []
+
+    async def next(self) -> dict[str, Any]:
+        """The next message, whatever it is."""
+        message = await self.ws.receive(DEADLINE_S)
+        assert message.type is aiohttp.WSMsgType.TEXT, (message.type, self.ws.close_code, message.extra)
+        data: dict[str, Any] = json.loads(message.data)
+        self.heard.append(data)
+        return data
+
+    async def until(self, kind: str, wanted: Callable[[dict[str, Any]], bool] = lambda message: True) -> dict[str, Any]:
+        """The next message of a kind that is wanted; what comes before it is in `heard`."""
+        while True:
+            message = await self.next()
+            if message["kind"] == kind and wanted(message):
+                return message
+
+    async def order(self, command: str, vehicle: str = "rig") -> None:
+        await self.ws.send_json({"kind": "command", "vehicle": vehicle, "command": command})
+
+    async def closed(self) -> tuple[int | None, str]:
+        """Close code and reason, whatever is said before."""
+        while True:
+            message = await self.ws.receive(DEADLINE_S)
+            if message.type is aiohttp.WSMsgType.CLOSE:
+                return self.ws.close_code, str(message.extra or "")
+            if message.type in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.CLOSING, aiohttp.WSMsgType.ERROR):
+                return self.ws.close_code, ""
+
+
+@contextlib.asynccontextmanager
+async def viewer_of(monitor: Monitor, token: str | None = None, **settings: Any) -> AsyncIterator[Viewer]:
+    """A viewer; `token`: another one than the monitor's."""
+    base = base_of(monitor)
+    async with (
+        aiohttp.ClientSession() as session,
+        session.ws_connect(f"{base}ws", origin=base.rstrip("/"), max_msg_size=0, **settings) as ws,
+    ):
+        await ws.send_json({"kind": "token", "token": token_of(monitor) if token is None else token})
+        yield Viewer(ws)
+
+
+def self_signed(folder: Path) -> tuple[Path, Path]:
+    """A certificate for 127.0.0.1 and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "monitor")])
+    now = datetime.datetime.now(datetime.UTC)
+    cert = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    cert_file, key_file = folder / "cert.pem", folder / "key.pem"
+    cert_file.write_bytes(cert.public_bytes(serialization.Encoding.PEM))
+    key_file.write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    return cert_file, key_file

@@ -1,0 +1,166 @@
+"""Headless Chromium with the page in it. The page's clock stands still until a test lets it run: nothing here waits for time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import sync_playwright
+
+from companion.ground.messages import VERSION, Events, Preflight, PreflightRow, Stream
+from tests.ground.page_stand import NAME, SESSION, Message, Stand, told
+from tests.support import DEADLINE_S
+
+CHROMIUM = Path("/usr/bin/chromium")
+ARGUMENTS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+SIZES = {"desktop": (1440, 900), "small": (1024, 768), "tablet": (768, 1024)}
+_marks = itertools.count()
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """The browser; without it the test is skipped with a reason."""
+    if not CHROMIUM.exists():
+        pytest.skip(f"{CHROMIUM} is not installed: apt install chromium")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=list(ARGUMENTS))
+        yield browser
+        browser.close()
+
+
+class Page:
+    """The page as a person has it open.
+
+    Attributes:
+        shown: name of the vehicle that is looked at.
+        complaints: what the browser had to complain about: errors, violations of the content security policy.
+    """
+
+    def __init__(self, context: Any, stand: Stand | None, script: str) -> None:
+        self._stand = stand
+        self.shown = NAME
+        self.complaints: list[str] = []
+        self.tab = context.new_page()
+        self.tab.set_default_timeout(DEADLINE_S * 1e3)
+        self.tab.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.tab.on("console", self._hear)
+        self.tab.add_init_script(
+            "window.violations = []; addEventListener('securitypolicyviolation', (e) => violations.push(e.blockedURI))"
+        )
+        self.tab.add_init_script(script)
+        self.tab.clock.install(time=0)
+
+    def _hear(self, message: Any) -> None:
+        if message.type in ("error", "warning"):
+            self.complaints.append(message.text)
+
+    def open(self, url: str, settle: Callable[[Page], None]) -> None:
+        self.tab.goto(url)
+        settle(self)
+        self.tab.clock.pause_at(self.tab.evaluate("Date.now()") + 1000)
+
+    def tell(self, *messages: Message) -> None:
+        """Let the stand say this, until the page has shown it."""
+        mark = f"mark {next(_marks)}"
+        known = Preflight(VERSION, SESSION, (PreflightRow("mark", "ok", mark),))
+        assert self._stand is not None
+        self._stand.say(*messages, told(known, self.shown))
+        self.until("mark => document.getElementById('preflight-list').textContent.includes(mark)", mark)
+
+    def run(self, seconds: float) -> None:
+        """Let the page's clock run on."""
+        self.tab.clock.run_for(round(seconds * 1000))
+
+    def until(self, expression: str, argument: object = None) -> None:
+        """Until something is true in the page."""
+        self.tab.wait_for_function(expression, arg=argument, polling=20)
+
+    def text(self, selector: str) -> str:
+        """What is read there, in one line."""
+        return " ".join(self.tab.locator(selector).inner_text().split())
+
+    def until_text(self, selector: str, text: str) -> None:
+        self.until("([s, t]) => document.querySelector(s)?.textContent.includes(t)", [selector, text])
+
+    def figure(self, name: str) -> str:
+        return self.text(f"[data-figure='{name}']")
+
+    def body(self, name: str) -> str:
+        found: str = self.tab.evaluate("name => document.body.dataset[name]", name)
+        return found
+
+    def press(self, command: str) -> None:
+        self.tab.click(f"[data-command='{command}']")
+
+    def enabled(self) -> set[str]:
+        """Commands that can be given."""
+        return set(
+            self.tab.evaluate("[...document.querySelectorAll('[data-command]:enabled')].map((b) => b.dataset.command)")
+        )
+
+
+def greeted(page: Page) -> None:
+    """Until the page knows whether it may command."""
+    page.until("() => document.querySelector('#operator').textContent || !document.querySelector('#badge-view').hidden")
+
+
+@contextmanager
+def watching(
+    browser: Any,
+    source: Stand | str,
+    *,
+    size: str = "desktop",
+    scheme: str = "dark",
+    touch: bool = False,
+    may: str = "",
+    script: str = "",
+    settle: Callable[[Page], None] = greeted,
+) -> Iterator[Page]:
+    """The page, opened.
+
+    Args:
+        browser: where.
+        source: the stand, or the address of a monitor.
+        size: one of `SIZES`.
+        scheme: ``dark`` or ``light``.
+        touch: it is a tablet.
+        may: nobody may have complained at the end, but of what contains this.
+        script: runs in the page before its own.
+        settle: waits until the page is ready; then its clock is stopped.
+    """
+    width, height = SIZES[size]
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=touch, reduced_motion="reduce"
+    )
+    stand = source if isinstance(source, Stand) else None
+    page = Page(context, stand, script)
+    try:
+        page.open(source if isinstance(source, str) else source.url, settle)
+        yield page
+        assert page.tab.evaluate("window.violations") == []
+        assert [text for text in page.complaints if not may or may not in text] == []
+    finally:
+        context.close()
+
+
+def playing(stream: Stream, **changes: Any) -> Callable[[], Message]:
+    """The record, newer each time than everything before: the page's clock stands, the vehicle's runs."""
+    numbers = itertools.count(1)
+    return lambda: told(replace(stream, t_s=1000.0 + 100.0 * next(numbers), **changes))
+
+
+def events_of(*lines: Any, vehicle: str = NAME) -> Message:
+    return told(Events(VERSION, SESSION, len(lines), tuple(lines)), vehicle)

@@ -1,0 +1,241 @@
+"""A stand for the page: a web server that says to it what a test wants, and a flight to tell it about.
+
+The flight is a real one, of the fast loop, in the records that a vehicle sends. The server is not the monitor's own (that has tests of
+its own): here a test decides what is said and when, and hears every word of the page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from functools import cache
+from types import TracebackType
+from typing import Any, Self
+
+from aiohttp import WSMsgType, web
+
+from companion.config.loader import load_flight
+from companion.ground.messages import (
+    VERSION,
+    Ack,
+    CommandName,
+    EventLine,
+    Events,
+    Preflight,
+    PreflightRow,
+    Presence,
+    Scene,
+    State,
+    Stream,
+)
+from companion.ground.scene import scene_of
+from companion.ground.snapshot import replay
+from companion.ground.web import PAGE
+from companion.ground.web_guard import HEADERS
+from companion.record import to_jsonable
+from companion.types import Sent
+from sitl.fast import FastFlight
+from tests.support import CATCH, DEADLINE_S
+
+SESSION = "5e55104e"
+NAME = "tarot650-2r"
+Message = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A flight as its telemetry."""
+
+    scene: Scene
+    streams: tuple[Stream, ...]
+    events: Events
+
+    def at(self, mission_t_s: float) -> Stream:
+        """The record at a time of the mission."""
+        return next(stream for stream in self.streams if stream.mission_t_s >= mission_t_s)
+
+
+@cache
+def flown() -> Flown:
+    """The mission `catch`, flown in the fast loop."""
+    config = load_flight(CATCH)
+    result = FastFlight(config).run()
+    rows = [(i, o, sent_at(i.tick, i.t_s)) for i, o in zip(result.inputs, result.outputs, strict=True)]
+    streams, events = replay(rows, config, SESSION, 1.7e9)
+    path = [o.reference.position_world_m for o in result.outputs if o.reference is not None]
+    scene = scene_of(config, SESSION, path[:: max(1, len(path) // 290)], mission_s=result.outputs[-1].mission_t_s)
+    return Flown(scene, tuple(streams), events)
+
+
+def sent_at(tick: int, t_s: float) -> Sent:
+    """The fast loop has no wires: times as they are over a good one."""
+    return Sent(tick, True, None, t_s - 0.0008, 0.0003, t_s, t_s + 0.0002, t_s + 0.0004, t_s + 0.0003)
+
+
+def state(presence: Presence = Presence.FLYING, **changes: Any) -> State:
+    """What is said of the vehicle."""
+    usual = State(VERSION, NAME, SESSION, presence, True, "catch", "adaptive", "recommended", 1.7e9, True)
+    return replace(usual, **changes)
+
+
+def preflight() -> Preflight:
+    """Two rows."""
+    rows = (
+        PreflightRow("px4.link", "ok", "PX4 1.16.1 answers"),
+        PreflightRow("battery", "warn", "82 %, 90 % wished for"),
+    )
+    return Preflight(VERSION, SESSION, rows)
+
+
+def event(number: int, text: str, *, id_: str = "hold", severity: str = "warning", action: str = "hold") -> EventLine:
+    """One line."""
+    return EventLine(20.0 + number, 8.0 + number, id_, severity, action, text)
+
+
+def ack(command: str, nonce: str, text: str, *, accepted: bool = True, operator: str = "anna") -> Ack:
+    """The vehicle's answer to a command."""
+    return Ack(VERSION, SESSION, nonce, operator, CommandName(command), accepted, text, 21.0, "catch", "hold")
+
+
+def told(record: object, vehicle: str = NAME, **more: Any) -> Message:
+    """A record as the monitor passes it on."""
+    return {"kind": type(record).__name__.lower(), "vehicle": vehicle, **more, "data": to_jsonable(record)}
+
+
+def hello(**changes: Any) -> Message:
+    """The monitor's first word: this page may command."""
+    usual = {"kind": "hello", "version": "1", "can_command": True, "operator": "anna", "why_not": None}
+    return {**usual, "replay": False, "logs": [], **changes}
+
+
+BROKER: Message = {"kind": "broker", "connected": True, "text": "connected to mqtt://127.0.0.1:1883"}
+
+
+class Stand:
+    """The server, in a thread of its own.
+
+    Attributes:
+        greeting: said to every page that connects.
+        replay: answer to ``/replay/N.json``.
+    """
+
+    def __init__(self, greeting: Iterable[Message] = ()) -> None:
+        self.greeting: list[Message] = [hello(), BROKER, *greeting]
+        self.replay: list[Message] = []
+        self.port = 0
+        self._heard: list[Message] = []
+        self._change = threading.Condition()
+        self._sockets: list[web.WebSocketResponse] = []
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="stand")
+        self._runner: web.AppRunner | None = None
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}/#token=secret"
+
+    def start(self) -> None:
+        """Listen, on the same port as before."""
+        self._do(self._start())
+
+    def stop(self) -> None:
+        """Gone, with all connections."""
+        self._do(self._stop())
+
+    def say(self, *messages: Message) -> None:
+        """To every page that is connected."""
+        self._do(self._say(messages))
+
+    def heard(self, kind: str) -> list[Message]:
+        """Everything of a kind that pages have said."""
+        with self._change:
+            return [message for message in self._heard if message["kind"] == kind]
+
+    def wait_heard(self, kind: str, count: int) -> list[Message]:
+        """Until so many of a kind were heard."""
+        with self._change:
+            enough = self._change.wait_for(
+                lambda: sum(message["kind"] == kind for message in self._heard) >= count, DEADLINE_S
+            )
+            assert enough, (kind, count, self._heard)
+        return self.heard(kind)
+
+    def _do(self, work: Any) -> None:
+        future: Future[None] = asyncio.run_coroutine_threadsafe(work, self._loop)
+        future.result(DEADLINE_S)
+
+    async def _start(self) -> None:
+        app = web.Application()
+        app.on_response_prepare.append(_guarded)
+        app.router.add_get("/ws", self._viewer)
+        app.router.add_get(r"/replay/{number:\d+}.json", self._log)
+        app.router.add_get("/", _index)
+        app.router.add_static("/", PAGE)
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)
+        await self._runner.setup()
+        await web.TCPSite(self._runner, "127.0.0.1", self.port).start()
+        self.port = self._runner.addresses[0][1]
+
+    async def _stop(self) -> None:
+        for socket in list(self._sockets):
+            await socket.close()
+        if self._runner is not None:
+            await self._runner.cleanup()
+            self._runner = None
+
+    async def _say(self, messages: Iterable[Message]) -> None:
+        for message in messages:
+            for socket in self._sockets:
+                await socket.send_json(message)
+
+    async def _viewer(self, request: web.Request) -> web.WebSocketResponse:
+        socket = web.WebSocketResponse()
+        await socket.prepare(request)
+        for message in self.greeting:
+            await socket.send_json(message)
+        self._sockets.append(socket)
+        try:
+            async for received in socket:
+                if received.type is WSMsgType.TEXT:
+                    with self._change:
+                        self._heard.append(received.json())
+                        self._change.notify_all()
+        finally:
+            self._sockets.remove(socket)
+        return socket
+
+    async def _log(self, request: web.Request) -> web.Response:
+        return web.json_response(self.replay[int(request.match_info["number"])])
+
+
+async def _guarded(request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(HEADERS)
+
+
+async def _index(request: web.Request) -> web.FileResponse:
+    return web.FileResponse(PAGE / "index.html")
+
+
+def retained(name: str = NAME, condition: Callable[[State], State] = lambda known: known) -> list[Message]:
+    """What a page is told of a vehicle when it connects."""
+    flight = flown()
+    known = condition(replace(state(), vehicle=name))
+    return [
+        told(record, name) for record in (known, flight.scene, preflight(), replace(flight.events, lines=(), count=0))
+    ]

@@ -1,0 +1,196 @@
+"""`companion command` with a real broker and a vehicle that judges."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+from companion import cli, command_command
+from companion.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.ground.keys import Operator, Operators, load_operators, operators_text, write_private
+from companion.ground.messages import Presence, Topic
+from companion.ground.orders import TRIES
+from tests.broker import Broker, free_port, loopback_broker
+from tests.ground.monitor_rig import ANNA, OPERATORS, play
+from tests.ground.vehicle import played_vehicle
+from tests.support import Ended, sandbox_in
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with loopback_broker(tmp_path) as broker:
+        yield broker
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> str:
+    """An operators file with anna alone."""
+    file = tmp_path / "operators.yaml"
+    write_private(file, operators_text([ANNA]).encode())
+    return str(file)
+
+
+async def command(capsys: pytest.CaptureFixture[str], name: str, broker: Broker | str, keys: str, *more: str) -> Ended:
+    url = broker if isinstance(broker, str) else broker.url
+    code = await asyncio.to_thread(cli.main, ["command", name, "--broker", url, "--operators", keys, *more])
+    out, err = capsys.readouterr()
+    assert "Traceback" not in err
+    return Ended(code, out, err)
+
+
+def test_what_was_done_is_printed(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS) as vehicle:
+            for name in ("hold", "resume", "land", "abort", "start"):
+                ended = await command(capsys, name, broker, keys)
+                assert (ended.code, ended.out, ended.err) == (EXIT_OK, f"rig: {name}: {name}: done\n", "")
+            assert [heard.command.value for heard in vehicle.accepted] == ["hold", "resume", "land", "abort", "start"]
+
+    play(scene())
+
+
+def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS) as vehicle:
+            vehicle.accepts = lambda heard: (False, "start refused: PX4 is not ready")
+            ended = await command(capsys, "start", broker, keys)
+            assert ended.code == EXIT_REFUSED
+            assert ended.err_lines == ["companion command: rig: start refused: PX4 is not ready"]
+            await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
+            ended = await command(capsys, "land", broker, keys, "--vehicle", "rig")
+            assert (ended.code, ended.err_lines) == (
+                EXIT_REFUSED,
+                ["companion command: rig: land: the flight of rig has ended"],
+            )
+
+    play(scene())
+
+
+def test_a_stranger_is_refused_by_the_vehicle(
+    broker: Broker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another key of the same name: the vehicle does not even answer."""
+    keys = tmp_path / "stranger.yaml"
+    write_private(keys, operators_text([Operator("anna", b"x" * 32)]).encode())
+
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS) as vehicle:
+            ended = await command(capsys, "start", broker, str(keys))
+            assert ended.code == EXIT_LOST
+            assert [refused.reason.value for refused in vehicle.refused] == ["bad_signature"]
+
+    play(scene())
+
+
+def test_no_answer(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS) as vehicle:
+            vehicle.answers = False
+            ended = await command(capsys, "land", broker, keys)
+            assert ended.code == EXIT_LOST and ended.out == ""
+            assert len(ended.err_lines) == TRIES == len(vehicle.accepted)
+            assert all("no answer from the vehicle within 1.5 s" in line for line in ended.err_lines)
+
+    play(scene())
+
+
+def test_nobody_there(
+    broker: Broker, keys: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command_command, "FOUND_S", 1.0)
+
+    async def scene() -> None:
+        nowhere = f"mqtt://127.0.0.1:{free_port()}"
+        ended = await command(capsys, "land", nowhere, keys)
+        assert ended.code == EXIT_LOST and len(ended.err_lines) == 1
+        assert ended.err.startswith(f"companion command: no broker at {nowhere}")
+        ended = await command(capsys, "land", broker, keys)
+        assert ended.code == EXIT_LOST
+        assert ended.err.startswith("companion command: nothing heard from a vehicle at the broker within")
+        async with played_vehicle(broker.port, OPERATORS):
+            ended = await command(capsys, "land", broker, keys, "--vehicle", "rug")
+        assert ended.code == EXIT_LOST
+        assert "nothing heard from 'rug'" in ended.err and "known: rig (flying)" in ended.err
+
+    play(scene())
+
+
+def test_several_vehicles_have_to_be_told_apart(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS, "one") as one,
+            played_vehicle(broker.port, OPERATORS, "two") as two,
+        ):
+            ended = await command(capsys, "land", broker, keys)
+            assert ended.code == EXIT_BAD_INPUT
+            assert ended.err_lines == [
+                "companion command: there are several vehicles (one, two); say which: --vehicle NAME"
+            ]
+            ended = await command(capsys, "land", broker, keys, "--vehicle", "two")
+            assert (ended.code, ended.out) == (EXIT_OK, "two: land: land: done\n")
+            assert (len(one.accepted), len(two.accepted)) == (0, 1)
+
+    play(scene())
+
+
+def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_quiet(
+    broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is retained is known before anything is sent, however many there are."""
+
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS, "one") as one:
+            async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+                for number in range(50):
+                    name = f"quiet-{number:02}"
+                    state = b'{"v":1,"vehicle":"%s","session":"s","presence":"%s","simulated":true,"mission":"m","law":"l",' \
+                        b'"preset":"p","wall_s":0.0,"commands":true}'  # fmt: skip
+                    presence = b"flying" if number == 49 else b"ended"
+                    await client.publish(Topic.STATE.of(name), state % (name.encode(), presence), qos=1, retain=True)
+            ended = await command(capsys, "land", broker, keys)
+            assert ended.code == EXIT_BAD_INPUT and "(one, quiet-49)" in ended.err
+            assert not one.accepted
+
+    play(scene())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["jump"], "invalid choice: 'jump'"),
+        (["hold", "--broker", "http://x"], "--broker: expected mqtt://"),
+        (["hold", "--vehicle", "a/b"], "--vehicle 'a/b': expected the vehicle's name"),
+        (["hold", "--operators", "nofile.yaml"], "nofile.yaml: no such file"),
+        (["hold", "--broker", "mqtt://192.0.2.1"], "is another computer and the way there is plain"),
+        (["hold", "--login", "nofile.yaml"], "nofile.yaml: no such file"),
+    ],
+)
+def test_bad_input(arguments: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = cli.main(["command", *arguments])
+    except SystemExit as end:
+        code = int(str(end.code))
+    assert code == EXIT_BAD_INPUT
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and why in lines[0]
+
+
+def test_vehicle_and_ground_station_of_one_user_need_no_setting_up(broker: Broker, tmp_path: Path) -> None:
+    """The real command, with a key file that the vehicle's side has made."""
+    home = {"XDG_CONFIG_HOME": str(tmp_path / "config")}
+
+    async def scene(operators: Operators) -> None:
+        async with played_vehicle(broker.port, operators):
+            with sandbox_in(tmp_path, home) as sandbox:
+                ended = await asyncio.to_thread(sandbox.run, "command", "hold", "--broker", broker.url)
+                sandbox.assert_nobody_left()
+        assert (ended.code, ended.out, ended.err) == (EXIT_OK, "rig: hold: hold: done\n", "")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(*next(iter(home.items())))
+        operators = load_operators(None)
+    play(scene(operators))

@@ -1,0 +1,261 @@
+"""What a ground station believes, and how it hands that to viewers; no sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from companion.config.document import ConfigError
+from companion.ground.access import broker_access
+from companion.ground.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Outbox
+from companion.ground.messages import VERSION, Ack, CommandName, Events, Presence, Topic, encode
+from companion.ground.watch import LIVE_S, VEHICLES_MAX, Heard, Watch
+from companion.ground.web_guard import MESSAGES_BURST, Bucket, host_allowed, origin_allowed, same_token
+from tests.ground.vehicle import flight, state_of
+
+SESSION = "s1"
+
+
+def stream_of(session: str = SESSION, t_s: float = 1.0, **values: Any) -> bytes:
+    return encode(replace(flight()[1][30], session=session, t_s=t_s, **values))
+
+
+def ack_of(nonce: str) -> Ack:
+    return Ack(VERSION, SESSION, nonce, "anna", CommandName.HOLD, True, "holding", 1.0, "catch", "hold")
+
+
+def took(outbox: Outbox) -> list[Any]:
+    """What lies in an outbox that has something."""
+
+    async def take() -> list[str]:
+        async with asyncio.timeout(10.0):
+            return await outbox.take()
+
+    return [json.loads(text) for text in asyncio.run(take())]
+
+
+RUBBISH: dict[str, tuple[str, bytes]] = {
+    "no JSON": ("companion/rig/stream", b"\xff{"),
+    "deep JSON": ("companion/rig/stream", b"[" * 100_000),
+    "another version": ("companion/rig/stream", stream_of().replace(b'"v":1', b'"v":2')),
+    "a field too many": ("companion/rig/stream", stream_of()[:-1] + b',"hack":1}'),
+    "a field of another kind": ("companion/rig/stream", stream_of(phase="catch").replace(b'"catch"', b"7")),
+    "another record": ("companion/rig/state", stream_of()),
+    "another vehicle": ("companion/rig/state", encode(state_of("other", SESSION))),
+    "oversized": ("companion/rig/events", b" " * 200_001),
+    "no vehicle's name": ("companion/<b>/stream", stream_of()),
+    "a command": ("companion/rig/command", stream_of()),
+    "no topic of ours": ("companion/rig/stream/deeper", stream_of()),
+    "empty": ("companion/rig/stream", b""),
+}
+
+
+@pytest.mark.parametrize(("topic", "payload"), RUBBISH.values(), ids=RUBBISH.keys())
+def test_rubbish_is_counted_and_remembered_by_nobody(topic: str, payload: bytes) -> None:
+    watch = Watch()
+    assert watch.take(topic, payload, False, 0.0) is None
+    assert watch.rubbish == 1
+    assert watch.rubbish_text is not None and watch.rubbish_text.isprintable()
+    assert not watch.vehicles
+
+
+def test_a_retained_record_that_is_deleted_is_no_rubbish() -> None:
+    watch = Watch()
+    assert watch.take("companion/rig/state", b"", True, 0.0) is None
+    assert watch.rubbish == 0
+
+
+def test_a_retained_stream_does_not_look_alive() -> None:
+    watch = Watch()
+    assert watch.take("companion/rig/stream", stream_of(), True, 0.0) is None
+    assert not watch.vehicles["rig"].live(0.0)
+
+
+def test_a_late_message_says_how_late_it_is() -> None:
+    watch = Watch()
+    first = watch.take("companion/rig/stream", stream_of(t_s=1.0), False, 100.0)
+    late = watch.take("companion/rig/stream", stream_of(t_s=1.05), False, 103.0)
+    assert first is not None and first.age_s == pytest.approx(0.0, abs=2e-3)
+    assert late is not None and late.age_s == pytest.approx(2.95, abs=2e-3)
+
+
+def test_a_new_flight_has_a_clock_of_its_own_and_an_old_retained_state_does_not_bring_the_old_one_back() -> None:
+    watch = Watch()
+    watch.take("companion/rig/stream", stream_of(t_s=500.0), False, 100.0)
+    watch.take("companion/rig/stream", stream_of("s2", t_s=1.0), False, 101.0)
+    watch.take("companion/rig/state", encode(state_of("rig", SESSION, presence=Presence.ENDED)), True, 101.0)
+    known = watch.vehicles["rig"]
+    assert known.session == "s2"
+    assert known.clock.now_ms(102.0) == pytest.approx(2000, abs=1)
+    assert not known.ended
+
+
+def test_a_flood_of_vehicles_does_not_push_out_the_one_that_flies() -> None:
+    watch = Watch()
+    for number in range(3 * VEHICLES_MAX):
+        watch.take("companion/rig/stream", stream_of(), False, number + 0.5)
+        watch.take(f"companion/fake-{number}/state", encode(state_of(f"fake-{number}", "s")), True, float(number))
+    assert len(watch.vehicles) == VEHICLES_MAX
+    assert watch.vehicles["rig"].stream is not None
+
+
+def test_who_is_there() -> None:
+    watch = Watch()
+    for name, presence in (("flies", Presence.FLYING), ("over", Presence.ENDED), ("gone", Presence.LOST)):
+        watch.take(f"companion/{name}/state", encode(state_of(name, SESSION, presence=presence)), True, 0.0)
+    watch.take("companion/heard/stream", stream_of(), False, 0.0)
+    assert watch.there(0.0) == ["flies", "heard"]
+    assert watch.there(2 * LIVE_S) == ["flies"]
+
+
+def test_only_one_vehicle_is_watched_if_one_is_named() -> None:
+    watch = Watch("rig")
+    watch.take("companion/other/stream", stream_of(), False, 0.0)
+    watch.take("companion/rig/stream", stream_of(), False, 0.0)
+    assert list(watch.vehicles) == ["rig"] and watch.rubbish == 0
+
+
+def test_the_newest_stream_wins_and_nothing_else_is_lost() -> None:
+    outbox = Outbox()
+    for number in range(5):
+        outbox.put_stream("rig", f'"rig {number}"')
+        outbox.put_stream("other", f'"other {number}"')
+        outbox.put(f'"event {number}"')
+    assert took(outbox) == [f"event {number}" for number in range(5)] + ["rig 4", "other 4"]
+
+
+def test_a_viewer_that_would_lose_an_event_is_sent_away_and_streams_never_do_that() -> None:
+    outbox = Outbox()
+    for _ in range(10 * OUTBOX_MAX):
+        outbox.put_stream("rig", "{}")
+    for _ in range(OUTBOX_MAX):
+        outbox.put("{}")
+    assert outbox.parting is None
+    outbox.put("{}")
+    assert outbox.parting is TOO_SLOW
+
+
+def test_an_idle_viewer_costs_bounded_memory_however_many_vehicles_are_made_up() -> None:
+    outbox = Outbox()
+    for number in range(10 * VEHICLES_MAX):
+        outbox.put_stream(f"fake-{number}", str(number))
+    assert took(outbox) == list(range(9 * VEHICLES_MAX, 10 * VEHICLES_MAX))
+
+
+def test_a_few_huge_messages_are_too_many_too() -> None:
+    outbox = Outbox()
+    for _ in range(30):
+        outbox.put("x" * 200_000)
+    assert outbox.parting is TOO_SLOW
+
+
+def test_who_comes_late_is_told_what_is_known_but_no_old_stream() -> None:
+    watch = Watch()
+    hub = Hub(watch, "no broker yet")
+    watch.take("companion/rig/state", encode(state_of("rig", SESSION)), True, 0.0)
+    watch.take("companion/rig/events", encode(Events(VERSION, SESSION, 0, ())), True, 0.0)
+    watch.take("companion/rig/stream", stream_of(), False, 10.0)
+    soon, late = Outbox(), Outbox()
+    hub.join(soon, 10.0 + 0.9 * FRESH_S)
+    hub.join(late, 10.0 + 1.1 * FRESH_S)
+    assert [message["kind"] for message in took(soon)] == ["broker", "state", "events", "stream"]
+    assert [message["kind"] for message in took(late)] == ["broker", "state", "events"]
+
+
+def test_everybody_gets_the_same_text_and_who_left_gets_nothing() -> None:
+    hub = Hub(Watch(), "no broker yet")
+    outboxes = [Outbox() for _ in range(3)]
+    for outbox in outboxes:
+        hub.join(outbox, 0.0)
+        took(outbox)
+    hub.leave(outboxes[0])
+    hub.relay(Heard("rig", Topic.ACK, ack_of("00")))
+    outboxes[0].put("{}")
+    assert took(outboxes[0]) == [{}]
+    first, second = (took(outbox) for outbox in outboxes[1:])
+    assert first == second and first[0]["kind"] == "ack" and first[0]["data"]["text"] == "holding"
+
+
+def test_what_browsers_cannot_read_is_not_sent() -> None:
+    """NaN is JSON to Python and to no browser."""
+    watch, hub, outbox = Watch(), Hub(Watch(), ""), Outbox()
+    hub.join(outbox, 0.0)
+    took(outbox)
+    payload = stream_of(progress=0.25).replace(b'"progress":0.25', b'"progress":NaN')
+    heard = watch.take("companion/rig/stream", payload, False, 0.0)
+    assert heard is not None
+    hub.relay(heard)
+    assert took(outbox)[0]["data"]["progress"] == "nan"
+
+
+HOSTS: dict[str, tuple[str | None, str, bool]] = {
+    "address": ("127.0.0.1:8642", "127.0.0.1", True),
+    "name": ("localhost:8642", "127.0.0.1", True),
+    "through ssh -L": ("LOCALHOST:9000", "127.0.0.1", True),
+    "IPv6": ("[::1]:8642", "::1", True),
+    "rebinding": ("evil.example:8642", "127.0.0.1", False),
+    "rebinding, looks like loopback": ("127.0.0.1.evil.example", "127.0.0.1", False),
+    "another address": ("192.168.1.5:8642", "127.0.0.1", False),
+    "none": (None, "127.0.0.1", False),
+    "rubbish": ("127.0.0.1:8642@evil", "127.0.0.1", False),
+    "the host given": ("ground.lab:8642", "ground.lab", True),
+    "everywhere, by address": ("192.168.1.5:8642", "0.0.0.0", True),
+    "everywhere, rebinding": ("evil.example:8642", "0.0.0.0", False),
+}
+
+
+@pytest.mark.parametrize(("header", "listens_on", "allowed"), HOSTS.values(), ids=HOSTS.keys())
+def test_host_headers(header: str | None, listens_on: str, allowed: bool) -> None:
+    assert host_allowed(header, listens_on) is allowed
+
+
+ORIGINS: dict[str, tuple[str | None, bool, bool]] = {
+    "same": ("http://127.0.0.1:8642", False, True),
+    "same, TLS": ("https://127.0.0.1:8642", True, True),
+    "TLS here, plain there": ("http://127.0.0.1:8642", True, False),
+    "another port": ("http://127.0.0.1:8643", False, False),
+    "another name of the same computer": ("http://localhost:8642", False, False),
+    "elsewhere": ("http://evil.example", False, False),
+    "a file": ("null", False, False),
+    "none": (None, False, False),
+    "rubbish": ("http://[", False, False),
+}
+
+
+@pytest.mark.parametrize(("origin", "tls", "allowed"), ORIGINS.values(), ids=ORIGINS.keys())
+def test_origins(origin: str | None, tls: bool, allowed: bool) -> None:
+    assert origin_allowed(origin, "127.0.0.1:8642", tls=tls) is allowed
+
+
+def test_tokens() -> None:
+    assert same_token("abc", "abc")
+    for other in ("", "ab", "abcd", "ABC", None, 7, ["abc"], "\ud800"):
+        assert not same_token(other, "abc")
+
+
+def test_a_burst_is_allowed_a_flood_is_not_and_it_is_forgotten() -> None:
+    bucket = Bucket(0.0)
+    allowed = sum(bucket.take(0.0) for _ in range(1000))
+    assert allowed == MESSAGES_BURST
+    assert not bucket.take(0.05)
+    assert all(bucket.take(100.0) for _ in range(int(MESSAGES_BURST)))
+
+
+@pytest.mark.parametrize(
+    ("url", "ca", "why"),
+    [
+        ("http://127.0.0.1", None, "--broker: expected mqtt://HOST:PORT"),
+        ("mqtt://127.0.0.1:99999", None, "--broker: expected a port"),
+        ("mqtts://127.0.0.1", "nofile.pem", "--ca nofile.pem: no such file"),
+        ("mqtts://127.0.0.1", "README.md", "--ca README.md: is no certificate"),
+        ("mqtt://127.0.0.1", "README.md", "--ca README.md: means nothing without TLS"),
+    ],
+)
+def test_unusable_brokers(url: str, ca: str | None, why: str) -> None:
+    with pytest.raises(ConfigError, match=why) as caught:
+        broker_access(url, None, ca)
+    assert len(caught.value.lines) == 1

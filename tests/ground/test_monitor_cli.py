@@ -1,0 +1,192 @@
+"""The command `companion monitor`: one line to open, one line for every mistake, logs that it plays."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import itertools
+import json
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from companion import cli
+from companion.config.loader import load_flight
+from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.ground.keys import operators_text, write_private
+from companion.ground.messages import Events, Preflight, Scene, State, Stream, decode
+from companion.ground.replay_log import read_for_page
+from companion.record import json_text
+from tests.analysis.synthetic_flight import record_flight
+from tests.broker import Broker, free_port, loopback_broker
+from tests.ground.monitor_rig import ANNA, OPERATORS, play, self_signed
+from tests.ground.vehicle import played_vehicle
+from tests.support import CATCH, Sandbox, sandbox_in
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with loopback_broker(tmp_path) as broker:
+        yield broker
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path / "sandbox", {"XDG_CONFIG_HOME": str(tmp_path / "config")}) as sandbox:
+        yield sandbox
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight's log, by the real recorder."""
+    path = tmp_path_factory.mktemp("log") / "flight.mcap"
+    record_flight(path, config=load_flight(CATCH).model_dump(mode="json"), end_s=8.0)
+    return path
+
+
+def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    """Exit code and the one line."""
+    code = cli.main(["monitor", *arguments])
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    return code, lines[0]
+
+
+def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sandbox: Sandbox, tmp_path: Path) -> None:
+    keys = tmp_path / "operators.yaml"
+    write_private(keys, operators_text([ANNA]).encode())
+
+    async def scene() -> None:
+        arguments = ("monitor", "--broker", broker.url, "--operators", keys, "--port", 0)
+        async with played_vehicle(broker.port, OPERATORS):
+            with sandbox.start(*arguments) as running:
+                await asyncio.to_thread(running.wait_for, "(Ctrl-C ends)\n")
+                out = running._text("out")
+                address = re.match(r"companion monitor: (http://127\.0\.0\.1:\d+/)#token=([\w-]{22})  ", out)
+                assert address is not None, out
+                async with aiohttp.ClientSession() as session:
+                    async with session.get(address[1]) as page:
+                        assert page.status == 200 and "<script" in await page.text()
+                    async with session.ws_connect(f"{address[1]}ws", origin=address[1].rstrip("/")) as ws:
+                        await ws.send_json({"kind": "token", "token": address[2]})
+                        assert (await ws.receive_json())["can_command"] is True
+                        running.signal(signal.SIGINT)
+                        async for _ in ws:
+                            pass
+                        assert ws.close_code == 1001
+                ended = await asyncio.to_thread(running.end)
+        assert (ended.code, ended.err) == (EXIT_OK, "")
+
+    play(scene())
+    sandbox.assert_nobody_left()
+
+
+def test_a_broker_that_does_not_want_us_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with loopback_broker(tmp_path) as broker:
+        broker.stop()
+        config = tmp_path / "loopback.conf"
+        config.write_text(config.read_text().replace("allow_anonymous true", "allow_anonymous false"))
+        broker.start()
+        for more in ([], ["--text"]):
+            code, line = failed(["--broker", broker.url, "--view-only", "--port", "0", *more], capsys)
+            assert code == EXIT_REFUSED
+            assert line == (
+                f"companion monitor: {broker.url}: the broker refuses a connection without login: Not authorized; see --login"
+            )
+
+
+def test_a_port_that_is_taken(sandbox: Sandbox) -> None:
+    with sandbox.start("monitor", "--port", 0, "--broker", f"mqtt://127.0.0.1:{free_port()}", "--view-only") as running:
+        running.wait_for("(Ctrl-C ends)\n")
+        port = re.findall(r":(\d+)/", running._text("out"))[0]
+        ended = sandbox.run("monitor", "--port", port, "--view-only")
+        running.signal(signal.SIGTERM)
+        assert running.end().code == EXIT_OK
+    assert ended.code == EXIT_REFUSED
+    assert ended.err_lines == [
+        f"companion monitor: port {port} of 127.0.0.1 is in use, by another monitor perhaps; choose another one: --port N"
+    ]
+
+
+def test_mistakes(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged, foreign, empty = tmp_path / "damaged.mcap", tmp_path / "foreign.mcap", tmp_path / "empty.mcap"
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    damaged.write_bytes(data)
+    foreign.write_text("no log at all")
+    empty.write_bytes(b"")
+    cert, key = self_signed(tmp_path)
+    for arguments, why in (
+        ([str(tmp_path / "nofile.mcap")], "nofile.mcap: cannot be read: No such file"),
+        ([str(damaged)], f"{damaged}: damaged"),
+        ([str(foreign)], f"{foreign}: is no MCAP file"),
+        ([str(empty)], f"{empty}: is empty"),
+        ([str(log), str(foreign)], f"{foreign}: is no MCAP file"),
+        ([str(log), "--text"], "--text shows a running flight"),
+        (["--port", "70000"], "--port 70000: expected 0 to 65535"),
+        (["--cert", str(cert)], "--cert and --key go together"),
+        (["--cert", str(cert), "--key", "nofile.pem"], "--key nofile.pem: cannot be read"),
+        (["--cert", str(key), "--key", str(cert)], "expected a certificate and its private key"),
+        (["--broker", "localhost"], "--broker: expected mqtt://"),
+        (["--vehicle", "a b"], "--vehicle 'a b'"),
+        (["--operators", "nofile.yaml"], "nofile.yaml: no such file"),
+        (["--login", "nofile.yaml"], "nofile.yaml: no such file"),
+    ):
+        code, line = failed(arguments, capsys)
+        assert code == EXIT_BAD_INPUT and why in line, (arguments, line)
+
+
+def test_a_log_is_the_records_that_the_vehicle_would_have_sent(log: Path) -> None:
+    replayed = read_for_page(log, 3)
+    assert replayed.name == str(log)
+    data: dict[str, Any] = json.loads(gzip.decompress(replayed.gzip_json))
+
+    def record(cls: type[Any], part: Any) -> Any:
+        return decode(cls, json_text(part).encode())
+
+    state = record(State, data["state"])
+    assert (state.presence.value, state.mission, state.law, state.commands) == ("ended", "catch", "adaptive", False)
+    scene = record(Scene, data["scene"])
+    assert scene.session == state.session == "log-3"
+    assert 2 <= len(scene.path_world_m) <= 300
+    assert record(Preflight, data["preflight"]).rows == ()
+    events = record(Events, data["events"])
+    assert "payload in the net" in [line.text for line in events.lines]
+    streams = [record(Stream, part) for part in data["streams"]]
+    # 9 s of flight at 20 Hz.
+    assert 175 <= len(streams) <= 185
+    assert all(a.t_s < b.t_s for a, b in itertools.pairwise(streams))
+    assert {stream.phase for stream in streams} >= {"ground", "take-off", "catch"}
+    assert streams[0].wall_s == pytest.approx(1.7e9, abs=1.0)
+
+
+def test_logs_are_served_without_a_broker(log: Path, tmp_path: Path, sandbox: Sandbox) -> None:
+    async def scene() -> None:
+        with sandbox.start("monitor", log, log, "--port", 0) as running:
+            await asyncio.to_thread(running.wait_for, "(Ctrl-C ends)\n")
+            address = re.findall(r"http://\S+", running._text("out"))[0]
+            assert "#" not in address
+            async with aiohttp.ClientSession() as session:
+                async with session.ws_connect(f"{address}ws", origin=address.rstrip("/")) as ws:
+                    await ws.send_json({"kind": "token", "token": ""})
+                    hello = await ws.receive_json()
+                    assert hello["replay"] is True and hello["logs"] == [str(log), str(log)]
+                    assert hello["can_command"] is False and "replayed" in hello["why_not"]
+                for number, status in ((0, 200), (1, 200), (2, 404)):
+                    async with session.get(f"{address}replay/{number}.json") as answer:
+                        assert answer.status == status
+                        if status == 200:
+                            assert answer.headers["Content-Encoding"] == "gzip"
+                            assert answer.content_type == "application/json"
+                            data = await answer.json()
+                            assert data["state"]["session"] == f"log-{number}"
+            running.signal(signal.SIGINT)
+            assert (await asyncio.to_thread(running.end)).code == EXIT_OK
+
+    play(scene())
+    sandbox.assert_nobody_left()

@@ -1,0 +1,310 @@
+"""The page in a real browser: what a person sees and presses. The stand plays the monitor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from companion.ground.messages import Presence, Stream
+from tests.ground.page_browser import Page, chromium, events_of, playing, watching
+from tests.ground.page_stand import BROKER, NAME, Stand, ack, event, flown, hello, retained, state, told
+
+SAFE = {"hold", "land", "abort"}
+HOSTILE = "<img src=x onerror='window.pwned = 1'><script>window.pwned = 1</script>"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def stand() -> Iterator[Stand]:
+    with Stand(retained()) as stand:
+        yield stand
+
+
+@pytest.fixture
+def page(browser: Any, stand: Stand) -> Iterator[Page]:
+    with watching(browser, stand) as page:
+        yield page
+
+
+def in_flight(**changes: Any) -> Stream:
+    """Well after the catch, nothing wrong."""
+    return replace(flown().at(8.5), **changes)
+
+
+def test_the_page_says_its_token_first_and_hides_it(stand: Stand, page: Page) -> None:
+    assert stand.heard("token") == [{"kind": "token", "token": "secret"}]
+    assert page.tab.evaluate("location.hash") == ""
+
+
+def test_values_are_those_of_the_newest_record(page: Page) -> None:
+    for mission_t_s in (1.5, 8.5, 14.0):
+        stream = flown().at(mission_t_s)
+        page.tell(told(stream))
+        assert stream.tether is not None and stream.position_world_m is not None and stream.e_p_m is not None
+        assert page.figure("tether") == f"{stream.tether.slack_m:.2f}"
+        assert page.figure("height") == f"{stream.position_world_m[2]:.2f}"
+        assert page.figure("error") == f"{stream.e_p_m:.3f}"
+        assert page.text("#phase") == stream.phase
+        assert page.text("#light-list li:last-child .text") == stream.lights[-1].text
+    page.run(0.1)
+    assert page.tab.evaluate("document.getElementById('progress').value") == pytest.approx(stream.progress, abs=1e-3)
+
+
+def test_every_light_of_the_vehicle_is_shown_with_its_state(page: Page) -> None:
+    page.tell(told(in_flight()))
+    rows = page.tab.locator("#light-list li")
+    shown = [(rows.nth(k).get_attribute("data-light"), rows.nth(k).locator(".text").inner_text()) for k in range(10)]
+    assert shown == [(light.light.value, light.text) for light in in_flight().lights]
+
+
+def test_pictures_change_with_the_flight(page: Page) -> None:
+    """Not what they show, but that the canvases are drawn at all, and again."""
+
+    def pictures() -> list[str]:
+        page.run(0.5)
+        found: list[str] = page.tab.evaluate("[...document.querySelectorAll('canvas')].map((c) => c.toDataURL())")
+        return found
+
+    page.tell(*[told(stream) for stream in flown().streams if stream.mission_t_s < 2.0])
+    before = pictures()
+    page.tell(*[told(stream) for stream in flown().streams if 2.0 < stream.mission_t_s < 8.0])
+    after = pictures()
+    assert len(before) == 8 and all(one != other for one, other in zip(before, after, strict=True))
+
+
+def test_stale_shows_within_half_a_second_of_the_last_message(page: Page) -> None:
+    news = playing(in_flight())
+    page.tell(news())
+    for _ in range(3):
+        page.run(0.3)
+        assert page.body("stale") == "false"
+        page.tell(news())
+    page.run(0.3)
+    assert (page.body("stale"), page.tab.is_visible("#stale")) == ("false", False)
+    page.run(0.2)
+    assert 0.4 < float(page.tab.get_attribute("#age", "data-age")) <= 0.5
+    assert page.text("#stale").startswith("STALE 0.5 s") and "FLYING" in page.text("#stale")
+    assert page.tab.is_visible("#edge")
+    assert page.body("frame") == "bad"
+    page.run(3.0)
+    assert page.text("#stale").startswith("STALE 3.5 s")
+    page.tell(news())
+    assert (page.body("stale"), page.tab.is_visible("#stale"), page.tab.is_visible("#edge")) == ("false", False, False)
+
+
+def test_figures_look_dead_when_they_are_old(page: Page) -> None:
+    def look() -> list[str]:
+        found: list[str] = page.tab.evaluate(
+            "['.tile .value', '#light-list .text', '.lamp', '#scene', '.plot canvas'].map((s) => document.querySelector(s))"
+            ".map((e) => getComputedStyle(e)).map((s) => [s.color, s.backgroundColor, s.filter, s.fontStyle].join())"
+        )
+        return found
+
+    page.tell(told(in_flight()))
+    alive = look()
+    page.run(1.0)
+    assert all(one != other for one, other in zip(alive, look(), strict=True))
+
+
+def test_a_record_that_was_long_on_its_way_is_old_when_it_comes(page: Page) -> None:
+    news = playing(in_flight())
+    page.tell(news() | {"age_s": 0.9})
+    assert page.body("stale") == "true" and float(page.tab.get_attribute("#age", "data-age")) >= 0.9
+    page.tell(news() | {"age_s": 0.01})
+    assert page.body("stale") == "false"
+
+
+def test_a_backlog_does_not_look_alive(page: Page) -> None:
+    """Records that arrive at the vehicle's own pace, but all of them two seconds late."""
+    first = in_flight()
+    page.tell(told(first))
+    page.run(2.1)
+    page.tell(told(replace(first, t_s=first.t_s + 0.1)))
+    assert page.body("stale") == "true"
+    assert float(page.tab.get_attribute("#age", "data-age")) == pytest.approx(2.0, abs=0.01)
+
+
+def test_no_broker_is_stale_at_once(page: Page) -> None:
+    page.tell(told(in_flight()))
+    page.tell({**BROKER, "connected": False, "text": "no broker at mqtt://127.0.0.1:1883, trying"})
+    assert page.body("frame") == "bad"
+    assert page.text("#stale").startswith("NO BROKER") and "mqtt://127.0.0.1:1883, trying" in page.text("#stale")
+    assert page.enabled() == SAFE
+
+
+@pytest.mark.parametrize(
+    ("known", "word", "level"),
+    [
+        (state(Presence.ENDED, outcome="completed"), "ENDED completed", "ok"),
+        (state(Presence.ENDED, outcome="aborted", text="landed by the guardian"), "ENDED aborted: landed", "warn"),
+        (state(Presence.ENDED, outcome="crashed"), "ENDED crashed", "bad"),
+    ],
+)
+def test_an_end_is_told_calmly(page: Page, known: Any, word: str, level: str) -> None:
+    page.tell(told(in_flight()), told(known))
+    page.run(5.0)
+    assert f"{page.text('#word')} {page.text('#why')}".startswith(word)
+    assert (page.body("level"), page.body("stale"), page.enabled()) == (level, "false", set())
+
+
+@pytest.mark.parametrize("presence", [Presence.LOST, Presence.SILENT])
+def test_a_vehicle_that_is_gone_is_framed_in_red_and_can_still_be_commanded(page: Page, presence: Presence) -> None:
+    page.tell(told(in_flight()), told(state(presence, text="the guardian may be landing it")))
+    assert page.text("#stale").startswith(presence.value.upper())
+    assert "the guardian may be landing it" in page.text("#stale")
+    assert (page.body("frame"), page.enabled()) == ("bad", SAFE)
+
+
+def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) -> None:
+    page.tell(told(in_flight()), told(state(Presence.LOST, session="older")))
+    assert (page.text("#word"), page.body("stale")) == ("FLYING", "false")
+
+
+@pytest.mark.parametrize(
+    ("changes", "word", "level"),
+    [
+        ({}, "FLYING", "ok"),
+        ({"kind": "ground", "armed": False}, "GROUND", "ok"),
+        ({"action": "hold"}, "HOLDING", "warn"),
+        ({"action": "retract"}, "RETURNING", "warn"),
+        ({"action": "land"}, "LANDING", "warn"),
+        ({"kind": "landing"}, "LANDING", "ok"),
+        ({"action": "terminate"}, "TERMINATED", "bad"),
+        ({"e_p_m": 0.5}, "FLYING", "warn"),
+        ({"e_p_m": 0.9}, "FLYING", "bad"),
+    ],
+)
+def test_the_word_says_what_it_does_and_how_grave_that_is(
+    page: Page, changes: dict[str, Any], word: str, level: str
+) -> None:
+    page.tell(told(in_flight(**changes)))
+    assert (page.text("#word"), page.body("level")) == (word, level)
+
+
+@pytest.mark.parametrize(
+    ("slack_m", "taut", "snagged", "level"),
+    [(1.0, False, False, "ok"), (0.2, False, False, "warn"), (0.03, True, False, "bad"), (1.0, False, True, "bad")],
+)
+def test_tether_slack_shows_in_its_colour(page: Page, slack_m: float, taut: bool, snagged: bool, level: str) -> None:
+    tether = in_flight().tether
+    assert tether is not None
+    view = replace(tether, slack_m=slack_m, stop_slack_m=slack_m, taut=taut, snagged=snagged)
+    page.tell(told(in_flight(tether=view)))
+    assert page.figure("tether") == f"{slack_m:.2f}"
+    assert page.tab.get_attribute(".tile:first-child", "data-level") == level
+    assert page.body("level") == level
+
+
+def test_the_catch_appears_among_the_events_and_is_read_out(page: Page) -> None:
+    page.tell(told(in_flight()))
+    assert page.tab.locator("#event-list li").count() == 0
+    page.tell(told(flown().events))
+    assert "payload caught" in page.text("[data-event='catch']")
+    assert page.tab.locator("#event-list li").first.get_attribute("data-event") == "touchdown"
+    assert "payload caught" in page.tab.locator("#announce").text_content()
+    page.tell(told(flown().events))
+    assert page.tab.locator("#event-list li").count() == len(flown().events.lines)
+
+
+def test_events_can_be_filtered(page: Page) -> None:
+    page.tell(events_of(event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")))
+    visible = page.tab.locator("#event-list li:visible")
+    for filtered, expected in (("warning", ["critical", "warning"]), ("critical", ["critical"])):
+        page.tab.click(f"[data-filter='{filtered}']")
+        assert [visible.nth(k).get_attribute("data-severity") for k in range(visible.count())] == expected
+    page.tab.click("[data-filter='info']")
+    assert visible.count() == 3
+
+
+def test_a_filter_that_leaves_nothing_says_so(page: Page) -> None:
+    page.tab.click("[data-filter='critical']")
+    assert page.text("#event-none") == "Nothing has happened yet."
+    page.tell(told(flown().events))
+    assert page.tab.locator("#event-list li:visible").count() == 0
+    assert page.text("#event-none") == "Nothing so grave has happened."
+
+
+def test_a_new_session_begins_with_nothing_of_the_old_one(page: Page) -> None:
+    page.tell(told(in_flight()), told(flown().events))
+    assert page.tab.locator("#event-list li").count() > 0
+    page.tell(told(state(session="new")), told(replace(flown().at(1.0), session="new", t_s=1.0)))
+    assert page.tab.locator("#event-list li").count() == 0 and page.body("stale") == "false"
+
+
+def test_what_comes_from_outside_is_text(stand: Stand, page: Page) -> None:
+    light = replace(in_flight().lights[0], text=HOSTILE, name=HOSTILE)
+    page.tell(
+        told(state(mission=HOSTILE, text=HOSTILE)),
+        told(in_flight(phase=HOSTILE, lights=(light,), bent_by=(HOSTILE,), mode=HOSTILE)),
+        events_of(event(1, HOSTILE, id_=HOSTILE, action=HOSTILE)),
+        told(ack("hold", "f" * 32, HOSTILE, operator=HOSTILE)),
+        {**BROKER, "rubbish": 3, "rubbish_text": HOSTILE},
+    )
+    page.tab.click("#control summary")
+    stand.say(told(state(), HOSTILE))
+    page.until_text("#vehicle-select", HOSTILE)
+    page.run(1.0)
+    assert HOSTILE in page.text("#event-list .text") and HOSTILE in page.text("#light-list .text")
+    assert HOSTILE in page.text("#answers") and HOSTILE in page.text("#notice")
+    assert HOSTILE in page.tab.locator("#phase").text_content()
+    assert page.tab.evaluate("[document.images.length, document.scripts.length, window.pwned ?? null]") == [0, 1, None]
+
+
+def test_several_vehicles(stand: Stand, page: Page) -> None:
+    page.tell(told(in_flight()))
+    assert not page.tab.is_visible("#vehicle-select")
+    page.tell(*retained("second"), told(in_flight(position_world_m=(0.0, 0.0, 1.77)), "second"))
+    options = page.tab.locator("#vehicle-select option")
+    assert [options.nth(k).text_content() for k in range(2)] == [f"{NAME} · FLYING", "second · FLYING"]
+    assert page.figure("height") == "1.00"
+    page.tab.select_option("#vehicle-select", "second")
+    page.shown = "second"
+    assert page.figure("height") == "1.77"
+    page.tell(told(state(Presence.LOST)))
+    assert options.nth(0).text_content() == f"⚠ {NAME} · LOST"
+    assert page.text("#word") == "FLYING"
+    page.press("hold")
+    assert stand.wait_heard("command", 1) == [{"kind": "command", "vehicle": "second", "command": "hold"}]
+
+
+def test_a_restarted_monitor_is_found_again(browser: Any, stand: Stand) -> None:
+    with watching(browser, stand, may="WebSocket connection to") as page:
+        page.tell(told(in_flight()))
+        stand.stop()
+        page.until_text("#stale", "NO CONNECTION")
+        assert page.body("frame") == "bad" and page.enabled() <= SAFE
+        stand.start()
+        page.tab.clock.resume()
+        stand.wait_heard("token", 2)
+        page.tell(told(in_flight(t_s=5000.0, position_world_m=(0.0, 0.0, 1.55))))
+        page.until_text("[data-figure='height']", "1.55")
+
+
+def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, stand: Stand) -> None:
+    with watching(browser, stand, may="WebSocket connection to") as page:
+        page.tell(told(in_flight()))
+        stand.stop()
+        page.until_text("#stale", "NO CONNECTION")
+        page.press("hold")
+        assert "NOT SENT" in page.text("#answers [data-for='hold']")
+
+
+def test_a_page_that_may_only_watch_says_why(browser: Any, stand: Stand) -> None:
+    stand.greeting[0] = hello(can_command=False, operator=None, why_not="this monitor was started with --view-only")
+    with watching(browser, stand) as page:
+        page.tell(told(in_flight()))
+        assert page.enabled() == set()
+        assert page.text("#commands-why") == "this monitor was started with --view-only"
+        assert page.tab.is_visible("#badge-view")
+        page.tab.keyboard.press("Shift+H")
+        page.tell(hello())
+        page.press("abort")
+        assert [message["command"] for message in stand.wait_heard("command", 1)] == ["abort"]

@@ -1,0 +1,177 @@
+"""The command buttons in a real browser: what is pressed arrives once, and what came of it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.ground.page_browser import Page, chromium, playing, watching
+from tests.ground.page_stand import NAME, Message, Stand, ack, flown, retained, state, told
+
+NONCE = "0123456789abcdef" * 2
+NO_ANSWER = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def stand() -> Iterator[Stand]:
+    with Stand(retained()) as stand:
+        yield stand
+
+
+@pytest.fixture
+def page(browser: Any, stand: Stand) -> Iterator[Page]:
+    with watching(browser, stand) as page:
+        page.tell(told(flown().at(8.5)))
+        yield page
+
+
+def sent(command: str, nonce: str = NONCE) -> Message:
+    return {"kind": "sent", "vehicle": NAME, "command": command, "nonce": nonce}
+
+
+def refused(command: str, text: str) -> Message:
+    return {"kind": "refused", "vehicle": NAME, "command": command, "text": text}
+
+
+def answer(page: Page, command: str) -> tuple[str, str]:
+    output = page.tab.locator(f"#answers [data-for='{command}']")
+    return output.get_attribute("data-state"), output.inner_text()
+
+
+def asked(stand: Stand, count: int) -> list[str]:
+    """The first commands that arrive; `count` of them and no more."""
+    heard = stand.wait_heard("command", count)
+    assert all(message["vehicle"] == NAME for message in heard)
+    return [message["command"] for message in heard]
+
+
+def test_hold_then_land_arrive_and_their_answers_show(stand: Stand, page: Page) -> None:
+    page.press("hold")
+    assert asked(stand, 1) == ["hold"]
+    assert answer(page, "hold") == ("wait", "sending …")
+    page.tell(sent("hold"))
+    assert answer(page, "hold") == ("wait", "sent, waiting for the vehicle …")
+    page.tell(told(ack("hold", NONCE, "holding at (1.00, 0.00, 1.00) m")))
+    assert answer(page, "hold") == ("done", "✓ holding at (1.00, 0.00, 1.00) m")
+    page.press("land")
+    assert asked(stand, 2) == ["hold", "land"]
+    page.tell(sent("land", "b" * 32), told(ack("land", "b" * 32, "landing")))
+    assert answer(page, "land") == ("done", "✓ landing")
+    assert answer(page, "hold")[0] == "done"
+
+
+def test_what_the_vehicle_refuses_is_red(page: Page) -> None:
+    page.press("abort")
+    page.tell(sent("abort"), told(ack("abort", NONCE, "nothing to abort: on the ground", accepted=False)))
+    assert answer(page, "abort") == ("no", "✗ nothing to abort: on the ground")
+
+
+def test_no_answer_is_red_until_a_late_one_comes(page: Page) -> None:
+    page.press("land")
+    page.tell(sent("land"), refused("land", NO_ANSWER))
+    assert answer(page, "land") == ("no", NO_ANSWER)
+    page.tell(sent("land", "c" * 32))
+    assert answer(page, "land")[0] == "no" and "sent again (2)" in answer(page, "land")[1]
+    page.tell(told(ack("land", NONCE, "landing")))
+    assert answer(page, "land") == ("done", "✓ landing")
+
+
+def test_a_monitor_that_says_nothing_is_no_answer_either(page: Page) -> None:
+    page.press("hold")
+    page.run(2.4)
+    assert answer(page, "hold")[0] == "wait"
+    page.run(0.3)
+    assert answer(page, "hold")[0] == "no" and "no answer from the monitor" in answer(page, "hold")[1]
+
+
+def test_what_others_command_is_shown_with_their_name(page: Page) -> None:
+    page.tell(told(ack("hold", "d" * 32, "holding", operator="bert")))
+    assert answer(page, "hold") == ("done", "✓ bert: holding")
+
+
+def test_a_double_click_sends_one_command(stand: Stand, page: Page) -> None:
+    page.tab.dblclick("[data-command='hold']")
+    page.run(0.29)
+    page.press("hold")
+    page.press("land")
+    page.run(0.02)
+    page.press("hold")
+    assert asked(stand, 3) == ["hold", "land", "hold"]
+
+
+def test_safety_does_not_wait_for_fresh_data(stand: Stand, page: Page) -> None:
+    page.run(60.0)
+    assert page.body("stale") == "true"
+    for command in ("hold", "land", "abort"):
+        page.press(command)
+    assert asked(stand, 3) == ["hold", "land", "abort"]
+
+
+def test_keys_command_too(stand: Stand, page: Page) -> None:
+    for key in ("h", "l", "Shift+L", "Control+Shift+H", "Shift+A"):
+        page.tab.keyboard.press(key)
+    assert asked(stand, 2) == ["land", "abort"]
+    page.tab.focus("[data-command='hold']")
+    page.tab.keyboard.press("Enter")
+    assert asked(stand, 3)[2] == "hold"
+
+
+def test_start_needs_a_vehicle_that_waits_and_a_long_press(stand: Stand, page: Page) -> None:
+    assert "start" not in page.enabled() and "only when it waits" in page.text("[data-command='start']")
+    news = playing(flown().streams[0], waits_for_start=True)
+    page.tell(news())
+    assert "start" in page.enabled() and "resume" not in page.enabled()
+    _hold_down(page, "start", 0.7, news)
+    _hold_down(page, "start", 0.9, news)
+    page.press("hold")
+    assert asked(stand, 2) == ["start", "hold"]
+
+
+def test_resume_needs_a_hold_and_works_by_keyboard(stand: Stand, page: Page) -> None:
+    news = playing(flown().at(8.5), action="hold")
+    page.tell(news())
+    assert "resume" in page.enabled()
+    page.tab.focus("[data-command='resume']")
+    page.tab.keyboard.down("Enter")
+    for _ in range(3):
+        page.run(0.3)
+        page.tell(news())
+    page.tab.keyboard.up("Enter")
+    assert asked(stand, 1) == ["resume"]
+    page.run(1.0)
+    assert "resume" not in page.enabled() and page.body("stale") == "true"
+
+
+def test_a_long_press_ends_with_the_permission(stand: Stand, page: Page) -> None:
+    """It begins while it waits for START, and the data grows old under the finger."""
+    page.tell(playing(flown().streams[0], waits_for_start=True)())
+    page.tab.hover("[data-command='start']")
+    page.tab.mouse.down()
+    page.run(2.0)
+    page.tab.mouse.up()
+    page.press("land")
+    assert asked(stand, 1) == ["land"]
+
+
+def test_a_vehicle_that_hears_no_commands_says_so(page: Page) -> None:
+    page.tell(told(state(commands=False, text="commands are switched off in the vehicle file")))
+    assert page.enabled() == set()
+    assert page.text("#commands-why") == "commands are switched off in the vehicle file"
+
+
+def _hold_down(page: Page, command: str, seconds: float, news: Callable[[], Message]) -> None:
+    """While the vehicle goes on sending."""
+    page.tab.hover(f"[data-command='{command}']")
+    page.tab.mouse.down()
+    for _ in range(round(seconds / 0.1)):
+        page.run(0.1)
+        page.tell(news())
+    page.tab.mouse.up()

@@ -1,0 +1,212 @@
+"""How the page looks, measured: sizes, contrast, keyboard; and that its geometry is the controller's."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from companion.config.loader import load_flight
+from companion.control.manipulator import Manipulator
+from companion.frames import quat_from_euler_zyx, quat_rotate
+from companion.record import to_jsonable
+from tests.ground.page_browser import SIZES, Page, chromium, events_of, watching
+from tests.ground.page_stand import Stand, event, flown, retained, told
+from tests.support import CATCH
+
+TOUCH_PX = 56.0
+LARGE_PX, LARGE_BOLD_PX = 24.0, 18.66
+"""WCAG 2.2, 1.4.3: text of this size needs 3 : 1, all other 4.5 : 1."""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def stand() -> Iterator[Stand]:
+    with Stand(retained()) as stand:
+        yield stand
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_nothing_scrolls_sideways_and_safety_is_always_in_reach(browser: Any, stand: Stand, size: str) -> None:
+    with watching(browser, stand, size=size, touch=True) as page:
+        page.tell(told(flown().at(8.5)), told(flown().events))
+        for down_px in (0, 100_000):
+            page.tab.evaluate("y => window.scrollTo(0, y)", down_px)
+            wide, shown = page.tab.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+            assert wide <= shown
+            for command in ("hold", "land", "abort"):
+                _assert_in_reach(page, command)
+
+
+def _assert_in_reach(page: Page, command: str) -> None:
+    box = page.tab.locator(f"[data-command='{command}']").bounding_box()
+    assert box["width"] >= TOUCH_PX and box["height"] >= TOUCH_PX
+    middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+    found = page.tab.evaluate(
+        "([x, y]) => document.elementFromPoint(x, y)?.closest('[data-command]')?.dataset.command", middle
+    )
+    assert found == command
+
+
+def test_every_control_of_a_tablet_is_large_enough(browser: Any, stand: Stand) -> None:
+    stand.greeting += retained("second")
+    with watching(browser, stand, size="tablet", touch=True) as page:
+        page.tell(told(flown().at(8.5)))
+        for control in page.tab.locator("button:visible, select:visible, summary:visible").all():
+            box = control.bounding_box()
+            assert box["height"] >= TOUCH_PX and box["width"] >= TOUCH_PX, control.inner_text()
+
+
+def test_buttons_stay_where_they_are_when_things_go_wrong(browser: Any, stand: Stand) -> None:
+    """A finger may be on its way."""
+    for size in SIZES:
+        with watching(browser, stand, size=size) as page:
+            page.tell(told(flown().at(8.5)))
+
+            def boxes(page: Page = page) -> list[Any]:
+                commands = ("hold", "land", "abort")
+                return [page.tab.locator(f"[data-command='{command}']").bounding_box() for command in commands]
+
+            before = boxes()
+            for command in ("hold", "land"):
+                text = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch (sent again, 2 of 3)"
+                page.tell({"kind": "refused", "vehicle": page.shown, "command": command, "text": text})
+            page.run(5.0)
+            assert page.tab.is_visible("#stale") and boxes() == before
+
+
+@pytest.mark.parametrize(("scheme", "stale"), list(itertools.product(("dark", "light"), (False, True))))
+def test_text_has_enough_contrast(browser: Any, stand: Stand, scheme: str, stale: bool) -> None:
+    with watching(browser, stand, scheme=scheme) as page:
+        lines = [event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")]
+        page.tell(told(flown().at(8.5)), events_of(*lines))
+        page.tell({"kind": "refused", "vehicle": page.shown, "command": "land", "text": "no answer"})
+        page.tab.click("#control summary")
+        page.tab.click("#preflight summary")
+        if stale:
+            page.run(2.0)
+        weak = [text for text in page.tab.evaluate(_CONTRAST, [LARGE_PX, LARGE_BOLD_PX]) if text]
+        assert weak == []
+
+
+_CONTRAST = """([large, largeBold]) => {
+  const parts = (colour) => {
+    const srgb = colour.startsWith("color(srgb");
+    const [r, g, b, a = 1] = colour.replace(/^[a-z]+\\((srgb )?/, "").match(/[\\d.]+/g).map(Number);
+    return { rgb: srgb ? [r, g, b] : [r / 255, g / 255, b / 255], a };
+  };
+  const luminance = (rgb) => {
+    const [r, g, b] = rgb.map((c) => (c <= 0.03928 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const behind = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const { rgb, a } = parts(getComputedStyle(e).backgroundColor);
+      if (a > 0.99) return rgb;
+    }
+    throw new Error("nothing is behind it");
+  };
+  return [...document.querySelectorAll("body *")].map((element) => {
+    const own = [...element.childNodes].filter((n) => n.nodeType === 3).map((n) => n.textContent.trim()).join("");
+    if (!own || !element.checkVisibility({ visibilityProperty: true }) || element.closest(".unseen, .skip, select")) return null;
+    const style = getComputedStyle(element);
+    const [one, two] = [luminance(parts(style.color).rgb), luminance(behind(element))];
+    const ratio = (Math.max(one, two) + 0.05) / (Math.min(one, two) + 0.05);
+    const size = parseFloat(style.fontSize);
+    const needed = size >= large || (size >= largeBold && Number(style.fontWeight) >= 700) ? 3 : 4.5;
+    return ratio < needed ? `${own}: ${ratio.toFixed(2)}` : null;
+  });
+}"""
+
+
+def test_everything_can_be_reached_by_keyboard_and_the_commands_first(browser: Any, stand: Stand) -> None:
+    with watching(browser, stand) as page:
+        page.tell(told(flown().at(8.5)))
+        page.tab.keyboard.press("Tab")
+        page.tab.keyboard.press("Enter")
+        order = []
+        for _ in range(3):
+            page.tab.keyboard.press("Tab")
+            order.append(page.tab.evaluate("document.activeElement.dataset.command"))
+        assert order == ["hold", "land", "abort"]
+
+
+def test_the_camera_moves_by_mouse_wheel_and_keys(browser: Any, stand: Stand) -> None:
+    with watching(browser, stand) as page:
+        page.tell(told(flown().at(8.5)))
+
+        def picture() -> str:
+            page.run(0.5)
+            found: str = page.tab.evaluate("document.getElementById('scene').toDataURL()")
+            return found
+
+        seen = [picture()]
+        for preset in ("behind", "top", "side", "room"):
+            page.tab.click(f"[data-preset='{preset}']")
+            seen.append(picture())
+        assert seen[0] == seen[4] and len(set(seen)) == 4
+        page.tab.hover("#scene")
+        page.tab.mouse.down()
+        page.tab.mouse.move(400, 400)
+        page.tab.mouse.up()
+        seen.append(picture())
+        page.tab.evaluate("window.wheels = 0; addEventListener('wheel', () => { window.wheels += 1; })")
+        page.tab.mouse.wheel(0, -300)
+        page.until("() => window.wheels > 0")
+        seen.append(picture())
+        page.tab.focus("#scene")
+        page.tab.keyboard.press("ArrowLeft")
+        seen.append(picture())
+        assert len(set(seen)) == 7
+
+
+def test_the_arm_is_drawn_as_the_controller_knows_it(browser: Any, stand: Stand) -> None:
+    vehicle = load_flight(CATCH).vehicle
+    arm = Manipulator(vehicle.arm, vehicle.tool)
+    angles = list(itertools.product((-0.5, 0.4, 1.7, 2.9), (-0.2, 0.0, 1.0, 2.4)))
+    script = "const { armBody } = await import('/geometry.js'); return a.map((q) => armBody(scene, q));"
+    with watching(browser, stand) as page:
+        drawn = page.tab.evaluate(
+            f"async ([scene, a]) => {{ {script} }}", [to_jsonable(flown().scene), [list(pair) for pair in angles]]
+        )
+    for pair, parts in zip(angles, drawn, strict=True):
+        assert parts["elbow"] == pytest.approx(arm.elbow_body_m(pair), abs=1e-12)
+        assert parts["net"] == pytest.approx(arm.net_body_m(pair), abs=1e-12)
+
+
+def test_vectors_turn_as_the_controller_turns_them(browser: Any, stand: Stand) -> None:
+    q, v = quat_from_euler_zyx(0.3, -0.4, 2.0), (0.3, -1.2, 0.7)
+    with watching(browser, stand) as page:
+        script = "async ([q, v]) => (await import('/geometry.js')).rotate(q, v)"
+        assert page.tab.evaluate(script, [list(q), list(v)]) == pytest.approx(quat_rotate(q, v), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("end", "length_m", "floor_m"),
+    [
+        ((1.5, 0.8, 1.2), 2.2, -9.0),  # hangs free
+        ((1.5, 0.8, 1.2), 3.0, -9.0),
+        ((0.0, 0.0, 1.0), 3.0, -9.0),  # straight above the anchor
+        ((1.5, 0.8, 1.2), 2.2, 0.0),  # lies on the floor in part
+        ((1.0, -0.5, 1.0), 2.0, 0.0),
+        ((-1.8, 0.2, -0.3), 2.5, -1.0),  # both ends in the air
+    ],
+)
+def test_the_tether_has_its_length_and_its_ends(
+    browser: Any, stand: Stand, end: tuple[float, float, float], length_m: float, floor_m: float
+) -> None:
+    with watching(browser, stand) as page:
+        script = "async ([a, b, l, f]) => (await import('/geometry.js')).hanging(a, b, l, f)"
+        points = page.tab.evaluate(script, [[0.0, 0.0, 0.0], list(end), length_m, floor_m])
+    assert points[0] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert points[-1] == pytest.approx(end, abs=1e-6)
+    assert sum(math.dist(a, b) for a, b in itertools.pairwise(points)) == pytest.approx(length_m, rel=0.01)
+    assert min(point[2] for point in points) >= floor_m - 1e-6

@@ -1,0 +1,194 @@
+"""The page plays logs: the same view, scrubbed. In a real browser; once with the real monitor and the log of a flight."""
+
+from __future__ import annotations
+
+import re
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.analysis.log import FlightLog
+from companion.config.loader import load_flight
+from companion.ground.messages import Presence, Stream
+from companion.record import to_jsonable
+from sitl.fast import FastFlight
+from tests.analysis.recorded import record
+from tests.broker import free_port
+from tests.ground.page_browser import Page, chromium, watching
+from tests.ground.page_stand import Message, Stand, flown, hello, preflight, sent_at, state
+from tests.support import CATCH, sandbox_in
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+def log_of(streams: tuple[Stream, ...] | None = None) -> Message:
+    """What the monitor makes of a log."""
+    flight = flown()
+    ended = state(Presence.ENDED, outcome="completed", commands=False)
+    return {
+        "state": to_jsonable(ended),
+        "scene": to_jsonable(flight.scene),
+        "preflight": to_jsonable(preflight()),
+        "events": to_jsonable(flight.events),
+        "streams": [to_jsonable(stream) for stream in streams or flight.streams],
+    }
+
+
+@pytest.fixture
+def stand() -> Iterator[Stand]:
+    with Stand() as stand:
+        stand.greeting = [hello(can_command=False, replay=True, logs=["first.mcap", "second.mcap"], why_not="a log")]
+        stand.replay = [log_of(), log_of(tuple(replace(s, phase="second log") for s in flown().streams))]
+        yield stand
+
+
+@pytest.fixture
+def page(browser: Any, stand: Stand) -> Iterator[Page]:
+    with watching(browser, stand, settle=loaded) as page:
+        yield page
+
+
+def loaded(page: Page) -> None:
+    """Until all of the log is there."""
+    page.until("() => document.querySelectorAll('#replay-marks span').length === 3")
+    page.until("() => document.getElementById('notice').hidden")
+
+
+def scrub(page: Page, t_s: float) -> None:
+    page.tab.evaluate(
+        "t => { const s = document.getElementById('replay-time'); s.value = t; s.dispatchEvent(new Event('input')); }",
+        t_s,
+    )
+
+
+def shown_s(page: Page) -> float:
+    """Time in the log, as the page shows it."""
+    match = re.match(r"(\d+):([\d.]+) / ", page.text("#replay-now"))
+    assert match is not None
+    return 60.0 * int(match[1]) + float(match[2])
+
+
+def test_scrubbing_shows_that_instant(page: Page) -> None:
+    for mission_t_s in (15.0, 2.0, 8.5):
+        stream = flown().at(mission_t_s)
+        scrub(page, stream.t_s + 0.01)
+        assert stream.tether is not None and stream.position_world_m is not None
+        assert page.figure("tether") == f"{stream.tether.slack_m:.2f}"
+        assert page.figure("height") == f"{stream.position_world_m[2]:.2f}"
+        assert page.text("#phase") == stream.phase
+    assert page.text("#word") == "FLYING" and not page.tab.is_visible("#stale")
+
+
+def test_events_are_those_up_to_the_instant(page: Page) -> None:
+    catch = next(line for line in flown().events.lines if line.id == "catch")
+    scrub(page, catch.t_s - 0.1)
+    assert page.tab.locator("[data-event='catch']:not(#replay-marks *)").count() == 0
+    scrub(page, catch.t_s + 0.1)
+    assert page.tab.locator("#event-list [data-event='catch']").count() == 1
+    scrub(page, catch.t_s - 0.1)
+    assert page.tab.locator("#event-list [data-event='catch']").count() == 0
+
+
+def test_the_end_says_how_it_ended(page: Page) -> None:
+    page.tab.keyboard.press("End")
+    assert (page.text("#word"), page.text("#why")) == ("ENDED", "completed")
+    page.tab.keyboard.press("Home")
+    assert page.text("#word") == "GROUND" and shown_s(page) == 0.0
+
+
+def test_keys_step_and_play(page: Page) -> None:
+    for key, expected_s in (("ArrowRight", 1.0), ("ArrowRight", 2.0), ("ArrowLeft", 1.0), ("Shift+ArrowLeft", 0.95)):
+        page.tab.keyboard.press(key)
+        assert shown_s(page) == pytest.approx(expected_s, abs=0.051)
+    page.tab.keyboard.press("ArrowUp")
+    assert page.tab.input_value("#replay-speed") == "2"
+    page.tab.keyboard.press("Space")
+    page.run(3.0)
+    page.tab.keyboard.press("Space")
+    after_s = shown_s(page)
+    assert after_s == pytest.approx(0.95 + 2 * 3.0, abs=0.2)
+    page.run(3.0)
+    assert shown_s(page) == after_s
+
+
+@pytest.mark.parametrize("speed", ["0.25", "8"])
+def test_speeds(page: Page, speed: str) -> None:
+    page.tab.select_option("#replay-speed", speed)
+    page.tab.click("#replay-play")
+    page.run(2.0)
+    assert shown_s(page) == pytest.approx(2.0 * float(speed), abs=0.4)
+
+
+def test_playing_ends_with_the_log(page: Page) -> None:
+    page.tab.keyboard.press("End")
+    page.tab.keyboard.press("ArrowLeft")
+    page.tab.click("#replay-play")
+    page.run(2.0)
+    assert page.tab.get_attribute("#replay-play", "aria-label") == "Play"
+    assert page.text("#word") == "ENDED"
+
+
+def test_another_log_can_be_picked(page: Page) -> None:
+    page.tab.select_option("#replay-log", "1")
+    page.until_text("#phase", "second log")
+    loaded(page)
+    page.tab.select_option("#replay-log", "0")
+    page.until("() => document.getElementById('phase').textContent !== 'second log'")
+
+
+def test_nothing_can_be_commanded(stand: Stand, page: Page) -> None:
+    assert not page.tab.is_visible("#commands")
+    page.tab.keyboard.press("Shift+H")
+    page.tab.keyboard.press("End")
+    assert page.text("#word") == "ENDED" and stand.heard("command") == []
+
+
+def test_a_log_that_is_not_to_be_had_is_one_line(browser: Any, stand: Stand) -> None:
+    stand.replay = []
+    with watching(browser, stand, may="Failed to load resource", settle=lambda page: None) as page:
+        page.until_text("#notice", "first.mcap cannot be loaded: the monitor answers")
+
+
+def test_ten_minutes_load_in_pieces(browser: Any, stand: Stand) -> None:
+    """The page comes to its senses between the pieces: it shows how far it is, again and again."""
+    streams = flown().streams
+    count = 12_000
+    times = (streams[0].t_s + 0.05 * k for k in range(count))
+    stand.replay = [log_of(tuple(replace(streams[k * len(streams) // count], t_s=t) for k, t in enumerate(times)))]
+    watch = """
+        window.percents = new Set();
+        new MutationObserver(() => {
+          const found = document.getElementById("notice")?.textContent.match(/: (\\d+) %/);
+          if (found) percents.add(found[1]);
+        }).observe(document, { subtree: true, childList: true, characterData: true });
+    """
+    with watching(browser, stand, settle=loaded, script=watch) as page:
+        assert page.tab.evaluate("percents.size") >= 20
+        page.tab.keyboard.press("End")
+        assert shown_s(page) == pytest.approx(0.05 * (count - 1), abs=0.1)
+
+
+def test_the_real_monitor_plays_the_log_of_a_flight(browser: Any, tmp_path: Path) -> None:
+    config = load_flight(CATCH)
+    result = FastFlight(config).run()
+    sent = tuple(sent_at(i.tick, i.t_s) for i in result.inputs)
+    metadata = {"config": {"json": config.model_dump_json()}}
+    log = FlightLog(tmp_path, tuple(result.inputs), tuple(result.outputs), sent, metadata, True)
+    path = record(log, tmp_path / "flight.mcap")
+    url = f"http://127.0.0.1:{(port := free_port())}/"
+    with sandbox_in(tmp_path / "sandbox") as sandbox, sandbox.start("monitor", path, "--port", port) as monitor:
+        monitor.wait_for(url)
+        with watching(browser, url, settle=loaded) as page:
+            scrub(page, flown().at(8.5).t_s + 0.01)
+            assert page.figure("height") == "1.00" and page.text("#word") == "FLYING"
+            assert page.tab.locator("#event-list [data-event='catch']").count() == 1
+        monitor.signal(signal.SIGINT)
+        assert monitor.end().code == 0

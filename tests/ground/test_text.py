@@ -1,0 +1,256 @@
+"""`companion monitor --text`: what it shows, in a real terminal (a pty) and in a pipe."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import termios
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from companion.ground.keys import operators_text, write_private
+from companion.ground.messages import Presence, encode
+from companion.ground.text_view import STALE_S, Around, Note, frame, line, stale, word
+from companion.ground.watch import Vehicle, Watch
+from tests.broker import Broker, loopback_broker
+from tests.ground.monitor_rig import ANNA, OPERATORS, play
+from tests.ground.vehicle import flight, played_vehicle, state_of
+from tests.support import ROOT
+
+AROUND = Around("connected to mqtt://127.0.0.1:1883", True, "anna", None)
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with loopback_broker(tmp_path) as broker:
+        yield broker
+
+
+def known(presence: Presence = Presence.FLYING, heard_s: float = 0.0, event: str = "caught", **values: Any) -> Vehicle:
+    """What is known of a vehicle that said this."""
+    watch = Watch()
+    events = flight()[2]
+    lines = (replace(events.lines[0], text=event),)
+    state = state_of("rig", "s", presence=presence, outcome="completed" if presence is Presence.ENDED else None)
+    for topic, record in (
+        ("state", state),
+        ("events", replace(events, session="s", lines=lines)),
+        ("stream", replace(flight()[1][-1], session="s", **values)),
+    ):
+        assert watch.take(f"companion/rig/{topic}", encode(record), False, heard_s) is not None
+    return watch.vehicles["rig"]
+
+
+def drawn(vehicle: Vehicle | None, now_s: float = 0.0, around: Around = AROUND) -> str:
+    console = Console(width=140, record=True, file=open(os.devnull, "w"), color_system="standard", force_terminal=True)  # noqa: SIM115
+    with contextlib.closing(console.file):
+        console.print(frame(vehicle, now_s, around))
+        return console.export_text(styles=True)
+
+
+def plain(text: str) -> str:
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "now_s", "expected", "alarm"),
+    [
+        (known(), 0.0, "FLYING", False),
+        (known(kind="ground"), 0.0, "ON THE GROUND", False),
+        (known(waits_for_start=True), 0.0, "WAITS FOR START", False),
+        (known(action="hold"), 0.0, "HOLD", False),
+        (known(action="autopilot_land"), 0.0, "AUTOPILOT LAND", False),
+        (known(), STALE_S + 0.1, "NO DATA FOR 0.4 s", True),
+        (known(Presence.SILENT), 0.0, "SILENT", True),
+        (known(Presence.LOST), 0.0, "LOST", True),
+        (known(Presence.ENDED), 100.0, "ENDED: completed", False),
+    ],
+)
+def test_the_word(vehicle: Vehicle, now_s: float, expected: str, alarm: bool) -> None:
+    text, style = word(vehicle, now_s)
+    assert text == expected
+    assert ("on red" in style) is alarm
+
+
+def test_what_is_shown_of_a_flight() -> None:
+    text = plain(drawn(known(progress=0.4321, mission_t_s=9.0)))
+    for expected in ("rig", "SIMULATION", "adaptive", " 43 %", "t   9.0 s", "|e_p|", "battery 15.8 V", "motion capture", "caught",
+                     "HOLD", "LAND", "ABORT", "anna", "connected to"):  # fmt: skip
+        assert expected in text, (expected, text)
+
+
+def test_old_figures_do_not_look_alive() -> None:
+    vehicle = known()
+    assert not stale(vehicle, STALE_S - 0.01) and stale(vehicle, STALE_S + 0.01)
+    fresh, old = drawn(vehicle, 0.0), drawn(vehicle, 5.0)
+    assert "\x1b[32m● " in fresh
+    assert "\x1b[32m" not in old.split("caught")[0], "something is still green"
+
+
+def test_a_taut_tether_is_loud() -> None:
+    tether = {"slack_m": 0.0, "stop_slack_m": 0.0, "pull_n": 3.0, "turns": 0.0, "taut": True, "snagged": False}
+    from companion.ground.messages import TetherView
+
+    assert "TETHER TAUT" in drawn(known(tether=TetherView(**tether)))  # type: ignore[arg-type]
+
+
+def test_who_may_not_command_is_told_why_and_shown_no_keys() -> None:
+    text = plain(drawn(known(), 0.0, replace(AROUND, operator=None, why_not="nobody shall", notes=(Note("a note"),))))
+    assert "view only: nobody shall" in text and "ABORT" not in text and "a note" in text
+
+
+def test_text_from_the_network_does_not_steer_the_terminal() -> None:
+    hostile = "\x1b[2J\x1b]0;title\x07[red]markup[/red]\r\n\x9b31m"
+    vehicle = known(event=hostile, phase=hostile, action=hostile, mode=hostile)
+    shown = drawn(vehicle) + line(vehicle, 0.0)
+    assert "\x1b[2J" not in shown and "\x07" not in shown and "\x9b" not in shown and "\x1b]" not in shown
+    assert "[red]markup[/red]" in plain(shown)
+
+
+class Terminal:
+    """`companion monitor --text` in a pty, as SSH gives one."""
+
+    def __init__(self, broker: Broker, keys: Path, *more: str) -> None:
+        self.ours, theirs = pty.openpty()
+        self._screen = ""
+        termios.tcsetwinsize(theirs, (40, 140))
+        self.before = termios.tcgetattr(theirs)
+        self._theirs = theirs
+        command = [sys.executable, "-m", "companion.cli", "monitor", "--text", "--broker", broker.url]
+        self.process = subprocess.Popen(
+            [*command, "--operators", str(keys), *more],
+            cwd=ROOT,
+            env={**os.environ, "TERM": "xterm-256color"},
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+        )
+
+    @property
+    def settings(self) -> list[Any]:
+        return termios.tcgetattr(self._theirs)
+
+    def press(self, keys: str) -> None:
+        os.write(self.ours, keys.encode())
+
+    async def shows(self, text: str) -> None:
+        """Wait until something is drawn; what was there before does not count."""
+        while text not in plain(self._screen):
+            self._screen += (await asyncio.to_thread(os.read, self.ours, 65536)).decode("utf-8", "replace")
+        self._screen = ""
+
+    async def ended(self) -> int:
+        """The exit code; what is still drawn is taken."""
+        drain = asyncio.ensure_future(asyncio.to_thread(self._drain))
+        code = await asyncio.to_thread(self.process.wait)
+        os.write(self._theirs, b"\x04")
+        await drain
+        return code
+
+    def _drain(self) -> None:
+        while not os.read(self.ours, 65536).endswith(b"\x04"):
+            pass
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        os.close(self.ours)
+        os.close(self._theirs)
+
+
+@contextlib.asynccontextmanager
+async def terminal_at(broker: Broker, folder: Path, *more: str) -> AsyncIterator[Terminal]:
+    keys = folder / "operators.yaml"
+    write_private(keys, operators_text([ANNA]).encode())
+    terminal = Terminal(broker, keys, *more)
+    try:
+        yield terminal
+    finally:
+        terminal.close()
+
+
+def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS) as vehicle, terminal_at(broker, tmp_path) as terminal:
+            await terminal.shows("FLYING")
+            for key, name in (("h", "hold"), ("L", "land"), ("a", "abort")):
+                terminal.press(key)
+                await terminal.shows(f"rig: {name}: {name}: done (anna)")
+            terminal.press("s")
+            await terminal.shows("start? press s again")
+            terminal.press("r")
+            await terminal.shows("resume? press r again")
+            terminal.press("r")
+            await terminal.shows("rig: resume: resume: done (anna)")
+            assert [heard.command.value for heard in vehicle.accepted] == ["hold", "land", "abort", "resume"]
+            vehicle.streams = False
+            await terminal.shows("NO DATA FOR")
+            vehicle.streams = True
+            await terminal.shows("FLYING")
+            assert terminal.settings != terminal.before
+            terminal.press("q")
+            assert await terminal.ended() == 0
+            assert terminal.settings == terminal.before
+
+    play(scene())
+
+
+def test_ctrl_c_ends_it(broker: Broker, tmp_path: Path) -> None:
+    async def scene() -> None:
+        async with terminal_at(broker, tmp_path, "--view-only") as terminal:
+            await terminal.shows("view only: this monitor was started with --view-only")
+            terminal.process.send_signal(signal.SIGINT)
+            assert await terminal.ended() == 0
+            assert terminal.settings == terminal.before
+
+    play(scene())
+
+
+def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS, "one") as one,
+            played_vehicle(broker.port, OPERATORS, "two") as two,
+            terminal_at(broker, tmp_path) as terminal,
+        ):
+            await terminal.shows("n: next of one, two")
+            terminal.press("h")
+            await terminal.shows(": hold: hold: done (anna)")
+            terminal.press("nh")
+            await terminal.shows("two: hold: hold: done (anna)" if one.accepted else "one: hold: hold: done (anna)")
+            assert (len(one.accepted), len(two.accepted)) == (1, 1)
+
+    play(scene())
+
+
+def test_a_pipe_gets_a_line_a_second(broker: Broker) -> None:
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS):
+            process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "companion.cli", "monitor", "--text", "--view-only", "--broker", broker.url),
+                cwd=ROOT,
+                stdout=asyncio.subprocess.PIPE,
+            )
+            assert process.stdout is not None
+            lines = [(await process.stdout.readline()).decode() for _ in range(4)]
+            process.send_signal(signal.SIGINT)
+            await process.communicate()
+            assert process.returncode == 0
+            assert lines[:2] == [f"no broker at {broker.url} yet, trying\n", f"connected to {broker.url}\n"]
+            for text in lines[2:]:
+                assert re.match(r"\d\d:\d\d:\d\d rig \| [A-Z .0-9s]+ \| .* \| last event ", text), text
+
+    play(scene())

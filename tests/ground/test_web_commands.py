@@ -1,0 +1,251 @@
+"""Commands through the page: signed, judged by the vehicle, followed until they are answered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+from companion.config.document import ConfigError
+from companion.ground.access import broker_access
+from companion.ground.keys import Operator, operators_text, write_private
+from companion.ground.messages import CommandName, Presence
+from companion.ground.orders import NO_ANSWER, TRIES, Signer, signer_of
+from tests.broker import Broker, loopback_broker
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, play, token_of, viewer_of
+from tests.ground.vehicle import PlayedVehicle, played_vehicle
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with loopback_broker(tmp_path) as broker:
+        yield broker
+
+
+@pytest.mark.parametrize("command", list(CommandName))
+def test_a_command_is_signed_judged_by_the_vehicle_and_its_answer_shown(broker: Broker, command: CommandName) -> None:
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS) as vehicle,
+            monitor_at(broker.url) as monitor,
+            viewer_of(monitor) as viewer,
+            viewer_of(monitor) as other,
+        ):
+            await viewer.until("stream")
+            await viewer.order(command.value)
+            sent = await viewer.until("sent")
+            ack = await viewer.until("ack")
+            assert (sent["vehicle"], sent["command"]) == ("rig", command.value)
+            assert ack["data"]["nonce"] == sent["nonce"] == vehicle.accepted[0].nonce
+            assert ack["data"]["text"] == f"{command.value}: done"
+            assert vehicle.accepted[0].command is command and vehicle.accepted[0].operator == "anna"
+            assert (await other.until("ack"))["data"] == ack["data"]
+            assert not [message for message in other.heard if message["kind"] == "sent"]
+
+    play(scene())
+
+
+def test_a_refusal_of_the_vehicle_reaches_the_page(broker: Broker) -> None:
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS) as vehicle,
+            monitor_at(broker.url) as monitor,
+            viewer_of(monitor) as viewer,
+        ):
+            vehicle.accepts = lambda command: (False, "nothing to resume: not holding")
+            await viewer.until("stream")
+            await viewer.order("resume")
+            ack = await viewer.until("ack")
+            assert ack["data"]["accepted"] is False
+            assert ack["data"]["text"] == "nothing to resume: not holding"
+
+    play(scene())
+
+
+@pytest.mark.parametrize("command", ["hold", "start"])
+def test_no_answer_is_said_and_only_what_makes_things_safer_is_sent_again(broker: Broker, command: str) -> None:
+    tries = TRIES if command == "hold" else 1
+
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS) as vehicle,
+            monitor_at(broker.url) as monitor,
+            viewer_of(monitor) as viewer,
+        ):
+            vehicle.answers = False
+            await viewer.until("stream")
+            await viewer.order(command)
+            texts = [(await viewer.until("refused"))["text"] for _ in range(tries)]
+            assert all(text.startswith(NO_ANSWER) for text in texts)
+            assert [text[len(NO_ANSWER) :] for text in texts] == [
+                f" (sent again, {number} of {tries})" for number in range(2, tries + 1)
+            ] + [""]
+            nonces = [message["nonce"] for message in viewer.heard if message["kind"] == "sent"]
+            assert len(set(nonces)) == tries
+            assert [heard.nonce for heard in vehicle.accepted] == nonces
+
+    play(scene())
+
+
+def test_a_late_answer_ends_the_tries(broker: Broker) -> None:
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS) as vehicle,
+            monitor_at(broker.url) as monitor,
+            viewer_of(monitor) as viewer,
+        ):
+            vehicle.answers = False
+            await viewer.until("stream")
+            await viewer.order("land")
+            await viewer.until("refused")
+            vehicle.answers = True
+            ack = await viewer.until("ack")
+            assert ack["data"]["nonce"] == vehicle.accepted[-1].nonce
+            await viewer.order("hold")
+            await viewer.until("ack", lambda message: message["data"]["command"] == "hold")
+            assert sum(heard.command is CommandName.LAND for heard in vehicle.accepted) <= 2
+
+    play(scene())
+
+
+def test_a_newer_command_ends_the_tries_of_an_older_one(broker: Broker) -> None:
+    """A HOLD that is sent again after a RESUME would hold once more."""
+
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS) as vehicle,
+            monitor_at(broker.url) as monitor,
+            viewer_of(monitor) as viewer,
+        ):
+            vehicle.answers = False
+            await viewer.until("stream")
+            await viewer.order("hold")
+            await viewer.until("sent")
+            await viewer.order("resume")
+            await viewer.until("refused", lambda message: message["command"] == "resume")
+            held = [
+                message for message in viewer.heard if message["kind"] == "refused" and message["command"] == "hold"
+            ]
+            assert [message["text"] for message in held] == [NO_ANSWER]
+            assert [heard.command.value for heard in vehicle.accepted] == ["hold", "resume"]
+
+    play(scene())
+
+
+def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broker) -> None:
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
+            monitor_at(broker.url) as monitor,
+            viewer_of(monitor) as viewer,
+        ):
+
+            async def why_not(name: str) -> str:
+                await viewer.order("hold", name)
+                return str((await viewer.until("refused"))["text"])
+
+            await viewer.until("broker", lambda message: message["connected"])
+            assert "nothing is known of a vehicle 'other'" in await why_not("other")
+            assert "no command can be dated" in await why_not("rig")
+            await vehicle.say_stream()
+            await viewer.until("stream")
+            await vehicle.say_state(commands=False, text="the broker is another computer")
+            await viewer.until("state", lambda message: not message["data"]["commands"])
+            assert "hears no commands: the broker is another computer" in await why_not("rig")
+            await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
+            await viewer.until("state", lambda message: message["data"]["presence"] == "ended")
+            assert "has ended" in await why_not("rig")
+            assert vehicle.commands_heard == 0
+
+    play(scene())
+
+
+def test_who_has_no_token_or_another_one_sees_everything_and_commands_nothing(broker: Broker) -> None:
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS) as vehicle, monitor_at(broker.url) as monitor:
+            for token in ("", "x", token_of(monitor)[:-1], token_of(monitor).swapcase()):
+                async with viewer_of(monitor, token) as viewer:
+                    hello = await viewer.next()
+                    assert hello["can_command"] is False and "#" in hello["why_not"]
+                    await viewer.until("stream")
+                    await viewer.order("land")
+                    assert (await viewer.until("refused"))["text"] == hello["why_not"]
+            async with viewer_of(monitor, "") as viewer:
+                await viewer.ws.send_json({"kind": "token", "token": token_of(monitor)})
+                await viewer.until("hello", lambda message: message["can_command"])
+                await viewer.order("hold")
+                await viewer.until("ack")
+            assert [command.command.value for command in vehicle.accepted] == ["hold"]
+
+    play(scene())
+
+
+def test_a_command_that_the_broker_does_not_let_pass_is_told_as_that(tmp_path: Path) -> None:
+    with loopback_broker(tmp_path) as broker:
+        broker.stop()
+        (tmp_path / "acl").write_text("topic read companion/#\nuser vehicle\ntopic readwrite companion/#\n")
+        config = tmp_path / "loopback.conf"
+        config.write_text(
+            config.read_text() + f"user root\nacl_file {tmp_path / 'acl'}\n"
+        )  # root alone sees this folder
+        broker.start()
+
+        async def scene() -> None:
+            async with (
+                aiomqtt.Client("127.0.0.1", broker.port, username="vehicle") as client,
+                monitor_at(broker.url) as monitor,
+                viewer_of(monitor) as viewer,
+            ):
+                await viewer.until("broker", lambda message: message["connected"])
+                vehicle = PlayedVehicle(client, "rig", "s", OPERATORS)
+                await vehicle.say_all()
+                await vehicle.say_stream()
+                await viewer.until("stream")
+                await viewer.order("start")
+                refused = await viewer.until("refused")
+                assert refused["text"].startswith("the broker refused it: Not authorized")
+
+        play(scene())
+
+
+def test_who_may_command_from_a_monitor(broker: Broker, tmp_path: Path) -> None:
+    here = broker_access(broker.url, None, None)
+    remote = broker_access("mqtt://192.0.2.1", None, None)
+    file = tmp_path / "operators.yaml"
+    write_private(file, operators_text([ANNA, Operator("bob", b"b" * 32)]).encode())
+    assert "is another computer and the way there is plain" in str(signer_of(remote, str(file), "anna"))
+    assert "--view-only" in str(signer_of(here, str(file), "anna", view_only=True))
+    assert "several operators (anna, bob); say who you are" in str(signer_of(here, str(file), None))
+    assert signer_of(here, str(file), "anna") == SIGNER
+    with pytest.raises(ConfigError, match="no operator 'eve'"):
+        signer_of(here, str(file), "eve")
+
+
+def test_a_key_is_made_for_this_computer_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No vehicle elsewhere would know it."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    why_not = signer_of(broker_access("mqtts://192.0.2.1", None, None), None, None)
+    assert "name a file: --operators" in str(why_not)
+    assert not list(tmp_path.iterdir())
+    signer = signer_of(broker_access("mqtt://127.0.0.1", None, None), None, None)
+    assert isinstance(signer, Signer) and list(tmp_path.rglob("operators.yaml"))
+
+
+def test_nobody_commands_through_a_monitor_that_is_view_only(broker: Broker) -> None:
+    async def scene() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS) as vehicle,
+            monitor_at(broker.url, "nobody shall") as monitor,
+            viewer_of(monitor, "") as viewer,
+        ):
+            assert "#" not in monitor.url
+            hello = await viewer.next()
+            assert (hello["can_command"], hello["operator"], hello["why_not"]) == (False, None, "nobody shall")
+            await viewer.until("stream")
+            await viewer.order("hold")
+            assert (await viewer.until("refused"))["text"] == "nobody shall"
+            assert vehicle.commands_heard == 0
+
+    play(scene())
