@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install fly test lint unit bench clean
+.PHONY: install fly test lint unit debian bench clean
 
 install: $(STAMP)
 
@@ -18,7 +18,21 @@ $(STAMP): pyproject.toml constraints.txt
 fly: install
 	@$(BIN)/companion fly configs/missions/catch.yaml --sitl
 
-test: lint unit
+test: debian lint unit
+
+# What tests need beside Python: a real broker and a real browser. Nobody is asked for a password.
+debian:
+	@PATH="$$PATH:/usr/sbin"; missing=; \
+	command -v mosquitto >/dev/null || missing="$$missing mosquitto"; \
+	command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || missing="$$missing chromium"; \
+	test -n "$$missing" || exit 0; \
+	if ! command -v apt-get >/dev/null; then as=none; elif test "$$(id -u)" = 0; then as=; elif sudo -n true 2>/dev/null; then as="sudo -n"; else as=none; fi; \
+	if test "$$as" != none; then \
+	  echo "installing$$missing ..."; \
+	  export DEBIAN_FRONTEND=noninteractive; \
+	  { $$as apt-get -qq update && $$as apt-get -qq install -y --no-install-recommends $$missing; } >/dev/null 2>&1 && exit 0; \
+	fi; \
+	echo "not installed:$$missing; tests that need them are skipped (on Debian: apt install$$missing)"
 
 lint: install
 	$(BIN)/ruff format --check .

@@ -10,12 +10,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion import compare_command, faults_command, hover_command, px4_command, robustness_command
+from companion import (
+    broker_command,
+    command_command,
+    compare_command,
+    faults_command,
+    hover_command,
+    monitor_command,
+    px4_command,
+    report_command,
+    robustness_command,
+)
 from companion.campaign_command import why_unusable
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from companion.mission.check import check_mission
 from companion.planning_progress import PlanningProgress
 from companion.terminal import tell, terminal_console
@@ -87,6 +97,20 @@ def _parser() -> argparse.ArgumentParser:
         "--sitl", metavar="stub|px4", help="fly in the simulated world: with our stub of PX4, or with a real PX4 (SITL)"
     )
     fly.add_argument("--out", metavar="DIR", help="where log and report go (default: flights/TIME-MISSION)")
+    fly.add_argument("--no-report", action="store_true", help="log and summary only; companion report makes the rest")
+    fly.add_argument(
+        "--mqtt", metavar="URL|off", help="broker for telemetry and commands (default: the vehicle file's)"
+    )
+    fly.add_argument(
+        "--qgroundcontrol",
+        metavar="ADDRESS",
+        help="forward MAVLink to a ground station, e.g. udpout://192.168.1.20:14550",
+    )
+    fly.add_argument(
+        "--wait-for-start",
+        action="store_true",
+        help="when everything is ready, wait on the ground until an operator commands start",
+    )
     fly.set_defaults(run=_fly)
 
     check = commands.add_parser(
@@ -119,11 +143,10 @@ def _parser() -> argparse.ArgumentParser:
     faults_command.add_parser(commands)
     hover_command.add_parser(commands)
     px4_command.add_parser(commands)
-
-    report = commands.add_parser("report", help="make summary and report of a log again")
-    report.add_argument("log", type=Path)
-    report.add_argument("--out", type=Path, metavar="DIR", help="default: beside the log")
-    report.set_defaults(run=_report)
+    monitor_command.add_parser(commands)
+    command_command.add_parser(commands)
+    broker_command.add_parser(commands)
+    report_command.add_parser(commands)
 
     replay = commands.add_parser(
         "replay", help="run the core on a log's inputs; exit 0 if every output is bit-identical"
@@ -178,8 +201,15 @@ def _fly(arguments: argparse.Namespace) -> int:
     if arguments.out is not None and not arguments.out.strip():
         tell("companion fly: --out: expected the name of a folder, got an empty one")
         return EXIT_BAD_INPUT
+    if arguments.mqtt is not None:
+        off = arguments.mqtt == "off"
+        arguments.overrides += ["vehicle.ground.mqtt=null"] if off else [f"vehicle.ground.mqtt.url={arguments.mqtt}"]
+    if arguments.qgroundcontrol is not None:
+        arguments.overrides += [f"vehicle.ground.qgroundcontrol={arguments.qgroundcontrol}"]
+    if arguments.wait_for_start:
+        arguments.overrides += ["mission.start.takeoff=by_operator"]
     config = _load(arguments)
-    problems = _problems(config)
+    problems = [*_problems(config), *_nobody_could_start(config)]
     if problems:
         for line in problems:
             tell(line)
@@ -190,7 +220,23 @@ def _fly(arguments: argparse.Namespace) -> int:
     if problem is not None:
         tell(f"companion fly: --out {out}: {problem}")
         return EXIT_BAD_INPUT
-    return run_flight(config, out, sitl=arguments.sitl, console=terminal_console())
+    return run_flight(config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report)
+
+
+def _nobody_could_start(config: FlightConfig) -> list[str]:
+    """Why a flight that waits for its start would wait for ever, one line; empty: it would not."""
+    if config.mission.start.takeoff != "by_operator":
+        return []
+    mqtt = config.vehicle.ground.mqtt
+    if mqtt is None:
+        why = "vehicle.ground.mqtt is null"
+    elif not mqtt.commands:
+        why = "vehicle.ground.mqtt.commands is false"
+    elif not (mqtt.address.tls or mqtt.address.loopback):
+        why = f"vehicle.ground.mqtt.url is {mqtt.url}, and commands are not heard over a plain connection to another computer"
+    else:
+        return []
+    return [f"mission.start.takeoff is by_operator (--wait-for-start), but nobody could command start: {why}"]
 
 
 def _sitl(arguments: argparse.Namespace) -> int:
@@ -203,22 +249,6 @@ def _sitl(arguments: argparse.Namespace) -> int:
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
         command += ["--px4", str((Path("flights") / f"{stamp}-sitl" / "px4").resolve())]
     os.execv(sys.executable, command)
-
-
-def _report(arguments: argparse.Namespace) -> int:
-    from companion.analysis.log import LogError
-    from companion.flight import report_again
-
-    try:
-        report = report_again(arguments.log, arguments.out or arguments.log.parent)
-    except LogError as error:
-        tell(error)
-        return EXIT_BAD_INPUT
-    if report is None:
-        tell("companion report: plots need matplotlib: pip install 'companion[analysis]'")
-        return EXIT_REFUSED
-    print(report)
-    return EXIT_OK
 
 
 def _replay(arguments: argparse.Namespace) -> int:

@@ -69,6 +69,10 @@ def codes(cell: str) -> list[str]:
     return re.findall(r"`([^`]+)`", cell)
 
 
+HAVE_PARTS = {"broker", "px4", "hover", "arm", "mocap", "ft"}
+"""Commands whose second word is the name of a part: in running text that is a name, not a whole command."""
+
+
 def commands() -> Iterator[tuple[str, list[str]]]:
     """Every `companion ...` line of a shell block, and in running text every one with an argument."""
     for page in PAGES:
@@ -76,7 +80,8 @@ def commands() -> Iterator[tuple[str, list[str]]]:
         inline = [code for code in codes(prose(page)) if "..." not in code]
         for line in [*shell.splitlines(), *inline]:
             words = shlex.split(line, comments=True) if line.startswith("companion ") else []
-            if len(words) > 2:
+            named_only = line in inline and len(words) == 3 and words[1] in HAVE_PARTS
+            if len(words) > 2 and not named_only:
                 yield page.name, words[1:]
 
 

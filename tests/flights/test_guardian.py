@@ -12,10 +12,7 @@ import pytest
 from mcap.reader import make_reader
 
 from companion.analysis.log import FlightLog
-from companion.config.loader import load_flight
 from companion.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
-from companion.launcher import Launcher
-from companion.types import Outcome
 from tests.support import CATCH, HOVER, Sandbox, read_summary, sandbox_in
 
 OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
@@ -62,21 +59,6 @@ def test_at_the_catch_the_guardian_lands(sandbox: Sandbox, kind: str) -> None:
     with open(out / "flight.mcap", "rb") as file:
         lines = b"".join(message.data for _, _, message in make_reader(file).iter_messages(topics=["/log"]))
     assert b"guardian_landed" in lines, "the log goes on to the end"
-
-
-@pytest.mark.flight
-def test_the_vehicle_stands_where_it_was_left(tmp_path: Path) -> None:
-    """The world's own word, not the guardian's."""
-    fault = "world.faults=[{kind: stop_flight, t_s: 6}]"
-    launcher = Launcher(load_flight(HOVER, overrides=[fault]), tmp_path, sitl=True, on_message=lambda message: None)
-    result = launcher.run()
-    assert result.outcome is Outcome.ABORTED
-    assert not result.world["crashed"]
-    report = result.world["flight_fault"]
-    assert report["kind"] == "stop_flight"
-    assert report["disarmed_s"] is not None
-    assert report["drift_m"] < 0.5
-    assert report["worst_tilt_deg"] < 30.0
 
 
 @pytest.mark.flight

@@ -1,0 +1,332 @@
+"""What a broker, its absence, and what is done to it cost the control loop: one flight, one condition after the other.
+
+    python -m benchmarks.broker                    # 3 rounds of 8 conditions, 20 s each: 9 minutes of hovering
+    python -m benchmarks.broker --rounds 1 --slot 10 --json FILE
+
+All conditions are met by one and the same flight, in an order drawn anew for each round, so that what the machine does meanwhile meets
+all of them alike. Exit code 0 only if the flight was completed, nothing was dropped, and no condition makes ticks later than no broker
+does (p99 by more than a quarter and a tenth of a period, which is what two runs without a broker differ by).
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from rich.console import Console
+from rich.table import Table
+
+from companion.analysis.log import FlightLog
+from companion.clock import flight_clock
+from companion.config.ground import topic_name
+from companion.config.loader import load_flight
+from companion.core import NOMINAL_DT_S
+from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.ticker import Ticker
+from tests.broker import LOOPBACK, Broker, free_port
+
+MISSION = Path(__file__).parents[1] / "configs/missions/hover.yaml"
+SETTLE_S = 3.0
+"""From one condition to the next; not counted."""
+START_TIMEOUT_S, END_TIMEOUT_S = 60.0, 180.0
+P99_RATIO_MAX = 1.25
+P99_MORE_MAX_MS = 0.5
+NO_BROKER = "no broker"
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """A condition that was met between two times of the wall clock."""
+
+    condition: str
+    begin_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """All ticks of one condition; lateness in ms."""
+
+    condition: str
+    ticks: int
+    p50: float
+    p99: float
+    p999: float
+    max: float
+    missed: int
+    empty_p50: float
+    empty_p99: float
+    empty_max: float
+    empty_missed: int
+
+
+class Conditions:
+    """What can be done to the broker; each of them leaves nothing behind."""
+
+    def __init__(self, folder: Path, vehicle: str) -> None:
+        self.port = free_port()
+        self._vehicle = vehicle
+        config = folder / "loopback.conf"
+        text = LOOPBACK.read_text(encoding="utf-8")
+        config.write_text(text.replace("listener 1883 127.0.0.1\n", f"listener {self.port} 127.0.0.1\n"))
+        self.broker = Broker(folder, config, self.port)
+        self.all: dict[str, Callable[[float], None]] = {
+            NO_BROKER: self.nothing,
+            "broker": self.plain,
+            "killed, restarted": self.killed,
+            "slow": self.slow,
+            "retained rubbish": lambda s: self.loaded("rubbish", s),
+            "20 viewers": lambda s: self.loaded("viewers", s),
+            "1,000 commands/s": lambda s: self.loaded("noise", s),
+        }
+
+    def nothing(self, seconds: float) -> None:
+        """Nobody listens on the port."""
+        time.sleep(seconds)
+
+    def plain(self, seconds: float) -> None:
+        """A broker, and nobody else."""
+        with self._broker():
+            time.sleep(seconds)
+
+    def killed(self, seconds: float) -> None:
+        """Killed and started again, over and over."""
+        end_s = time.monotonic() + seconds
+        with self._broker():
+            while time.monotonic() < end_s:
+                time.sleep(2.0)
+                self.broker.kill()
+                time.sleep(1.0)
+                self.broker.start()
+
+    def slow(self, seconds: float) -> None:
+        """It gets a twentieth of the time: its socket fills up, and is emptied in bursts."""
+        end_s = time.monotonic() + seconds
+        with self._broker():
+            while time.monotonic() < end_s:
+                self.broker.signal(signal.SIGSTOP)
+                time.sleep(1.9)
+                self.broker.signal(signal.SIGCONT)
+                time.sleep(0.1)
+
+    def loaded(self, load: str, seconds: float) -> None:
+        """A broker that others use."""
+        with self._broker():
+            command = [sys.executable, "-m", "benchmarks.brokering.load", load, self.broker.url, self._vehicle]
+            process = subprocess.Popen(command)
+            try:
+                time.sleep(seconds)
+                if process.poll() is not None:
+                    raise SystemExit(f"broker: the load {load!r} ended by itself, exit code {process.returncode}")
+            finally:
+                process.terminate()
+                process.wait(30.0)
+
+    @contextlib.contextmanager
+    def _broker(self) -> Iterator[None]:
+        self.broker.start()
+        try:
+            yield
+        finally:
+            self.broker.stop()
+
+
+def fly(rounds: int, slot_s: float, folder: Path, console: Console) -> tuple[list[Slot], int]:
+    """Hover while one condition follows the other; when each was met, and the flight's exit code."""
+    config = load_flight(MISSION)
+    conditions = Conditions(folder, topic_name(config.vehicle.ground.topic, config.vehicle.name))
+    order = random.Random(1)
+    names = [
+        name for _ in range(rounds) for name in order.sample([*conditions.all, NO_BROKER], len(conditions.all) + 1)
+    ]
+    hover_s = len(names) * (slot_s + 3.0 + SETTLE_S) + 10.0
+    command = [
+        *(sys.executable, "-m", "companion.cli", "fly", str(MISSION), "--sitl", "--out", str(folder / "flight")),
+        *("--set", f"mission.phases[1].duration_s={hover_s}", f"world.battery_life_s={4.0 * hover_s}"),
+        f"vehicle.ground.mqtt.url=mqtt://127.0.0.1:{conditions.port}",
+    ]
+    empty = subprocess.Popen([sys.executable, "-m", "benchmarks.broker", "--empty-loop", str(folder / "empty.npy")])
+    slots: list[Slot] = []
+    with (folder / "fly.txt").open("wb") as out:
+        flight = subprocess.Popen(command, stdout=out, stderr=out, env={**os.environ, "PYTHONUNBUFFERED": "1"})
+        try:
+            _await_hover(flight, folder)
+            for number, name in enumerate(names, 1):
+                if flight.poll() is not None:
+                    break
+                console.print(f"  {number:>2}/{len(names)}  {name}", highlight=False)
+                begin_s = time.time() + SETTLE_S
+                conditions.all[name](slot_s + SETTLE_S)
+                slots.append(Slot(name, begin_s, begin_s + slot_s))
+            if flight.poll() is None:
+                flight.send_signal(signal.SIGINT)
+            flight.wait(END_TIMEOUT_S)
+        finally:
+            for process in (flight, empty):
+                if process.poll() is None:
+                    process.terminate()
+                    process.wait(END_TIMEOUT_S)
+    return slots, flight.returncode
+
+
+def _await_hover(flight: subprocess.Popen[bytes], folder: Path) -> None:
+    deadline_s = time.monotonic() + START_TIMEOUT_S
+    while "  hold" not in (folder / "fly.txt").read_text():
+        if flight.poll() is not None or time.monotonic() > deadline_s:
+            raise SystemExit(f"broker: no flight: {(folder / 'fly.txt').read_text()}")
+        time.sleep(0.1)
+    time.sleep(SETTLE_S)
+
+
+def judge(slots: list[Slot], folder: Path) -> list[Row]:
+    """Lateness by condition, of the flight and of the empty loop."""
+    log = folder / "flight/flight.mcap"
+    offset_s = int(FlightLog.read(log, ticks_max=1000).metadata["companion"]["epoch_offset_ns"]) * 1e-9
+    starts, lateness = [], []
+    with log.open("rb") as file:
+        for _, _, message in make_reader(file).iter_messages(topics=["/sent"], log_time_order=False):
+            sent: dict[str, Any] = json.loads(message.data)
+            starts.append(offset_s + sent["start_s"])
+            lateness.append(1e3 * sent["lateness_s"])
+    flown = np.array([starts, lateness])
+    empty: Any = np.load(folder / "empty.npy")
+    rows = []
+    for condition in dict.fromkeys(slot.condition for slot in slots):
+        own = [slot for slot in slots if slot.condition == condition]
+        ticks, beside = (_within(ticks, own) for ticks in (flown, empty))
+        p50, p99, p999 = np.percentile(ticks, [50.0, 99.0, 99.9])
+        e50, e99 = np.percentile(beside, [50.0, 99.0])
+        period_ms = 1e3 * NOMINAL_DT_S
+        rows.append(
+            Row(
+                condition,
+                len(ticks),
+                float(p50),
+                float(p99),
+                float(p999),
+                float(ticks.max()),
+                int((ticks > period_ms).sum()),
+                float(e50),
+                float(e99),
+                float(beside.max()),
+                int((beside > period_ms).sum()),
+            )
+        )
+    return sorted(rows, key=lambda row: row.condition != NO_BROKER)
+
+
+def _within(ticks: Any, slots: list[Slot]) -> Any:
+    inside = np.zeros(ticks.shape[1], dtype=bool)
+    for slot in slots:
+        inside |= (ticks[0] >= slot.begin_s) & (ticks[0] < slot.end_s)
+    return ticks[1][inside]
+
+
+def run_empty_loop(path: Path) -> None:
+    """Tick as a flight does, with its priority, and do nothing, until SIGTERM; then write wall clock and lateness (ms) of each tick."""
+    np.save(path, asyncio.run(_empty_loop()))
+
+
+async def _empty_loop() -> Any:
+    over = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, over.set)
+    origin_s, origin_wall_s = time.monotonic(), time.time()
+    claim_realtime(FLIGHT_PRIORITY)
+    ticker = Ticker(NOMINAL_DT_S, flight_clock(origin_s))
+    rows = []
+    while not over.is_set():
+        tick = await ticker.next()
+        rows.append((origin_wall_s + tick.start_s, 1e3 * tick.lateness_s))
+    return np.array(rows).T
+
+
+def problems_of(rows: list[Row], code: int, summary: dict[str, Any]) -> list[str]:
+    """What is not as it must be."""
+    found = [] if code == 4 else [f"the flight ended with exit code {code}, 4 (landed on demand) was expected"]
+    unasked = [
+        e["text"] for e in summary["events"] if e["severity"] != "info" and e["id"] not in ("operator_land", "ground")
+    ]
+    found += [f"the flight said: {text}" for text in unasked]
+    if summary["recorder"]["dropped"]:
+        found.append(f"recorder: {summary['recorder']['dropped']} dropped")
+    by_name = {row.condition: row for row in rows}
+    none = by_name[NO_BROKER]
+    for row in rows:
+        if row.p99 > P99_RATIO_MAX * none.p99 and row.p99 > none.p99 + P99_MORE_MAX_MS:
+            found.append(f"{row.condition}: p99 {row.p99:.2f} ms, without a broker {none.p99:.2f} ms")
+    return found
+
+
+def show(rows: list[Row], console: Console) -> None:
+    none = rows[0]
+    table = Table(title="lateness of ticks, ms", title_justify="left")
+    for name in (
+        "condition",
+        "ticks",
+        "p50",
+        "p99",
+        "p99.9",
+        "max",
+        "missed",
+        "p99 / no broker",
+        "empty loop p50",
+        "p99",
+        "max",
+        "missed",
+    ):
+        table.add_column(name, justify="left" if name == "condition" else "right")
+    for row in rows:
+        table.add_row(
+            row.condition, str(row.ticks), f"{row.p50:.2f}", f"{row.p99:.2f}", f"{row.p999:.2f}", f"{row.max:.2f}", str(row.missed),
+            f"{row.p99 / none.p99:.2f}", f"{row.empty_p50:.2f}", f"{row.empty_p99:.2f}", f"{row.empty_max:.2f}", str(row.empty_missed),
+        )  # fmt: skip
+    console.print(table)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.broker", description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--slot", type=float, default=20.0, help="seconds of each condition that count")
+    parser.add_argument("--json", type=Path, help="write the figures here as well")
+    parser.add_argument("--out", type=Path, help="keep the flight in this folder; must not exist")
+    parser.add_argument("--empty-loop", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args(argv)
+    if arguments.empty_loop is not None:
+        run_empty_loop(arguments.empty_loop)
+        return 0
+    console = Console(width=150)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = arguments.out or Path(scratch) / "run"
+        if folder.exists():
+            parser.error(f"{folder} exists already; choose another --out")
+        folder.mkdir(parents=True)
+        slots, code = fly(arguments.rounds, arguments.slot, folder, console)
+        rows = judge(slots, folder)
+        summary = json.loads((folder / "flight/summary.json").read_text())
+    show(rows, console)
+    problems = problems_of(rows, code, summary)
+    for problem in problems:
+        console.print(problem, style="red", highlight=False)
+    if arguments.json is not None:
+        found = {"rows": [asdict(row) for row in rows], "problems": problems}
+        arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
