@@ -283,6 +283,7 @@ async def fly(
                     "mission": config.mission.name,
                     "law": config.controller.law,
                     "preset": config.controller.preset,
+                    "simulated": str(sitl).lower(),
                 },
                 simulated=sitl,
             )
