@@ -15,14 +15,21 @@ import aiomqtt
 from companion.config.document import ConfigError
 from companion.config.ground import Mqtt, topic_name
 from companion.config.loader import FlightConfig
+from companion.ground.access import KEYS, BrokerAccess, broker_access
 from companion.ground.commands import Verifier
+from companion.ground.connection import Connection, why
 from companion.ground.keys import load_operators
 from companion.ground.messages import MESSAGE_MAX_BYTES, RETAINED, STREAM_PERIOD_S, Command, Topic
 from companion.io.packets import TEXT, UNNUMBERED
-from companion.io.telemetry_client import Access, Client, access_of, why
 from companion.record import pack_plain
 from companion.recording.ground_desk import INFO, WARNING, GroundDesk, Outgoing
 
+ANSWER_S = 4.0
+"""For each answer of the broker."""
+COMMAND_PACKET_MAX_BYTES = 16_384
+"""The broker keeps larger messages to itself: sixteen times a command, so that one too large is seen and told."""
+SEND_BUFFER_BYTES = 65_536
+"""About a second of the stream: what a slow broker has not taken by then would be old anyway."""
 PAUSE_MIN_S, PAUSE_MAX_S = 0.2, 2.0
 """Between two attempts to reach the broker."""
 FAREWELL_S = 1.0
@@ -107,7 +114,7 @@ class Uplink:
     def __init__(
         self,
         desk: GroundDesk,
-        access: Access,
+        access: BrokerAccess,
         flight: FlightSide,
         packets: deque[tuple[float, bytes]],
         recorder_state: Callable[[], tuple[int, str | None]],
@@ -175,7 +182,15 @@ class Uplink:
         will = aiomqtt.Will(Topic.STATE.of(self._desk.vehicle), self._desk.last_will(), qos=1, retain=True)
         identifier = f"companion-{self._desk.vehicle}-{self._desk.session}"
         while True:
-            client = Client(self._access, identifier, will, self._message)
+            client = Connection(
+                self._access,
+                identifier,
+                self._message,
+                packet_max_bytes=COMMAND_PACKET_MAX_BYTES,
+                answer_s=ANSWER_S,
+                will=will,
+                send_buffer_bytes=SEND_BUFFER_BYTES,
+            )
             reason = ""
             try:
                 await client.open()
@@ -191,7 +206,7 @@ class Uplink:
             await asyncio.sleep(pause_s)
             pause_s = min(PAUSE_MAX_S, pause_s * 1.6)
 
-    async def _serve(self, client: Client) -> None:
+    async def _serve(self, client: Connection) -> None:
         """As long as the connection holds.
 
         Raises:
@@ -200,7 +215,7 @@ class Uplink:
         self._counts.connections += 1
         self._tell_change(INFO, f"connected to {self._access.address}")
         if self._desk.hears_commands:
-            refusal = await client.hear(self._command_topic)
+            refusal = await client.hear(self._command_topic, 1)
             text = f"the broker does not let this vehicle hear commands: {refusal}"
             if refusal is not None:
                 self._desk.tell(time.monotonic(), WARNING, text)
@@ -222,7 +237,7 @@ class Uplink:
                 if not part.cancelled():
                     part.exception()
 
-    async def _send_stream(self, client: Client) -> None:
+    async def _send_stream(self, client: Connection) -> None:
         """One message at a time: as long as the system takes none, the newest replaces the one that waits."""
         outbox, topic = self._outbox, Topic.STREAM.of(self._desk.vehicle)
         while True:
@@ -233,7 +248,7 @@ class Uplink:
                 await client.send(topic, payload, qos=0, retain=False)
                 self._counts.stream_sent += 1
 
-    async def _send_kept(self, client: Client) -> None:
+    async def _send_kept(self, client: Connection) -> None:
         """Answers first, then what is retained; each is kept until the broker has it."""
         outbox = self._outbox
         while True:
@@ -251,7 +266,7 @@ class Uplink:
                 await self._send(client, topic, outbox.kept[topic])
             outbox.sent.set()
 
-    async def _send(self, client: Client, topic: Topic, payload: bytes) -> None:
+    async def _send(self, client: Connection, topic: Topic, payload: bytes) -> None:
         refusal = await client.send(topic.of(self._desk.vehicle), payload, qos=1, retain=topic in RETAINED)
         if refusal is None:
             self._not_let.discard(topic)
@@ -319,7 +334,7 @@ def run(
     mqtt = config.vehicle.ground.mqtt
     if mqtt is None:
         return
-    access = access_of(mqtt)
+    access = broker_access(mqtt.url, mqtt.login_file, mqtt.ca_file, KEYS)
 
     async def all_of_it() -> None:
         verifier, no_commands = _verifier(config, mqtt, session)

@@ -100,7 +100,8 @@ def test_stale_shows_within_half_a_second_of_the_last_message(page: Page) -> Non
     assert (page.body("stale"), page.tab.is_visible("#stale"), page.tab.is_visible("#edge")) == ("false", False, False)
 
 
-def test_figures_look_dead_when_they_are_old(page: Page) -> None:
+@pytest.mark.parametrize("how", ["stale", "ended"])
+def test_figures_look_dead_when_they_are_old(page: Page, how: str) -> None:
     def look() -> list[str]:
         found: list[str] = page.tab.evaluate(
             "['.tile .value', '#light-list .text', '.lamp', '#scene', '.plot canvas'].map((s) => document.querySelector(s))"
@@ -110,7 +111,10 @@ def test_figures_look_dead_when_they_are_old(page: Page) -> None:
 
     page.tell(told(in_flight()))
     alive = look()
-    page.run(1.0)
+    if how == "stale":
+        page.run(1.0)
+    else:
+        page.tell(told(state(Presence.ENDED, outcome="completed")))
     assert all(one != other for one, other in zip(alive, look(), strict=True))
 
 
@@ -152,7 +156,8 @@ def test_an_end_is_told_calmly(page: Page, known: Any, word: str, level: str) ->
     page.tell(told(in_flight()), told(known))
     page.run(5.0)
     assert f"{page.text('#word')} {page.text('#why')}".startswith(word)
-    assert (page.body("level"), page.body("stale"), page.enabled()) == (level, "false", set())
+    assert (page.body("level"), page.body("stale"), page.body("old")) == (level, "false", "true")
+    assert (page.enabled(), page.text("#commands-why")) == (set(), "the flight is over")
 
 
 @pytest.mark.parametrize("presence", [Presence.LOST, Presence.SILENT])
@@ -270,7 +275,7 @@ def test_several_vehicles(stand: Stand, page: Page) -> None:
     assert page.figure("height") == "1.77"
     page.tell(told(state(Presence.LOST)))
     assert options.nth(0).text_content() == f"⚠ {NAME} · LOST"
-    assert page.text("#word") == "FLYING"
+    assert page.text("#word") == "FLYING" and page.text("#notice").startswith(f"{NAME}: LOST")
     page.press("hold")
     assert stand.wait_heard("command", 1) == [{"kind": "command", "vehicle": "second", "command": "hold"}]
 

@@ -14,7 +14,7 @@ from companion.control.manipulator import Manipulator
 from companion.frames import quat_from_euler_zyx, quat_rotate
 from companion.record import to_jsonable
 from tests.ground.page_browser import SIZES, Page, chromium, events_of, watching
-from tests.ground.page_stand import Stand, event, flown, retained, told
+from tests.ground.page_stand import BROKER, Stand, event, flown, hello, retained, told
 from tests.support import CATCH
 
 TOUCH_PX = 56.0
@@ -81,6 +81,10 @@ def test_buttons_stay_where_they_are_when_things_go_wrong(browser: Any, stand: S
                 page.tell({"kind": "refused", "vehicle": page.shown, "command": command, "text": text})
             page.run(5.0)
             assert page.tab.is_visible("#stale") and boxes() == before
+            page.tell({**BROKER, "rubbish": 7, "rubbish_text": "no JSON"})
+            assert page.tab.is_visible("#notice") and boxes() == before
+            page.tell(hello(can_command=False, why_not="this monitor was started with --view-only"))
+            assert page.tab.is_visible("#commands-why") and boxes() == before
 
 
 @pytest.mark.parametrize(("scheme", "stale"), list(itertools.product(("dark", "light"), (False, True))))

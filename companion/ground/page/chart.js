@@ -167,7 +167,8 @@ export class StripChart {
       if (!named) continue;
       const wide = context.measureText(event.id).width;
       const left = at + 4 + wide > box.right ? at - 4 - wide : at + 4;
-      const row = [0, 1, 2].find((number) => left > (ends[number] ?? -Infinity)) ?? 0;
+      const row = [0, 1, 2].find((number) => left > (ends[number] ?? -Infinity));
+      if (row === undefined) continue;
       ends[row] = left + wide + 6;
       labels.push({ text: event.id, colour, x: left, y: box.top + LABEL_PX * (row + 1) });
     }

@@ -19,8 +19,8 @@ const HELP = "use Ctrl-C in the flight's terminal, or the pilot's switch";
 export function refusal(name, { canCommand, whyNot, vehicle, verdict }) {
   if (!canCommand) return whyNot || "view only";
   if (vehicle === null) return "no vehicle";
-  if (vehicle.state && !vehicle.state.commands && vehicle.state.presence !== "lost") return vehicle.state.text || "this vehicle hears no commands";
   if (verdict.ended) return "the flight is over";
+  if (vehicle.state && !vehicle.state.commands && vehicle.state.presence !== "lost") return vehicle.state.text || "this vehicle hears no commands";
   if (SAFE.has(name)) return null;
   if (verdict.stale) return "not while the data is old";
   const { stream } = vehicle;

@@ -3,7 +3,7 @@
 import { nowMs } from "./clock.js";
 import { onColours } from "./colours.js";
 import { Commands } from "./commands.js";
-import { byId, setHidden, setText } from "./dom.js";
+import { byId, setData, setHidden, setText } from "./dom.js";
 import { EventList } from "./events.js";
 import { judge } from "./judge.js";
 import { Link, takeToken } from "./link.js";
@@ -113,13 +113,21 @@ function look() {
   eventList.draw(vehicle);
   commands.draw({ canCommand: Boolean(hello?.can_command), whyNot: hello === null ? "not connected yet" : hello.why_not, vehicle, verdict });
   setText(byId("operator"), hello?.operator && hello.can_command ? `as ${hello.operator}` : "");
-  const said = notice ?? (broker?.rubbish ? `${broker.rubbish} messages on the broker were none of ours and were thrown away (${broker.rubbish_text ?? ""})` : null);
+  const trouble = link.open && broker?.connected !== false ? troubleElsewhere(vehicle, others) : null;
+  setData(byId("notice"), "level", trouble === null ? "" : "bad");
+  const said = notice ?? trouble ?? (broker?.rubbish ? `${broker.rubbish} messages on the broker were none of ours and were thrown away (${broker.rubbish_text ?? ""})` : null);
   setHidden(byId("notice"), said === null);
   setText(byId("notice"), said ?? "");
   if (link.open && broker?.connected && verdict.presence === "flying" && verdict.ageS > DUMB_S && now - renewedMs > RENEW_MS) {
     renewedMs = now;
     link.renew();
   }
+}
+
+/** Vehicles that are not shown and not well; null: none. */
+function troubleElsewhere(shown, others) {
+  const bad = [...others].filter(([name, verdict]) => name !== shown?.name && (verdict.level === "bad" || verdict.stale));
+  return bad.map(([name, { banner, word, why }]) => `${name}: ${banner?.word ?? word}, ${banner?.text ?? why}`).join(" · ") || null;
 }
 
 /** Draw everything anew, soon. */

@@ -40,7 +40,7 @@ export class Figures {
   constructor(parent) {
     this._tiles = TILES.map((tile) => {
       const value = make("span", { text: NOTHING, data: { figure: tile.id } });
-      const note = make("div", { className: "note", text: " " });
+      const note = make("div", { className: "note", text: "\u00a0" });
       const line = make("div", { className: "value", children: [value, make("small", { text: ` ${tile.unit}` })] });
       const element = make("div", { className: "tile", children: [make("h2", { text: tile.title }), line, note] });
       parent.append(element);
@@ -50,7 +50,7 @@ export class Figures {
 
   draw(vehicle) {
     for (const { tile, element, value, note } of this._tiles) {
-      const read = vehicle?.stream ? tile.read(vehicle.stream, vehicle.scene) : { value: null, note: " ", level: "unknown" };
+      const read = vehicle?.stream ? tile.read(vehicle.stream, vehicle.scene) : { value: null, note: "\u00a0", level: "unknown" };
       setText(value, fixed(read.value, tile.digits));
       setText(note, read.note);
       setData(element, "level", read.level);

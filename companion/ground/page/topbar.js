@@ -15,7 +15,7 @@ export class TopBar {
     setData(body, "level", old ? "unknown" : verdict.level);
     setData(body, "stale", String(old));
     setData(body, "frame", old || verdict.level === "bad" ? "bad" : "");
-    setData(body, "ended", String(verdict.ended));
+    setData(body, "old", String(old || verdict.ended));
     setData(body, "presence", verdict.presence);
     setText(byId("word"), verdict.word);
     setText(byId("why"), verdict.why);

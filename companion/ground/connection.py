@@ -1,8 +1,8 @@
-"""One connection of the vehicle to its broker, on aiomqtt: last will, answers with their reasons, commands without a queue.
+"""One connection to a broker, on aiomqtt: answers with their reasons, messages without a queue, an end that leaves nothing behind.
 
-Differs from `aiomqtt.Client` in three things that it does not offer: the reason code of a publish (an ACL that does not let us write
-says so in PUBACK only), messages that are handed on at once instead of being queued (a flood of them makes no task for each), and an
-end that leaves no socket behind whatever state the connection is in.
+Differs from `aiomqtt.Client` in what that does not offer: the reason code of a publish (an ACL that does not let us write says so in
+PUBACK only), messages that are handed on at once instead of being queued (a flood of them makes no task for each), and an end that
+leaves no socket behind whatever state the connection is in.
 """
 
 from __future__ import annotations
@@ -10,11 +10,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import re
 import socket
-import ssl
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import aiomqtt
@@ -23,79 +21,44 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from companion.config.document import ConfigError
-from companion.config.ground import BrokerAddress, Mqtt
-from companion.ground.keys import load_login
+from companion.ground.access import BrokerAccess
 
-ANSWER_S = 4.0
-"""For each answer of the broker."""
 KEEPALIVE_S = 5
 """After 1.5 times this without a word the broker sends the last will (MQTT 5, 3.1.2.10)."""
-COMMAND_PACKET_MAX_BYTES = 16_384
-"""The broker keeps larger messages to itself (Maximum Packet Size): sixteen times a command, so that one too large is seen and told."""
-SEND_BUFFER_BYTES = 65_536
-"""About a second of the stream: what a slow broker has not taken by then would be old anyway."""
+OnMessage = Callable[[str, bytes, bool], None]
+"""Topic, payload, retained. Called in the event loop; must not raise."""
+_SSL_SOURCE = re.compile(r" \(_ssl\.c:\d+\)$")
 
 
-@dataclass(frozen=True, slots=True)
-class Access:
-    """Everything that a connection to a broker needs."""
-
-    address: BrokerAddress
-    username: str | None = None
-    password: str | None = field(default=None, repr=False)
-    tls: ssl.SSLContext | None = None
-
-
-def access_of(mqtt: Mqtt) -> Access:
-    """Read what the vehicle file names.
-
-    Raises:
-        ConfigError: one line that says which key or file, what was found and how to mend it.
-    """
-    address = mqtt.address
-    login = load_login(mqtt.login_file) if mqtt.login_file is not None else None
-    if login is not None and not (address.tls or address.loopback):
-        text = f"{address} is another computer and the way there is plain: the password could be read; use mqtts://HOST:PORT"
-        raise ConfigError([f"ground.mqtt.login_file {mqtt.login_file}: {text}"])
-    return Access(
-        address,
-        login.username if login is not None else None,
-        login.password if login is not None else None,
-        _tls(mqtt.ca_file) if address.tls else None,
-    )
-
-
-def _tls(ca_file: str | None) -> ssl.SSLContext:
-    where = f"ground.mqtt.ca_file {ca_file}"
-    try:
-        context = ssl.create_default_context(cafile=str(Path(ca_file).expanduser()) if ca_file is not None else None)
-    except FileNotFoundError:
-        raise ConfigError([f"{where}: no such file"]) from None
-    except ssl.SSLError:
-        raise ConfigError([f"{where}: is no certificate in PEM form (-----BEGIN CERTIFICATE-----)"]) from None
-    except OSError as error:
-        raise ConfigError([f"{where}: cannot be read: {error.strerror}"]) from None
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    return context
-
-
-class Client(aiomqtt.Client):
+class Connection(aiomqtt.Client):
     """One connection; a new one for each attempt.
 
     Args:
         access: how to get there.
-        identifier: the same for every connection of a session: a new one ends the one before it at the broker, and its last will
-            comes before what the new one says, not after it.
+        identifier: a new connection with the same one ends the one before it at the broker.
+        on_message: for every message.
+        packet_max_bytes: the broker keeps larger ones to itself (Maximum Packet Size).
+        answer_s: for each answer of the broker.
         will: what the broker publishes when the connection breaks.
-        on_message: called in the event loop with (topic, payload, retained); must not raise.
+        send_buffer_bytes: of the system; what a slow broker has not taken lies in there and gets old.
     """
 
     def __init__(
-        self, access: Access, identifier: str, will: aiomqtt.Will, on_message: Callable[[str, bytes, bool], None]
+        self,
+        access: BrokerAccess,
+        identifier: str,
+        on_message: OnMessage,
+        *,
+        packet_max_bytes: int,
+        answer_s: float,
+        will: aiomqtt.Will | None = None,
+        send_buffer_bytes: int | None = None,
     ) -> None:
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-        properties.MaximumPacketSize = COMMAND_PACKET_MAX_BYTES
+        properties.MaximumPacketSize = packet_max_bytes
+        options = [(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
+        if send_buffer_bytes is not None:
+            options.append((socket.SOL_SOCKET, socket.SO_SNDBUF, send_buffer_bytes))
         super().__init__(
             access.address.host,
             access.address.port,
@@ -105,16 +68,14 @@ class Client(aiomqtt.Client):
             identifier=identifier,
             protocol=aiomqtt.ProtocolVersion.V5,
             will=will,
-            timeout=ANSWER_S,
+            timeout=answer_s,
             keepalive=KEEPALIVE_S,
             properties=properties,
             tls_context=access.tls,
-            socket_options=[
-                (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
-                (socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES),
-            ],
+            socket_options=options,
         )
-        self._client.connect_timeout = ANSWER_S
+        self._client.connect_timeout = answer_s
+        self._answer_s = answer_s
         self._take = on_message
         self._under_way: dict[int, asyncio.Future[ReasonCode]] = {}
 
@@ -134,22 +95,25 @@ class Client(aiomqtt.Client):
                 await opening
             raise
 
-    async def hear(self, topic: str) -> str | None:
-        """Subscribe, QoS 1; None, or why the broker does not let us.
+    async def hear(self, topic: str, qos: int) -> str | None:
+        """Subscribe; None, or why the broker does not let us.
 
         Raises:
             aiomqtt.MqttError: no answer.
         """
-        for code in await self.subscribe(topic, qos=1):
-            if isinstance(code, ReasonCode) and code.is_failure:
-                return str(code)
-        return None
+        codes = await self.subscribe(topic, qos)
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            # Python 3.11's `asyncio.wait_for`, which aiomqtt waits with, forgets a cancellation that comes together with the result.
+            raise asyncio.CancelledError
+        refused = [code for code in codes if isinstance(code, ReasonCode) and code.is_failure]
+        return str(refused[0]) if refused else None
 
-    async def send(self, topic: str, payload: bytes, *, qos: int, retain: bool) -> str | None:
+    async def send(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> str | None:
         """Publish, and wait until the broker has it (QoS 1) or the system has taken it (QoS 0); None, or why the broker refuses it.
 
         Raises:
-            aiomqtt.MqttError: the connection is gone, or nothing happened within `ANSWER_S`.
+            aiomqtt.MqttError: the connection is gone, or nothing happened within `answer_s`.
         """
         info = self._client.publish(topic, payload, qos=qos, retain=retain)
         if info.rc != 0:
@@ -157,10 +121,10 @@ class Client(aiomqtt.Client):
         done: asyncio.Future[ReasonCode] = asyncio.get_running_loop().create_future()
         self._under_way[info.mid] = done
         try:
-            async with asyncio.timeout(ANSWER_S):
+            async with asyncio.timeout(self._answer_s):
                 code = await done
         except TimeoutError:
-            raise aiomqtt.MqttError(f"the broker took nothing for {ANSWER_S:g} s") from None
+            raise aiomqtt.MqttError(f"no answer from the broker within {self._answer_s:g} s") from None
         finally:
             self._under_way.pop(info.mid, None)
         return str(code) if code.is_failure else None
@@ -175,14 +139,15 @@ class Client(aiomqtt.Client):
             pass  # none comes this way: see _on_message
         raise aiomqtt.MqttError("the connection ended")
 
-    async def drop(self, *, with_will: bool) -> None:
+    async def drop(self, *, with_will: bool = False) -> None:
         """Close, whatever state it is in.
 
         Args:
             with_will: without a word, so that the broker says the last will.
         """
         if not with_will:
-            self._client.disconnect()
+            with contextlib.suppress(OSError, ValueError):
+                self._client.disconnect()
         await asyncio.sleep(0)  # a writer that was asked for is registered by now, and goes with the socket
         if not with_will:
             with contextlib.suppress(OSError, ValueError):
@@ -205,18 +170,25 @@ class Client(aiomqtt.Client):
             done.set_result(reason_code)
 
 
-def why(error: aiomqtt.MqttError) -> str:
-    """One line of an error, without the library's own framing."""
+def code_of(error: aiomqtt.MqttError) -> ReasonCode | None:
+    """The broker's reason code in an error, if there is one."""
     cause = error.__cause__ if isinstance(error.__cause__, aiomqtt.MqttError) else error
     code = getattr(cause, "rc", None)
-    if isinstance(code, ReasonCode):
+    return code if isinstance(code, ReasonCode) else None
+
+
+def why(error: aiomqtt.MqttError) -> str:
+    """One line of an error, without the library's own framing."""
+    code = code_of(error)
+    if code is not None:
         return str(code)
-    return str(cause).split("] ")[-1] or "no answer"
+    cause = error.__cause__ if isinstance(error.__cause__, aiomqtt.MqttError) else error
+    return _SSL_SOURCE.sub("", str(cause).split("] ")[-1]) or "no answer"
 
 
 def _logger() -> logging.Logger:
     """What the library says of a connection is said by us, in our words."""
-    logger = logging.getLogger("companion.telemetry.mqtt")
+    logger = logging.getLogger("companion.mqtt")
     logger.propagate = False
     if not logger.handlers:
         logger.addHandler(logging.NullHandler())
