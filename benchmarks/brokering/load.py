@@ -76,12 +76,17 @@ async def noise(url: str, vehicle: str) -> None:
     payloads = [secrets.token_bytes(200), json.dumps(wrong).encode(), b"{" * 900]
     loop = asyncio.get_running_loop()
     async with _client(url) as client:
-        begun_s, sent = loop.time(), 0
-        while True:
-            while sent < NOISE_PER_S * (loop.time() - begun_s):
-                await client.publish(topic, payloads[sent % len(payloads)], qos=0)
-                sent += 1
-            await asyncio.sleep(0.005)
+        step_s, sent = 0.02, 0
+        begun_s = due_s = loop.time()
+        try:
+            while True:
+                for _ in range(round(NOISE_PER_S * step_s)):
+                    await client.publish(topic, payloads[sent % len(payloads)], qos=0)
+                    sent += 1
+                due_s += step_s
+                await asyncio.sleep(max(0.001, due_s - loop.time()))
+        finally:
+            print(f"  {sent / (loop.time() - begun_s):.0f} commands a second", flush=True)
 
 
 async def rubbish(url: str, vehicle: str) -> None:
