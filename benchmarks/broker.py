@@ -1,6 +1,6 @@
 """What a broker, its absence, and what is done to it cost the control loop: one flight, one condition after the other.
 
-    python -m benchmarks.broker                    # 3 rounds of 8 conditions, 20 s each: 9 minutes of hovering
+    python -m benchmarks.broker                    # 3 rounds of 8 conditions, 16 s each: 9 minutes of hovering
     python -m benchmarks.broker --rounds 1 --slot 10 --json FILE
 
 All conditions are met by one and the same flight, in an order drawn anew for each round, so that what the machine does meanwhile meets
@@ -39,6 +39,7 @@ from companion.core import NOMINAL_DT_S
 from companion.realtime import FLIGHT_PRIORITY, claim_realtime
 from companion.ticker import Ticker
 from tests.broker import LOOPBACK, Broker, free_port
+from tests.support import PATIENT
 
 MISSION = Path(__file__).parents[1] / "configs/missions/hover.yaml"
 SETTLE_S = 3.0
@@ -159,6 +160,7 @@ def fly(rounds: int, slot_s: float, folder: Path, console: Console) -> tuple[lis
         *(sys.executable, "-m", "companion.cli", "fly", str(MISSION), "--sitl", "--out", str(folder / "flight")),
         *("--set", f"mission.phases[1].duration_s={hover_s}", f"world.battery_life_s={4.0 * hover_s}"),
         f"vehicle.ground.mqtt.url=mqtt://127.0.0.1:{conditions.port}",
+        *(f"{key}={value}" for key, value in PATIENT.items() if "mqtt" not in key),
     ]
     empty = subprocess.Popen([sys.executable, "-m", "benchmarks.broker", "--empty-loop", str(folder / "empty.npy")])
     slots: list[Slot] = []
@@ -301,7 +303,7 @@ def show(rows: list[Row], console: Console) -> None:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.broker", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--slot", type=float, default=20.0, help="seconds of each condition that count")
+    parser.add_argument("--slot", type=float, default=16.0, help="seconds of each condition that count")
     parser.add_argument("--json", type=Path, help="write the figures here as well")
     parser.add_argument("--out", type=Path, help="keep the flight in this folder; must not exist")
     parser.add_argument("--empty-loop", type=Path, help=argparse.SUPPRESS)

@@ -24,6 +24,7 @@ from companion.ground.messages import (
     TetherView,
     Timing,
 )
+from companion.mission.sequencer import Stage
 from companion.types import (
     ControlLog,
     Inputs,
@@ -36,7 +37,9 @@ from companion.types import (
     Vec3,
 )
 
-WAITS_FOR_START = "waits for start"
+_TOUCHDOWN = Stage.TOUCHDOWN.value
+"""On the floor the reference lies below it: no error of the flight."""
+WAITS_FOR_START = Stage.READY.value
 """`Outputs.phase` of a flight that is ready and waits for the command."""
 PERIOD_S = 0.005
 """Of the control loop: a tick that begins later than this is missed (`companion.core.NOMINAL_DT_S`)."""
@@ -174,7 +177,7 @@ class StreamMaker:
             reference_world_m=_rounded(reference.position_world_m, 4) if reference is not None else None,
             reference_yaw_rad=_number(reference.yaw_rad, 5) if reference is not None else None,
             reference_arm_rad=_rounded(reference.arm_rad, 5) if reference is not None else None,
-            e_p_m=_number(_position_error_m(position, age_s, reference), 5),
+            e_p_m=None if o.phase == _TOUCHDOWN else _number(_position_error_m(position, age_s, reference), 5),
             e_q_deg=_number(_angle_deg(attitude, setpoint.attitude_wxyz), 4) if setpoint is not None else None,
             thrust=_number(setpoint.thrust, 5) if setpoint is not None else None,
             battery_v=_number(status.battery_voltage_v, 3) if status is not None else None,
