@@ -260,10 +260,6 @@ async def _empty_loop() -> Any:
 def problems_of(rows: list[Row], code: int, summary: dict[str, Any]) -> list[str]:
     """What is not as it must be."""
     found = [] if code == 4 else [f"the flight ended with exit code {code}, 4 (landed on demand) was expected"]
-    unasked = [
-        e["text"] for e in summary["events"] if e["severity"] != "info" and e["id"] not in ("operator_land", "ground")
-    ]
-    found += [f"the flight said: {text}" for text in unasked]
     if summary["recorder"]["dropped"]:
         found.append(f"recorder: {summary['recorder']['dropped']} dropped")
     by_name = {row.condition: row for row in rows}
@@ -272,6 +268,14 @@ def problems_of(rows: list[Row], code: int, summary: dict[str, Any]) -> list[str
         if row.p99 > P99_RATIO_MAX * none.p99 and row.p99 > none.p99 + P99_MORE_MAX_MS:
             found.append(f"{row.condition}: p99 {row.p99:.2f} ms, without a broker {none.p99:.2f} ms")
     return found
+
+
+def said(summary: dict[str, Any]) -> list[str]:
+    """What the flight warned of: the machine is held up as a whole now and then, and the empty loop with it."""
+    asked_for = ("operator_land", "ground")
+    return [
+        event["text"] for event in summary["events"] if event["severity"] != "info" and event["id"] not in asked_for
+    ]
 
 
 def show(rows: list[Row], console: Console) -> None:
@@ -321,6 +325,8 @@ def main(argv: list[str] | None = None) -> int:
         rows = judge(slots, folder)
         summary = json.loads((folder / "flight/summary.json").read_text())
     show(rows, console)
+    for text in said(summary):
+        console.print(f"the flight said: {text}", highlight=False)
     problems = problems_of(rows, code, summary)
     for problem in problems:
         console.print(problem, style="red", highlight=False)

@@ -13,8 +13,11 @@ from benchmarks.fuzzing.mutate import mutated
 from companion.guardian import beat as words
 from companion.guardian.beat import Beat
 from companion.io.recorder import RecorderClient
+from companion.types import OperatorCommand
+from tests.analysis.synthetic_flight import synthetic_flight
 
 _SIZE_MAX_BYTES = 4000
+_TICK = next(iter(synthetic_flight()))
 _BEAT = Beat(
     tick=7, t_s=1.5, origin_s=100.0, mission_t_s=0.5, lifting=True, pilot=False, goodbye=False, autopilot_system=1,
     own_system=1, own_component=191, local_port=14540, pose_stamp_s=1.49, position_world_m=(1.0, 2.0, 3.0),
@@ -31,6 +34,8 @@ class ChannelsTarget(Target):
         self._tidings = [
             b'{"error": "recorder: log.mcap: No space left on device"}',
             b'{"samples": 1}',
+            b'{"command": "hold", "operator": "anna", "nonce": "0123456789abcdef"}',
+            b'{"ground": "connected to mqtt://127.0.0.1:1883"}',
             b"[1]",
             b"null",
         ]
@@ -58,9 +63,17 @@ class ChannelsTarget(Target):
             if words.unpack(words.pack(_BEAT)) != _BEAT:
                 raise Wrong("a valid beat behind it is not understood")
         elif len(data) > 1:
-            self._theirs.send(data[1:])
-            self._client._listen()
+            self._hear(data[1:])
+            self._client.take_commands()
             self._client.error = None
-            self._theirs.send(b'{"error": "disk full"}')
-            self._client._listen()
+            self._hear(b'{"error": "disk full"}')
             one_line(self._client.error or "", "the recorder's word")
+            self._hear(b'{"command": "land", "operator": "anna", "nonce": "00"}')
+            if [asked.command for asked in self._client.take_commands()] != [OperatorCommand.LAND]:
+                raise Wrong("a valid command behind it is not heard")
+
+    def _hear(self, data: bytes) -> None:
+        """The recorder says something; the flight hears it in its next tick."""
+        self._theirs.send(data)
+        self._client.record(*_TICK)
+        self._theirs.recv(2**20)
