@@ -11,11 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from companion import (
+    arm_command,
     broker_command,
     command_command,
     compare_command,
     faults_command,
+    ft_command,
     hover_command,
+    latency_command,
+    mocap_command,
     monitor_command,
     px4_command,
     report_command,
@@ -142,7 +146,11 @@ def _parser() -> argparse.ArgumentParser:
     robustness_command.add_parser(commands)
     faults_command.add_parser(commands)
     hover_command.add_parser(commands)
+    arm_command.add_parser(commands)
     px4_command.add_parser(commands)
+    mocap_command.add_parser(commands)
+    ft_command.add_parser(commands)
+    latency_command.add_parser(commands)
     monitor_command.add_parser(commands)
     command_command.add_parser(commands)
     broker_command.add_parser(commands)

@@ -28,6 +28,12 @@ _MAX_CATCH_UP = 8  # frames; a world that jumped further is not paid back in a b
 class ForceTorqueServer:
     """The emulated sensor; an async context manager on the running event loop.
 
+    Args:
+        product_name: what it answers to PRODUCT_NAME.
+        serial_number: to SERIAL_NUMBER.
+        firmware: to FIRMWARE_VERSION.
+        scale: its readings over the truth, of a sensor that is badly calibrated or another model.
+
     Attributes:
         silent: the sensor neither answers nor streams (cable cut).
         stuck: it streams its last reading for ever.
@@ -35,8 +41,13 @@ class ForceTorqueServer:
     """
 
     def __init__(
-        self, product_name: str = "RFT60-HA01", serial_number: str = "RFT60HA-0001", firmware: str = "V1.2.0"
+        self,
+        product_name: str = "RFT60-HA01",
+        serial_number: str = "RFT60HA-0001",
+        firmware: str = "V1.2.0",
+        scale: float = 1.0,
     ) -> None:
+        self._scale = scale
         self.silent = False
         self.stuck = False
         self.dropped = 0
@@ -96,8 +107,8 @@ class ForceTorqueServer:
 
     def set_wrench(self, force_n: Vec3, torque_nm: Vec3) -> None:
         """What the sensor feels from now on, in its own frame, N and N m; any rate."""
-        self._force_n = force_n
-        self._torque_nm = torque_nm
+        self._force_n = _scaled(force_n, self._scale)
+        self._torque_nm = _scaled(torque_nm, self._scale)
 
     def tick(self, t_s: float) -> None:
         """Send every packet that is due by the world's time `t_s`; call it every millisecond or two of world time."""
@@ -177,6 +188,10 @@ class ForceTorqueServer:
         else:
             text = self._texts[command].encode("ascii")[:15]
             self._write(rft.pack(bytes((command,)) + text, rft.RESPONSE_BYTES))
+
+
+def _scaled(v: Vec3, k: float) -> Vec3:
+    return v if k == 1.0 else (k * v[0], k * v[1], k * v[2])
 
 
 def _subtract(a: Vec3, b: Vec3) -> Vec3:

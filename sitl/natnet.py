@@ -32,6 +32,11 @@ _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
     (0.0, 0.05, 0.11),
 )
 _STRAY_MARKER_M: Final[Vec3] = (2.5, -2.0, 0.03)  # a reflection on the floor, as every lab has one
+LOOPBACK, LOOPBACK_BROADCAST = "127.0.0.1", "127.255.255.255"
+"""A server on a network hears broadcasts; one that is bound to the loopback address has to listen for them beside it."""
+OTHER_BODY: Final = "wand"
+OTHER_PLACE_M: Final[Vec3] = (1.9, -1.5, 0.04)
+"""A rigid body that somebody left on the floor."""
 _MARKER_SIZE_M: Final = 0.014
 _MARKER_OCCLUDED = 0x01
 _MARKER_POINT_CLOUD_SOLVED = 0x02
@@ -90,6 +95,7 @@ class NatNetServer:
         self._ports = (command_port, data_port)
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
+        self._broadcast: socket.socket | None = None
         self._clients: dict[tuple[str, int], tuple[float, NatNetVersion]] = {}
         self._number = 0
         self._last: tuple[float, tuple[BodyPose, ...], float | None] = (0.0, (), None)
@@ -123,6 +129,8 @@ class NatNetServer:
         try:
             self._command = self._bind(self._ports[0])
             self._data = self._bind(self._ports[1])
+            if self.interface == LOOPBACK:
+                self._broadcast = self._bind(self.command_port, LOOPBACK_BROADCAST)
             if self.multicast_group is not None:
                 self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self.interface))
                 self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
@@ -130,16 +138,20 @@ class NatNetServer:
         except BaseException:
             self._close()
             raise
-        asyncio.get_running_loop().add_reader(self._command.fileno(), self._answer_all)
+        for opened in self._listening():
+            asyncio.get_running_loop().add_reader(opened.fileno(), self._answer_all, opened)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close both sockets."""
-        if self._command is not None:
-            asyncio.get_running_loop().remove_reader(self._command.fileno())
+        for opened in self._listening():
+            asyncio.get_running_loop().remove_reader(opened.fileno())
         self._close()
+
+    def _listening(self) -> list[socket.socket]:
+        return [opened for opened in (self._command, self._broadcast) if opened is not None]
 
     def publish(self, t_s: float, poses: Sequence[BodyPose], exposure_t_s: float | None) -> None:
         """Send one frame to everybody; never blocks.
@@ -168,23 +180,22 @@ class NatNetServer:
         t_s, poses, exposure_t_s = self._last
         return encode_frame(version, self._number, t_s, poses, exposure_t_s, dict(self.bodies))
 
-    def _bind(self, port: int) -> socket.socket:
+    def _bind(self, port: int, address: str = "") -> socket.socket:
+        address = address or self.interface
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             opened.setblocking(False)
-            opened.bind((self.interface, port))
+            opened.bind((address, port))
         except OSError as error:
             opened.close()
-            raise OSError(
-                error.errno, f"NatNet server: cannot bind UDP {self.interface}:{port} ({error.strerror})"
-            ) from None
+            raise OSError(error.errno, f"NatNet server: cannot bind UDP {address}:{port} ({error.strerror})") from None
         return opened
 
     def _close(self) -> None:
-        for opened in (self._command, self._data):
+        for opened in (self._command, self._data, self._broadcast):
             if opened is not None:
                 opened.close()
-        self._command = self._data = None
+        self._command = self._data = self._broadcast = None
         self._clients.clear()
 
     def _send(self, sender: socket.socket | None, datagram: bytes, address: tuple[str, int]) -> None:
@@ -195,10 +206,10 @@ class NatNetServer:
         except OSError:
             self.dropped += 1
 
-    def _answer_all(self) -> None:
+    def _answer_all(self, opened: socket.socket) -> None:
         while self._command is not None:
             try:
-                datagram, address = self._command.recvfrom(65535)
+                datagram, address = opened.recvfrom(65535)
             except (BlockingIOError, InterruptedError):
                 return
             except OSError:  # an ICMP error of an earlier answer

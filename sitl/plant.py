@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from companion.config.faults import Fault, FaultKind
-from companion.config.vehicle import Vehicle
-from companion.config.world import Push
+from companion.config.vehicle import Joint, Vehicle
+from companion.config.world import Push, Servo
 from companion.config.world import World as WorldConfig
 from companion.frames import quat_from_euler_zyx, quat_multiply
 from companion.types import Quat, Vec2, Vec3, Vec4
@@ -58,6 +58,11 @@ class MocapFrame(NamedTuple):
     valid: bool
 
 
+def _zero_rad(joint: Joint, servo: Servo) -> float:
+    """Shaft angle at joint angle 0."""
+    return joint.zero_count / _COUNTS_PER_RAD + joint.sign * math.radians(servo.zero_error_deg)
+
+
 def battery_voltage_v(remaining: float) -> float:
     """Voltage at a charge of 0 to 1."""
     return BATTERY_EMPTY_V + (BATTERY_FULL_V - BATTERY_EMPTY_V) * remaining
@@ -95,9 +100,14 @@ class Plant:
         for drive in drives:
             drive.goal_delay_s = config.arm_delay_s
         first, second = vehicle.arm.joints
-        self._joint_signs = (first.sign, second.sign)
-        self._servo_zeros_rad = (first.zero_count / _COUNTS_PER_RAD, second.zero_count / _COUNTS_PER_RAD)
-        self._torque_per_amp_nm_a = vehicle.arm.torque_per_amp_nm_a
+        servo1, servo2 = config.servo(0), config.servo(1)
+        self._joint_signs = (
+            -first.sign if servo1.reversed else first.sign,
+            -second.sign if servo2.reversed else second.sign,
+        )
+        self._servo_zeros_rad = (_zero_rad(first, servo1), _zero_rad(second, servo2))
+        k = vehicle.arm.torque_per_amp_nm_a
+        self._torque_per_amp_nm_a = (k / (1.0 + servo1.torque_per_amp_error), k / (1.0 + servo2.torque_per_amp_error))
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
@@ -156,9 +166,9 @@ class Plant:
         (q1, q2), (v1, v2) = layout.joint_q, layout.joint_v
         (sign1, sign2), (zero1, zero2) = self._joint_signs, self._servo_zeros_rad
         drive1, drive2 = self._drives
-        k = self._torque_per_amp_nm_a
-        torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * q[q1], sign1 * v[v1]) * k
-        torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * q[q2], sign2 * v[v2]) * k
+        k1, k2 = self._torque_per_amp_nm_a
+        torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * q[q1], sign1 * v[v1]) * k1
+        torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * q[q2], sign2 * v[v2]) * k2
         if self._tick % IMU_EVERY == 0:
             self._rotors = self._px4.step(self._imu_sample or self._imu())
             self._imu_sample = None

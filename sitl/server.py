@@ -18,16 +18,19 @@ from typing import Any
 from companion.config.faults import FaultKind
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
-from companion.types import Vec2
+from companion.types import IDENTITY_QUAT, Vec2
+from sitl.arm_hand import ArmHand
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.ends import AutopilotEnd, StubEnd
 from sitl.faults import Faults, Sample, sample
 from sitl.flight_faults import SIGNALS, FlightFaults, environment, strike
 from sitl.force_torque import ForceTorqueServer
-from sitl.natnet import BodyPose, NatNetServer
+from sitl.hand import HungWeight
+from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
 from sitl.plant import MocapFrame, Plant
 from sitl.px4_link import Px4Error
 from sitl.servo_bus import ServoBus
+from sitl.servo_knobs import servo_of
 from sitl.servo_model import ServoModel
 from sitl.world import PHYSICS_DT_S
 
@@ -87,8 +90,11 @@ class Sitl:
         self._config = config
         self._on_message = on_message
         arm = vehicle.arm
-        device = vehicle.devices.arm
-        self.servos = [ServoModel(joint.servo_id, baud_bps=device.baud) for joint in arm.joints]
+        knobs = [config.servo(index) for index in range(len(arm.joints))]
+        self.servos = [
+            servo_of(joint, vehicle.devices.arm, knob) for joint, knob in zip(arm.joints, knobs, strict=True)
+        ]
+        self._on_bus = [servo for servo, knob in zip(self.servos, knobs, strict=True) if knob.connected]
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
         self.autopilot: AutopilotEnd = autopilot or StubEnd(config, stub_ports)
         pose = (start.position_m, start.yaw_rad, start.arm_rad)
@@ -104,6 +110,10 @@ class Sitl:
         )
         if config.faults:
             self.plant.faults = self.faults
+        self._weight = HungWeight(config)
+        other = config.mocap_other_id
+        self._others = () if other is None else ((other, OTHER_BODY),)
+        self._arm_hand = ArmHand(vehicle.arm, pose[2]) if config.arm_hand else None
         self.flight = FlightFaults()
         self.course: list[Sample] = []
         """Where the machine truly was, from the first fault on."""
@@ -126,15 +136,15 @@ class Sitl:
         """Open every wire; yields the addresses as settings of the vehicle file's devices."""
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
-            self.bus = await stack.enter_async_context(ServoBus(self.servos))
-            self.force = await stack.enter_async_context(ForceTorqueServer())
+            self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
+            self.force = await stack.enter_async_context(ForceTorqueServer(scale=self._config.force_scale))
             self.mocap = await stack.enter_async_context(
                 NatNetServer(
                     version=self._config.natnet_version,
                     command_port=self._ports.mocap_command,
                     data_port=self._ports.mocap_data,
                     multicast_group=device.mocap.multicast_group if self._ports.multicast else None,
-                    bodies=((device.mocap.rigid_body_id, self._vehicle.name),),
+                    bodies=((device.mocap.rigid_body_id, self._vehicle.name), *self._others),
                     rate_hz=self._config.mocap_rate_hz,
                 )
             )
@@ -210,11 +220,15 @@ class Sitl:
         if plant.faults is not None:
             self._plant_faults()
         autopilot = self.autopilot
+        if self._arm_hand is not None and not autopilot.armed:
+            self._hold_arm(self._arm_hand)
         plant.step(autopilot.armed)
         if autopilot.lockstep and plant.imu_due:
             autopilot.sense(plant.sample_imu())
         for frame in plant.take_mocap():
             self._publish(frame)
+        if self._weight.changed(plant.t_s, self.force.streaming):
+            plant.world.push((0.0, 0.0, -self._weight.pull_n))
         self.force.set_wrench(*plant.force_torque())
         self.force.tick(plant.t_s)
         autopilot.pump(plant.t_s, plant.battery())
@@ -231,11 +245,25 @@ class Sitl:
             self._at_rest = at_rest
             self._on_message({"type": "at_rest", "at_rest": at_rest})
 
+    def _hold_arm(self, hand: ArmHand) -> None:
+        servos, world = self.servos, self.plant.world
+        first, second = world.layout.joint_q
+        held = hand.angles_rad(
+            self.plant.t_s,
+            not any(servo.drive.torque_on for servo in servos),
+            (world.q[first], world.q[second]),
+            max(servo.lights for servo in servos),
+            any(servo.lit for servo in servos),
+        )
+        if held is not None:
+            world.hold_arm(held)
+
     def _publish(self, frame: MocapFrame) -> None:
         body = self._vehicle.devices.mocap.rigid_body_id
         pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
+        others = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
         clock = self.faults.server_clock_s
-        self.mocap.publish(clock(self.plant.t_s), (pose,), clock(frame.exposure_t_s))
+        self.mocap.publish(clock(self.plant.t_s), (*others, pose), clock(frame.exposure_t_s))
 
     def _plant_faults(self) -> None:
         plant = self.plant

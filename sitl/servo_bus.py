@@ -6,6 +6,7 @@ Source: ROBOTIS e-manual, "DYNAMIXEL Protocol 2.0".
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import termios
 import tty
@@ -35,17 +36,10 @@ _BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in BAUDS if hasatt
 
 
 class ServoLine:
-    """What the servos on one wire answer.
-
-    Raises:
-        ValueError: two servos with the same id.
-    """
+    """What the servos on one wire answer. Two of them with the same id answer at the same time: nobody can read that."""
 
     def __init__(self, servos: Iterable[ServoModel]) -> None:
         self.servos = tuple(servos)
-        ids = [servo.servo_id for servo in self.servos]
-        if len(set(ids)) != len(ids):
-            raise ValueError(f"servo ids on one bus must differ, got {ids}")
         self._parser = PacketParser()
         self._listening: list[ServoModel] = []
         self._delay_s = 0.0
@@ -79,10 +73,9 @@ class ServoLine:
 
     def _answer(self, packet: Packet) -> bytes:
         if not packet.crc_ok:
-            servo = self._servo(packet.packet_id)
-            if servo is None or packet.instruction == Instruction.STATUS:
+            if packet.instruction == Instruction.STATUS:
                 return b""
-            return self._status(servo, StatusError.CRC)
+            return _together([self._status(servo, StatusError.CRC) for servo in self._having(packet.packet_id)])
         if packet.instruction == Instruction.STATUS:
             return b""
         for servo in self._listening:
@@ -106,18 +99,20 @@ class ServoLine:
 
     def _broadcast(self, packet: Packet) -> bytes:
         if packet.instruction == Instruction.PING:
-            return b"".join(self._ping(servo) for servo in sorted(self._listening, key=lambda s: s.servo_id))
+            ids = sorted({servo.servo_id for servo in self._listening})
+            return b"".join(_together([self._ping(servo) for servo in self._having(servo_id)]) for servo_id in ids)
         for servo in self._listening:
             self._carry_out(servo, packet)
         return b""
 
     def _unicast(self, packet: Packet) -> bytes:
-        servo = self._servo(packet.packet_id)
+        having = self._having(packet.packet_id)
         for other in self._listening:
-            if other is not servo and other.secondary_id == packet.packet_id:
+            if other not in having and other.secondary_id == packet.packet_id:
                 self._carry_out(other, packet)
-        if servo is None:
-            return b""
+        return _together([self._answer_of(servo, packet) for servo in having])
+
+    def _answer_of(self, servo: ServoModel, packet: Packet) -> bytes:
         if packet.instruction == Instruction.PING:
             return self._ping(servo)
         # A write to register 68 or 7 counts from the next packet on.
@@ -178,11 +173,10 @@ class ServoLine:
     def _read_chain(self, items: list[tuple[int, int, int]]) -> bytes:
         out = bytearray()
         for servo_id, address, length in items:
-            servo = self._servo(servo_id)
-            if servo is None or servo.status_return_level == 0:
+            having = self._having(servo_id)
+            if not having or having[0].status_return_level == 0:
                 break  # each servo waits for the status packet of the one before it
-            error, data = _try_read(servo, address, length)
-            out += self._status(servo, error, data)
+            out += _together([self._status(servo, *_try_read(servo, address, length)) for servo in having])
         return bytes(out)
 
     def _fast_read(self, items: list[tuple[int, int, int]]) -> bytes:
@@ -191,9 +185,10 @@ class ServoLine:
         if size > MAX_LENGTH:
             return b""
         for servo_id, address, length in items:
-            servo = self._servo(servo_id)
-            if servo is None or servo.status_return_level == 0:
+            having = self._having(servo_id)
+            if len(having) != 1 or having[0].status_return_level == 0:
                 break
+            servo = having[0]
             error, data = _try_read(servo, address, length)
             self._delay_s += servo.return_delay_s
             blocks.append((servo_id, error | servo.alert, data or bytes(length)))
@@ -219,21 +214,28 @@ class ServoLine:
         return b""
 
     def _quiet_write(self, servo_id: int, address: int, data: bytes) -> None:
-        servo = self._servo(servo_id)
-        if servo is not None:
-            try:
+        for servo in self._having(servo_id):
+            with contextlib.suppress(ServoRefusal):  # writes to several servos have no status packet that could tell
                 servo.write(address, data)
-            except ServoRefusal:
-                return  # writes to several servos have no status packet that could tell
 
     # --- helpers -----------------------------------------------------------------------------------------------------
 
-    def _servo(self, servo_id: int) -> ServoModel | None:
-        return next((servo for servo in self._listening if servo.servo_id == servo_id), None)
+    def _having(self, servo_id: int) -> list[ServoModel]:
+        return [servo for servo in self._listening if servo.servo_id == servo_id]
 
     def _status(self, servo: ServoModel, error: int, data: bytes = b"", servo_id: int | None = None) -> bytes:
         self._delay_s += servo.return_delay_s
         return status(servo.servo_id if servo_id is None else servo_id, error | servo.alert, data)
+
+
+def _together(answers: list[bytes]) -> bytes:
+    """What is read when several drive the line at once, a moment apart: low wins."""
+    line = answers[0] if answers else b""
+    for late in answers[1:]:
+        late = b"\xff" + late
+        size = max(len(line), len(late))
+        line = bytes(a & b for a, b in zip(line.ljust(size, b"\xff"), late.ljust(size, b"\xff"), strict=True))
+    return line
 
 
 def _word(data: bytes, offset: int) -> int:

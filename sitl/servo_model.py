@@ -79,6 +79,8 @@ class ServoModel:
         self._set(reg.FIRMWARE, firmware)
         self.drive = ServoDrive(shaft_angle_rad)
         """The motor."""
+        self.lights = 0
+        """How often its light went on."""
         self._shutdown = False
         self._silent = False
         self._registered: tuple[int, bytes] | None = None
@@ -163,6 +165,11 @@ class ServoModel:
     def return_delay_s(self) -> float:
         """Register 9, 2 us each."""
         return self._memory[9] * 2e-6
+
+    @property
+    def lit(self) -> bool:
+        """Register 65."""
+        return bool(self._memory[65])
 
     @property
     def status_return_level(self) -> int:
@@ -317,6 +324,8 @@ class ServoModel:
             raise ServoRefusal(StatusError.DATA_LIMIT)
 
     def _apply(self, register: Register, value: int) -> None:
+        if register is reg.LED and value > self._get(reg.LED):
+            self.lights += 1
         self._set(register, value)
         drive, memory = self.drive, self._memory
         if register is reg.TORQUE_ENABLE and value == 1:

@@ -73,8 +73,10 @@ CURRENT_LIMIT = _read_write(38, 2, "current limit", 1193, 0, 1193)
 VELOCITY_LIMIT = _read_write(44, 4, "velocity limit", 330, 0, 1023)
 MAX_POSITION_LIMIT = _read_write(48, 4, "max position limit", 4095, 0, 4095)
 MIN_POSITION_LIMIT = _read_write(52, 4, "min position limit", 0, 0, 4095)
+SECONDARY_ID = _read_write(12, 1, "secondary id", 255, 0, 255)
 SHUTDOWN = _read_write(63, 1, "shutdown", 52, 0, 255)
 TORQUE_ENABLE = _read_write(64, 1, "torque enable", 0, 0, 1)
+LED = _read_write(65, 1, "led", 0, 0, 1)
 STATUS_RETURN_LEVEL = _read_write(68, 1, "status return level", 2, 0, 2)
 REGISTERED_INSTRUCTION = _read_only(69, 1, "registered instruction")
 HARDWARE_ERROR = _read_only(70, 1, "hardware error status")
@@ -108,7 +110,7 @@ _PLAIN = (
     RETURN_DELAY,
     DRIVE_MODE,
     OPERATING_MODE,
-    _read_write(12, 1, "secondary id", 255, 0, 255),
+    SECONDARY_ID,
     _read_write(13, 1, "protocol type", 2, 2, 2),
     HOMING_OFFSET,
     MOVING_THRESHOLD,
@@ -123,7 +125,7 @@ _PLAIN = (
     _read_write(60, 1, "startup configuration", 0, 0, 3),
     SHUTDOWN,
     TORQUE_ENABLE,
-    _read_write(65, 1, "led", 0, 0, 1),
+    LED,
     STATUS_RETURN_LEVEL,
     REGISTERED_INSTRUCTION,
     HARDWARE_ERROR,

@@ -250,6 +250,13 @@ class World:
         self._parked = False
         self.data.eq_active[self._park] = 0
 
+    def hold_arm(self, angle_rad: Vec2) -> None:
+        """A hand holds both joints from now on, where the stand did, until `release_arm`."""
+        self._parked = True
+        self.data.eq_active[self._park] = 1
+        for park, angle in zip(self._park, angle_rad, strict=True):
+            self.model.eq_data[park, 0] = angle
+
     def _throw_and_catch(self, airborne: bool) -> None:
         if self._kept_since_s is not None:
             if self.t_s - self._kept_since_s >= self._config.keep_s:

@@ -49,6 +49,31 @@ class Push(Model):
     force_world_n: Vector3
 
 
+class Servo(Model):
+    """What is true of one servo and its joint, whatever the vehicle file says. Without a word it comes out of its box, with the vehicle
+    file's id and baud rate."""
+
+    id: Annotated[int, Field(ge=0, le=252)] | None = None
+    """Register 7; null: the vehicle file's. Two servos may have the same: then their answers collide."""
+    baud: Literal[9600, 57600, 115200, 1000000, 2000000, 3000000, 4000000] | None = None
+    """Register 8; null: the vehicle file's."""
+    firmware: Annotated[int, Field(ge=0, le=255)] = 48
+    return_delay_us: Annotated[int, Field(ge=0, le=508, multiple_of=2)] = 500
+    operating_mode: Literal[0, 3, 5] = 3
+    drive_mode: Annotated[int, Field(ge=0, le=5)] = 0
+    shadow_id: Annotated[int, Field(ge=0, le=255)] = 255
+    current_limit_counts: Annotated[int, Field(ge=0, le=1193)] = 1193
+    position_limit_counts: tuple[Annotated[int, Field(ge=0, le=4095)], Annotated[int, Field(ge=0, le=4095)]] = (0, 4095)
+    connected: bool = True
+    """Its plug is in."""
+    reversed: bool = False
+    """Mounted the other way round: its counts run against the vehicle file's sign."""
+    zero_error_deg: float = 0.0
+    """The joint's zero is so much further in the direction of the joint angle than the vehicle file says."""
+    torque_per_amp_error: RelativeError = 0.0
+    """Relative error of the vehicle file's torque constant against the truth."""
+
+
 class World(Model):
     """The simulated world."""
 
@@ -77,8 +102,18 @@ class World(Model):
     accel_noise_m_s2: NonNegative = 0.15
     force_noise_n: NonNegative = 0.05
     force_bias_n: Vector3 = (1.2, -0.8, 2.5)
+    force_scale: Positive = 1.0
+    """The force sensor's readings are larger than the truth by this."""
+    net_weight_kg: Annotated[float, Field(ge=0, le=5)] = 0.0
+    """Somebody hangs it on the net's centre while the force sensor is being read, and takes it off when that ends."""
+    net_weight_t_s: NonNegative = 8.0
+    """From the first reading until it hangs there."""
     joint_friction_nm: NonNegative = 0.04
     joint_damping_nms: NonNegative = 0.02
+    servos: tuple[Servo, Servo] | None = None
+    """Null: both as `Servo` says without a word."""
+    arm_hand: bool = False
+    """A hand holds the arm whenever it is limp, and moves it as `companion arm zero` asks: on whenever the servos' lights go on."""
     wind_m_s: Vector3 = (0.0, 0.0, 0.0)
     mass_error: RelativeError = 0.0
     """Relative error of the vehicle file's base mass against the truth."""
@@ -96,13 +131,23 @@ class World(Model):
     """The rigid body's zero is off: its streamed yaw is larger than the true one by this."""
     mocap_body_tilt_deg: Vector2 = (0.0, 0.0)
     """The same for roll and pitch."""
+    mocap_other_id: Annotated[int, Field(ge=0)] | None = None
+    """Streaming id of another rigid body, which lies on the floor of the room."""
     hand: bool = False
     """A hand carries the machine through the guided hand test, rotors off, again and again."""
     hand_t_s: NonNegative = 20.0
     """World time at which it first does."""
+    hand_taps: Annotated[int, Field(ge=0, le=100)] = 0
+    """More than none: the hand only lifts and holds the machine, and another one taps its frame so often a round."""
+    hand_tap_n: Positive = 30.0
+    """Peak of a tap's force."""
     px4_params: Px4Params = Field(default={})
     """Parameters of PX4 that somebody has spoiled after it was set up, by name."""
     faults: tuple[Fault, ...] = ()
+
+    def servo(self, joint: int) -> Servo:
+        """The servo of joint 0 or 1."""
+        return Servo() if self.servos is None else self.servos[joint]
 
     def spoiled_px4_params(self) -> dict[str, float | int]:
         """`px4_params` in PX4's types."""

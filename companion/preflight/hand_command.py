@@ -24,13 +24,14 @@ from companion.config.loader import FlightConfig
 from companion.devices import Edges, SomeEdges
 from companion.preflight import hand_judge, hand_record
 from companion.preflight.checks import Check
-from companion.preflight.hand_test import TOLD, HandSample, HandTest, HandView, Step
+from companion.preflight.hand_test import TOLD, HandResult, HandSample, HandTest, HandView, Step
 from companion.preflight.rows import Row, refusals
 from companion.types import AutopilotStatus, MocapPose, VehicleState
 
 LOOK_PERIOD_S: Final = 0.004
 ARM_PERIOD_S: Final = 0.02
 _ARM_TIMEOUT_S: Final = 0.003
+ENDED_BY_HAND: Final = "ended by hand"
 _STEPS: Final = tuple(step for step in Step if step is not Step.DONE)
 
 RECORD = Check(
@@ -54,10 +55,25 @@ async def run_hand_test(
         json: standard output is kept free: people are told on standard error, wherever the console writes.
         record: where a passed test is written down (`hand_record.record_path()`); None: nowhere, as in SITL.
     """
+    outcome = await perform(edges, config, console, json)
+    if isinstance(outcome, str):
+        return [hand_judge.ended(outcome)]
+    rows = hand_judge.rows(outcome, config.vehicle.devices.mocap.up_axis)
+    if record is not None and edges.mocap is not None and not refusals(rows):
+        info = edges.mocap.server_info
+        setup = hand_record.Setup.of(config.vehicle, info.version if info is not None else "")
+        rows.append(_keep(record, setup, rows))
+    return rows
+
+
+async def perform(
+    edges: Edges | SomeEdges, config: FlightConfig, console: Console, json: bool = False
+) -> HandResult | str:
+    """Guide somebody through the test; what was measured, or why there is nothing. Arguments as of `run_hand_test`."""
     mocap, autopilot, arm = edges.mocap, edges.autopilot, edges.arm
     if mocap is None or autopilot is None:
         missing = "motion capture" if mocap is None else "PX4"
-        return [hand_judge.ended(f"{missing} is not open")]
+        return f"{missing} is not open"
     test, clock, arm_due_s = HandTest(), _StampClock(), 0.0
     stop = asyncio.Event()
     with (
@@ -75,14 +91,7 @@ async def run_hand_test(
                 arm_due_s = now_s + ARM_PERIOD_S
                 await arm.read(_ARM_TIMEOUT_S)
             await asyncio.sleep(LOOK_PERIOD_S)
-    if view.result is None:
-        return [hand_judge.ended(view.ended or "ended by hand")]
-    rows = hand_judge.rows(view.result, config.vehicle.devices.mocap.up_axis)
-    if record is not None and not refusals(rows):
-        info = mocap.server_info
-        setup = hand_record.Setup.of(config.vehicle, info.version if info is not None else "")
-        rows.append(_keep(record, setup, rows))
-    return rows
+    return view.result if view.result is not None else view.ended or ENDED_BY_HAND
 
 
 def _keep(path: Path, setup: hand_record.Setup, rows: list[Row]) -> Row:

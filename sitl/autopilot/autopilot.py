@@ -136,6 +136,8 @@ class Px4Stub:
         """World time at zero of PX4's own clock; before it nothing runs."""
         self.clock_ahead_s = 0.0
         """PX4's own clock goes on while the world is held up."""
+        self.since_sample_s = 0.0
+        """From its last IMU sample to the message that it answers; PX4's clock does not stand still between two. Set by its links."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
         self._offboard: OffboardTarget | None = None
         self._setpoint_at_s: float | None = None

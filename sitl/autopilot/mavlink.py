@@ -31,6 +31,9 @@ _TEXTS_KEPT, _TEXT_STALE_S = 8, 5.0
 _CLOSE_DEADLINE_S = 1.0
 
 
+_STEP_MAX_S = 0.03
+
+
 class LinkError(Exception):
     """A UDP port cannot be had: one line for the user."""
 
@@ -74,6 +77,8 @@ class Link(asyncio.DatagramProtocol):
         self._ground_station_at_s: float | None = None
         self._texts: deque[tuple[float, int, bytes]] = deque(maxlen=_TEXTS_KEPT)
         self._text_id = 0
+        self._pumped: tuple[float, float] | None = None
+        """Wall clock and world time."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The socket is bound."""
@@ -109,7 +114,15 @@ class Link(asyncio.DatagramProtocol):
             self.messages_in += 1
             if not self._loyal or self._spoken_to_of_boot != self._stub.booted_at_s:
                 self._spoken_to_of_boot, self._partner = self._stub.booted_at_s, (addr[0], addr[1])
+            self._stub.since_sample_s = self._since_sample_s()
             self._receiver.handle(self, message)
+
+    def _since_sample_s(self) -> float:
+        if self._pumped is None:
+            return 0.0
+        wall_s, t_s = self._pumped
+        since_s = t_s - self._stub.t_s + asyncio.get_running_loop().time() - wall_s
+        return min(_STEP_MAX_S, max(0.0, since_s))  # longer: the world is held up
 
     def close(self) -> None:
         """Start closing the socket; `closed` tells when it is."""
@@ -162,6 +175,7 @@ class Link(asyncio.DatagramProtocol):
 
     def pump(self, t_s: float) -> None:
         """Send the streams that are due at world time `t_s` and a portion of the parameter list."""
+        self._pumped = (asyncio.get_running_loop().time(), t_s)
         if self.down or self._partner is None:
             return
         for message_id in self.schedule.due(t_s):

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.frames import quat_from_euler_zyx
 from companion.types import Vec3
+from sitl.autopilot import telemetry
 from sitl.autopilot.autopilot import Command7, Origin, Px4Stub
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.params import HASH_CHECK, MAV_PARAM_TYPE_INT32
@@ -97,7 +98,8 @@ class Receiver:
 
     def _timesync(self, link: Reply, message: Message) -> None:
         if message.tc1 == 0:
-            link.send(mavlink.MAVLink_timesync_message(int(self._stub.t_s * 1e9), message.ts1))
+            now_us = telemetry.clock_us(self._stub) + round(self._stub.since_sample_s * 1e6)
+            link.send(mavlink.MAVLink_timesync_message(1000 * now_us, message.ts1))
 
     def _param_request_list(self, link: Reply, _message: Message) -> None:
         link.send_all_params()

@@ -28,7 +28,8 @@ def _ms(stub: Px4Stub) -> int:
     return int((stub.t_s - stub.booted_at_s + stub.clock_ahead_s) * 1e3) & 0xFFFFFFFF
 
 
-def _us(stub: Px4Stub) -> int:
+def clock_us(stub: Px4Stub) -> int:
+    """PX4's own clock, since it booted: of every message that tells microseconds."""
     return int((stub.t_s - stub.booted_at_s + stub.clock_ahead_s) * 1e6)
 
 
@@ -138,7 +139,7 @@ def odometry(stub: Px4Stub) -> Message | None:
     x, y, z = estimate.position_ned_m
     frame = mavlink.MAV_FRAME_LOCAL_NED
     return mavlink.MAVLink_odometry_message(
-        _us(stub), frame, frame, x, y, z, estimate.attitude_ned_frd, *estimate.velocity_ned_m_s, *estimate.rates_frd_rad_s,
+        clock_us(stub), frame, frame, x, y, z, estimate.attitude_ned_frd, *estimate.velocity_ned_m_s, *estimate.rates_frd_rad_s,
         _NO_COVARIANCE, _NO_COVARIANCE, 0, mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT, 100 if estimate.vision_fused else 0,
     )  # fmt: skip
 
@@ -149,7 +150,7 @@ def highres_imu(stub: Px4Stub) -> Message | None:
     if imu is None:
         return None
     return mavlink.MAVLink_highres_imu_message(
-        _us(stub),
+        clock_us(stub),
         *imu.accel_frd_m_s2,
         *imu.gyro_frd_rad_s,
         0.0,
@@ -190,7 +191,7 @@ def estimator_status(stub: Px4Stub) -> Message | None:
         flags |= mavlink.ESTIMATOR_CONST_POS_MODE
     fusion = stub.fusion
     return mavlink.MAVLink_estimator_status_message(
-        _us(stub), flags, _NAN, fusion.horizontal_ratio, fusion.vertical_ratio, _NAN, _NAN, _NAN,
+        clock_us(stub), flags, _NAN, fusion.horizontal_ratio, fusion.vertical_ratio, _NAN, _NAN, _NAN,
         fusion.horizontal_accuracy_m, fusion.vertical_accuracy_m,
     )  # fmt: skip
 
@@ -219,7 +220,7 @@ def altitude(stub: Px4Stub) -> Message | None:
     local = -estimate.position_ned_m[2]
     relative = local + stub.home_ned_m[2] if stub.home_ned_m is not None else _NAN
     absolute = _altitude_m(stub, estimate)
-    return mavlink.MAVLink_altitude_message(_us(stub), local, absolute, local, relative, _NAN, _NAN)
+    return mavlink.MAVLink_altitude_message(clock_us(stub), local, absolute, local, relative, _NAN, _NAN)
 
 
 def attitude_target(stub: Px4Stub) -> Message | None:
@@ -266,7 +267,10 @@ def gps_global_origin(stub: Px4Stub) -> Message | None:
     if origin is None or _position(stub) is None:
         return None
     return mavlink.MAVLink_gps_global_origin_message(
-        round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7), round(origin.altitude_m * 1e3), _us(stub)
+        round(origin.latitude_deg * 1e7),
+        round(origin.longitude_deg * 1e7),
+        round(origin.altitude_m * 1e3),
+        clock_us(stub),
     )
 
 
@@ -278,19 +282,19 @@ def home_position(stub: Px4Stub) -> Message | None:
     latitude, longitude, absolute = origin.global_deg_m(home)
     return mavlink.MAVLink_home_position_message(
         round(latitude * 1e7), round(longitude * 1e7), round(absolute * 1e3), *home, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0,
-        _us(stub),
+        clock_us(stub),
     )  # fmt: skip
 
 
 def servo_output_raw(stub: Px4Stub) -> Message:
     """SERVO_OUTPUT_RAW: 1000 to 2000 us per rotor, 900 when disarmed."""
     pulses = [round(1000 + 1000 * command) for command in stub.rotors] if stub.armed else [900] * 4
-    return mavlink.MAVLink_servo_output_raw_message(_us(stub) & 0xFFFFFFFF, 0, *pulses, 0, 0, 0, 0)
+    return mavlink.MAVLink_servo_output_raw_message(clock_us(stub) & 0xFFFFFFFF, 0, *pulses, 0, 0, 0, 0)
 
 
 def actuator_output_status(stub: Px4Stub) -> Message:
     """ACTUATOR_OUTPUT_STATUS: rotor commands, 0 to 1."""
-    return mavlink.MAVLink_actuator_output_status_message(_us(stub), 0xF, [*stub.rotors, *[0.0] * 28])
+    return mavlink.MAVLink_actuator_output_status_message(clock_us(stub), 0xF, [*stub.rotors, *[0.0] * 28])
 
 
 def system_time(stub: Px4Stub) -> Message:
@@ -300,17 +304,17 @@ def system_time(stub: Px4Stub) -> Message:
 
 def timesync_request(stub: Px4Stub) -> Message:
     """TIMESYNC as PX4 asks for it."""
-    return mavlink.MAVLink_timesync_message(0, _us(stub) * 1000)
+    return mavlink.MAVLink_timesync_message(0, clock_us(stub) * 1000)
 
 
 def ping(stub: Px4Stub) -> Message:
     """PING request to everybody."""
-    return mavlink.MAVLink_ping_message(_us(stub), int(stub.t_s) & 0xFFFFFFFF, 0, 0)
+    return mavlink.MAVLink_ping_message(clock_us(stub), int(stub.t_s) & 0xFFFFFFFF, 0, 0)
 
 
 def vibration(stub: Px4Stub) -> Message:
     """VIBRATION."""
-    return mavlink.MAVLink_vibration_message(_us(stub), 0.0, 0.0, 0.0, 0, 0, 0)
+    return mavlink.MAVLink_vibration_message(clock_us(stub), 0.0, 0.0, 0.0, 0, 0, 0)
 
 
 def autopilot_version(stub: Px4Stub) -> Message:

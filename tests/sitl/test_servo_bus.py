@@ -351,6 +351,14 @@ def test_bus_survives_a_master_that_never_reads() -> None:
     assert asyncio.run(scenario()) > 0
 
 
-def test_two_servos_with_one_id_are_refused() -> None:
-    with pytest.raises(ValueError, match="must differ"):
-        ServoLine([ServoModel(1), ServoModel(1)])
+def test_two_servos_with_one_id_answer_at_once_and_nobody_can_read_it() -> None:
+    first, second, third = ServoModel(1), ServoModel(1), ServoModel(2)
+    line = line_of(first, second, third)
+    answer = line.feed(_PING)
+    assert answer and not [found for found in PacketParser().feed(answer) if found.crc_ok]
+    everybody = PacketParser().feed(line.feed(packet(0xFE, bytes((Instruction.PING,)))))
+    assert [found.packet_id for found in everybody if found.crc_ok] == [2]
+    assert not line.feed(packet(9, bytes((Instruction.PING,))))
+
+    line.feed(packet(1, bytes((Instruction.WRITE, 7, 0, 5))))
+    assert [servo.servo_id for servo in (first, second, third)] == [5, 5, 2], "both take what is written"

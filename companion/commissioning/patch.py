@@ -1,0 +1,212 @@
+"""A change of the vehicle file that a commissioning tool proposes: printed for people and scripts, written only when asked."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.commissioning.yaml_edit import EditError, edited, scalar_text
+from companion.config.base import Location
+from companion.config.document import ConfigError, Data, Document, Origin, key_path, problem_lines
+from companion.config.explain import validate
+from companion.config.vehicle import Vehicle
+from companion.config.yaml_strict import parse_value, read_document
+
+_BOM = "\ufeff"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One value."""
+
+    location: Location
+    old: Data
+    """None also where the file leaves the key to its default."""
+    new: Data
+    origin: Origin | None
+    """Where the old value stands; None: it is not in the file."""
+
+    @property
+    def key(self) -> str:
+        """`arm.joints[1].sign`."""
+        return key_path(self.location)
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        at = self.origin
+        return {
+            "key": self.key,
+            "old": self.old,
+            "new": self.new,
+            "line": at.line if at else None,
+            "column": at.column if at else None,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Changes that one vehicle file needs. Empty: it says all that already."""
+
+    path: Path
+    shown: str
+    """The file's name as the user wrote it."""
+    changes: tuple[Change, ...]
+    before: bytes
+    """The file as it was when the patch was made."""
+    after: bytes
+
+    def __bool__(self) -> bool:
+        return bool(self.changes)
+
+    @property
+    def text(self) -> str:
+        """For people: the lines for the file, in its own shape, each with the line that it replaces."""
+        if not self.changes:
+            return f"# {self.shown}: nothing to change"
+        lines: list[tuple[str, str]] = [(f"# {self.shown}", "")]
+        open_steps: Location = ()
+        for change in sorted(self.changes, key=lambda one: [str(step) for step in one.location]):
+            lines += _lines(open_steps, change, self.shown)
+            open_steps = change.location[:-1]
+        width = min(48, max(len(left) for left, right in lines if right))
+        return "\n".join(f"{left:<{width}}  # {right}" if right else left for left, right in lines)
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {"file": self.shown, "changes": [change.as_json() for change in self.changes], "text": self.text}
+
+    def write(self) -> Path:
+        """Write the file, the old one beside it; returns the backup's path.
+
+        Raises:
+            ConfigError: the file has changed meanwhile, or cannot be written; then it is as it was.
+        """
+        path = self.path.resolve()
+        try:
+            if path.read_bytes() != self.before:
+                raise ConfigError(
+                    [f"{self.shown}: has been changed meanwhile; nothing was written, run the tool again"]
+                )
+            backup = _back_up(path, self.before)
+            _replace(path, self.after)
+        except OSError as error:
+            raise ConfigError(
+                [f"{self.shown}: cannot be written: {error.strerror or error}; change it by hand as printed"]
+            ) from None
+        return backup
+
+
+def propose(vehicle_path: str | Path, changes: Mapping[Location, Data]) -> Patch:
+    """The patch that makes the vehicle file say what was found. Nothing is written.
+
+    Args:
+        vehicle_path: vehicle file.
+        changes: new values by location, in the file's units: `{("arm", "joints", 0, "sign"): -1}`. What the file says already is
+            left out; keys that it leaves to their default are added. Round before: values are written as they are given.
+
+    Raises:
+        ConfigError: the file cannot be read, or would not be a vehicle file any more; one line per problem.
+    """
+    path, shown = Path(vehicle_path), str(vehicle_path)
+    document = read_document(path)
+    if document.problems:
+        raise ConfigError(problem_lines(document.problems))
+    before = path.read_bytes()
+    found = tuple(_change(document, location, new) for location, new in changes.items())
+    wanted = tuple(change for change in found if change.origin is None or not _same(change.old, change.new))
+    text = before.decode("utf-8-sig")
+    try:
+        new_text = edited(text, {change.location: change.new for change in wanted})
+    except EditError as error:
+        raise ConfigError([f"{shown}: {error}"]) from None
+    _check(shown, new_text, wanted)
+    bom = _BOM if before.startswith(_BOM.encode()) else ""
+    return Patch(path, shown, wanted, before, (bom + new_text).encode())
+
+
+def _change(document: Document, location: Location, new: Data) -> Change:
+    try:
+        old = document.get(location)
+    except (KeyError, IndexError):
+        return Change(location, None, new, None)
+    return Change(location, old, new, document.origin(location))
+
+
+def _same(old: Data, new: Data) -> bool:
+    return old == new and isinstance(old, bool) == isinstance(new, bool)
+
+
+def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
+    """The text says what it was to say, and is a vehicle file."""
+    data = parse_value(text, Origin(shown))
+    assert isinstance(data, dict)
+    document = Document(shown, data)
+    for change in changes:
+        if not _same(document.get(change.location), change.new):
+            raise ConfigError(
+                [f"{shown}: {change.key} cannot be changed by a tool here; write it by hand: {change.new}"]
+            )
+    if validate(Vehicle, document) is None:
+        raise ConfigError([f"{line} (after the proposed change)" for line in problem_lines(document.problems)])
+
+
+def _lines(open_steps: Location, change: Change, shown: str) -> list[tuple[str, str]]:
+    """The change's own line and those of the blocks that it opens."""
+    *way, last = change.location
+    common = 0
+    while common < min(len(open_steps), len(way)) and open_steps[common] == way[common]:
+        common += 1
+    lines: list[tuple[str, str]] = []
+    dash = False
+    for depth in range(common, len(way)):
+        step = way[depth]
+        if isinstance(step, int):
+            lines.append((f"{_indent(way[:depth])}# {key_path(tuple(way[: depth + 1]))}", ""))
+            dash = True
+        else:
+            lines.append((f"{_indent(way[:depth], dash)}{step}:", ""))
+            dash = False
+    at = change.origin
+    was = f"{shown}:{at.line}: was {scalar_text(change.old)}" if at is not None else "new"
+    name = f"- {scalar_text(change.new)}" if isinstance(last, int) else f"{last}: {scalar_text(change.new)}"
+    return [*lines, (f"{_indent(way, dash)}{name}", was)]
+
+
+def _indent(way: list[str | int] | Location, dash: bool = False) -> str:
+    """Two columns for each step; the first key of a list's item stands behind its dash."""
+    width = 2 * len(way)
+    return " " * (width - 2) + "- " if dash else " " * width
+
+
+def _back_up(path: Path, data: bytes) -> Path:
+    number = 0
+    while True:
+        backup = path.with_name(f"{path.name}.bak{number or ''}")
+        try:
+            with backup.open("xb") as file:
+                file.write(data)
+        except FileExistsError:
+            number += 1
+            continue
+        return backup
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """All of it or nothing, whatever happens."""
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, path.stat().st_mode & 0o7777)
+        os.replace(name, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(name)
+        raise

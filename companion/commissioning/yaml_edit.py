@@ -1,0 +1,166 @@
+"""Single values of a YAML text replaced or added where they stand; comments, order and everything else stay as they are. Pure.
+
+`companion.config.yaml_strict` knows the place of every node; here its nodes are looked at once more, for where they end.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import yaml
+
+from companion.config.base import Location
+from companion.config.document import Data, Origin, key_path
+from companion.config.yaml_strict import StrictLoader, parse_value
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./+-]*(?::[A-Za-z0-9_./+-]+)*")
+
+
+class EditError(Exception):
+    """The text cannot be edited there; one line without the file's name."""
+
+
+class Edit(NamedTuple):
+    """Characters `begin` to `end` of a text give way to `text`."""
+
+    begin: int
+    end: int
+    text: str
+
+
+def edited(text: str, changes: Mapping[Location, Data]) -> str:
+    """The text with every change made.
+
+    Args:
+        text: YAML whose top level is a mapping, as `read_document` takes it.
+        changes: new values by location; missing keys, and mappings on the way to them, are added.
+
+    Raises:
+        EditError: a location leads through a list index that is not there or through a single value, or a list in block style
+            changes its length.
+    """
+    for location, value in changes.items():
+        # One after the other: each change moves what stands behind it.
+        text = _edited(text, location, value)
+    return text
+
+
+def scalar_text(value: Data) -> str:
+    """A value in flow style, on one line, as it is read back by the same loader."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {scalar_text(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(scalar_text, value)) + "]"
+    if isinstance(value, bool) or value is None or not isinstance(value, str):
+        return json.dumps(value)
+    if _PLAIN.fullmatch(value) and parse_value(value, Origin("")) == value:
+        return value
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _edited(text: str, location: Location, value: Data) -> str:
+    loader = StrictLoader(text)
+    try:
+        node: yaml.Node | None = loader.get_single_node()
+    finally:
+        loader.dispose()
+    if not isinstance(node, yaml.MappingNode):
+        raise EditError("expected a mapping (key: value) at the top level")
+    found: yaml.Node = node
+    for depth, step in enumerate(location):
+        below = _child(found, step)
+        if below is not None:
+            found = below
+            continue
+        if not isinstance(found, yaml.MappingNode) or not isinstance(step, str):
+            raise EditError(f"{key_path(location[: depth + 1])}: there is no such place; write it by hand")
+        return _added(text, found, location[depth:], value)
+    edits = _replaced(text, found, value, location)
+    for begin, end, new in sorted(edits, reverse=True):
+        text = text[:begin] + new + _aligned(text, end, len(new) - (end - begin))
+    return text
+
+
+def _child(node: yaml.Node, step: str | int) -> yaml.Node | None:
+    if isinstance(node, yaml.MappingNode) and isinstance(step, str):
+        return next((value for key, value in node.value if key.value == step), None)
+    if isinstance(node, yaml.SequenceNode) and isinstance(step, int) and 0 <= step < len(node.value):
+        item: yaml.Node = node.value[step]
+        return item
+    return None
+
+
+def _replaced(text: str, node: yaml.Node, value: Data, location: Location) -> list[Edit]:
+    if _is_flow(node):
+        begin, end = node.start_mark.index, node.end_mark.index
+        new = scalar_text(value)
+        if end > begin and text[end - 1] == "\n":  # a block of text ends with its line
+            new += "\n"
+        if begin == end:  # nothing stands behind the key
+            new = f" {new}" if text[begin - 1] == ":" else new
+        return [Edit(begin, end, new)]
+    if isinstance(node, yaml.SequenceNode) and isinstance(value, list) and len(value) == len(node.value):
+        pairs = [(item, value[index], (*location, index)) for index, item in enumerate(node.value)]
+    elif (
+        isinstance(node, yaml.MappingNode)
+        and isinstance(value, dict)
+        and set(value) == {k.value for k, _ in node.value}
+    ):
+        pairs = [(item, value[key.value], (*location, key.value)) for key, item in node.value]
+    else:
+        raise EditError(f"{key_path(location)}: a block of another shape stands there; write it by hand")
+    return [edit for item, new, at in pairs for edit in _replaced(text, item, new, at)]
+
+
+def _aligned(text: str, end: int, longer: int) -> str:
+    """What follows a value, a comment behind it moved back to its column as far as there is room."""
+    rest = text[end:]
+    comment = re.match(r"( {2,})#", rest)
+    if comment is None or longer == 0:
+        return rest
+    width = max(2, len(comment[1]) - longer)
+    return " " * width + rest[len(comment[1]) :]
+
+
+def _added(text: str, parent: yaml.MappingNode, steps: Location, value: Data) -> str:
+    for step in reversed(steps[1:]):
+        if not isinstance(step, str):
+            raise EditError(f"{key_path(steps)}: there is no such list; write it by hand")
+    if parent.flow_style:
+        for step in reversed(steps[1:]):
+            value = {str(step): value}
+        end = parent.end_mark.index - 1
+        comma = ", " if parent.value else ""
+        before = text[:end].rstrip(" ")
+        return before + f"{comma}{steps[0]}: {scalar_text(value)}" + text[len(before) :]
+    newline = "\r\n" if "\r\n" in text else "\n"
+    column = parent.value[0][0].start_mark.column
+    lines = [f"{' ' * (column + 2 * depth)}{step}:" for depth, step in enumerate(steps)]
+    lines[-1] += f" {scalar_text(value)}"
+    at = _line_end(text, _last_line_of_plain_values(parent))
+    separator = newline if at == len(text) and not text.endswith("\n") else ""
+    return text[:at] + separator + newline.join(lines) + newline + text[at:]
+
+
+def _last_line_of_plain_values(parent: yaml.MappingNode) -> int:
+    """Index of a character on the line behind which a new key reads best: behind the last value that is no block."""
+    plain = [value for _, value in parent.value if _is_flow(value)]
+    last: yaml.Node = (plain or [parent.value[-1][1]])[-1]
+    while not _is_flow(last):
+        item = last.value[-1]
+        last = item[1] if isinstance(item, tuple) else item
+    return max(last.start_mark.index, last.end_mark.index - 1)
+
+
+def _is_flow(node: yaml.Node) -> bool:
+    """Its end mark is its end; that of a block stands behind the comments that follow."""
+    return isinstance(node, yaml.ScalarNode) or (isinstance(node, yaml.CollectionNode) and bool(node.flow_style))
+
+
+def _line_end(text: str, index: int) -> int:
+    """Just behind the end of the line."""
+    end = text.find("\n", index)
+    return len(text) if end < 0 else end + 1

@@ -1,0 +1,35 @@
+"""A servo as the world's settings want it: out of its box, or as somebody left it."""
+
+from __future__ import annotations
+
+from companion.config.vehicle import ArmDevice, Joint
+from companion.config.world import Servo
+from sitl import servo_registers as reg
+from sitl.servo_model import ServoModel
+
+
+def servo_of(joint: Joint, device: ArmDevice, knobs: Servo) -> ServoModel:
+    """The servo that is built into a joint.
+
+    Args:
+        joint: its id, unless the knobs say another.
+        device: the bus's baud rate, unless the knobs say another.
+        knobs: what is true of it.
+    """
+    servo = ServoModel(
+        joint.servo_id if knobs.id is None else knobs.id,
+        baud_bps=device.baud if knobs.baud is None else knobs.baud,
+        firmware=knobs.firmware,
+    )
+    low, high = knobs.position_limit_counts
+    for register, value in (
+        (reg.RETURN_DELAY, knobs.return_delay_us // 2),
+        (reg.DRIVE_MODE, knobs.drive_mode),
+        (reg.OPERATING_MODE, knobs.operating_mode),
+        (reg.SECONDARY_ID, knobs.shadow_id),
+        (reg.CURRENT_LIMIT, knobs.current_limit_counts),
+        (reg.MIN_POSITION_LIMIT, low),
+        (reg.MAX_POSITION_LIMIT, high),
+    ):
+        servo.write(register.address, register.encode(value))
+    return servo

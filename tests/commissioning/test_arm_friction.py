@@ -1,0 +1,132 @@
+"""The fit tells what was put in, within the errors that it claims, and says when the data cannot tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from companion.commissioning.arm_friction import FrictionFit, JointFit, fit
+from companion.commissioning.arm_sweep import HANGING_DEG, REACH_DEG, SPEEDS_DEG_S, Sample
+from companion.config.loader import load_vehicle
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import Manipulator
+from companion.types import IDENTITY_QUAT, Vec2
+from tests.commissioning.arm_rig import SHIPPED
+
+RATE_HZ = 200.0
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> Vehicle:
+    return load_vehicle(SHIPPED)
+
+
+def swept(
+    vehicle: Vehicle,
+    seed: int = 1,
+    *,
+    k: tuple[float, float] = (1.3, 1.3),
+    dry_nm: float = 0.04,
+    viscous_nms: float = 0.02,
+    off_deg: float = 0.0,
+    noise_a: float = 0.01,
+    reach: float = 1.0,
+) -> list[Sample]:
+    """What the sweeps of an arm with these properties give; noise that wanders, as a control loop's does."""
+    rng = np.random.default_rng(seed)
+    manipulator = Manipulator(vehicle.arm, vehicle.tool)
+
+    def leg(number: int, joint: int, begin_deg: float, end_deg: float, speed_deg_s: float) -> Iterator[Sample]:
+        way = math.copysign(1.0, end_deg - begin_deg)
+        rate, wander = math.radians(way * speed_deg_s), 0.0
+        for tick in range(int(abs(end_deg - begin_deg) / speed_deg_s * RATE_HZ)):
+            angle = [math.radians(deg) for deg in HANGING_DEG]
+            angle[joint] = math.radians(begin_deg) + rate * tick / RATE_HZ
+            true: Vec2 = (angle[0] + math.radians(off_deg), angle[1])
+            gravity = manipulator.gravity_torque_nm(true, IDENTITY_QUAT)[joint]
+            wander = 0.97 * wander + math.sqrt(1.0 - 0.97**2) * noise_a * rng.standard_normal()
+            current = (gravity + way * dry_nm + viscous_nms * rate) / k[joint] + wander
+            yield Sample(
+                number,
+                joint,
+                int(way),
+                100.0 * number + tick / RATE_HZ,
+                (angle[0], angle[1]),
+                rate,
+                round(current / 2.69e-3) * 2.69e-3,
+            )
+
+    samples: list[Sample] = []
+    for joint in (0, 1):
+        low, high = (HANGING_DEG[joint] + reach * deg for deg in REACH_DEG[joint])
+        for speed in SPEEDS_DEG_S:
+            for begin, end in ((low, high), (high, low)):
+                samples += leg(len({one.leg for one in samples}), joint, begin, end, speed)
+    return samples
+
+
+def both(found: FrictionFit) -> list[JointFit]:
+    fits = [one for one in found.joints if one is not None]
+    assert len(fits) == 2
+    return fits
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 1.5])
+def test_what_was_put_in_is_told_within_the_errors_claimed(vehicle: Vehicle, off_deg: float) -> None:
+    beyond = 0
+    for seed in range(20):
+        found = fit(swept(vehicle, seed, k=(1.15, 1.15), dry_nm=0.08, viscous_nms=0.05, off_deg=off_deg), vehicle)
+        assert found.torque_per_amp_nm_a is not None and found.joint_friction_nm is not None
+        assert found.torque_per_amp_nm_a.value == pytest.approx(1.15, rel=0.03)
+        assert found.joint_friction_nm.value == pytest.approx(0.08, abs=0.01)
+        for one in both(found):
+            for estimate, truth in ((one.torque_per_amp_nm_a, 1.15), (one.dry_nm, 0.08), (one.viscous_nms, 0.05)):
+                beyond += abs(estimate.value - truth) > 2.0 * estimate.error
+        changes = found.changes(vehicle)
+        assert changes.keys() == {("arm", "torque_per_amp_nm_a"), ("arm", "joint_friction_nm")}
+    assert beyond <= 0.15 * 120, "two standard errors hold 95 % of what is told; the noise wanders"
+
+
+def test_an_arm_as_the_file_says_is_left_alone(vehicle: Vehicle) -> None:
+    for seed in range(20):
+        found = fit(swept(vehicle, seed), vehicle)
+        assert found.changes(vehicle) == {} and found.notes == ()
+
+
+def test_a_sweep_that_gravity_does_not_change_along_cannot_tell_the_constant(vehicle: Vehicle) -> None:
+    found = fit(swept(vehicle, reach=0.1, noise_a=0.03), vehicle)
+    assert found.torque_per_amp_nm_a is None
+    assert ("arm", "torque_per_amp_nm_a") not in found.changes(vehicle)
+    assert any("cannot tell" in note for note in found.notes)
+
+
+def test_noise_that_hides_the_friction_is_told(vehicle: Vehicle) -> None:
+    found = fit(swept(vehicle, noise_a=0.3), vehicle)
+    assert found.joint_friction_nm is None and found.changes(vehicle) == {}
+    assert sum("cannot tell the dry friction" in note for note in found.notes) == 2
+
+
+def test_too_few_samples_tell_nothing(vehicle: Vehicle) -> None:
+    found = fit(swept(vehicle)[:50], vehicle)
+    assert found.joints == (None, None)
+    assert (found.torque_per_amp_nm_a, found.joint_friction_nm) == (None, None)
+    assert len(found.notes) == 2 and found.changes(vehicle) == {}
+
+
+def test_constants_that_differ_point_at_the_masses(vehicle: Vehicle) -> None:
+    found = fit(swept(vehicle, k=(1.3, 1.0)), vehicle)
+    assert any("torque constants differ" in note for note in found.notes)
+
+
+def test_a_constant_of_no_such_servo_is_not_proposed(vehicle: Vehicle) -> None:
+    found = fit(swept(vehicle, k=(3.0, 3.0)), vehicle)
+    assert found.torque_per_amp_nm_a is None
+    assert any("none of an XM430-W210" in note for note in found.notes)
+
+
+def test_a_machine_that_is_not_level_is_told(vehicle: Vehicle) -> None:
+    found = fit(swept(vehicle, off_deg=6.0, noise_a=0.003), vehicle)
+    assert any("gravity pulls as if the arm were turned" in note for note in found.notes)

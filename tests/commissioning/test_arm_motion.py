@@ -1,0 +1,233 @@
+"""The arm's motion on the ground: bounded in speed, torque and walls, and ended by everything that should end it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from companion.commissioning.arm_jog import KEY_TIMEOUT_S, STEP_DEG, ByKeys, ToAngle, keys_in
+from companion.commissioning.arm_motion import SPEED_MAX_DEG_S, TORQUE_SHARE, Motion, Moved, walls_deg
+from companion.commissioning.arm_sweep import Sweeper, legs_of
+from companion.config.document import ConfigError
+from companion.config.loader import load_vehicle
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import Manipulator
+from companion.types import IDENTITY_QUAT, ArmState, Vec2
+from tests.commissioning.arm_rig import SHIPPED
+
+DT_S = 0.005
+INERTIA_KG_M2 = (0.06, 0.02)
+FRICTION_NM = 0.05
+PATIENCE = 100_000
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> Vehicle:
+    return load_vehicle(SHIPPED)
+
+
+class Bench:
+    """Two joints with inertia, gravity and dry friction, led by a `Motion`."""
+
+    def __init__(self, vehicle: Vehicle, at_deg: Vec2 = (90.0, 10.0)) -> None:
+        self.vehicle = vehicle
+        self.manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self.angle = [math.radians(deg) for deg in at_deg]
+        self.rate = [0.0, 0.0]
+        self.t_s = 0.0
+        self.temperature_c = 40.0
+        self.errors = (0, 0)
+        self.sign = (1.0, 1.0)
+        self.disturbance: Callable[[list[float]], Vec2] = lambda _: (0.0, 0.0)
+        self.torque = (0.0, 0.0)
+        self.motion = Motion(vehicle, self.state())
+        self.fastest_deg_s = 0.0
+        self.strongest_nm = [0.0, 0.0]
+
+    def state(self) -> ArmState:
+        first, second = self.angle
+        return ArmState(
+            self.t_s, (first, second), (self.rate[0], self.rate[1]), self.torque, self.errors,
+            (self.temperature_c, self.temperature_c), 0,
+        )  # fmt: skip
+
+    def step(self) -> Moved:
+        self.t_s += DT_S
+        moved = self.motion.step(self.state(), DT_S)
+        self.torque = moved.torque_nm
+        gravity = self.manipulator.gravity_torque_nm((self.angle[0], self.angle[1]), IDENTITY_QUAT)
+        beside = self.disturbance(self.angle)
+        for j in (0, 1):
+            net = self.sign[j] * moved.torque_nm[j] - gravity[j] + beside[j]
+            drag = min(FRICTION_NM, abs(net) if self.rate[j] == 0.0 else FRICTION_NM)
+            before = self.rate[j]
+            self.rate[j] += (net - math.copysign(drag, self.rate[j] or net)) / INERTIA_KG_M2[j] * DT_S
+            if before and before * self.rate[j] < 0.0:
+                self.rate[j] = 0.0
+            self.angle[j] += self.rate[j] * DT_S
+            self.strongest_nm[j] = max(self.strongest_nm[j], abs(moved.torque_nm[j]))
+        self.fastest_deg_s = max(self.fastest_deg_s, *(abs(math.degrees(rate)) for rate in self.rate))
+        return moved
+
+    def until(self, done: Callable[[Moved], bool]) -> Moved:
+        for _ in range(PATIENCE):
+            moved = self.step()
+            if moved.stop or done(moved):
+                return moved
+        raise AssertionError("it never came to an end")
+
+    @property
+    def degrees(self) -> Vec2:
+        return math.degrees(self.angle[0]), math.degrees(self.angle[1])
+
+
+def test_a_joint_reaches_its_goal_slowly_and_the_other_one_stays(vehicle: Vehicle) -> None:
+    bench = Bench(vehicle)
+    bench.motion.go(0, math.radians(140.0), math.radians(99.0))
+    moved = bench.until(lambda m: m.reached)
+    assert moved.stop == "" and bench.degrees == pytest.approx((140.0, 10.0), abs=1.0)
+    assert bench.fastest_deg_s + 1.0 > SPEED_MAX_DEG_S and bench.fastest_deg_s < 1.5 * SPEED_MAX_DEG_S
+    assert bench.t_s > 50.0 / SPEED_MAX_DEG_S
+    assert all(
+        most <= TORQUE_SHARE * joint.torque_max_nm
+        for most, joint in zip(bench.strongest_nm, vehicle.arm.joints, strict=True)
+    )
+
+
+def test_no_goal_lies_beyond_a_wall(vehicle: Vehicle) -> None:
+    for joint, goal_deg in ((0, 400.0), (1, -400.0)):
+        bench = Bench(vehicle, (120.0, 60.0))
+        bench.motion.go(joint, math.radians(goal_deg), math.radians(20.0))
+        assert bench.until(lambda m: m.reached).stop == ""
+        low, high = walls_deg(vehicle.arm, joint)
+        assert bench.degrees[joint] == pytest.approx(high if goal_deg > 0 else low, abs=1.0)
+
+
+def test_something_in_the_way_stops_it_gently(vehicle: Vehicle) -> None:
+    bench = Bench(vehicle)
+    wall_rad = math.radians(40.0)
+    bench.disturbance = lambda angle: (0.0, -200.0 * max(0.0, angle[1] - wall_rad))
+    bench.motion.go(1, math.radians(80.0), math.radians(20.0))
+    moved = bench.until(lambda m: m.reached)
+    assert moved.stop.startswith("joint 2: +0.") and "in its way" in moved.stop and moved.torque_nm == (0.0, 0.0)
+    assert bench.degrees[1] < 41.0
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_wrong_sign_ends_before_it_goes_far(vehicle: Vehicle, joint: int) -> None:
+    bench = Bench(vehicle, (90.0, 40.0))
+    bench.sign = (-1.0, 1.0) if joint == 0 else (1.0, -1.0)
+    begin = bench.degrees
+    bench.motion.go(joint, bench.angle[joint] + 0.5, math.radians(20.0))
+    assert bench.until(lambda m: m.reached).stop
+    assert abs(bench.degrees[joint] - begin[joint]) < 15.0
+
+
+def test_hot_servos_and_hardware_errors_stop_it(vehicle: Vehicle) -> None:
+    for change, words in (
+        ({"temperature_c": 66.0}, "66 degC"),
+        ({"errors": (0, 0x20)}, "joint 2: hardware error: overload"),
+        ({"errors": (0x80, 0)}, "joint 1: the bus watchdog let go"),
+    ):
+        bench = Bench(vehicle)
+        bench.motion.go(0, math.radians(120.0), math.radians(20.0))
+        for name, value in change.items():
+            setattr(bench, name, value)
+        moved = bench.step()
+        assert words in moved.stop and moved.torque_nm == (0.0, 0.0)
+
+
+def test_a_pose_that_is_too_heavy_is_refused_before_anything_moves(vehicle: Vehicle) -> None:
+    heavy = vehicle.model_copy(update={"tool": vehicle.tool.model_copy(update={"net_mass_kg": 0.5})})
+    motion = Motion(heavy, Bench(heavy).state())
+    assert motion.refusal([(math.radians(90.0), 0.0)]) == ""
+    assert "joint 1 carries" in motion.refusal([(math.radians(90.0), 0.0), (math.radians(165.0), 0.0)])
+
+
+def test_a_held_key_moves_a_released_one_stops(vehicle: Vehicle) -> None:
+    bench, leader = Bench(vehicle), ByKeys()
+    leader.begin(bench.state())
+    moved: Moved | None = None
+
+    def run(seconds: float, key: str = "", every_s: float = 0.03) -> None:
+        nonlocal moved
+        for tick in range(round(seconds / DT_S)):
+            if key and tick % round(every_s / DT_S) == 0:
+                leader.press([key])
+            moved = bench.step()
+            assert not leader.update(bench.motion, moved, bench.state())
+
+    run(0.1)
+    leader.press(["2"])
+    run(2.0, "+")
+    held_deg = bench.degrees[1]
+    assert held_deg - 10.0 > 0.6 * 2.0 * SPEED_MAX_DEG_S
+    run(3.0)
+    assert bench.degrees[1] - held_deg <= STEP_DEG + 1.0
+    assert bench.degrees[0] == pytest.approx(90.0, abs=1.0)
+    stays_deg = bench.degrees[1]
+    leader.press(["+", "x"])
+    run(1.0)
+    assert bench.degrees[1] == pytest.approx(stays_deg, abs=0.3), "any other key stops it"
+    leader.press(["q"])
+    assert leader.update(bench.motion, moved, bench.state())
+
+
+def test_a_key_that_a_jam_makes_last_times_out(vehicle: Vehicle) -> None:
+    bench, leader = Bench(vehicle), ByKeys()
+    leader.begin(bench.state())
+    leader.press(["+"])
+    leader.update(bench.motion, None, bench.state())
+    late = replace(bench.state(), stamp_s=KEY_TIMEOUT_S + 0.1)
+    leader.update(bench.motion, None, late)
+    before = bench.motion.reference_rad
+    bench.step()
+    assert bench.motion.reference_rad == before
+
+
+def test_nobody_at_the_keys_ends_it(vehicle: Vehicle) -> None:
+    bench, leader = Bench(vehicle), ByKeys()
+    leader.begin(bench.state())
+    assert not leader.update(bench.motion, None, bench.state())
+    assert leader.update(bench.motion, None, replace(bench.state(), stamp_s=1000.0))
+
+
+def test_what_a_terminal_sends_is_taken_apart() -> None:
+    assert keys_in("\x1b[C\x1b[Dq1") == ["\x1b[C", "\x1b[D", "q", "1"]
+    assert keys_in("\x1b") == ["\x1b"]
+
+
+def test_to_an_angle_and_no_further(vehicle: Vehicle) -> None:
+    bench, leader = Bench(vehicle), ToAngle(1, 50.0)
+    leader.begin(bench.state())
+    bench.until(lambda m: leader.update(bench.motion, m, bench.state()))
+    assert bench.degrees == pytest.approx((90.0, 50.0), abs=1.0)
+
+
+def test_the_sweeps_keep_samples_of_both_ways_at_both_speeds_and_end_hanging(vehicle: Vehicle) -> None:
+    bench = Bench(vehicle, (165.0, 140.0))
+    sweeper = Sweeper(legs_of(vehicle.arm), vehicle.arm.torque_per_amp_nm_a)
+
+    def led(moved: Moved) -> bool:
+        sweeper.update(bench.motion, moved, bench.state())
+        return sweeper.done
+
+    assert bench.until(led).stop == ""
+    assert bench.degrees == pytest.approx((90.0, 0.0), abs=1.0)
+    seen = {(one.joint, one.direction, sweeper.legs[one.leg].speed_deg_s) for one in sweeper.samples}
+    assert len(seen) == 8
+    for number, leg in enumerate(sweeper.legs):
+        speeds = [one.velocity_rad_s * one.direction for one in sweeper.samples if one.leg == number]
+        if leg.counts:
+            assert math.degrees(math.fsum(speeds) / len(speeds)) == pytest.approx(leg.speed_deg_s, rel=0.05)
+
+
+def test_walls_without_room_to_sweep_are_one_line() -> None:
+    narrow = load_vehicle(
+        SHIPPED, ["vehicle.arm.joints[0].angle_deg=[80, 100]", "vehicle.safety.fold_arm_deg=[90, 140]"]
+    )
+    with pytest.raises(ConfigError, match=r"arm.joints\[0\].angle_deg"):
+        legs_of(narrow.arm)

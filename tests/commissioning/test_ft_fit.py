@@ -1,0 +1,145 @@
+"""A known weight on the net tells how the sensor lies and what its scale is; drift with its error."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from companion.commissioning import ft_fit
+from companion.commissioning.ft_fit import Loaded
+from companion.config.loader import load_vehicle
+from companion.config.world import World
+from companion.control.manipulator import Manipulator
+from companion.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
+from companion.types import ForceSample, Quat, Vec2, Vec3
+from sitl.hand import HungWeight
+from tests.support import ROOT
+
+VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")
+WEIGHT_KG = 0.5
+FOLDED: Vec2 = (math.radians(165.0), math.radians(140.0))
+HANGING: Vec2 = (math.radians(90.0), 0.0)
+TURNS = sorted(ROTATIONS, key=lambda turn: turn.names)
+
+
+def quat_of(rpy_deg: Vec3) -> Quat:
+    roll, pitch, yaw = (math.radians(angle) for angle in rpy_deg)
+    return quat_from_euler_zyx(roll, pitch, yaw)
+
+
+def loaded(truth: Quat, arm_rad: Vec2 = FOLDED, scale: float = 1.0, off_n: Vec3 = (0.0, 0.0, 0.0)) -> Loaded:
+    """What a sensor mounted as `truth` reads, with a bias."""
+    down = ft_fit.down_in_link2(arm_rad)
+    x, y, z = quat_rotate(quat_conjugate(truth), down)
+    n = scale * 9.81 * WEIGHT_KG
+    return Loaded((1.0, -2.0, 30.0), (1.0 + n * x + off_n[0], -2.0 + n * y + off_n[1], 30.0 + n * z + off_n[2]), down)
+
+
+def test_down_in_link_2_is_what_the_arm_says() -> None:
+    arm = Manipulator(VEHICLE.arm, VEHICLE.tool)
+    for arm_rad in (FOLDED, HANGING, (1.3, -0.1)):
+        body = quat_rotate(arm.sensor_attitude_body(arm_rad), ft_fit.down_in_link2(arm_rad))
+        assert body == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
+
+
+@pytest.mark.parametrize("mounted_deg", [(0.0, 0.0, 0.0), (0.0, 0.0, 45.0), (180.0, 0.0, 0.0)])
+@pytest.mark.parametrize("turn", TURNS, ids=lambda turn: ",".join(turn.names))
+def test_every_right_angle_turn_is_found(turn: AxisMap, mounted_deg: Vec3) -> None:
+    truth = quat_multiply(quat_of(mounted_deg), turn.inverse.quat)
+    fit = ft_fit.fit_weight([loaded(truth, off_n=(0.05, -0.05, 0.05))], WEIGHT_KG, mounted_deg)
+    assert fit.rest_deg < 3.0
+    assert fit.scale == pytest.approx(1.0, abs=0.03)
+    if fit.others:
+        return  # said so, and nothing is proposed
+    assert fit.turn == turn
+    assert abs(sum(a * b for a, b in zip(quat_of(fit.rpy_deg), truth, strict=True))) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_most_turns_are_certain_in_the_folded_pose() -> None:
+    fits = [ft_fit.fit_weight([loaded(turn.inverse.quat)], WEIGHT_KG, (0.0, 0.0, 0.0)) for turn in TURNS]
+    assert all(not fit.others for fit in fits)
+
+
+def test_a_turned_sensor_is_a_patch_and_a_right_one_none() -> None:
+    turned = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 90.0)))], WEIGHT_KG, (0.0, 0.0, 0.0))
+    assert ft_fit.changes(turned) == {("tool", "sensor_rpy_deg"): [0.0, 0.0, 90.0]}
+    right = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 90.0)))], WEIGHT_KG, (0.0, 0.0, 90.0))
+    assert ft_fit.changes(right) == {}
+    assert right.turn == IDENTITY
+    assert all(row.ok for row in ft_fit.rows(right))
+
+
+def test_straight_down_nobody_can_tell_and_it_says_so() -> None:
+    """A turn about the link is invisible there: the configured one is kept, with a warning."""
+    seen = ft_fit.fit_weight([loaded(quat_of((90.0, 0.0, 0.0)), HANGING)], WEIGHT_KG, (0.0, 0.0, 0.0))
+    assert len(seen.others) == 3
+    assert [row.id for row in ft_fit.rows(seen) if not row.ok] == ["ft.pose"]
+    hidden = ft_fit.fit_weight([loaded(quat_of((0.0, 90.0, 0.0)), HANGING)], WEIGHT_KG, (0.0, 0.0, 0.0))
+    assert ft_fit.changes(hidden) == {}
+    assert {row.id for row in ft_fit.rows(hidden) if not row.ok} == {"ft.pose", "ft.direction"}
+
+
+def test_two_poses_tell_what_one_cannot() -> None:
+    truth = quat_of((90.0, 0.0, 0.0))
+    fit = ft_fit.fit_weight([loaded(truth, HANGING), loaded(truth)], WEIGHT_KG, (0.0, 0.0, 0.0))
+    assert fit.rpy_deg == (90.0, 0.0, 0.0)
+    assert not fit.others
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.9, 1.1, 2.0])
+def test_a_wrong_scale_is_told_and_no_turn_of_the_sensor(scale: float) -> None:
+    fit = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 0.0)), scale=scale)], WEIGHT_KG, (0.0, 0.0, 0.0))
+    assert fit.scale == pytest.approx(scale)
+    assert [row.id for row in ft_fit.rows(fit) if not row.ok] == ["ft.scale"]
+    assert ft_fit.changes(fit) == {}
+
+
+def test_a_weight_that_touches_something_is_no_turned_sensor() -> None:
+    fit = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 0.0)), off_n=(3.0, 3.0, 0.0))], WEIGHT_KG, (0.0, 0.0, 0.0))
+    assert ft_fit.changes(fit) == {}
+    assert "ft.direction" in [row.id for row in ft_fit.rows(fit) if not row.ok]
+
+
+def stream(force_n: np.ndarray, rate_hz: float = 200.0) -> list[ForceSample]:
+    return [
+        ForceSample(5.0 + k / rate_hz, (float(x), float(y), float(z)), (0.0, 0.0, 0.0), False)
+        for k, (x, y, z) in enumerate(force_n)
+    ]
+
+
+def test_drift_is_told_with_its_error() -> None:
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 60.0, 0.005)
+    force = rng.normal(0.0, 0.05, (len(t), 3)) + np.outer(t, (0.5 / 60.0, 0.0, -1.0 / 60.0))
+    x, y, z = ft_fit.drift(stream(force))
+    for axis, truth in ((x, 0.5), (y, 0.0), (z, -1.0)):
+        assert abs(axis.per_minute_n - truth) < 5.0 * axis.standard_error_n
+        assert 0.0 < axis.standard_error_n < 0.01
+        assert axis.noise_n == pytest.approx(0.05, rel=0.05)
+
+
+def test_a_sensor_that_repeats_itself_is_stuck() -> None:
+    rng = np.random.default_rng(4)
+    alive = rng.normal(0.0, 0.05, (600, 3))
+    assert ft_fit.stuck_row(stream(alive), VEHICLE).ok
+    alive[200:280] = alive[200]
+    row = ft_fit.stuck_row(stream(alive), VEHICLE)
+    assert not row.ok
+    assert "0.39 s" in row.read or "0.40 s" in row.read
+
+
+def test_the_worlds_weight_hangs_while_somebody_reads_the_sensor() -> None:
+    hung = HungWeight(World(net_weight_kg=0.5, net_weight_t_s=2.0))
+    told = [
+        (t_s, hung.changed(t_s, read), hung.pull_n)
+        for t_s, read in ((0.0, False), (1.0, True), (2.9, True), (3.0, True))
+    ]
+    assert [changed for _, changed, _ in told] == [False, False, False, True]
+    assert hung.pull_n == pytest.approx(4.905)
+    assert not hung.changed(9.0, True)
+    assert hung.changed(9.1, False)
+    assert hung.pull_n == 0.0
+    assert not hung.changed(9.2, True)

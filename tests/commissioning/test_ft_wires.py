@@ -1,0 +1,162 @@
+"""`companion ft check` and `tare` over real wires: a known weight hangs on the simulated net; what is planted is found."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.clock import flight_clock
+from companion.commissioning.ft_watch import FtSensor
+from companion.config.vehicle import ForceDevice
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from sitl.force_torque import ForceTorqueServer
+from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle, wait_for_error
+from tests.support import Sandbox, World
+
+__all__ = ["sandbox", "vehicle"]
+WEIGHT_KG = 0.5
+
+
+def checked(
+    sandbox: Sandbox, vehicle: Path, *knobs: str, options: tuple[object, ...] = (), more: tuple[object, ...] = ()
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """What the first check finds; and what a second one does, with the file as the first one left it."""
+    with World(sandbox, overrides=[f"world.net_weight_kg={WEIGHT_KG}", *knobs]) as world:
+        words = ["ft", "check", "--weight", WEIGHT_KG, "--json", "--vehicle", vehicle, *world.addresses(), *options]
+        first = document(sandbox.run(*words, *more))
+        second = document(sandbox.run(*words)) if more else None
+    return first, second
+
+
+def test_a_sound_sensor_feels_the_weight_as_it_is(sandbox: Sandbox) -> None:
+    found, _ = checked(sandbox, VEHICLE)
+    assert bad(found).keys() <= {"force.rate"}, found
+    assert found["weight"]["scale"] == pytest.approx(1.0, abs=0.02)
+    assert found["weight"]["off_deg"] < 2.0
+    assert found["weight"]["certain"]
+    assert found["rest"]["bias_n"] == pytest.approx([1.2, -0.8, 2.5], abs=0.1)
+    assert found["rest"]["arm_deg"] == pytest.approx([165.0, 140.0], abs=1.0)
+    assert found["patch"] is None
+
+
+def test_a_biased_and_turned_sensor_is_found_and_the_written_file_is_right(sandbox: Sandbox, vehicle: Path) -> None:
+    knobs = ("world.force_bias_n=[30,0,0]", "vehicle.tool.sensor_rpy_deg=[0,0,90]")
+    first, second = checked(sandbox, vehicle, *knobs, more=("--write", "--yes"))
+    assert {"force.tare", "ft.direction"} <= set(bad(first))
+    assert "companion ft tare --sensor" in bad(first)["force.tare"]
+    assert changes(first) == {"tool.sensor_rpy_deg": [0.0, 0.0, 90.0]}
+    assert second is not None
+    assert "ft.direction" not in bad(second)
+    assert "force.tare" in bad(second)
+    assert second["rest"]["bias_n"] == pytest.approx([30.0, 0.0, 0.0], abs=0.1)
+
+
+def test_a_wrong_scale_is_the_sensors_and_no_patch(sandbox: Sandbox) -> None:
+    found, _ = checked(sandbox, VEHICLE, "world.force_scale=2.0", "world.force_bias_n=[0,0,0]")
+    assert set(bad(found)) - {"force.rate"} == {"ft.scale"}
+    assert "2.00 times the truth" in bad(found)["ft.scale"]
+    assert found["patch"] is None
+
+
+def test_the_arm_need_not_be_wired(sandbox: Sandbox) -> None:
+    without_bus = ("--arm-pose", "165,140", "--set", "vehicle.devices.arm.port=/dev/null")
+    found, _ = checked(sandbox, VEHICLE, options=without_bus)
+    assert found["weight"]["off_deg"] < 2.0
+    with World(sandbox) as world:
+        ended = sandbox.run("ft", "check", "--vehicle", VEHICLE, *world.addresses(arm={"port": "/dev/null"}))
+    assert ended.code == EXIT_REFUSED
+    assert "--arm-pose A1,A2" in ended.out
+
+
+def test_tare_shows_the_drift_and_writes_to_the_sensor_only_when_asked(sandbox: Sandbox) -> None:
+    with World(sandbox, overrides=["world.force_bias_n=[30,0,0]"]) as world:
+        words = ["ft", "tare", "--seconds", 5, "--json", "--vehicle", VEHICLE, *world.addresses()]
+        before = json.loads(sandbox.run(*words).out)
+        unasked = sandbox.run(*words, "--sensor")
+        still = json.loads(sandbox.run(*words).out)
+        zeroed = json.loads(sandbox.run(*words, "--sensor", "--yes").out)
+        after = json.loads(sandbox.run(*words).out)
+        cleared = json.loads(sandbox.run(*words, "--clear", "--yes").out)
+    assert unasked.code == EXIT_ABORTED
+    assert "say --yes" in unasked.err
+    assert [axis["axis"] for axis in before["drift"]] == ["x", "y", "z"]
+    assert before["tare"]["bias_n"] == pytest.approx([30.0, 0.0, 0.0], abs=0.1)
+    assert still["tare"]["bias_n"] == pytest.approx([30.0, 0.0, 0.0], abs=0.1)
+    assert [row["ok"] for row in zeroed["rows"] if row["id"] == "ft.bias_set"] == [True]
+    assert max(abs(axis["mean_n"]) for axis in after["drift"]) < 0.3
+    assert cleared["tare"]["bias_n"] == pytest.approx([30.0, 0.0, 0.0], abs=0.1)
+
+
+def test_a_sensor_that_is_not_there_is_one_line(sandbox: Sandbox) -> None:
+    for part in ("check", "tare"):
+        options = ("--vehicle", VEHICLE, "--arm-pose", "90,0", "--set", "vehicle.devices.force.port=/dev/no-such-port")
+        ended = sandbox.run("ft", part, *options)
+        assert ended.code == EXIT_REFUSED
+        assert "no such port" in ended.out
+        assert "Traceback" not in ended.err
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("check", "--weight", "0"),
+        ("check", "--weight", "nan"),
+        ("check", "--arm-pose", "90"),
+        ("check", "--arm-pose", "10,0"),
+        ("tare", "--seconds", "1"),
+    ],
+)
+def test_bad_input_opens_nothing(sandbox: Sandbox, options: tuple[str, ...]) -> None:
+    ended = sandbox.run("ft", *options, "--vehicle", VEHICLE)
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1
+
+
+def test_ctrl_c_while_the_weight_is_awaited(sandbox: Sandbox) -> None:
+    with World(sandbox) as world:
+        running = sandbox.start("ft", "check", "--weight", 1, "--vehicle", VEHICLE, *world.addresses())
+        with running:
+            wait_for_error(running, "hang 1 kg")
+            running.signal(signal.SIGINT)
+            ended = running.end()
+    assert ended.code == EXIT_ABORTED
+    assert ended.err_lines[-1] == "companion ft: interrupted"
+
+
+def test_the_sensors_zero_is_taken_while_it_streams() -> None:
+    async def go() -> list[float]:
+        async with ForceTorqueServer() as server:
+            server.set_wrench((3.0, 4.0, 0.0), (0.0, 0.0, 0.0))
+            ticking = asyncio.ensure_future(_tick(server))
+            try:
+                async with FtSensor(ForceDevice(port=server.port), flight_clock()) as sensor:
+                    read = []
+                    for on in (True, False):
+                        sensor.set_bias(on)
+                        await sensor.tare_samples(0.2)
+                        read.append((await sensor.tare_samples(0.05))[-1].force_sensor_n[0])
+                    return read
+            finally:
+                ticking.cancel()
+                await asyncio.wait((ticking,))
+
+    assert asyncio.run(go()) == [0.0, 3.0]
+
+
+async def _tick(server: ForceTorqueServer) -> None:
+    loop = asyncio.get_running_loop()
+    while True:
+        server.tick(loop.time())
+        await asyncio.sleep(0.002)
+
+
+def test_exit_code_of_a_sound_sensor_is_0(sandbox: Sandbox) -> None:
+    with World(sandbox) as world:
+        ended = sandbox.run("ft", "check", "--vehicle", VEHICLE, *world.addresses())
+    assert ended.code == EXIT_OK, ended
+    assert "--weight KG" in ended.out

@@ -1,0 +1,96 @@
+"""`companion latency` over real wires: the simulated machine is held and tapped; NatNet on one side, MAVLink on the other."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+import pytest
+
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from tests.commissioning.test_mocap_wires import VEHICLE, bad, document, sandbox, wait_for_error
+from tests.support import Ended, Sandbox, World
+
+__all__ = ["sandbox"]
+TAPPED = ("world.hand=true", "world.hand_t_s=2", "world.hand_taps=12", "world.payload_kg=0")
+STEP_MS = 1.0
+"""The world sends a frame in the next of its steps of 2 ms, and is held up now and then."""
+
+
+def measured(sandbox: Sandbox, *knobs: str, options: tuple[object, ...] = ()) -> Ended:
+    with World(sandbox, overrides=[*TAPPED, *knobs]) as world:
+        return sandbox.run("latency", "--json", "--vehicle", VEHICLE, *options, *world.addresses())
+
+
+def near(found: dict[str, Any], wanted_ms: float) -> None:
+    assert found["ev_delay_ms"] == pytest.approx(wanted_ms, abs=STEP_MS + 4.0 * found["standard_error_ms"]), found
+    assert found["standard_error_ms"] < 1.5
+
+
+def test_the_stubs_5_ms_are_found(sandbox: Sandbox) -> None:
+    ended = measured(sandbox)
+    found = document(ended)
+    assert ended.code == EXIT_OK
+    near(found, 6.0)
+    assert found["px4_ms"] == 5.0
+    assert sum(tap["problem"] is None for tap in found["taps"]) >= 8
+    assert found["mocap_latency_ms"] == pytest.approx(6.0, abs=1.5)
+    assert "tap 1 of 8" in ended.err
+
+
+def test_more_latency_is_found_written_and_then_right(sandbox: Sandbox) -> None:
+    knobs = [*TAPPED, "world.mocap_latency_s=0.020"]
+    with World(sandbox, overrides=knobs) as world:
+        words = ["latency", "--json", "--vehicle", VEHICLE, *world.addresses()]
+        first = document(sandbox.run(*words, "--write", "--yes"))
+        second = document(sandbox.run(*words))
+    near(first, 20.0)
+    assert set(bad(first)) == {"latency.delay"}
+    assert first["written_ms"] == pytest.approx(first["parameter"]["EKF2_EV_DELAY"], abs=1e-4)
+    assert second["px4_ms"] == pytest.approx(first["written_ms"], abs=1e-4)
+    assert bad(second) == {}
+
+
+def test_30_ms_more_are_found_and_too_many_to_be_written(sandbox: Sandbox) -> None:
+    ended = measured(sandbox, "world.mocap_latency_s=0.035", options=("--write", "--yes"))
+    found = document(ended)
+    near(found, 36.0)
+    assert set(bad(found)) == {"latency.delay", "latency.long"}
+    assert found["written_ms"] is None
+    assert "EKF2_EV_DELAY is not written" in ended.err
+
+
+def test_weak_taps_are_refused(sandbox: Sandbox) -> None:
+    ended = measured(sandbox, "world.hand_tap_n=3", options=("--seconds", 15))
+    found = document(ended)
+    assert ended.code == EXIT_REFUSED
+    assert set(bad(found)) == {"latency.taps"}
+    assert found["ev_delay_ms"] is None
+    assert "tap harder" in bad(found)["latency.taps"]
+
+
+def test_without_px4_it_says_so(sandbox: Sandbox) -> None:
+    with World(sandbox) as world:
+        address = {"address": "udpin://127.0.0.1:0"}
+        ended = sandbox.run("latency", "--vehicle", VEHICLE, *world.addresses(autopilot=address))
+    assert ended.code == EXIT_REFUSED
+    assert "a port from 1 to 65535" in ended.out
+    assert "Traceback" not in ended.err
+
+
+@pytest.mark.parametrize("options", [("--taps", "2"), ("--seconds", "nan"), ("--taps", "many")])
+def test_bad_input_opens_nothing(sandbox: Sandbox, options: tuple[str, ...]) -> None:
+    ended = sandbox.run("latency", "--vehicle", VEHICLE, *options)
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1
+
+
+def test_ctrl_c_gives_up(sandbox: Sandbox) -> None:
+    with World(sandbox) as world:
+        running = sandbox.start("latency", "--vehicle", VEHICLE, *world.addresses())
+        with running:
+            wait_for_error(running, "hold the machine up")
+            running.signal(signal.SIGINT)
+            ended = running.end()
+    assert (ended.code, ended.out) == (EXIT_ABORTED, "")
+    assert ended.err_lines[-1] == "companion latency: interrupted"

@@ -1,0 +1,132 @@
+"""A watched stream of motion capture: its timing, which body it is, and what is proposed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from companion.commissioning import mocap_judge
+from companion.commissioning.mocap_judge import FrameSeen, Judged, Route, Timing
+from companion.config.loader import load_vehicle
+from companion.io.natnet import RigidBody, ServerInfo
+from companion.types import IDENTITY_QUAT, Vec3
+from tests.support import ROOT
+
+VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")
+INFO = ServerInfo("Motive", (3, 0, 0, 0), (4, 1, 0, 0), 10_000_000, 1511, True, "239.255.42.99")
+CABLE = Route("unicast", "10.0.0.2", "eth0", False)
+NAMES = {1: "quad", 5: "wand"}
+
+Place = Callable[[float], Vec3]
+
+
+def still(_: float) -> Vec3:
+    return (0.0, 0.0, 0.3)
+
+
+def carried(t_s: float) -> Vec3:
+    return (0.3 * math.sin(t_s), 0.0, 0.3)
+
+
+def frames(
+    rate_hz: float = 200.0,
+    seconds: float = 4.0,
+    places: dict[int, Place] | None = None,
+    latency_s: float | None = 0.005,
+    lost: Callable[[int], bool] = lambda _: False,
+    late_s: Callable[[int], float] = lambda _: 0.0,
+) -> list[FrameSeen]:
+    found = []
+    for number in range(int(rate_hz * seconds)):
+        t_s = number / rate_hz
+        if lost(number):
+            continue
+        bodies = tuple(
+            RigidBody(id_, place(t_s), IDENTITY_QUAT, 0.0003, True) for id_, place in (places or {1: still}).items()
+        )
+        found.append(FrameSeen(10.0 + t_s + late_s(number), number + 1000, 50.0 + t_s, latency_s, bodies))
+    return found
+
+
+def judged(seen: Sequence[FrameSeen], *, moving: bool = False, route: Route = CABLE) -> Judged:
+    return mocap_judge.judge(seen, NAMES, INFO, VEHICLE, 4.0, route, moving=moving)
+
+
+def bad(found: Judged) -> set[str]:
+    return {row.id for row in found.rows if not row.ok}
+
+
+def timing_of(seen: Sequence[FrameSeen]) -> Timing:
+    t = mocap_judge.timing(seen)
+    assert t is not None
+    return t
+
+
+def test_a_sound_stream_is_fine() -> None:
+    found = judged(frames())
+    assert bad(found) == set()
+    assert found.changes == {}
+
+
+def test_lost_frames_are_counted_by_their_numbers() -> None:
+    t = timing_of(frames(lost=lambda number: number % 10 == 3))
+    assert t.lost == 80
+    assert t.share_lost == pytest.approx(0.1)
+    assert t.server_rate_hz == pytest.approx(200.0)
+    assert t.rate_hz == pytest.approx(180.0, rel=0.01)
+
+
+def test_jitter_is_told_and_drawn() -> None:
+    seen = frames(late_s=lambda number: 0.004 if number % 20 == 0 else 0.0)
+    t = timing_of(seen)
+    assert t.percentile_off_s(0.5) == pytest.approx(0.0, abs=2e-4)
+    assert t.off_s[-1] == pytest.approx(0.004, abs=2e-4)
+    lines = mocap_judge.histogram(t)
+    assert sum(float(line.split("%")[0].split()[-1]) for line in lines) == pytest.approx(100.0, abs=0.5)
+    assert lines[0].count("#") > 10 * lines[-1].count("#") > 0
+    assert "mocap.steady" in bad(judged(seen))
+
+
+def test_a_camera_at_half_the_rate_is_told_from_frames_that_are_lost() -> None:
+    slow, holes = judged(frames(rate_hz=100.0)), judged(frames(lost=lambda number: number % 2 == 1))
+    assert slow.changes == {("devices", "mocap", "rate_hz"): 100.0}
+    assert "mocap.rate" in bad(slow) and "mocap.lost" not in bad(slow)
+    assert {"mocap.rate", "mocap.lost"} <= bad(holes)
+    assert holes.changes == {}
+
+
+def test_more_latency_than_px4_is_told_of() -> None:
+    assert "mocap.delay" in bad(judged(frames(latency_s=0.035)))
+    assert "mocap.delay" not in bad(judged(frames(latency_s=0.006)))
+    assert "mocap.latency" in bad(judged(frames(latency_s=None)))
+
+
+@pytest.mark.parametrize(
+    ("places", "moving", "proposed", "fine"),
+    [
+        ({5: still}, False, 5, False),
+        ({5: still, 6: still}, False, None, False),
+        ({1: still, 5: carried}, True, 5, False),
+        ({1: carried, 5: still}, True, None, True),
+        ({1: carried, 5: carried}, True, None, False),
+        ({1: still, 5: still}, True, None, False),
+        ({1: still, 5: still}, False, None, True),
+    ],
+)
+def test_the_body_that_moves_is_the_vehicle(
+    places: dict[int, Place], moving: bool, proposed: int | None, fine: bool
+) -> None:
+    found = judged(frames(places=places), moving=moving)
+    assert ("mocap.own" not in bad(found)) == fine
+    assert found.changes.get(("devices", "mocap", "rigid_body_id")) == proposed
+
+
+def test_wifi_is_told() -> None:
+    assert "mocap.network" in bad(judged(frames(), route=Route("unicast", "10.0.0.2", "wlan0", True)))
+
+
+def test_too_few_frames_are_not_judged() -> None:
+    found = judged(frames(seconds=0.02))
+    assert {row.id for row in found.rows} == {"mocap.server", "mocap.network", "mocap.own"}

@@ -1,0 +1,199 @@
+"""`companion mocap check` and `align` over real wires: each planted fault is found, and the patch that is written puts it right."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from tests.support import CATCH, DEADLINE_S, ROOT, Ended, Running, Sandbox, World, sandbox_in, set_options
+
+VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
+WATCH_S = 2
+CARRIED_S = 12
+"""Longer than the hand's rest between two rounds: it is seen to move whenever one begins to watch."""
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def vehicle(tmp_path: Path) -> Path:
+    """A vehicle file that may be written."""
+    return Path(shutil.copy(VEHICLE, tmp_path / "vehicle.yaml"))
+
+
+def addresses(world: World, *left_out: str) -> list[str]:
+    """`--set` options without those keys of motion capture that are to come from the vehicle file."""
+    keys = {
+        name: {key: value for key, value in keys.items() if name != "mocap" or key not in left_out}
+        for name, keys in world.devices.items()
+    }
+    flat = {f"vehicle.devices.{name}.{key}": value for name, one in keys.items() for key, value in one.items()}
+    return set_options(**flat)
+
+
+def wait_for_error(running: Running, text: str) -> None:
+    """Until standard error has shown it: there people are told what to do."""
+    deadline_s = time.monotonic() + DEADLINE_S
+    while text not in running._text("err"):
+        assert running._pump(deadline_s), (text, running._text("out"), running._text("err"))
+
+
+def document(ended: Ended) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(ended.out)
+    assert found["schema_version"] == 1
+    assert found["ok"] == (ended.code == EXIT_OK), ended
+    return found
+
+
+def bad(found: Mapping[str, Any]) -> dict[str, str]:
+    """Rows that refuse: id and what to do."""
+    return {row["id"]: row["fix"] for row in found["rows"] if not row["ok"] and row["level"] == "refuse"}
+
+
+def changes(found: Mapping[str, Any]) -> dict[str, Any]:
+    return {change["key"]: change["new"] for change in (found["patch"] or {"changes": []})["changes"]}
+
+
+def test_a_sound_stream_is_described(sandbox: Sandbox) -> None:
+    with World(sandbox) as world:
+        ended = sandbox.run("mocap", "check", "--seconds", WATCH_S, "--json", "--vehicle", VEHICLE, *addresses(world))
+        people = sandbox.run("mocap", "check", "--seconds", 1, "--vehicle", VEHICLE, *addresses(world))
+    found = json.loads(ended.out)
+    # What a busy computer makes of the arrival times is not this test's.
+    assert not {"mocap.server", "mocap.own", "mocap.delay", "mocap.tracked", "mocap.error"} & set(bad(found))
+    assert found["server"]["natnet"] == "4.1"
+    assert found["server"]["interface"] == "lo"
+    assert [(body["id"], body["name"]) for body in found["bodies"]] == [(1, "tarot650-2r")]
+    assert found["timing"]["latency_s"]["p50"] == pytest.approx(0.006, abs=0.0015)
+    assert found["timing"]["server_rate_hz"] == pytest.approx(200.0, rel=0.02)
+    for words in ("id 1", "tarot650-2r", "100 % tracked", "#####", "ms and more", "unicast on lo"):
+        assert words in people.out
+    sandbox.assert_nobody_left(5.0)
+
+
+def test_wrong_body_half_the_rate_and_more_latency_are_found_and_the_patch_is_right(
+    sandbox: Sandbox, vehicle: Path
+) -> None:
+    """The file names a wand on the floor; the vehicle is another body."""
+    knobs = {
+        "world.mocap_rate_hz": 100.0,
+        "world.mocap_latency_s": 0.035,
+        "world.mocap_other_id": 1,
+        "vehicle.devices.mocap.rigid_body_id": 7,
+        "world.hand": True,
+        "world.hand_t_s": 0.5,
+    }
+    overrides = [word for word in set_options(**knobs) if word != "--set"]
+    with World(sandbox, overrides=overrides) as world:
+        options = ["--move", "--seconds", CARRIED_S, "--json", "--vehicle", vehicle, *addresses(world, "rate_hz")]
+        first = document(sandbox.run("mocap", "check", "--write", "--yes", *options))
+        again = document(sandbox.run("mocap", "check", *options))
+    fixes = bad(first)
+    assert {"mocap.own", "mocap.rate", "mocap.delay"} <= set(fixes)
+    assert "id 7" in fixes["mocap.own"]
+    assert "100" in fixes["mocap.rate"] and "Motive" in fixes["mocap.rate"]
+    assert "EKF2_EV_DELAY: 36 ms" in fixes["mocap.delay"]
+    assert changes(first) == {"devices.mocap.rigid_body_id": 7, "devices.mocap.rate_hz": 100.0}
+    assert Path(first["written"]).read_bytes() == VEHICLE.read_bytes()
+    assert "# Motive: Settings > Streaming > Up Axis" in vehicle.read_text(encoding="utf-8")
+    # What is Motive's own stays; what the file said wrong is gone.
+    assert not {"mocap.own"} & set(bad(again))
+    assert "mocap.delay" in bad(again)
+    assert changes(again) == {}
+
+
+def test_a_server_at_another_address_is_found_by_broadcast(sandbox: Sandbox, vehicle: Path) -> None:
+    with World(sandbox) as world:
+        options = ["--seconds", WATCH_S, "--json", "--vehicle", vehicle, *addresses(world, "server")]
+        wrong = [*options, *set_options(**{"vehicle.devices.mocap.server": "127.0.0.9"})]
+        first = document(sandbox.run("mocap", "check", "--write", "--yes", *wrong))
+        again = json.loads(sandbox.run("mocap", "check", *options).out)
+    assert "no answer" in first["rows"][0]["read"]
+    assert bad(first) == {"mocap.server": "set devices.mocap.server: 127.0.0.1"}
+    assert changes(first) == {"devices.mocap.server": "127.0.0.1"}
+    assert "mocap.server" not in bad(again)
+
+
+def test_nobody_there_is_one_line_with_what_to_look_at(sandbox: Sandbox) -> None:
+    port = {"vehicle.devices.mocap.server": "127.0.0.1", "vehicle.devices.mocap.interface": "127.0.0.1"}
+    ended = sandbox.run(
+        "mocap", "check", "--vehicle", VEHICLE, *set_options(**port, **{"vehicle.devices.mocap.command_port": 9})
+    )
+    assert ended.code == EXIT_REFUSED
+    assert "Motive running" in ended.out
+    assert "nobody answers on this segment" in ended.out
+    assert "Traceback" not in ended.err
+
+
+@pytest.mark.parametrize("options", [("--seconds", "0"), ("--seconds", "nan"), ("--vehicle", "none.yaml")])
+def test_bad_input_opens_nothing(sandbox: Sandbox, options: tuple[str, ...]) -> None:
+    ended = sandbox.run("mocap", "check", *(() if "--vehicle" in options else ("--vehicle", VEHICLE)), *options)
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1
+
+
+def test_ctrl_c_gives_up_and_leaves_nothing(sandbox: Sandbox) -> None:
+    with World(sandbox) as world:
+        running = sandbox.start("mocap", "check", "--seconds", 300, "--vehicle", VEHICLE, *addresses(world))
+        with running:
+            wait_for_error(running, "watching")
+            running.signal(signal.SIGINT)
+            ended = running.end()
+    assert ended.code == EXIT_ABORTED
+    assert ended.out == ""
+    assert ended.err_lines[-1] == "companion mocap: interrupted"
+
+
+def test_ctrl_c_ends_the_hand_test(sandbox: Sandbox, vehicle: Path) -> None:
+    with World(sandbox) as world:
+        running = sandbox.start("mocap", "align", CATCH, "--json", "--vehicle", vehicle, *addresses(world))
+        with running:
+            wait_for_error(running, "1/4")
+            running.signal(signal.SIGINT)
+            ended = running.end()
+    assert (ended.code, ended.out) == (EXIT_ABORTED, "")
+    assert "given up; nothing was changed" in ended.err
+
+
+def aligned(sandbox: Sandbox, vehicle: Path, *knobs: str) -> tuple[dict[str, Any], Ended]:
+    words = ["world.hand=true", "world.hand_t_s=10", "world.payload_kg=0", *(f"world.{knob}" for knob in knobs)]
+    with World(sandbox, overrides=words) as world:
+        options = ["--json", "--write", "--yes", "--vehicle", vehicle, *addresses(world, "up_axis")]
+        ended = sandbox.run("mocap", "align", CATCH, *options)
+    return document(ended), ended
+
+
+def test_a_y_up_stream_is_found_and_written(sandbox: Sandbox, vehicle: Path) -> None:
+    found, ended = aligned(sandbox, vehicle, 'mocap_axes=["x","z","-y"]')
+    assert changes(found) == {"devices.mocap.up_axis": "y"}
+    assert {"hand.lift", "hand.turn"} <= set(bad(found))
+    assert "up_axis: y " in vehicle.read_text(encoding="utf-8")
+    assert "lift it straight up" in ended.err
+    # The same stream, read as the written file says, is right.
+    with World(sandbox, overrides=['world.mocap_axes=["x","z","-y"]']) as world:
+        words = ["check", CATCH, "--json", "--vehicle", vehicle, *addresses(world, "up_axis")]
+        rows = json.loads(sandbox.run(*words).out)["rows"]
+    names = ("frames.gravity", "frames.height", "frames.place", "frames.yaw")
+    assert {row["id"]: row["ok"] for row in rows if row["id"] in names} == dict.fromkeys(names, True)
+
+
+def test_a_body_whose_yaw_is_off_by_a_right_angle_is_motives_to_put_right(sandbox: Sandbox, vehicle: Path) -> None:
+    found, _ = aligned(sandbox, vehicle, "mocap_body_yaw_deg=90")
+    assert set(bad(found)) == {"hand.forward"}
+    assert "reset the rigid body's orientation" in bad(found)["hand.forward"]
+    assert found["alignment"]["body_yaw_deg"] == pytest.approx(90.0, abs=8.0)
+    assert found["alignment"]["world_yaw_deg"] == pytest.approx(0.0, abs=8.0)
+    assert found["patch"] is None
+    assert vehicle.read_bytes() == VEHICLE.read_bytes()

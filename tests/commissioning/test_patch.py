@@ -1,0 +1,162 @@
+"""A patch changes what it says and nothing else: comments, order, the places of other values; refusals are one line."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.commissioning.patch import propose
+from companion.commissioning.yaml_edit import edited, scalar_text
+from companion.config.document import ConfigError, Data, Origin
+from companion.config.loader import load_vehicle
+from companion.config.yaml_strict import parse_value, read_document
+from tests.support import ROOT
+
+SHIPPED = ROOT / "configs/vehicles/tarot650_2r.yaml"
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    return Path(shutil.copy(SHIPPED, tmp_path / "mine.yaml"))
+
+
+def parsed(text: str) -> Data:
+    return parse_value(text, Origin("text"))
+
+
+def test_it_says_what_it_replaces_and_writes_only_that(mine: Path) -> None:
+    before = mine.read_text(encoding="utf-8").splitlines()
+    patch = propose(mine, {("arm", "joints", 0, "sign"): -1, ("arm", "joints", 1, "zero_count"): 3101})
+    lines = {change.key: change.origin.line for change in patch.changes if change.origin is not None}
+    told = [line.split() for line in patch.text.splitlines()]
+    assert ["-", "sign:", "-1", "#", f"{mine}:{lines['arm.joints[0].sign']}:", "was", "1"] in told
+    assert mine.read_text(encoding="utf-8").splitlines() == before, "nothing is written unasked"
+
+    backup = patch.write()
+    assert backup.read_text(encoding="utf-8").splitlines() == before
+    after = mine.read_text(encoding="utf-8").splitlines()
+    differ = [number for number, (a, b) in enumerate(zip(before, after, strict=True), 1) if a != b]
+    assert differ == sorted(lines.values())
+    comment = [line for line in after if "present position (register 132)" in line]
+    assert comment == [line for line in before if "present position (register 132)" in line]
+    joints = load_vehicle(mine).arm.joints
+    assert (joints[0].sign, joints[1].zero_count) == (-1, 3101)
+
+    assert not propose(mine, {("arm", "joints", 0, "sign"): -1})
+    again = propose(mine, {("arm", "joints", 0, "sign"): 1}).write()
+    assert again != backup and again.exists() and backup.exists()
+
+
+def test_what_the_file_leaves_to_its_default_is_added_to_its_block(mine: Path) -> None:
+    patch = propose(mine, {("arm", "joint_friction_nm"): 0.08, ("ground", "mqtt", "commands"): False})
+    patch.write()
+    vehicle = load_vehicle(mine)
+    assert vehicle.arm.joint_friction_nm == 0.08
+    assert vehicle.ground.mqtt is not None and vehicle.ground.mqtt.commands is False
+    lines = mine.read_text(encoding="utf-8").splitlines()
+    assert lines[lines.index("  torque_per_amp_nm_a: 1.3") + 1] == "  joint_friction_nm: 0.08"
+
+
+def test_a_list_keeps_its_comment(mine: Path) -> None:
+    propose(mine, {("arm", "link_masses_kg"): [0.16, 0.09]}).write()
+    assert "  link_masses_kg: [0.16, 0.09]   # link 1 carries" in mine.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("location", "value", "words"),
+    [
+        (("arm", "joints", 0, "sign"), 0, "arm.joints[0].sign"),
+        (("arm", "joints", 1, "servo_id"), 1, "both servos have the id 1"),
+        (("arm", "jonits"), 1, "unknown key"),
+        (("arm", "joints", 2, "sign"), 1, "there is no such place"),
+        (("arm", "joints"), [], "another shape"),
+    ],
+)
+def test_what_would_be_no_vehicle_file_is_refused(
+    mine: Path, location: tuple[str | int, ...], value: Data, words: str
+) -> None:
+    before = mine.read_bytes()
+    with pytest.raises(ConfigError) as caught:
+        propose(mine, {location: value})
+    assert words in str(caught.value) and str(mine) in str(caught.value)
+    assert len(caught.value.lines) == 1
+    assert mine.read_bytes() == before and list(mine.parent.iterdir()) == [mine]
+
+
+def test_a_file_that_was_changed_meanwhile_is_left_alone(mine: Path) -> None:
+    patch = propose(mine, {("arm", "joints", 0, "sign"): -1})
+    mine.write_bytes(mine.read_bytes() + b"# somebody else\n")
+    before = mine.read_bytes()
+    with pytest.raises(ConfigError, match="changed meanwhile"):
+        patch.write()
+    assert mine.read_bytes() == before and list(mine.parent.iterdir()) == [mine]
+
+
+def test_byte_order_mark_line_ends_and_mode_stay(mine: Path) -> None:
+    mine.write_bytes(b"\xef\xbb\xbf" + mine.read_bytes().replace(b"\n", b"\r\n"))
+    mine.chmod(0o640)
+    before = mine.read_bytes()
+    propose(mine, {("arm", "joints", 0, "sign"): -1, ("arm", "joint_friction_nm"): 0.05}).write()
+    after = mine.read_bytes()
+    assert after.startswith(b"\xef\xbb\xbf") and after.count(b"\n") == after.count(b"\r\n") == before.count(b"\n") + 1
+    assert mine.stat().st_mode & 0o777 == 0o640
+
+
+def test_a_link_goes_on_being_a_link(mine: Path) -> None:
+    link = mine.with_name("link.yaml")
+    link.symlink_to(mine.name)
+    propose(link, {("arm", "joints", 0, "sign"): -1}).write()
+    assert link.is_symlink() and load_vehicle(mine).arm.joints[0].sign == -1
+
+
+@pytest.mark.parametrize(
+    ("text", "location", "value", "expected"),
+    [
+        ("a: 1", ("b",), 2, "a: 1\nb: 2\n"),
+        ("a: {b: 1}  # c\n", ("a", "d"), 2, "a: {b: 1, d: 2}  # c\n"),
+        ("a: {}\n", ("a", "b", "c"), 2, "a: {b: {c: 2}}\n"),
+        ("a:\n  b: 1\n\n# end\n", ("a", "c"), "x y", 'a:\n  b: 1\n  c: "x y"\n\n# end\n'),
+        ("a:   # nothing yet\nb: 1\n", ("a",), 5, "a: 5  # nothing yet\nb: 1\n"),
+        ("a: 10  # ten\n", ("a",), 1000, "a: 1000  # ten\n"),
+        ("a: 1000  # thousand\n", ("a",), 10, "a: 10    # thousand\n"),
+        ("a:\n- 1  # one\n- 2\nb: 0\n", ("a",), [3, 4], "a:\n- 3  # one\n- 4\nb: 0\n"),
+        ("a: |\n  text\nb: 1\n", ("a",), "on", "a: on\nb: 1\n"),
+        (
+            "a:\n  - b:\n      c: 1\n    d: 2\n",
+            ("a", 0, "b", "e"),
+            True,
+            "a:\n  - b:\n      c: 1\n      e: true\n    d: 2\n",
+        ),
+    ],
+)
+def test_where_a_value_comes_to_stand(text: str, location: tuple[str | int, ...], value: Data, expected: str) -> None:
+    assert edited(text, {location: value}) == expected
+
+
+@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+                    lambda inner: st.lists(inner, max_size=3), max_leaves=5))  # fmt: skip
+def test_a_value_is_read_back_as_it_was_meant(value: Data) -> None:
+    try:
+        parse_value(scalar_text(value), Origin("text"))
+    except ConfigError:
+        return  # a control character or half a pair: `propose` refuses it
+    assert parsed(edited("a: 0  # c\nb: [1]\n", {("a",): value})) == {"a": value, "b": [1]}
+
+
+def every_scalar() -> list[tuple[str | int, ...]]:
+    return [
+        at for at in read_document(SHIPPED).values if at and not isinstance(read_document(SHIPPED).get(at), dict | list)
+    ]
+
+
+@pytest.mark.parametrize("location", every_scalar(), ids=lambda at: ".".join(map(str, at)))
+def test_every_value_of_the_shipped_file_can_be_replaced(location: tuple[str | int, ...]) -> None:
+    text = SHIPPED.read_text(encoding="utf-8")
+    data, document = parsed(text), read_document(SHIPPED)
+    document.data = data  # type: ignore[assignment]
+    document.replace(location, 123456, Origin("test"))
+    assert parsed(edited(text, {location: 123456})) == document.data
