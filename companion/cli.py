@@ -18,6 +18,7 @@ from companion import (
     faults_command,
     ft_command,
     hover_command,
+    install_command,
     latency_command,
     mocap_command,
     monitor_command,
@@ -29,7 +30,8 @@ from companion.campaign_command import why_unusable
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.installing.extras import lacking
 from companion.mission.check import check_mission
 from companion.planning_progress import PlanningProgress
 from companion.terminal import tell, terminal_console
@@ -55,6 +57,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"companion {arguments.command}: unknown arguments: {' '.join(unknown)}; see companion {arguments.command} --help"
         )
         return EXIT_BAD_INPUT
+    missing = lacking(arguments)
+    if missing is not None:
+        tell(missing)
+        return EXIT_REFUSED
     try:
         code: int = arguments.run(arguments)
     except ConfigError as error:
@@ -146,6 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     robustness_command.add_parser(commands)
     faults_command.add_parser(commands)
     hover_command.add_parser(commands)
+    install_command.add_parser(commands)
     arm_command.add_parser(commands)
     px4_command.add_parser(commands)
     mocap_command.add_parser(commands)

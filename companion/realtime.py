@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
 import gc
 import os
+import resource
 import sys
 import threading
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 GIL_SWITCH_S = 0.0005
@@ -17,31 +22,65 @@ GUARDIAN_PRIORITY = 60
 WORLD_PRIORITY = 40
 """Of the simulated world: below the flight that it must not disturb."""
 
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # <bits/mman.h>, the same numbers on x86 and ARM
+_CAP_IPC_LOCK = 14  # <linux/capability.h>
 
-def claim_realtime(priority: int) -> str:
-    """Switch garbage collection off and ask for real-time scheduling of every thread of this process; not of its children, nor of
-    threads that come later.
 
-    Returns:
-        One line that says what was got. Without the permission (rtprio) the flight goes on at normal priority.
+@dataclass(frozen=True, slots=True)
+class Realtime:
+    """What a process got from `claim_realtime`; `str()` is one line for people."""
+
+    priority: int | None
+    """SCHED_FIFO, of every thread; None: refused, it runs at normal priority."""
+    cpus: tuple[int, ...]
+    """Cores that it may run on."""
+    memory_locked: bool
+    """What it has in memory stays there, and so does what it will touch (mlockall)."""
+    refused: tuple[str, ...]
+    """What it did not get of what it asked for, and why, one phrase each."""
+
+    def __str__(self) -> str:
+        got = [f"SCHED_FIFO {self.priority}"] if self.priority is not None else []
+        got += ["memory locked"] if self.memory_locked else []
+        return "; ".join(
+            [*got, *self.refused, f"CPUs {','.join(map(str, self.cpus))}", "garbage collection off"],
+        )
+
+
+def claim_realtime(priority: int, *, cpus: Collection[int] = (), lock_memory: bool = True) -> Realtime:
+    """Set what a process of the flight needs for even timing: garbage collection off, the interpreter's switch interval, cores,
+    memory that stays, SCHED_FIFO. May be called again: threads that have come since get it, too.
+
+    Every part is for all threads of this process. Children get the cores, but neither priority nor locked memory; threads that come
+    later get all but the priority.
+
+    Args:
+        priority: of SCHED_FIFO, 1 to 99.
+        cpus: cores that the process is to run on; empty: as it is.
+        lock_memory: keep the process in memory. Pages are locked as they are touched (MCL_ONFAULT): without it every thread's stack
+            and every mapped library would be brought in whole.
     """
     gc.collect()
     gc.freeze()
     gc.disable()
     sys.setswitchinterval(GIL_SWITCH_S)
-    try:
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        # Every thread: the tick waits for the bus thread, and what MAVSDK's threads receive is what it flies on.
-        for thread in Path("/proc/self/task").iterdir():
-            with contextlib.suppress(ProcessLookupError):  # it has just ended
-                os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))
-    except (OSError, AttributeError) as error:
-        return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO); garbage collection off"
-    return f"SCHED_FIFO {priority}; garbage collection off"
+    refused = [why for why in (_set_cpus(cpus), _lock_memory() if lock_memory else None) if why is not None]
+    locked = lock_memory and not any(why.startswith(_NOT_LOCKED) for why in refused)
+    not_first = _set_fifo(priority)
+    if not_first is not None:
+        refused.insert(0, not_first)
+    return Realtime(
+        priority=priority if not_first is None else None,
+        cpus=tuple(sorted(os.sched_getaffinity(0))),
+        memory_locked=locked,
+        refused=tuple(refused),
+    )
 
 
 def realtime_permitted(priority: int) -> str | None:
-    """Whether `claim_realtime` would get real-time scheduling: tried on a thread that ends at once. None: it is refused."""
+    """Whether `claim_realtime` would get real-time scheduling: tried on a thread that ends at once; and whether memory may be locked.
+    None: scheduling is refused.
+    """
     got: list[str] = []
 
     def attempt() -> None:
@@ -52,4 +91,70 @@ def realtime_permitted(priority: int) -> str | None:
     thread = threading.Thread(target=attempt, name="realtime-permission")
     thread.start()
     thread.join()
-    return got[0] if got else None
+    if not got:
+        return None
+    return f"{got[0]}; {memory_lock_refused() or 'memory may be locked'}"
+
+
+def memory_lock_refused() -> str | None:
+    """Why memory is not to be locked, one phrase; None: it may be.
+
+    A limit that is not `unlimited` refuses: under it the process would get no more memory once it has used it up, in flight.
+    """
+    limit_bytes = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    if limit_bytes == resource.RLIM_INFINITY or _has_capability(_CAP_IPC_LOCK):
+        return None
+    return f"{_NOT_LOCKED} (RLIMIT_MEMLOCK is {limit_bytes // 1024} kB, expected unlimited)"
+
+
+_NOT_LOCKED = "memory not locked"
+
+
+def _set_fifo(priority: int) -> str | None:
+    try:
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        # Every thread: the tick waits for the bus thread, and what MAVSDK's threads receive is what it flies on.
+        for thread in _threads():
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.sched_setscheduler(thread, policy, os.sched_param(priority))
+    except (OSError, AttributeError) as error:
+        return f"normal priority ({error.__class__.__name__}: no permission for SCHED_FIFO)"
+    return None
+
+
+def _set_cpus(cpus: Collection[int]) -> str | None:
+    if not cpus:
+        return None
+    try:
+        for thread in _threads():
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setaffinity(thread, cpus)
+    except (OSError, ValueError) as error:
+        asked = ",".join(map(str, sorted(cpus)))
+        return f"not moved to CPUs {asked} ({getattr(error, 'strerror', None) or error}; there are {os.cpu_count()})"
+    return None
+
+
+def _lock_memory() -> str | None:
+    why = memory_lock_refused()
+    if why is not None:
+        return why
+    try:
+        c = ctypes.CDLL(None, use_errno=True)
+        if c.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+            return f"{_NOT_LOCKED} ({errno.errorcode.get(ctypes.get_errno(), 'refused')})"
+    except (OSError, AttributeError) as error:  # a C library without it
+        return f"{_NOT_LOCKED} ({error})"
+    return None
+
+
+def _threads() -> list[int]:
+    return [int(thread.name) for thread in Path("/proc/self/task").iterdir()]
+
+
+def _has_capability(number: int) -> bool:
+    for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+        name, _, value = line.partition(":")
+        if name == "CapEff":
+            return bool(int(value, 16) >> number & 1)
+    return False

@@ -58,7 +58,7 @@ async def _serve(config: FlightConfig, for_launcher: bool, witness: Path, px4_fo
 
         if for_launcher:
             _leave_with_launcher(sitl)
-        claim_realtime(WORLD_PRIORITY)
+        claim_realtime(WORLD_PRIORITY, lock_memory=False)
         await sitl.run(on_ready)
     if for_launcher:
         _say_last(sitl, witness if config.world.faults or config.world.throws > 1 else None)

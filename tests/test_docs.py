@@ -122,7 +122,8 @@ def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.Mon
         assert unknown == [], f"{page}: companion {shlex.join(words)}"
         mission = getattr(arguments, "mission", None)
         # MISSION stands for any; a vehicle file that the user is to write is not there.
-        if mission and mission.endswith(".yaml") and arguments.vehicle is None:
+        of_flight = hasattr(arguments, "overrides")
+        if of_flight and mission and mission.endswith(".yaml") and arguments.vehicle is None:
             law, preset = (getattr(arguments, name, None) for name in ("controller", "preset"))
             load_flight(mission, None, law, preset, arguments.overrides)
     assert seen >= {"fly", "check", "sitl", "report", "replay", "schema"}

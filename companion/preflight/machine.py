@@ -52,14 +52,15 @@ def rows(o: Observations) -> Iterator[Row]:
             yield _disk(machine.disk_free_bytes, o.mission_s if o.mission_s is not None else DEFAULT_MISSION_S)
         others = sorted({governor for governor in machine.governors if governor != "performance"})
         if others:
-            fix = (
-                "cpupower frequency-set -g performance, as root; on a Pi, force_turbo=1 in config.txt does it for good"
-            )
+            fix = "sudo companion install --systemd does it for good; until the next boot, cpupower frequency-set -g performance"
             yield GOVERNOR.bad(", ".join(others), "performance", fix)
         else:
             yield GOVERNOR.good("performance" if machine.governors else "no governor is told here", "performance")
         if machine.realtime is None:
-            fix = "`@dialout - rtprio 60` in /etc/security/limits.conf, then log in again"
+            fix = (
+                "sudo companion install --systemd permits it to the service and to people in dialout; by hand, `@dialout - rtprio 60` "
+                "and `@dialout - memlock unlimited` in /etc/security/limits.conf; then log in again"
+            )
             yield REALTIME.bad("refused: the flight runs at normal priority", "SCHED_FIFO", fix)
         else:
             yield REALTIME.good(machine.realtime, "SCHED_FIFO")
