@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install fly test lint unit debian bench clean
+.PHONY: install fly test lint unit debian bench docs clean
 
 install: $(STAMP)
 
@@ -40,11 +40,16 @@ lint: install
 	$(BIN)/mypy
 
 unit: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not flight"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not flight and not tools"
+	$(BIN)/python -m pytest -n 4 -m tools
 	$(BIN)/python -m pytest -m flight
 
 bench: install
 	$(BIN)/python benchmarks/wire_latency.py
+
+docs: install
+	@$(BIN)/mkdocs build --strict --quiet
+	@echo "build/docs/index.html; with search: $(BIN)/python -m http.server --bind 127.0.0.1 --directory build/docs"
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -17,9 +17,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.clock import flight_clock
+from companion.config.document import ConfigError
 from companion.config.loader import load_flight
 from companion.config.vehicle import AutopilotDevice
-from companion.devices import open_edges
 from companion.io.autopilot import MavsdkAutopilot
 from companion.io.edges import DeviceError
 from companion.io.ground_frames import UP_BURST, UP_RATE_HZ
@@ -395,15 +395,7 @@ def test_a_host_that_cannot_be_spoken_to_is_one_line_and_leaves_nothing_open(add
     asyncio.run(fly())
 
 
-def test_a_flight_with_an_address_that_is_none_ends_before_any_device_is_opened() -> None:
-    """No device of the catch is there, so whatever was opened first would be what is told."""
-
-    async def fly() -> None:
-        config = load_flight(CATCH, overrides=["vehicle.ground.qgroundcontrol=udp://127.0.0.1:14550"])
-        with pytest.raises(
-            DeviceError, match=r"^ground\.qgroundcontrol udp://127\.0\.0\.1:14550: expected an address like"
-        ):
-            async with open_edges(config, flight_clock()):
-                pytest.fail("it opened")
-
-    asyncio.run(fly())
+@pytest.mark.parametrize("address", ["udp://127.0.0.1:14550", "udpout://127.0.0.1", "udpout://127.0.0.1:0"])
+def test_an_address_that_is_none_is_told_before_any_device_is_opened(address: str) -> None:
+    with pytest.raises(ConfigError, match=r"vehicle\.ground\.qgroundcontrol: expected udpout://HOST:PORT"):
+        load_flight(CATCH, overrides=[f"vehicle.ground.qgroundcontrol={address}"])
