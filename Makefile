@@ -40,9 +40,9 @@ lint: install
 	$(BIN)/mypy
 
 unit: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not flight and not tools"
-	$(BIN)/python -m pytest -n 4 -m tools
-	$(BIN)/python -m pytest -m flight
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not flight and not waits" --durations=10
+	$(BIN)/python -m pytest -n 4 -m waits --durations=10
+	$(BIN)/python -m pytest -m flight --durations=10
 
 bench: install
 	$(BIN)/python benchmarks/wire_latency.py

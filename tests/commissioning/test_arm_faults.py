@@ -22,7 +22,7 @@ from sitl.servo_model import ServoModel
 from tests.commissioning.arm_rig import SHIPPED, bad_ids, keys, rig, row_of
 from tests.support import DEADLINE_S
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.waits
 
 OUT_OF_THE_BOX = {
     f"arm.scan.joint{n}.{name}" for n in (1, 2) for name in ("return_delay_time", "operating_mode")

@@ -18,7 +18,7 @@ from sitl.force_torque import ForceTorqueServer
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle, wait_for_error
 from tests.support import Sandbox, World
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.waits
 
 __all__ = ["sandbox", "vehicle"]
 WEIGHT_KG = 0.5

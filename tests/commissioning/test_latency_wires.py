@@ -11,7 +11,7 @@ from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REF
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, document, sandbox, wait_for_error
 from tests.support import Ended, Sandbox, World
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.waits
 
 __all__ = ["sandbox"]
 TAPPED = ("world.hand=true", "world.hand_t_s=2", "world.hand_taps=12", "world.payload_kg=0")

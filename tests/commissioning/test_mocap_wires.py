@@ -15,7 +15,7 @@ import pytest
 from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.support import CATCH, DEADLINE_S, ROOT, Ended, Running, Sandbox, World, sandbox_in, set_options
 
-pytestmark = pytest.mark.tools
+pytestmark = pytest.mark.waits
 
 VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
 WATCH_S = 2

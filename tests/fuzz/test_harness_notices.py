@@ -50,7 +50,7 @@ class Broken(Target):
                 except Exception:  # as a bus thread that outlives everything does
                     continue
         if data == b"hoard":
-            self.hoard.append(bytearray(os.urandom(1 << 18)))
+            self.hoard.append(bytearray(os.urandom(1 << 20)))
         if data == b"files":
             self.files.append(os.dup(0))
 

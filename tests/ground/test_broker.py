@@ -31,6 +31,8 @@ from companion.ground.messages import COMMAND_MAX_BYTES, Command, CommandName, T
 from tests.broker import LOOPBACK, Broker, free_port, loopback_broker
 from tests.support import DEADLINE_S, ROOT
 
+pytestmark = pytest.mark.waits
+
 NOT_AUTHORISED = 135
 TOO_LARGE = 149
 WANTED = broker_setup.Wanted(

@@ -20,6 +20,8 @@ from companion.ground.keys import load_login, load_operators
 from tests.broker import free_port, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
 
+pytestmark = pytest.mark.waits
+
 ROOMS = ["vehicles/tarot", "vehicles/second", "operators/anna", "operators/bert", "viewers/wall"]
 
 

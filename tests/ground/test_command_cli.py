@@ -19,6 +19,8 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, play
 from tests.ground.vehicle import played_vehicle
 from tests.support import Ended, sandbox_in
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:

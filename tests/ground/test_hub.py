@@ -17,6 +17,8 @@ from companion.ground.watch import LIVE_S, VEHICLES_MAX, Heard, Watch
 from companion.ground.web_guard import MESSAGES_BURST, Bucket, host_allowed, origin_allowed, same_token
 from tests.ground.vehicle import flight, state_of
 
+pytestmark = pytest.mark.waits
+
 SESSION = "s1"
 
 

@@ -28,6 +28,8 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, play, self_signed
 from tests.ground.vehicle import played_vehicle
 from tests.support import CATCH, Sandbox, sandbox_in
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:

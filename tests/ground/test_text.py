@@ -28,6 +28,8 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, play
 from tests.ground.vehicle import flight, played_vehicle, state_of
 from tests.support import ROOT
 
+pytestmark = pytest.mark.waits
+
 AROUND = Around("connected to mqtt://127.0.0.1:1883", True, "anna", None)
 
 

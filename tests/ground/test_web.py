@@ -32,6 +32,8 @@ from tests.ground.monitor_rig import (
 )
 from tests.ground.vehicle import flight, played_vehicle
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:

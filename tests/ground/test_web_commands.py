@@ -17,6 +17,8 @@ from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, play, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:

@@ -18,6 +18,8 @@ from companion.installing.record import PATH
 from companion.installing.state import State, put
 from tests.support import ROOT
 
+pytestmark = pytest.mark.waits
+
 UNIT = "etc/systemd/system/companion.service"
 RULES = "etc/udev/rules.d/99-companion.rules"
 MISSION = "/etc/companion/missions/hover.yaml"

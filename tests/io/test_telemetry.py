@@ -31,6 +31,8 @@ from tests.broker import Broker, free_port, loopback_broker
 from tests.io.telemetry_rig import ROWS, VEHICLE, Listener, flight_with, log_lines
 from tests.support import DEADLINE_S, wait_until
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:

@@ -39,6 +39,8 @@ from tests.ground.test_broker import WANTED, Site, running
 from tests.io.telemetry_rig import ROWS, VEHICLE, Listener, command, config_of, flight_with, log_lines
 from tests.support import CATCH, DEADLINE_S
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
