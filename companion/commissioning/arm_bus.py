@@ -34,6 +34,7 @@ SHUTDOWN = Register(63, 1, "shutdown")
 LED = Register(65, 1, "LED")
 
 PING_BYTES: Final = 14
+_WRITE_TIMEOUT_S = 1.0
 _REPLY_TIMEOUT_MS: Final = 30.0
 """An FTDI adapter with its factory latency timer holds an answer back by 16 ms."""
 _ERROR_NUMBER: Final = 0x7F
@@ -92,6 +93,7 @@ class ServoTalk:
         self._port.baudrate = baud
         if not self._port.openPort():
             raise DeviceError(f"arm bus {self._name}: this computer's serial ports do not know baud rate {baud}")
+        self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's is that of a tick; nobody waits for one here
         # What the wire still carries at the old rate is nobody's answer.
         with contextlib.suppress(OSError):
             self._port.ser.reset_input_buffer()
