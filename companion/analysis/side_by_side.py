@@ -220,14 +220,15 @@ def _zero_s(flight: Flight, align: Align) -> float | None:
 
 def _alignment(flights: Sequence[Flight], asked: Align | None) -> tuple[Align, list[str]]:
     notes: list[str] = []
-    for align, name in (("catch", "catch"), ("takeoff", "take-off")):
-        lacking = [flight for flight in flights if _zero_s(flight, align) is None]  # type: ignore[arg-type]
+    marks: tuple[tuple[Align, str], ...] = (("catch", "catch"), ("takeoff", "take-off"))
+    for align, name in marks:
+        lacking = [flight for flight in flights if _zero_s(flight, align) is None]
         if asked == align and lacking:
             raise NotAlignable(f"{lacking[0].path}: --align {align}: there is no {name} in this flight")
         if lacking:
             notes.append(f"No {name} in {', '.join(flight.letter for flight in lacking)}.")
         elif asked in (None, align):
-            return align, notes  # type: ignore[return-value]
+            return align, notes
     return "start", notes
 
 

@@ -9,7 +9,7 @@ import sys
 import termios
 import tty
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Self
+from typing import IO, Self, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -26,7 +26,7 @@ _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 def people_console(json: bool) -> Console:
     """Where people are told: standard output, or standard error when that is for a script."""
     stream = SteadyStream(sys.stderr if json else sys.stdout)
-    console = Console(file=stream)  # type: ignore[arg-type]
+    console = Console(file=cast("IO[str]", stream))
     if not console.is_terminal:
         console.width = max(console.width, 132)
     return console

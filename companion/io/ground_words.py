@@ -29,6 +29,7 @@ _EMERGENCY, _CRITICAL, _WARNING, _NOTICE, _INFO = 0, 2, 4, 5, 6
 _SEVERITIES = {Severity.INFO: _INFO, Severity.WARNING: _WARNING, Severity.CRITICAL: _CRITICAL}
 _OUTCOMES = {Outcome.COMPLETED: _NOTICE, Outcome.REFUSED: _WARNING, Outcome.ABORTED: _WARNING}
 
+FLOAT32_MAX = 3.4e38
 Text = tuple[int, str]
 """MAV_SEVERITY and the words."""
 
@@ -112,11 +113,11 @@ class Texts:
 
 
 def value_messages(time_boot_ms: int, named: Mapping[str, float]) -> list[Any]:
-    """NAMED_VALUE_FLOAT of each; what is not finite is left out."""
+    """NAMED_VALUE_FLOAT of each; what is no number of 32 bits is left out."""
     return [
         mavlink.MAVLink_named_value_float_message(time_boot_ms & 0xFFFFFFFF, name.encode(), value)
         for name, value in named.items()
-        if math.isfinite(value)
+        if abs(value) <= FLOAT32_MAX  # not for NaN either
     ]
 
 

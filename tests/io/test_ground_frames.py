@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import random
 import struct
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,8 +13,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from companion.io.ground_frames import GROUND_SYSTEMS_MAX, STREAM_RATE_HZ, UP_BURST, UP_RATE_HZ, Door, Thinner
-from companion.io.ground_words import TEXTS_WAITING_MAX, VALUE_NAMES, Texts, event_text, value_messages
+from companion.io.ground_words import TEXTS_WAITING_MAX, VALUE_NAMES, Texts, event_text, value_messages, values
 from companion.types import Event, SafetyAction, Severity
+from tests.analysis.synthetic_flight import synthetic_flight
 
 VEHICLE = 1
 _HEARTBEAT = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
@@ -249,3 +252,23 @@ def test_values_have_names_that_fit_and_what_is_not_finite_is_left_out() -> None
     (message,) = value_messages(2**32 + 5, named)
     decoded = mavlink.MAVLink(None).parse_buffer(message.pack(encoder))[0]
     assert (decoded.name, decoded.value, decoded.time_boot_ms) == ("slack_m", 1.5, 5)
+
+
+def test_no_value_of_a_sick_tick_breaks_the_tick_that_tells_it() -> None:
+    """NaN and infinity from a sensor, an estimator or the law: told to nobody, and nothing is raised in the flight process."""
+    inputs, outputs, _ = next(
+        row for row in synthetic_flight() if row[1].control and row[1].attitude and row[0].vehicle
+    )
+    assert inputs.vehicle is not None and outputs.control is not None and outputs.attitude is not None
+    for sick in (math.nan, math.inf, -math.inf, 1e308):
+        wild = (sick, sick, sick, sick)
+        seen = replace(inputs, vehicle=replace(inputs.vehicle, attitude_wxyz=wild))
+        made = replace(
+            outputs,
+            progress=sick,
+            attitude=replace(outputs.attitude, attitude_wxyz=wild),
+            control=replace(outputs.control, error=(sick,) * 8, rho=sick, payload_estimate_kg=sick),
+        )
+        for message in value_messages(0, values(seen, made)):
+            assert math.isfinite(message.value)
+            assert message.pack(mavlink.MAVLink(None, 1, 191))

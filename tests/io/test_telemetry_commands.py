@@ -6,6 +6,7 @@ import datetime
 import getpass
 import json
 import random
+import resource
 import socket
 import subprocess
 import sys
@@ -33,7 +34,7 @@ from companion.ground.messages import (
     Topic,
     encode,
 )
-from companion.types import OperatorCommand, SafetyAction
+from companion.types import GroundCommand, OperatorCommand, SafetyAction
 from tests.broker import Broker, free_port, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
 from tests.io.telemetry_rig import ROWS, VEHICLE, Listener, command, config_of, flight_with, log_lines
@@ -153,6 +154,26 @@ def test_a_flood_of_rubbish_passes_nothing_costs_no_sample_and_does_not_drown_th
     reasons = {"oversized", "malformed", "wrong_version", "wrong_vehicle", "unknown_operator", "bad_signature"}
     assert any(f"{reason}:" in line for reason in reasons for line in lines)
     assert len(lines) <= (took_s + 3.0) * (len(reasons) + 2)
+
+
+def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path: Path, broker: Broker) -> None:
+    with Listener(broker.port) as listener, flight_with(tmp_path, broker.url) as flight:
+        flight.begin(listener)
+        session = listener.wait(Topic.STATE, State, lambda state: state.commands).session
+        client, heard = flight.recorder.client, list[GroundCommand]()
+        size = flight.path.stat().st_size
+        resource.prlimit(flight.recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
+        flight.wait(lambda: client.error is not None, "the flight is not told that the disk is full")
+        listener.publish(Topic.COMMAND.of(VEHICLE), command(listener, CommandName.LAND, session))
+
+        def came() -> bool:
+            heard.extend(client.take_commands())
+            return bool(heard)
+
+        flight.wait(came, "the command does not come")
+        assert [asked.command for asked in heard] == [OperatorCommand.LAND]
+        client.ack(heard[0].nonce, "anna", OperatorCommand.LAND, True, "landing", 9.0, "land", SafetyAction.LAND)
+        assert listener.wait(Topic.ACK, Ack).text == "landing"
 
 
 def test_a_command_that_the_broker_kept_is_refused(tmp_path: Path, broker: Broker) -> None:
