@@ -24,6 +24,7 @@ from companion.clock import Clock, flight_clock
 from companion.config.loader import FlightConfig
 from companion.core import NOMINAL_DT_S, FlightCore
 from companion.devices import Edges, open_edges
+from companion.event_loop import run
 from companion.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
 from companion.flight_guard import FlightGuard
 from companion.ground.effect import effect_of
@@ -50,7 +51,11 @@ from companion.types import (
 )
 
 STATUS_EVERY = 20
-JOINT_READ_TIMEOUT_S = 0.003
+JOINT_READ_TIMEOUT_S = 0.002
+"""From the start of the tick; the read was begun before that."""
+JOINT_LEAD_MAX_S = 0.003
+JOINT_MARGIN_S = 0.0001
+"""The joints are read so that the answer is there when the tick starts, this much earlier, and no older than it must be."""
 
 
 class Flight:
@@ -66,6 +71,7 @@ class Flight:
         clock: Clock,
         guardian: FlightGuard | None,
     ) -> None:
+        self._mocap_rate_hz = config.vehicle.devices.mocap.rate_hz
         self._guardian = guardian
         self._edges = edges
         self._recorder = recorder
@@ -80,12 +86,18 @@ class Flight:
 
     async def run(self) -> Outcome:
         """Tick until the core says that it is over."""
-        ticker = Ticker(self._period_s, self._clock)
+        ticker = Ticker(self._period_s, self._clock, self._mocap_rate_hz)
+        self._edges.vision.on_frame = ticker.frame
+        arm = self._edges.arm
         tick = 0
         before: Outputs | None = None
         if self._edges.ground is not None:
             self._tell_forwarding(self._clock(), self._edges.ground.line)
         while True:
+            lead_s = min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S) if arm is not None else 0.0
+            await ticker.until(lead_s)
+            if arm is not None:
+                arm.begin_read()
             now = await ticker.next()
             command, asked = self._operator.next()
             inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, command)
@@ -125,12 +137,13 @@ class Flight:
         outputs = self._core.step(inputs)
         edges.vision.open = outputs.mocap_trusted
         core_s = self._clock()
+        # The setpoint first: handing over the currents wakes the bus thread, which wants the interpreter for itself.
+        attitude_sent = outputs.attitude is not None and edges.autopilot.send_attitude(outputs.attitude)
+        setpoint_s = self._clock()
         torque_sent: Vec2 | None = None
         if outputs.arm_torque_nm is not None and edges.arm is not None:
             torque_sent = edges.arm.write_torque(outputs.arm_torque_nm)
         current_s = self._clock()
-        attitude_sent = outputs.attitude is not None and edges.autopilot.send_attitude(outputs.attitude)
-        setpoint_s = self._clock()
         if outputs.request is not AutopilotRequest.NONE:
             edges.autopilot.request(outputs.request)
         sent = Sent(
@@ -340,7 +353,7 @@ def main(argv: list[str] | None = None) -> int:
     channel.setblocking(False)
     try:
         guardian = socket.socket(fileno=arguments.guardian)
-        outcome = asyncio.run(fly(config, arguments.out, channel, guardian, sitl=arguments.sitl))
+        outcome = run(fly(config, arguments.out, channel, guardian, sitl=arguments.sitl))
     except DeviceError as error:
         status.send(channel, {"type": "refused", "lines": str(error).splitlines()})
         return EXIT_REFUSED

@@ -31,6 +31,8 @@ class VisionValve:
     open: bool = True
     watch: Callable[[MocapPose], None] | None = None
     """Shown every pose as it arrives, whatever becomes of it."""
+    on_frame: Callable[[float], None] | None = None
+    """Told of every frame first: when it arrived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +162,20 @@ def _force(config: FlightConfig, clock: Clock) -> RobotousForceTorque:
 
 
 def _mocap(config: FlightConfig, clock: Clock, some: SomeEdges) -> NatNetMocap:
-    def on_pose(pose: MocapPose) -> None:
-        valve, autopilot = some.vision, some.autopilot
+    valve = some.vision
+
+    def pass_on(pose: MocapPose) -> None:
+        autopilot = some.autopilot
         if autopilot is not None and valve.open and pose.tracking_valid:
             autopilot.send_vision(pose)
+
+    def on_pose(pose: MocapPose) -> None:
+        if valve.on_frame is not None:
+            valve.on_frame(pose.stamp_s)
+            # A tick that this frame has started comes first: PX4 fuses the pose by its stamp, the setpoint is for now.
+            asyncio.get_running_loop().call_soon(pass_on, pose)
+        else:
+            pass_on(pose)
         if valve.watch is not None:
             valve.watch(pose)
 

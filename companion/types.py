@@ -196,6 +196,8 @@ class ArmState:
     """Consecutive bus cycles without an answer from every servo, up to now."""
     written_s: float | None = None
     """When the bus thread had written the newest currents before this read; None before the first."""
+    asked_s: float | None = None
+    """When the bus thread began this read."""
 
 
 @quick

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config.loader import FlightConfig
+from companion.event_loop import run
 from companion.realtime import WORLD_PRIORITY, claim_realtime
 from sitl.autopilot.mavlink import LinkError
 from sitl.faults import FaultError, in_time
@@ -123,7 +124,7 @@ def main(argv: list[str] | None = None) -> int:
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     try:
         witness = arguments.config.with_name(WITNESS)
-        asyncio.run(_serve(in_time(config), arguments.for_launcher, witness, arguments.px4))
+        run(_serve(in_time(config), arguments.for_launcher, witness, arguments.px4))
     except (OSError, LinkError, FaultError, Px4Error) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:

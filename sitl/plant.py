@@ -16,7 +16,7 @@ from companion.config.faults import Fault, FaultKind
 from companion.config.vehicle import Joint, Vehicle
 from companion.config.world import Push, Servo
 from companion.config.world import World as WorldConfig
-from companion.frames import quat_from_euler_zyx, quat_multiply
+from companion.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
 from companion.types import Quat, Vec2, Vec3, Vec4
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
@@ -83,7 +83,16 @@ def noise(seed: int, sensor: int) -> Iterator[Vec3]:
 
 
 class Plant:
-    """World, sensors and motors."""
+    """World, sensors and motors.
+
+    Args:
+        vehicle: the machine.
+        config: of the world.
+        px4: what flies it.
+        drives: of the joints.
+        start: position, yaw and joint angles, m and rad.
+        between_steps: cameras expose when they are due, as they do, and not at the end of the physics step that they are due in.
+    """
 
     def __init__(
         self,
@@ -92,7 +101,10 @@ class Plant:
         px4: Px4,
         drives: Sequence[JointDrive],
         start: tuple[Vec2, float, Vec2],
+        *,
+        between_steps: bool = False,
     ) -> None:
+        self._between_steps = between_steps
         position_m, yaw_rad, arm_rad = start
         self._config = config
         self._px4 = px4
@@ -179,7 +191,7 @@ class Plant:
             world.hold(None if armed else self._hand.wrench(t_s, q, v))
         world.step(self._rotors, (torque1, torque2), armed)
         if world.t_s >= self._mocap_next_s - 1e-9:
-            self._expose_mocap()
+            self._expose_mocap(min(world.t_s, self._mocap_next_s) if self._between_steps else world.t_s)
 
     @property
     def imu_due(self) -> bool:
@@ -204,15 +216,21 @@ class Plant:
             (s[a] + accel * mx, -(s[a + 1] + accel * my), -(s[a + 2] + accel * mz)),
         )
 
-    def _expose_mocap(self) -> None:
-        t_s, config = self.world.t_s, self._config
+    def _expose_mocap(self, t_s: float) -> None:
+        config, world = self._config, self.world
         faults, period_s, latency_s, valid = self.faults, 1.0 / config.mocap_rate_hz, config.mocap_latency_s, True
         if faults is not None:
             period_s = faults.mocap_period_s(period_s)
             latency_s += faults.size("mocap_latency")
         self._mocap_next_s += period_s
         self._mocap_number += 1
-        x, y, z, qw, qx, qy, qz = self.world.q[0:7]
+        x, y, z, qw, qx, qy, qz = world.q[0:7]
+        since_s = world.t_s - t_s
+        if since_s > 0.0:  # at most a step
+            vx, vy, vz, wx, wy, wz = world.v[0:6]
+            x, y, z = x - since_s * vx, y - since_s * vy, z - since_s * vz
+            back = (1.0, -0.5 * since_s * wx, -0.5 * since_s * wy, -0.5 * since_s * wz)
+            qw, qx, qy, qz = quat_normalize(quat_multiply((qw, qx, qy, qz), back))
         noise_m, noise_rad = config.mocap_noise_m, self._mocap_noise_rad
         nx, ny, nz = next(self._mocap_noise)
         roll, pitch, yaw = next(self._mocap_noise)
@@ -227,12 +245,16 @@ class Plant:
 
     def take_mocap(self) -> list[MocapFrame]:
         """Frames that leave the motion-capture machine now."""
-        queue, now_s = self._mocap_queue, self.world.t_s + 1e-9
-        if not queue or queue[0][0] > now_s:
+        return [frame for _, frame in self.mocap_until(self.world.t_s)]
+
+    def mocap_until(self, until_s: float) -> list[tuple[float, MocapFrame]]:
+        """Frames that leave the motion-capture machine up to `until_s`, and when each does."""
+        queue, until_s = self._mocap_queue, until_s + 1e-9
+        if not queue or queue[0][0] > until_s:
             return []
         frames = []
-        while queue and queue[0][0] <= now_s:
-            frames.append(queue.popleft()[1])
+        while queue and queue[0][0] <= until_s:
+            frames.append(queue.popleft())
         return [] if self.fault("mocap_loss") else frames
 
     def battery(self) -> Battery:

@@ -98,7 +98,7 @@ class Sitl:
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
         self.autopilot: AutopilotEnd = autopilot or StubEnd(config, stub_ports)
         pose = (start.position_m, start.yaw_rad, start.arm_rad)
-        self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose)
+        self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=True)
         self.autopilot.attach(self.plant.world)
         self.faults = Faults(
             config,
@@ -126,6 +126,10 @@ class Sitl:
         self._strike_due_s = 0.0
         self._ports = ports
         self.slipped_s = 0.0
+        self._origin_s = 0.0
+        """Of the world's clock, on the event loop's."""
+        self._next_frame: asyncio.TimerHandle | None = None
+        """Leaves before the next step."""
         self._at_rest = False
         self._leaving = False
         self._end_s = math.inf
@@ -189,7 +193,11 @@ class Sitl:
         try:
             async with asyncio.TaskGroup() as group:
                 preparing = group.create_task(self._prepare(on_ready))
-                await self._follow_clock()
+                try:
+                    await self._follow_clock()
+                finally:
+                    if self._next_frame is not None:
+                        self._next_frame.cancel()
                 preparing.cancel()
         except* Px4Error as errors:
             raise errors.exceptions[0] from None
@@ -200,11 +208,11 @@ class Sitl:
 
     async def _follow_clock(self) -> None:
         lockstep = self.autopilot.lockstep
-        origin_s = time.monotonic() - self.plant.t_s
+        origin_s = self._origin_s = time.monotonic() - self.plant.t_s
         while self.plant.t_s < self._end_s and not (self._leaving and not self.autopilot.armed):
             behind_s = time.monotonic() - origin_s - self.plant.t_s
             if behind_s > _CATCH_UP_S:
-                origin_s += behind_s - _CATCH_UP_S
+                origin_s = self._origin_s = origin_s + behind_s - _CATCH_UP_S
                 self.slipped_s += behind_s - _CATCH_UP_S
                 self.autopilot.skip(behind_s - _CATCH_UP_S)
                 behind_s = _CATCH_UP_S
@@ -225,8 +233,12 @@ class Sitl:
         plant.step(autopilot.armed)
         if autopilot.lockstep and plant.imu_due:
             autopilot.sense(plant.sample_imu())
-        for frame in plant.take_mocap():
-            self._publish(frame)
+        for leaves_s, frame in plant.mocap_until(plant.t_s + PHYSICS_DT_S - 1e-6):
+            if leaves_s <= plant.t_s:
+                self._publish(frame, plant.t_s)
+            else:
+                loop = asyncio.get_running_loop()
+                self._next_frame = loop.call_at(self._origin_s + leaves_s, self._publish, frame, leaves_s)
         if self._weight.changed(plant.t_s, self.force.streaming):
             plant.world.push((0.0, 0.0, -self._weight.pull_n))
         self.force.set_wrench(*plant.force_torque())
@@ -258,12 +270,12 @@ class Sitl:
         if held is not None:
             world.hold_arm(held)
 
-    def _publish(self, frame: MocapFrame) -> None:
+    def _publish(self, frame: MocapFrame, t_s: float) -> None:
         body = self._vehicle.devices.mocap.rigid_body_id
         pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
         others = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
         clock = self.faults.server_clock_s
-        self.mocap.publish(clock(self.plant.t_s), (*others, pose), clock(frame.exposure_t_s))
+        self.mocap.publish(clock(t_s), (*others, pose), clock(frame.exposure_t_s))
 
     def _plant_faults(self) -> None:
         plant = self.plant

@@ -25,6 +25,9 @@ from companion.types import ArmState, Vec2
 _OPEN_TIMEOUT_S = 8.0
 _CLOSE_TIMEOUT_S = 2.0
 _KEEPALIVES_PER_WATCHDOG = 3.0
+_FIRST_READ_S = 0.002
+_SMOOTHING, _DEVIATIONS = 0.05, 2.0
+"""Of the time that a read takes: as TCP does with round trips (RFC 6298), somewhat slower."""
 
 _T = TypeVar("_T")
 
@@ -63,6 +66,9 @@ class DynamixelArm:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._finished: asyncio.Future[None] | None = None
         self._reading: asyncio.Future[None] | None = None
+        self._answered: object = None
+        """The newest job that has been carried out: known here before the event loop has heard of it."""
+        self._read_s, self._read_deviation_s = _FIRST_READ_S, 0.0
         self._stop = threading.Event()
 
     # --- event loop --------------------------------------------------------------------------------------------------
@@ -109,17 +115,34 @@ class DynamixelArm:
         """What the port itself said when it last failed; empty while it has not."""
         return self._problem
 
+    @property
+    def read_takes_s(self) -> float:
+        """Time within which most reads are done."""
+        return self._read_s + _DEVIATIONS * self._read_deviation_s
+
+    def begin_read(self) -> None:
+        """Have the bus thread read, without waiting for it; nothing new is begun while an earlier read is under way."""
+        if self._reading is None or self._reading is self._answered or self._reading.done():
+            assert self._loop is not None, "the arm edge is not entered"
+            self._reading = self._loop.create_future()
+            self._jobs.put(self._reading)
+
     async def read(self, timeout_s: float) -> ArmState | None:
-        """One sync read; the newest state, whose `read_failures` counts the misses up to now.
+        """Wait for the read that was begun, or for one that is begun now; the newest state, whose `read_failures` counts the misses up
+        to now.
 
         A read that takes longer than `timeout_s` goes on in the bus thread and the next call waits for that one.
         """
         reading = self._reading
-        if reading is None or reading.done():
-            assert self._loop is not None, "the arm edge is not entered"
-            reading = self._reading = self._loop.create_future()
-            self._jobs.put(reading)
-        await asyncio.wait((reading,), timeout=timeout_s)
+        if reading is None:
+            self.begin_read()
+            reading = self._reading
+            assert reading is not None
+        if reading is not self._answered:
+            done, _ = await asyncio.wait((reading,), timeout=timeout_s)
+            if not done:
+                return self._state
+        self._reading = None
         return self._state
 
     def write_torque(self, torque_nm: Vec2) -> Vec2:
@@ -196,6 +219,7 @@ class DynamixelArm:
                 continue
             tripped = self._read_once(bus)
             if isinstance(job, asyncio.Future):
+                self._answered = job
                 self._post(functools.partial(_resolve, job, None))
             if tripped:
                 sent = (0, 0)
@@ -216,6 +240,7 @@ class DynamixelArm:
 
     def _read_once(self, bus: ArmBus) -> bool:
         """Read, publish the state; True if a bus watchdog had tripped."""
+        asked_s = self._clock()
         try:
             pair = bus.read()
         except Exception as error:  # as in `_try`
@@ -227,10 +252,13 @@ class DynamixelArm:
                 self._state = replace(self._state, read_failures=self._failures)
             return False
         self._failures = 0
-        self._state = self._to_state(pair)
+        self._state = state = self._to_state(pair, asked_s)
+        off_s = state.stamp_s - asked_s - self._read_s
+        self._read_s += _SMOOTHING * off_s
+        self._read_deviation_s += _SMOOTHING * (abs(off_s) - self._read_deviation_s)
         return WATCHDOG_TRIPPED in (pair[0].bus_watchdog, pair[1].bus_watchdog)
 
-    def _to_state(self, blocks: tuple[Block, Block]) -> ArmState:
+    def _to_state(self, blocks: tuple[Block, Block], asked_s: float) -> ArmState:
         assert self._scales is not None
         (a, b), (first, second) = blocks, self._scales
         return ArmState(
@@ -242,6 +270,7 @@ class DynamixelArm:
             temperature_c=(float(a.temperature_c), float(b.temperature_c)),
             read_failures=0,
             written_s=self._written_s,
+            asked_s=asked_s,
         )
 
     def _try(self, transaction: Callable[[], None]) -> None:

@@ -68,6 +68,13 @@ class Arm(Edge, Protocol):
     def latest(self) -> ArmState | None:
         """Newest joint state."""
 
+    @property
+    def read_takes_s(self) -> float:
+        """Time within which most reads are done."""
+
+    def begin_read(self) -> None:
+        """Begin the read that the next `read` waits for; never blocks."""
+
     async def read(self, timeout_s: float) -> ArmState | None:
         """One sync read; the newest state (its `read_failures` counts the misses). None before the first success."""
 

@@ -15,6 +15,7 @@ from typing import Final, Self
 from companion.clock import Clock
 from companion.config.vehicle import MocapDevice
 from companion.io import natnet
+from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.io.edges import DeviceError
 from companion.io.mocap_pose import VERSIONS, mocap_pose
 from companion.io.natnet import Frame, Malformed, Message, NatNetVersion, ServerInfo
@@ -189,6 +190,7 @@ class NatNetMocap:
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             opened.setblocking(False)
+            stamp_arrivals(opened)
             if shared:
                 opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             opened.bind((address, port))
@@ -306,11 +308,11 @@ class NatNetMocap:
 
     def _drain(self, readable: socket.socket) -> None:
         """Read all that waits in the socket; deliver the newest frame only."""
-        arrived_s = self._clock()
         newest: Frame | None = None
+        newest_s = 0.0
         for _ in range(_MAX_DATAGRAMS_PER_WAKE):
             try:
-                datagram, address = readable.recvfrom(_MAX_DATAGRAM_BYTES)
+                datagram, notes, _, address = readable.recvmsg(_MAX_DATAGRAM_BYTES, STAMP_ROOM_BYTES)
             except (BlockingIOError, InterruptedError):
                 break
             except OSError:  # an ICMP error of an earlier send
@@ -321,10 +323,11 @@ class NatNetMocap:
                 continue
             message = natnet.message_id(datagram)
             if message == Message.FRAME:
-                frame = self._take_frame(datagram, arrived_s)
+                stamp_s = arrived_s(notes, self._clock)
+                frame = self._take_frame(datagram, stamp_s)
                 if frame is not None:
                     self._superseded += newest is not None
-                    newest = frame
+                    newest, newest_s = frame, stamp_s
             elif message == Message.SERVER_INFO:
                 self._take_server_info(datagram)
             elif message == Message.MODELDEF and self._version is not None:
@@ -334,7 +337,7 @@ class NatNetMocap:
                 else:
                     self._names = {definition.id: definition.name for definition in definitions}
         if newest is not None:
-            self._deliver(newest, arrived_s)
+            self._deliver(newest, newest_s)
 
     def _take_server_info(self, datagram: bytes) -> None:
         info = natnet.parse_server_info(datagram)

@@ -492,6 +492,40 @@ def test_reads_end_though_the_caller_waits_for_less() -> None:
     fly(scenario)
 
 
+def test_a_read_begun_early_is_there_when_it_is_asked_for() -> None:
+    async def scenario(setup: Setup) -> None:
+        before = setup.arm.latest()
+        assert before is not None
+        setup.arm.begin_read()
+        setup.arm.begin_read()  # nothing new while one is under way
+        await until(lambda: setup.arm.latest() is not before)
+        early = setup.arm.latest()
+        state = await setup.arm.read(0.0)
+        assert state is early
+        assert state is not None
+        assert state.asked_s is not None
+        assert before.stamp_s <= state.asked_s < state.stamp_s
+        later = await setup.arm.read(1.0)
+        assert later is not None
+        assert later.stamp_s > state.stamp_s
+
+    # The thread must not read by itself meanwhile.
+    fly(scenario, watchdog_ms=2000)
+
+
+def test_the_time_of_a_read_is_learnt() -> None:
+    async def scenario(setup: Setup) -> None:
+        taken_s = []
+        for _ in range(100):
+            state = await setup.arm.read(1.0)
+            assert state is not None
+            assert state.asked_s is not None
+            taken_s.append(state.stamp_s - state.asked_s)
+        assert min(taken_s) < setup.arm.read_takes_s < max(taken_s) + 3 * (max(taken_s) - min(taken_s))
+
+    fly(scenario)
+
+
 def test_the_edge_tells_both_servos_as_it_left_them() -> None:
     async def main() -> None:
         servos = new_servos()

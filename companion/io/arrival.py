@@ -1,0 +1,42 @@
+"""When the kernel received a datagram, which may be well before a busy process reads it."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import time
+from typing import Final
+
+from companion.clock import Clock
+
+_SO_TIMESTAMPNS: Final = 35  # <asm-generic/socket.h>: of x86 and ARM; Python has no name for it
+_TIMESPEC: Final = struct.Struct("=qq")
+STAMP_ROOM_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size)
+_WAITED_MAX_S: Final = 0.5
+"""More than this is no wait: the wall clock was set between arrival and reading."""
+
+
+def stamp_arrivals(opened: socket.socket) -> None:
+    """Ask the kernel to note when datagrams arrive (SO_TIMESTAMPNS); where it cannot, `arrived_s` is when they are read."""
+    with contextlib.suppress(OSError):
+        opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+
+def arrived_s(notes: list[tuple[int, int, bytes]], clock: Clock) -> float:
+    """When a datagram that has just been read had arrived, on `clock`.
+
+    Args:
+        notes: the ancillary data of `recvmsg`, with room for `STAMP_ROOM_BYTES`.
+        clock: the flight clock.
+
+    Returns:
+        Now, if the kernel noted nothing, or did so by a wall clock that has been set since.
+    """
+    now_s = clock()
+    for level, kind, data in notes:
+        if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) == _TIMESPEC.size:
+            seconds, nanoseconds = _TIMESPEC.unpack(data)
+            waited_s = (time.time_ns() - seconds * 1_000_000_000 - nanoseconds) * 1e-9
+            return now_s - waited_s if 0.0 <= waited_s <= _WAITED_MAX_S else now_s
+    return now_s

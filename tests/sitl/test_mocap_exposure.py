@@ -1,0 +1,85 @@
+"""Cameras expose when they are due, also between two physics steps."""
+
+from __future__ import annotations
+
+import pytest
+
+from companion.frames import quat_conjugate, quat_multiply
+from companion.types import Quat, Vec3, Vec4
+from sitl.autopilot.types import ImuSample
+from sitl.plant import MocapFrame, Plant
+from sitl.server import start_of
+from sitl.servo_drive import ServoDrive
+from tests.preflight.hand_rig import world
+
+
+class FullAndUneven:
+    """An autopilot that climbs and tumbles."""
+
+    def step(self, imu: ImuSample) -> Vec4:
+        return (1.0, 0.9, 1.0, 0.95)
+
+
+def flight(between_steps: bool, rate_hz: float = 200.0) -> tuple[list[MocapFrame], dict[float, tuple[Vec3, Quat]]]:
+    """Frames of the first 0.4 s of a flight without noise, and the truth after every step."""
+    config = world("mocap_noise_m=0", "mocap_noise_deg=0", "hand=false", f"mocap_rate_hz={rate_hz:g}")
+    start = config.mission.start
+    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
+    drives = [ServoDrive() for _ in config.vehicle.arm.joints]
+    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
+    plant = Plant(config.vehicle, config.world, FullAndUneven(), drives, where, between_steps=between_steps)
+    frames, truth = [], {}
+    while plant.t_s < 0.4:
+        plant.step(True)
+        truth[round(plant.t_s, 6)] = (plant.truth.position_world_m, plant.truth.attitude_wxyz)
+        frames += plant.take_mocap()
+    return frames, truth
+
+
+@pytest.mark.parametrize("rate_hz", [200.0, 120.0])
+def test_exposures_are_as_even_as_the_cameras(rate_hz: float) -> None:
+    frames, _ = flight(True, rate_hz)
+    assert [frame.exposure_t_s for frame in frames[1:]] == pytest.approx(
+        [n / rate_hz for n in range(1, len(frames))], abs=1e-9
+    )
+    coarse, _ = flight(False, rate_hz)
+    steps = [frame.exposure_t_s / 0.002 for frame in coarse]
+    assert steps == pytest.approx([round(step) for step in steps])
+
+
+def test_a_frame_between_two_steps_shows_what_is_between_them() -> None:
+    frames, truth = flight(True)
+    moved = 0
+    for frame in frames:
+        before, after = (
+            truth.get(round(frame.exposure_t_s - 0.001, 6)),
+            truth.get(round(frame.exposure_t_s + 0.001, 6)),
+        )
+        if before is None or after is None:
+            continue
+        middle = [(a + b) / 2.0 for a, b in zip(before[0], after[0], strict=True)]
+        step_m = max(abs(a - b) for a, b in zip(before[0], after[0], strict=True))
+        off_m = max(abs(a - b) for a, b in zip(frame.position_world_m, middle, strict=True))
+        assert off_m < 0.05 * step_m + 3e-5
+        half = quat_multiply(quat_conjugate(before[1]), frame.attitude_wxyz)
+        other_half = quat_multiply(quat_conjugate(frame.attitude_wxyz), after[1])
+        assert half[1:] == pytest.approx(other_half[1:], abs=3e-4)
+        moved += step_m > 1e-3 and max(map(abs, half[1:])) > 5e-4
+    assert moved > 10
+
+
+def test_frames_are_handed_out_with_the_time_at_which_they_leave() -> None:
+    config = world("mocap_latency_s=0.005", "hand=false")
+    start = config.mission.start
+    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
+    drives = [ServoDrive() for _ in config.vehicle.arm.joints]
+    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
+    plant = Plant(config.vehicle, config.world, FullAndUneven(), drives, where, between_steps=True)
+    leave_s = []
+    while plant.t_s < 0.1:
+        plant.step(False)
+        for at_s, frame in plant.mocap_until(plant.t_s + 0.0019):
+            assert at_s == pytest.approx(frame.exposure_t_s + 0.005)
+            assert plant.t_s - 0.002 < at_s < plant.t_s + 0.002
+            leave_s.append(at_s)
+    assert leave_s[1:] == pytest.approx([0.005 + 0.005 * n for n in range(1, len(leave_s))])
