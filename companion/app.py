@@ -316,7 +316,9 @@ async def fly(
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
             flight = Flight(config, edges, recorder, channel, operator, clock, guardian)
-            got = str(claim_realtime(FLIGHT_PRIORITY))
+            computer = config.vehicle.computer
+            got = str(claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory))
+            recorder.client.metadata("realtime", {"got": got})
             status.send(channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got})
             try:
                 outcome = await flight.run()

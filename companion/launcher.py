@@ -23,6 +23,7 @@ from typing import Any, Literal
 from companion import status
 from companion.children import LaunchError, holds_traceback, how_it_ended, last_line, terminate, write_text
 from companion.config.loader import FlightConfig
+from companion.cores import keep_off
 from companion.exit_codes import EXIT_CODES
 from companion.guardian.beat import HANGS
 from companion.guardian_process import GuardianProcess
@@ -114,10 +115,14 @@ class Launcher:
     def run(self) -> FlightResult:
         """Fly. To be called inside of `landing_signals(launcher.ask_to_land)`.
 
+        From here on this process is off the cores of `computer.cpus`, and with it all that it starts; the flight process alone goes
+        there by itself.
+
         Raises:
             LaunchError: a process of the flight could not be started.
         """
         sitl: SitlProcess | None = None
+        keep_off(self._config.vehicle.computer.cpus)
         try:
             config = self._config
             if self._sitl_kind:

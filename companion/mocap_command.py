@@ -189,7 +189,7 @@ async def _carried(config: FlightConfig, console: Console, *, json: bool) -> Res
     if isinstance(outcome, str):
         if outcome == ENDED_BY_HAND:
             return None
-        return Result([hand_judge.ended(outcome)], {"alignment": None})
+        return Result([hand_judge.ended(outcome, "companion mocap align")], {"alignment": None})
     up_axis, start = config.vehicle.devices.mocap.up_axis, config.mission.start
     found = mocap_align.alignment(outcome, up_axis, math.radians(start.yaw_deg))
     rows = hand_judge.rows(outcome, up_axis)

@@ -78,9 +78,7 @@ def claim_realtime(priority: int, *, cpus: Collection[int] = (), lock_memory: bo
 
 
 def realtime_permitted(priority: int) -> str | None:
-    """Whether `claim_realtime` would get real-time scheduling: tried on a thread that ends at once; and whether memory may be locked.
-    None: scheduling is refused.
-    """
+    """Real-time scheduling as `claim_realtime` would get it, tried on a thread that ends at once; None: it is refused."""
     got: list[str] = []
 
     def attempt() -> None:
@@ -91,9 +89,7 @@ def realtime_permitted(priority: int) -> str | None:
     thread = threading.Thread(target=attempt, name="realtime-permission")
     thread.start()
     thread.join()
-    if not got:
-        return None
-    return f"{got[0]}; {memory_lock_refused() or 'memory may be locked'}"
+    return got[0] if got else None
 
 
 def memory_lock_refused() -> str | None:

@@ -23,6 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from companion.cores import keep_off
 from companion.io.packets import ACK, CLOSE, METADATA, TEXT, TICK, UNNUMBERED
 from companion.io.telemetry import Telemetry, wanted
 from companion.record import fingerprint, unpack_plain
@@ -136,12 +137,14 @@ def _read_config(source: str) -> str:
         return file.read()
 
 
-def _yield_to_flight() -> None:
-    """The control tick has the first claim on the processor, and its real-time priority is not ours."""
+def _yield_to_flight(config_json: str) -> None:
+    """The control tick has the first claim on the processor; neither its real-time priority nor its cores are ours."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
         os.nice(5)
+    with contextlib.suppress(ValueError, LookupError, TypeError):  # a configuration that names none
+        keep_off(json.loads(config_json)["vehicle"]["computer"]["cpus"])
 
 
 def _say(answer: dict[str, Any]) -> None:
@@ -166,9 +169,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run until the channel ends. First line on stdout: {"ready": true}; last line: the report. 0, or 1 if the log is not whole."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     arguments = _arguments(argv)
-    _yield_to_flight()
     try:
         config_json = _read_config(arguments.config)
+        _yield_to_flight(config_json)
         disk = Disk(arguments.out)
     except FileExistsError:
         _say({"samples": 0, "dropped": 0, "error": f"recorder: {arguments.out} exists already; choose another --out"})

@@ -139,6 +139,8 @@ class FlightDisplay:
             self._progress.update(self._task, description="preflight", completed=message["share"], note=message["text"])
         elif kind == "preflight":
             self._preflight(message["rows"])
+        elif kind == "started":
+            self._line("real time", message["realtime"], "dim")
         elif kind == "px4":
             self._line("PX4", message["text"], "yellow")
         elif kind == "command":

@@ -365,10 +365,11 @@ class Sent:
     arm_torque_sent_nm: Vec2 | None
     """After rounding to current counts and clipping."""
     start_s: float
-    """Tick deadline met at."""
+    """When the tick began, flight clock."""
     lateness_s: float
+    """Behind the motion-capture frame that started the tick, or behind its deadline."""
     joint_read_s: float
     core_s: float
     setpoint_sent_s: float
     current_sent_s: float
-    """Stamps on the flight clock of: joint read done, core step done, setpoint sent, currents written."""
+    """Stamps on the flight clock of: joint state at hand, core step done, setpoint sent, currents handed to the bus thread."""

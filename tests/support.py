@@ -58,6 +58,9 @@ SUMMARY_KEYS: dict[str, Any] = {
     "final_e_z_m": None,
     "loop": {"rate_hz": None, "ticks": None, "missed": None, "lateness_ms": dict.fromkeys(("p50", "p99", "max"))},
     "latency_ms": dict.fromkeys(("mocap_to_setpoint", "joint_read_to_write"), dict.fromkeys(("p50", "p99", "max"))),
+    "stages_ms": dict.fromkeys(
+        ("wait_for_joints", "core", "send", "whole", "bus_read", "bus_cycle"), dict.fromkeys(("p50", "p99", "max"))
+    ),
     "recorder": dict.fromkeys(("samples", "dropped")),
     "events": None,
     "tether": {"min_slack_m": None},

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, DASHED, INK, dress, mark_catch, new_figure, write_png
+from companion.analysis.timing import end_s
 from companion.control.manipulator import GRAVITY_M_S2
 from companion.frames import tilt_rad
 from companion.types import Outputs, PhaseKind
@@ -51,7 +52,12 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
         ("adaptation", "Adaptation", "Switching gain and its adapted parameters.", _adaptation),
         ("force", "Contact force", "Tared force on the net in the world frame, its weight removed.", _force),
         ("path", "Path", "By motion capture, seen from above and from the side.", _path),
-        ("timing", "Timing", "Lateness of the control tick, and the two latencies that matter.", _timing),
+        (
+            "timing",
+            "Timing",
+            "Lateness of the control tick, what ticks and bus reads took, and the two latencies that matter.",
+            _timing,
+        ),
     )
     written: list[Plot] = []
     for name, title, caption, make in makers:
@@ -177,11 +183,22 @@ def _timing(log: FlightLog) -> Figure | None:
     panes: dict[str, Any] = figure.subplot_mosaic([["time", "time", "time"], ["late", "joint", "mocap"]])
     late_ms = 1e3 * log.columns.lateness_s
     dress(panes["time"])
-    panes["time"].plot(log.columns.t_s, late_ms, color=_SERIES[0], lw=0.6)
+    whole_ms = 1e3 * log.column(lambda i, o, s: end_s(s) - s.start_s)
+    read_ms = 1e3 * log.column(
+        lambda i, o, s: i.arm.stamp_s - i.arm.asked_s if i.arm and i.arm.asked_s is not None else None
+    )
+    for values_ms, label, colour in (
+        (whole_ms, "whole tick", _SERIES[1]),
+        (read_ms, "servo bus read", _SERIES[2]),
+        (late_ms, "tick lateness", _SERIES[0]),
+    ):
+        if np.isfinite(values_ms).any():
+            panes["time"].plot(log.columns.t_s, values_ms, color=colour, lw=0.6, label=label)
     panes["time"].margins(x=0.0)
     panes["time"].set_ylim(bottom=0.0)
     panes["time"].set_xlabel("flight clock [s]")
-    panes["time"].set_ylabel("tick lateness [ms]")
+    panes["time"].set_ylabel("[ms]")
+    _legend(panes["time"], columns=3)
     for name, title, values_s in (
         ("late", "tick lateness", log.columns.lateness_s),
         ("joint", "joint read to current write", log.timing.joint_read_to_write_s),

@@ -90,6 +90,7 @@ def _results(summary: dict[str, Any], stride: int) -> str:
         )
     )
     loop, latency, recorder = summary["loop"], summary["latency_ms"], summary["recorder"]
+    stages = summary["stages_ms"]
     durations = "".join(
         f"<tr><td>{label}</td>"
         + "".join(f"<td class='n'>{_number(row[key], 2)}</td>" for key in ("p50", "p99", "max"))
@@ -98,6 +99,12 @@ def _results(summary: dict[str, Any], stride: int) -> str:
             ("tick lateness", loop["lateness_ms"]),
             ("joint read → current write", latency["joint_read_to_write"]),
             ("mocap datagram → setpoint", latency["mocap_to_setpoint"]),
+            ("whole tick", stages["whole"]),
+            ("· wait for the joints", stages["wait_for_joints"]),
+            ("· core: inputs → decision", stages["core"]),
+            ("· setpoint and currents sent", stages["send"]),
+            ("servo bus: read", stages["bus_read"]),
+            ("servo bus: read → write, whole", stages["bus_cycle"]),
         )
     )
     flight = _rows(

@@ -11,6 +11,8 @@ from companion.analysis import metrics
 from companion.analysis.log import FlightLog
 from companion.analysis.metrics import Percentiles, TrackingRms
 
+STAGES = ("wait_for_joints", "core", "send", "whole", "bus_read", "bus_cycle")
+"""Keys of `stages_ms`: fields `NAME_s` of `companion.analysis.timing.Timing`."""
 _NO_RMS = TrackingRms(None, None, None)
 
 
@@ -35,6 +37,7 @@ def empty_summary(
         "final_e_z_m": None,
         "loop": {"rate_hz": None, "ticks": 0, "missed": 0, "lateness_ms": _spread(None)},
         "latency_ms": {"mocap_to_setpoint": _spread(None), "joint_read_to_write": _spread(None)},
+        "stages_ms": {stage: _spread(None) for stage in STAGES},
         "recorder": {
             "samples": recorder.get("samples", 0),
             "dropped": recorder.get("dropped", 0),
@@ -94,6 +97,7 @@ def summarise(
             "mocap_to_setpoint": _spread(metrics.percentiles(timing.mocap_to_setpoint_s)),
             "joint_read_to_write": _spread(metrics.percentiles(timing.joint_read_to_write_s)),
         },
+        stages_ms={stage: _spread(metrics.percentiles(getattr(timing, f"{stage}_s"))) for stage in STAGES},
         events=_events(log),
         tether={"min_slack_m": metrics.min_slack_m(log)},
         graded_every=log.stride,

@@ -31,14 +31,28 @@ class Timing:
     """Answers of all servos read -> currents written, both by the bus thread, of ticks that wrote currents."""
     mocap_to_setpoint_s: Array
     """Mocap datagram -> setpoint sent, of ticks that saw a new frame and sent a setpoint."""
+    wait_for_joints_s: Array
+    """Tick start -> joint state there."""
+    core_s: Array
+    """Joint state there -> decided."""
+    send_s: Array
+    """Decided -> setpoint sent and currents handed over."""
+    whole_s: Array
+    """Tick start -> setpoint sent and currents handed over."""
+    bus_read_s: Array
+    """Joint read begun -> answers of all servos read, both by the bus thread, of ticks that saw a new joint state."""
+    bus_cycle_s: Array
+    """Joint read begun -> the currents that were computed from it written, both by the bus thread; as `joint_read_to_write_s`."""
 
 
 class Stopwatch:
-    """Takes one tick after another; 40 bytes of each are kept."""
+    """Takes one tick after another; 80 bytes of each are kept."""
 
     def __init__(self) -> None:
         self._t_s, self._lateness_s = array("d"), array("d")
         self._joint_s, self._mocap_s = array("d"), array("d")
+        self._wait_s, self._core_s, self._send_s, self._whole_s = array("d"), array("d"), array("d"), array("d")
+        self._read_s, self._cycle_s = array("d"), array("d")
         self._first: tuple[int, float] | None = None
         self._before: tuple[Inputs, Sent] | None = None
         self._frame_s: float | None = None
@@ -47,8 +61,15 @@ class Stopwatch:
         """The next tick."""
         self._t_s.append(inputs.t_s)
         self._lateness_s.append(sent.lateness_s)
+        self._wait_s.append(sent.joint_read_s - sent.start_s)
+        self._core_s.append(sent.core_s - sent.joint_read_s)
+        self._send_s.append(end_s(sent) - sent.core_s)
+        self._whole_s.append(end_s(sent) - sent.start_s)
         if self._first is None:
             self._first = (inputs.tick, sent.start_s)
+        arm, before = inputs.arm, self._before[0].arm if self._before is not None else None
+        if arm is not None and arm.asked_s is not None and (before is None or before.stamp_s != arm.stamp_s):
+            self._read_s.append(arm.stamp_s - arm.asked_s)
         if self._before is not None:
             self._joint(*self._before, inputs)
         self._before = (inputs, sent)
@@ -65,6 +86,8 @@ class Stopwatch:
             return
         if after.arm.written_s >= sent.core_s and after.arm.stamp_s > tick.arm.stamp_s:
             self._joint_s.append(after.arm.written_s - tick.arm.stamp_s)
+            if tick.arm.asked_s is not None:
+                self._cycle_s.append(after.arm.written_s - tick.arm.asked_s)
 
     def read(self) -> Timing:
         """What was taken so far."""
@@ -80,7 +103,18 @@ class Stopwatch:
             lateness_s=np.array(self._lateness_s),
             joint_read_to_write_s=np.array(self._joint_s),
             mocap_to_setpoint_s=np.array(self._mocap_s),
+            wait_for_joints_s=np.array(self._wait_s),
+            core_s=np.array(self._core_s),
+            send_s=np.array(self._send_s),
+            whole_s=np.array(self._whole_s),
+            bus_read_s=np.array(self._read_s),
+            bus_cycle_s=np.array(self._cycle_s),
         )
+
+
+def end_s(sent: Sent) -> float:
+    """When a tick had sent everything: setpoint to PX4, currents to the bus thread, in whichever order."""
+    return max(sent.setpoint_sent_s, sent.current_sent_s)
 
 
 def timing_of(rows: Iterable[tuple[Inputs, Outputs, Sent]]) -> Timing:

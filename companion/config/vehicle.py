@@ -19,6 +19,7 @@ from companion.config.base import (
     Vector3,
     refuse,
 )
+from companion.config.computer import Computer
 from companion.config.ground import Ground
 
 
@@ -305,6 +306,7 @@ class Vehicle(Model):
     tether: Tether
     room: Room
     devices: Devices
+    computer: Computer = Computer()
     safety: Safety = Safety()
     ground: Ground = Ground()
 

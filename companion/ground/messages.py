@@ -238,6 +238,10 @@ class Timing:
     """Ticks of this session that began a whole period late."""
     dropped: int
     """Records of this session that the recorder lost."""
+    whole_ms: float | None = None
+    """Tick begun to everything sent, the later of `Sent.setpoint_sent_s` and `Sent.current_sent_s`."""
+    bus_read_ms: float | None = None
+    """One read of all servos, by the bus thread."""
 
 
 @quick

@@ -9,11 +9,11 @@ import dataclasses
 import json
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TypeVar
 
 from companion.config.loader import FlightConfig
-from companion.ground.lights import UNKNOWN_S, Ages, Lights, Look
+from companion.ground.lights import Ages, Lights, Look
 from companion.ground.messages import (
     EVENTS_KEPT,
     VERSION,
@@ -24,6 +24,7 @@ from companion.ground.messages import (
     TetherView,
     Timing,
 )
+from companion.ground.timings import Worst, worst_of
 from companion.mission.sequencer import Stage
 from companion.types import (
     ControlLog,
@@ -63,7 +64,7 @@ class StreamMaker:
         self._lights = Lights(config.vehicle)
         self._newest: tuple[Inputs, Outputs, Sent] | None = None
         self._now = Ages()
-        self._worst = _Worst()
+        self._worst = Worst()
         self._past: deque[tuple[float, Ages]] = deque()
         self._frames_s: deque[float] = deque()
         self._first_frame_s: float | None = None
@@ -150,7 +151,7 @@ class StreamMaker:
         ages = self._ages_of_the_last_second(i.t_s)
         look = Look(i, o, ages, self._mocap_rate_hz(i.t_s), self._missed, lost, recorder_error)
         timing = self._worst.timing(self._missed, lost)
-        self._now, self._worst = Ages(), _Worst()
+        self._now, self._worst = Ages(), Worst()
         self._seq += 1
         pose_from, position, attitude, age_s = _pose(i, o)
         reference, status = o.reference, i.status
@@ -211,42 +212,6 @@ class StreamMaker:
         return float(len(frames)) if first_s is not None and t_s - first_s > 1.0 else None
 
 
-class _Worst:
-    """The worst durations of some ticks, s."""
-
-    def __init__(self) -> None:
-        self._lateness_s = self._core_s = 0.0
-        self._mocap_s = self._setpoint_s = self._joint_s = UNKNOWN_S
-
-    def take(self, before: tuple[Inputs, Outputs, Sent] | None, i: Inputs, sent: Sent, fresh: bool) -> None:
-        """One tick; durations as in `companion.analysis.timing.Stopwatch`."""
-        self._lateness_s = max(self._lateness_s, sent.lateness_s)
-        self._core_s = max(self._core_s, sent.core_s - sent.joint_read_s)
-        if i.mocap is not None:
-            self._mocap_s = max(self._mocap_s, i.t_s - i.mocap.stamp_s + (i.mocap.latency_s or 0.0))
-            if fresh and before is not None and sent.attitude_sent:
-                self._setpoint_s = max(self._setpoint_s, sent.setpoint_sent_s - i.mocap.stamp_s)
-        if before is None or before[2].arm_torque_sent_nm is None:
-            return
-        earlier, now = before[0].arm, i.arm
-        if earlier is None or now is None or now.written_s is None:
-            return
-        if now.written_s >= before[2].core_s and now.stamp_s > earlier.stamp_s:
-            self._joint_s = max(self._joint_s, now.written_s - earlier.stamp_s)
-
-    def timing(self, missed: int, dropped: int) -> Timing:
-        """As a message says it."""
-        return Timing(
-            lateness_ms=_ms(self._lateness_s) or 0.0,
-            mocap_age_ms=_ms(self._mocap_s),
-            mocap_to_setpoint_ms=_ms(self._setpoint_s),
-            joint_read_to_write_ms=_ms(self._joint_s),
-            core_ms=_ms(self._core_s) or 0.0,
-            missed=missed,
-            dropped=dropped,
-        )
-
-
 def replay(
     rows: Iterable[tuple[Inputs, Outputs, Sent]],
     config: FlightConfig,
@@ -300,25 +265,9 @@ def _halved(records: list[Stream]) -> list[Stream]:
         if index % 2 and index != len(records) - 1:
             between.append(record.timing)
             continue
-        kept.append(dataclasses.replace(record, timing=_worst_of([*between, record.timing])))
+        kept.append(dataclasses.replace(record, timing=worst_of([*between, record.timing])))
         between = []
     return kept
-
-
-def _worst_of(timings: Sequence[Timing]) -> Timing:
-    def worst(name: str) -> float | None:
-        return max((v for t in timings if (v := getattr(t, name)) is not None), default=None)
-
-    last = timings[-1]
-    return Timing(
-        lateness_ms=worst("lateness_ms") or 0.0,
-        mocap_age_ms=worst("mocap_age_ms"),
-        mocap_to_setpoint_ms=worst("mocap_to_setpoint_ms"),
-        joint_read_to_write_ms=worst("joint_read_to_write_ms"),
-        core_ms=worst("core_ms") or 0.0,
-        missed=last.missed,
-        dropped=last.dropped,
-    )
 
 
 def _pose(i: Inputs, o: Outputs) -> tuple[str | None, Vec3 | None, Quat | None, float]:
@@ -395,7 +344,3 @@ def _rounded(values: T | None, digits: int) -> T | None:
     if values is None or not all(map(math.isfinite, values)):
         return None
     return type(values)(round(value, digits) for value in values)
-
-
-def _ms(duration_s: float) -> float | None:
-    return _number(duration_s * 1e3, 3)

@@ -215,13 +215,15 @@ def _figures(stream: Stream) -> list[str]:
 
 
 def _timing(stream: Stream) -> str:
+    """What is behind what, and below it how long the parts of a tick took."""
     timing = stream.timing
-    parts = [f"late {timing.lateness_ms:.1f} ms"]
-    for name, value in (
-        ("mocap", timing.mocap_age_ms),
-        ("mocap to setpoint", timing.mocap_to_setpoint_ms),
-        ("joint read to write", timing.joint_read_to_write_ms),
-    ):
-        if value is not None:
-            parts.append(f"{name} {value:.1f} ms")
-    return "   ".join([*parts, f"missed {timing.missed}", f"lost records {timing.dropped}"])
+    behind = {
+        "late": timing.lateness_ms,
+        "mocap": timing.mocap_age_ms,
+        "mocap to setpoint": timing.mocap_to_setpoint_ms,
+        "joint read to write": timing.joint_read_to_write_ms,
+    }
+    took = {"tick": timing.whole_ms, "core": timing.core_ms, "bus read": timing.bus_read_ms}
+    lines = [[f"{name} {value:.1f} ms" for name, value in part.items() if value is not None] for part in (behind, took)]
+    lines[1] += [f"missed {timing.missed}", f"lost records {timing.dropped}"]
+    return "\n".join("   ".join(words) for words in lines)

@@ -101,7 +101,7 @@ def isolation(cores: int) -> tuple[str, ...]:
     rest, own = f"0-{cores - 3}" if cores > 3 else "0", f"{cores - 2},{cores - 1}"
     return (
         f"Cores: nothing is reserved. Should the report show late ticks, keep cores {own} for the flight:",
-        f"  systemctl edit companion.service               [Service] CPUAffinity={own}",
+        f"  vehicle file                                   computer: {{cpus: [{own.replace(',', ', ')}]}}",
         f"  /etc/systemd/system.conf.d/50-cores.conf       [Manager] CPUAffinity={rest}",
-        "Leave isolcpus= out of the kernel's command line: on isolated cores nothing moves threads from one to the other.",
+        "isolcpus= does the same as the second, but only with real-time scheduling: nothing balances threads between isolated cores.",
     )

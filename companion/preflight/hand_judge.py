@@ -124,11 +124,9 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
     ]
 
 
-def ended(cause: str) -> Row:
-    """A test that has no result."""
-    return DONE.bad(
-        cause, "lift, forward and a turn to the left, each recognised", "do it again: companion check --hand"
-    )
+def ended(cause: str, again: str = "companion check --hand") -> Row:
+    """A test that has no result; `again` is the command that it was part of."""
+    return DONE.bad(cause, "lift, forward and a turn to the left, each recognised", f"do it again: {again}")
 
 
 def yaw_offset_deg(forward: Motion) -> float:

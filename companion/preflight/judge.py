@@ -41,7 +41,7 @@ def rows(o: Observations, config: FlightConfig) -> list[Row]:
         *force.rows(o, vehicle),
         *tether.rows(o, vehicle),
         *mission.rows(o, config),
-        *machine.rows(o),
+        *machine.rows(o, vehicle),
     ]
 
 

@@ -1,11 +1,14 @@
-"""The computer itself: room for the log, processor, real-time permission, recorder, broker. Pure."""
+"""The computer itself: room for the log, processor, real-time permission, memory, cores, recorder. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from companion.config.computer import Computer
+from companion.config.vehicle import Vehicle
+from companion.cores import listed
 from companion.preflight.checks import Check
-from companion.preflight.observations import Observations
+from companion.preflight.observations import Machine, Observations
 from companion.preflight.rows import Row
 
 DISK = Check(
@@ -28,13 +31,26 @@ REALTIME = Check(
     "without it a busy computer makes ticks late",
     warns=True,
 )
+MEMORY_LOCK = Check(
+    "machine.memory_lock",
+    "memory lock",
+    "RLIMIT_MEMLOCK unlimited, unless `computer.lock_memory` is false",
+    "pages that the system dropped are read from the card again in flight, which takes tens of milliseconds",
+    warns=True,
+)
+CPUS = Check(
+    "machine.cpus",
+    "cores of the flight",
+    "this computer has every core of `computer.cpus`, and one more",
+    "a flight that was to have cores of its own would share them with everything else",
+)
 RECORDER = Check(
     "machine.recorder",
     "recorder",
     "the recorder process starts and opens a log",
     "a flight without a log cannot be explained",
 )
-CHECKS = (DISK, GOVERNOR, REALTIME, RECORDER)
+CHECKS = (DISK, GOVERNOR, REALTIME, MEMORY_LOCK, CPUS, RECORDER)
 
 LOG_BYTES_PER_S = 300_000
 """Measured: 0.24 MB/s of flight.mcap."""
@@ -44,8 +60,8 @@ GROUND_S = 30.0
 """Before take-off and after landing."""
 
 
-def rows(o: Observations) -> Iterator[Row]:
-    """What was seen of the computer."""
+def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
+    """What was seen of the computer, against what the vehicle file asks of it."""
     machine = o.machine
     if machine is not None:
         if machine.disk_free_bytes is not None:
@@ -57,18 +73,48 @@ def rows(o: Observations) -> Iterator[Row]:
         else:
             yield GOVERNOR.good("performance" if machine.governors else "no governor is told here", "performance")
         if machine.realtime is None:
-            fix = (
-                "sudo companion install --systemd permits it to the service and to people in dialout; by hand, `@dialout - rtprio 60` "
-                "and `@dialout - memlock unlimited` in /etc/security/limits.conf; then log in again"
+            yield REALTIME.bad(
+                "refused: the flight runs at normal priority", "SCHED_FIFO", _PERMIT.format("@dialout - rtprio 60")
             )
-            yield REALTIME.bad("refused: the flight runs at normal priority", "SCHED_FIFO", fix)
         else:
             yield REALTIME.good(machine.realtime, "SCHED_FIFO")
+        yield _memory_lock(machine, vehicle.computer)
+        yield _cpus(machine, vehicle.computer)
     if o.recorder is not None:
         if o.recorder:
             yield RECORDER.bad(o.recorder, "it opens a log", "see the line itself; it names file and reason")
         else:
             yield RECORDER.good("opens a log", "it opens a log")
+
+
+_PERMIT = (
+    "sudo companion install --systemd permits it to the service and to people in dialout; by hand, `{}` in "
+    "/etc/security/limits.conf; then log in again"
+)
+
+
+def _memory_lock(machine: Machine, computer: Computer) -> Row:
+    if not computer.lock_memory:
+        return MEMORY_LOCK.good("computer.lock_memory is false: not asked for")
+    if machine.memory_lock is None:
+        return MEMORY_LOCK.good("permitted", "RLIMIT_MEMLOCK unlimited")
+    return MEMORY_LOCK.bad(
+        machine.memory_lock, "RLIMIT_MEMLOCK unlimited", _PERMIT.format("@dialout - memlock unlimited")
+    )
+
+
+def _cpus(machine: Machine, computer: Computer) -> Row:
+    there = f"cores {listed(machine.cpus)}"
+    if not computer.cpus:
+        return CPUS.good(f"all: {there}")
+    asked = f"computer.cpus {listed(computer.cpus)}"
+    if missing := set(computer.cpus) - set(machine.cpus):
+        fix = f"take {listed(missing)} out of computer.cpus; elsewhere than on the vehicle --set 'vehicle.computer.cpus=[]'"
+        return CPUS.bad(there, asked, fix)
+    if not set(machine.cpus) - set(computer.cpus):
+        fix = "leave a core out of computer.cpus, or all of them: recorder and guardian share them with the flight"
+        return CPUS.doubtful(there, f"{asked} and one more", fix)
+    return CPUS.good(asked, f"among {there}")
 
 
 def _disk(free_bytes: int, mission_s: float) -> Row:

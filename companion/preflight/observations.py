@@ -55,6 +55,10 @@ class Machine:
     """Of each core, /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor; empty: none is told."""
     realtime: str | None
     """What `companion.realtime` would be permitted; None: SCHED_FIFO is refused."""
+    memory_lock: str | None
+    """Why `companion.realtime` would lock no memory; None: it would."""
+    cpus: tuple[int, ...]
+    """Cores that a process may be put on, in order."""
     arm_latency_ms: int | None
     """FTDI latency timer of the arm's serial port; None: not an FTDI port."""
     force_latency_ms: int | None

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from companion.clock import Clock
 from companion.config.loader import FlightConfig
+from companion.cores import usable_cpus
 from companion.devices import Edges, SomeEdges
 from companion.io.autopilot import MavsdkAutopilot
 from companion.io.dynamixel import usb_latency_ms
@@ -28,7 +29,7 @@ from companion.preflight.observations import (
     StateCounts,
     Waiting,
 )
-from companion.realtime import FLIGHT_PRIORITY, realtime_permitted
+from companion.realtime import FLIGHT_PRIORITY, memory_lock_refused, realtime_permitted
 from companion.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
 
 LOOK_PERIOD_S = 0.005
@@ -285,7 +286,7 @@ def _between(first: StateCounts, now: StateCounts) -> StateCounts:
 
 
 def machine_of(config: FlightConfig, out: Path) -> Machine:
-    """Disk, processor, permission and serial adapters of this computer."""
+    """Disk, processor, permissions, cores and serial adapters of this computer."""
     folder = next((path for path in (out, *out.absolute().parents) if path.is_dir()), Path())
     try:
         free_bytes: int | None = shutil.disk_usage(folder).free
@@ -301,6 +302,8 @@ def machine_of(config: FlightConfig, out: Path) -> Machine:
         disk_free_bytes=free_bytes,
         governors=tuple(governors),
         realtime=realtime_permitted(FLIGHT_PRIORITY),
+        memory_lock=memory_lock_refused(),
+        cpus=usable_cpus(),
         arm_latency_ms=usb_latency_ms(devices.arm.port),
         force_latency_ms=usb_latency_ms(devices.force.port),
     )

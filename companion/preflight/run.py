@@ -31,7 +31,7 @@ async def preflight(
     known: Observations,
     sitl: bool,
 ) -> list[Row]:
-    """Watch the open devices and judge what came, at the priority of a flight.
+    """Watch the open devices and judge what came, at the priority of a flight and on its cores.
 
     Args:
         edges, config, clock, out, tell, known: as `companion.preflight.observe.observe` takes them.
@@ -40,7 +40,9 @@ async def preflight(
     if not sitl and edges.mocap is not None and edges.mocap.server_info is not None:
         passed, changed = _hand_test(config, edges.mocap.server_info.version)
         known = replace(known, hand_test=passed, hand_test_changed=changed)
-    claim_realtime(FLIGHT_PRIORITY)  # as in flight: else a busy computer is taken for a bad bus and a bad network
+    computer = config.vehicle.computer
+    # As in flight: else a busy computer is taken for a bad bus and a bad network.
+    claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory)
     seen = await observe(
         edges,
         config,

@@ -237,6 +237,46 @@ def test_loop_and_latency_count_what_they_should() -> None:
     assert summary["latency_ms"]["mocap_to_setpoint"]["max"] == pytest.approx(3.0)
 
 
+def test_every_stage_of_a_tick_is_told_by_its_own_stamps() -> None:
+    def staged(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.arm is not None
+        # The bus thread writes the currents of a tick 1.2 ms after its start, and begins the read for the next 1.5 ms before that one.
+        # Every fourth tick finds no new joint state.
+        start_s = i.t_s - 0.0003
+        fresh = i.tick - (i.tick % 4 == 3)
+        read_s = fresh * 0.005 - 0.0003 - 0.0004
+        arm = replace(
+            i.arm, asked_s=read_s - 0.0011, stamp_s=read_s, written_s=(fresh - 1) * 0.005 + 0.0012 if fresh else None
+        )
+        late_s = 0.0001 if i.tick % 2 else 0.0  # the currents are handed over first in every second tick
+        s = replace(
+            s, start_s=start_s, joint_read_s=i.t_s, core_s=i.t_s + 0.0002, setpoint_sent_s=i.t_s + 0.0004 + late_s,
+            current_sent_s=i.t_s + 0.00045, arm_torque_sent_nm=(0.0, 0.0),
+        )  # fmt: skip
+        return replace(i, arm=arm), o, s
+
+    log = changed(staged)
+    stages = summarise(log, outcome="completed", controller="adaptive", preset="paper")["stages_ms"]
+    for name, p50, most in (
+        ("wait_for_joints", 0.3, 0.3),
+        ("core", 0.2, 0.2),
+        ("send", 0.25, 0.3),
+        ("whole", 0.75, 0.8),
+        ("bus_read", 1.1, 1.1),
+    ):
+        assert stages[name]["p50"] == pytest.approx(p50), name
+        assert stages[name]["max"] == pytest.approx(most), name
+    # From 1.8 ms before the tick to 1.2 ms after it; a write that is seen a tick too late is none of the read before.
+    assert stages["bus_cycle"]["p50"] == pytest.approx(3.0)
+    assert len(log.timing.bus_read_s) == sum(i.tick % 4 != 3 for i in log.inputs)
+
+
+def test_a_log_from_before_reads_were_stamped_tells_the_other_stages(flight: FlightLog) -> None:
+    stages = summarise(flight, outcome="completed", controller="adaptive", preset="paper")["stages_ms"]
+    assert stages["bus_read"] == stages["bus_cycle"] == {"p50": None, "p99": None, "max": None}
+    assert stages["whole"]["max"] >= stages["core"]["max"] > 0.0
+
+
 def test_the_least_tether_slack_is_that_of_the_attachment_point() -> None:
     def park(i: Inputs, o: Outputs, s: Sent) -> Row:
         assert i.mocap is not None

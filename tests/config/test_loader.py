@@ -190,6 +190,10 @@ BAD_VEHICLE = [
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole machine, but arm and tool alone weigh 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
+    ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: each core once, got 2 twice in [2, 3, 2]"]),
+    ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),
+    ("safety:", "computer:\n  cpus: 2\nsafety:", ["computer.cpus: expected a list, got 2"]),
+    ("safety:", "computer:\n  cores: [2]\nsafety:", ["computer.cores: unknown key; known here: cpus, lock_memory"]),
     ("length_m: 3.0", "length_cm: 300", ["tether.length_cm: unknown key; write length_m, in m (not in cm)"]),
 ]  # fmt: skip
 

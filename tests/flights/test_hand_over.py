@@ -37,7 +37,7 @@ def test_an_internal_error_in_the_air_lands_by_px4(
 ) -> None:
     """A full disk under flight.log costs the traceback, not the landing."""
     monkeypatch.setattr(app, "FlightCore", BreakingCore)
-    monkeypatch.setattr(app, "claim_realtime", lambda priority: "not for the test's own process")
+    monkeypatch.setattr(app, "claim_realtime", lambda priority, **_: "not for the test's own process")
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.setblocking(False)
     if disk_full:

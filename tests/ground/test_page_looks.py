@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -65,6 +66,19 @@ def test_every_control_of_a_tablet_is_large_enough(browser: Any, stand: Stand) -
         for control in page.tab.locator("button:visible, select:visible, summary:visible").all():
             box = control.bounding_box()
             assert box["height"] >= TOUCH_PX and box["width"] >= TOUCH_PX, control.inner_text()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_plots_values_stand_beside_its_title(browser: Any, stand: Stand, size: str) -> None:
+    """Its head has room for one line; a second one is cut off."""
+    late = dataclasses.replace(flown().at(8.5).timing, lateness_ms=12.3, mocap_age_ms=16.5, whole_ms=10.4)
+    with watching(browser, stand, size=size) as page:
+        page.tell(told(dataclasses.replace(flown().at(8.5), timing=late)))
+        cut = page.tab.evaluate(
+            "[...document.querySelectorAll('.plot header')].filter((h) => h.scrollHeight > h.clientHeight).map((h) => h.innerText)"
+        )
+        assert cut == []
+        assert page.tab.locator(".plot header").count() >= 7
 
 
 def test_buttons_stay_where_they_are_when_things_go_wrong(browser: Any, stand: Stand) -> None:

@@ -186,14 +186,23 @@ def test_numbers_that_are_none_make_a_message_that_every_parser_reads(bad: float
 
 
 def test_timings_are_the_worst_since_the_message_before() -> None:
+    def asked(row: Row) -> Row:
+        """Every seventh read takes longer."""
+        assert row[0].arm is not None
+        return changed(row, arm__asked_s=row[0].arm.stamp_s - (0.0009 if row[0].tick % 7 == 0 else 0.0004))
+
     maker = StreamMaker(CONFIG, "s")
     timings = []
-    for k, row in enumerate(ROWS):
+    rows = [asked(row) for row in ROWS]
+    for k, row in enumerate(rows):
         maker.take(*row)
-        if k % 10 == 9 or k == len(ROWS) - 1:
+        if k % 10 == 9 or k == len(rows) - 1:
             timings.append(maker.make(0.0).timing)
-    whole = timing_of(ROWS)
+    whole = timing_of(rows)
     for name, values_s in (
+        ("core_ms", whole.core_s),
+        ("whole_ms", whole.whole_s),
+        ("bus_read_ms", whole.bus_read_s),
         ("lateness_ms", whole.lateness_s),
         ("mocap_to_setpoint_ms", whole.mocap_to_setpoint_s),
         ("joint_read_to_write_ms", whole.joint_read_to_write_s),
@@ -201,6 +210,7 @@ def test_timings_are_the_worst_since_the_message_before() -> None:
         told = [value for timing in timings if (value := getattr(timing, name)) is not None]
         assert max(told) == pytest.approx(values_s.max() * 1e3, abs=1e-3)
     assert len({timing.lateness_ms for timing in timings}) > 100
+    assert stream_of(IN_FLIGHT).timing.bus_read_ms is None
 
 
 def test_late_ticks_and_lost_records_are_counted() -> None:

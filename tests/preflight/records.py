@@ -156,6 +156,8 @@ def machine(**changes: object) -> Machine:
         "disk_free_bytes": 10**10,
         "governors": ("performance",) * 4,
         "realtime": "SCHED_FIFO 50",
+        "memory_lock": None,
+        "cpus": (0, 1, 2, 3),
         "arm_latency_ms": 1,
         "force_latency_ms": None,
         **changes,

@@ -210,6 +210,14 @@ def test_it_ends_when_px4_does_not_say_whether_it_is_armed() -> None:
     assert view.ended.startswith(f"PX4 has not said for {SILENCE_MAX_S:g} s whether it is armed")
 
 
+def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
+    for again, row in (
+        ("companion check --hand", hand_judge.ended("nobody lifted it")),
+        ("companion mocap align", hand_judge.ended("nobody lifted it", "companion mocap align")),
+    ):
+        assert (row.refuses, row.read, row.fix) == (True, "nobody lifted it", f"do it again: {again}")
+
+
 def test_a_machine_that_nobody_lifts_is_told_after_the_time_limit() -> None:
     standing = Standing(world()).samples(STEP_TIMEOUT_S + 10.0)
     view = ran(standing)

@@ -185,6 +185,14 @@ CASES = {
     "full disk": Case("machine.disk", "20 MB", "delete", {"machine": r.machine(disk_free_bytes=20_000_000)}),
     "slow processor": Case("machine.governor", "powersave", "cpupower", {"machine": r.machine(governors=("powersave",))}, WARN),
     "normal priority": Case("machine.realtime", "refused", "limits.conf", {"machine": r.machine(realtime=None)}, WARN),
+    "memory that may not stay": Case(
+        "machine.memory_lock", "memory not locked", "memlock unlimited",
+        {"machine": r.machine(memory_lock="memory not locked (8 kB)")}, WARN,
+    ),
+    "cores that are not there": Case("machine.cpus", "cores 0-3", "take 4,6 out", {}, vehicle={"computer.cpus": (4, 2, 6)}),
+    "no core beside the flight's": Case(
+        "machine.cpus", "cores 0-3", "leave a core out", {}, WARN, vehicle={"computer.cpus": (0, 1, 2, 3)}
+    ),
     "no recorder": Case("machine.recorder", "no space", "names file", {"recorder": "no space"}),
 }  # fmt: skip
 NEVER_BAD = {"tether.line"}
@@ -246,6 +254,7 @@ def test_every_row_can_fail() -> None:
 LONELY = ("old heartbeat", "armed", "slow state", "flat battery", "hover thrust doubtful",
           "a parameter", "lost frames", "another body", "another mode",
           "servo error", "loose cable", "leaning hard", "overloaded", "weak tether", "arm elsewhere", "full disk", "no recorder",
+          "memory that may not stay", "cores that are not there",
           "frozen ratios", "wandering")  # fmt: skip
 
 
@@ -288,6 +297,15 @@ def test_waiting_is_worth_it_only_for_what_settles() -> None:
     assert waiting is not None and waiting.longest_s == judge.BEGIN_S
     flat = replace(r.sound(), status=r.status(battery_remaining=0.1))
     assert judge.unsettled(flat, r.config()) is None
+
+
+def test_what_the_vehicle_file_does_not_ask_for_is_no_warning() -> None:
+    unlocked = replace(r.sound(), machine=r.machine(memory_lock="memory not locked (8 kB)"))
+    rows = {row.id: row for row in judge.rows(unlocked, config_with({"computer.lock_memory": False}))}
+    assert rows["machine.memory_lock"].ok
+    assert "not asked for" in rows["machine.memory_lock"].read
+    own = {row.id: row for row in judge.rows(r.sound(), config_with({"computer.cpus": (2, 3)}))}["machine.cpus"]
+    assert own.ok and (own.read, own.wanted) == ("computer.cpus 2-3", "among cores 0-3")
 
 
 def test_a_row_is_one_line_with_read_wanted_and_fix() -> None:

@@ -59,11 +59,12 @@ export const PLOTS = [
     limits: (scene) => [{ value: scene.tether_margin_m, label: "margin", level: "warn" }, { value: 0, label: "taut", level: "bad" }],
   },
   {
-    title: "Latency, ms", digits: 1, floor: 0, span: 5,
+    title: "Times, ms", digits: 1, floor: 0, span: 5,
     series: [
       { label: "late", unit: "", colour: "1", value: (r) => r.timing.lateness_ms },
-      { label: "mocap age", unit: "", colour: "3", value: (r) => r.timing.mocap_age_ms },
-      { label: "to setpoint", unit: "", colour: "4", value: (r) => r.timing.mocap_to_setpoint_ms },
+      { label: "mocap", unit: "", colour: "3", value: (r) => r.timing.mocap_age_ms },
+      { label: "sent", unit: "", colour: "4", value: (r) => r.timing.mocap_to_setpoint_ms },
+      { label: "tick", unit: "", colour: "2", value: (r) => r.timing.whole_ms },
     ],
   },
 ];
