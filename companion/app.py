@@ -94,10 +94,8 @@ class Flight:
         if self._edges.ground is not None:
             self._tell_forwarding(self._clock(), self._edges.ground.line)
         while True:
-            lead_s = min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S) if arm is not None else 0.0
-            await ticker.until(lead_s)
             if arm is not None:
-                arm.begin_read()
+                arm.begin_read(ticker.due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
             now = await ticker.next()
             command, asked = self._operator.next()
             inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, command)

@@ -60,11 +60,10 @@ class Ticker:
         if self._waiter is not None and not self._waiter.done() and self._in_place(arrived_s):
             self._waiter.set_result(None)
 
-    async def until(self, lead_s: float) -> None:
-        """Wait until `lead_s` before the next tick is due: time to begin what is to be ready for it. May be left out."""
-        self._skip()
-        # Even when late: the loop must serve its sockets once a tick.
-        await asyncio.sleep(max(0.0, self._due_s - lead_s - self._clock()))
+    @property
+    def due_s(self) -> float:
+        """When the next tick is expected to begin."""
+        return self._due_s
 
     async def next(self) -> TickTime:
         """Wait for the next frame or deadline."""

@@ -34,7 +34,6 @@ def ticks_of(
     until_s: float,
     rate_hz: float = RATE_HZ,
     work: Callable[[int, SimulatedTime], None] = lambda tick, time: None,
-    lead_s: float = 0.001,
 ) -> tuple[list[TickTime], Ticker]:
     """Ticks from 0 to `until_s` of a loop to which frames arrive at those times; `work` is done in each."""
     time = SimulatedTime()
@@ -47,7 +46,6 @@ def ticks_of(
             loop.call_at(frame_s, ticker.frame, frame_s)
         ticks: list[TickTime] = []
         while time.now_s < until_s:
-            await ticker.until(lead_s)
             ticks.append(await ticker.next())
             work(len(ticks), time)
         return ticks, ticker
@@ -163,7 +161,7 @@ def test_a_stall_while_it_waits_is_lateness() -> None:
     assert late.lateness_s == pytest.approx(0.0142, abs=0.0011)
 
 
-def test_there_is_time_before_a_tick_to_begin_what_it_needs() -> None:
+def test_when_the_next_tick_is_due_is_known_before() -> None:
     time = SimulatedTime()
     loop = asyncio.SelectorEventLoop(time)
     loop.time = lambda: time.now_s  # type: ignore[method-assign]
@@ -174,11 +172,10 @@ def test_there_is_time_before_a_tick_to_begin_what_it_needs() -> None:
             loop.call_at(n * P + 0.001, ticker.frame, n * P + 0.001)
         leads_s: list[float] = []
         while time.now_s < 0.45:
-            await ticker.until(0.0015)
-            begun_s = time.now_s
-            leads_s.append((await ticker.next()).start_s - begun_s)
+            due_s = ticker.due_s
+            leads_s.append((await ticker.next()).start_s - due_s)
         return leads_s
 
     leads_s = loop.run_until_complete(run())
     loop.close()
-    assert leads_s[-20:] == pytest.approx([0.0015] * 20, abs=2e-5)
+    assert leads_s[-20:] == pytest.approx([0.0] * 20, abs=2e-5)

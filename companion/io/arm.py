@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -33,6 +33,18 @@ _T = TypeVar("_T")
 
 _WRITE = object()
 _STOP = object()
+_NOW = object()
+"""The read that was to begin later is wanted at once."""
+
+
+@dataclass(slots=True)
+class _Read:
+    """One read; the bus thread tells by assignment how far it is, and wakes the event loop only for somebody who waits."""
+
+    at_s: float
+    begun: bool = False
+    done: bool = False
+    waiter: asyncio.Future[None] | None = None
 
 
 class DynamixelArm:
@@ -54,6 +66,7 @@ class DynamixelArm:
         self._arm = arm
         self._clock = clock
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
+        """`_Read`, or one of the marks above."""
         self._goals: deque[Pair] = deque(maxlen=1)
         self._goal_handed_s = 0.0
         self._state: ArmState | None = None
@@ -65,9 +78,7 @@ class DynamixelArm:
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._finished: asyncio.Future[None] | None = None
-        self._reading: asyncio.Future[None] | None = None
-        self._answered: object = None
-        """The newest job that has been carried out: known here before the event loop has heard of it."""
+        self._reading: _Read | None = None
         self._read_s, self._read_deviation_s = _FIRST_READ_S, 0.0
         self._stop = threading.Event()
 
@@ -120,11 +131,14 @@ class DynamixelArm:
         """Time within which most reads are done."""
         return self._read_s + _DEVIATIONS * self._read_deviation_s
 
-    def begin_read(self) -> None:
-        """Have the bus thread read, without waiting for it; nothing new is begun while an earlier read is under way."""
-        if self._reading is None or self._reading is self._answered or self._reading.done():
-            assert self._loop is not None, "the arm edge is not entered"
-            self._reading = self._loop.create_future()
+    def begin_read(self, at_s: float = 0.0) -> None:
+        """Have the bus thread read, without waiting for it; nothing new is begun while an earlier read is under way.
+
+        Args:
+            at_s: when, flight clock; what is past is now.
+        """
+        if self._reading is None or self._reading.done:
+            self._reading = _Read(at_s)
             self._jobs.put(self._reading)
 
     async def read(self, timeout_s: float) -> ArmState | None:
@@ -133,14 +147,18 @@ class DynamixelArm:
 
         A read that takes longer than `timeout_s` goes on in the bus thread and the next call waits for that one.
         """
-        reading = self._reading
-        if reading is None:
+        if self._reading is None:
             self.begin_read()
-            reading = self._reading
-            assert reading is not None
-        if reading is not self._answered:
-            done, _ = await asyncio.wait((reading,), timeout=timeout_s)
-            if not done:
+        reading = self._reading
+        assert reading is not None
+        if not reading.done:
+            if not reading.begun:
+                self._jobs.put(_NOW)
+            assert self._loop is not None, "the arm edge is not entered"
+            waiter = reading.waiter = self._loop.create_future()
+            if not reading.done:  # else the thread may have looked for a waiter before there was one
+                await asyncio.wait((waiter,), timeout=timeout_s)
+            if not reading.done:
                 return self._state
         self._reading = None
         return self._state
@@ -207,9 +225,11 @@ class DynamixelArm:
     def _serve(self, bus: ArmBus) -> None:
         watchdog_s = self._device.watchdog_ms * 1e-3
         sent: Pair = (0, 0)
+        later: _Read | None = None
         while True:
+            wait_s = watchdog_s / _KEEPALIVES_PER_WATCHDOG if later is None else later.at_s - self._clock()
             try:
-                job = self._jobs.get(timeout=watchdog_s / _KEEPALIVES_PER_WATCHDOG)
+                job = self._jobs.get(timeout=max(0.0, wait_s))
             except queue.Empty:
                 job = None
             if job is _STOP:
@@ -217,10 +237,20 @@ class DynamixelArm:
             if job is _WRITE:
                 sent = self._write_newest(bus, sent)
                 continue
+            if isinstance(job, _Read):
+                later = job
+                if job.at_s > self._clock():
+                    continue
+            elif job is _NOW and later is None:
+                continue  # it has begun meanwhile
+            reading, later = later, None
+            if reading is not None:
+                reading.begun = True
             tripped = self._read_once(bus)
-            if isinstance(job, asyncio.Future):
-                self._answered = job
-                self._post(functools.partial(_resolve, job, None))
+            if reading is not None:
+                reading.done = True
+                if reading.waiter is not None:
+                    self._post(functools.partial(_resolve, reading.waiter, None))
             if tripped:
                 sent = (0, 0)
                 self._try(bus.restart_watchdogs)

@@ -16,6 +16,7 @@ from companion.io import autopilot_messages as messages
 from companion.io.autopilot_calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.autopilot_link import device_error
 from companion.io.autopilot_requests import RequestDesk
+from companion.io.native_threads import keep_interpreter_state
 from companion.preflight.observations import EstimatorReport, StateCounts
 from companion.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
 
@@ -137,6 +138,7 @@ class Inbox:
         self._rates = (value.roll_rad_s, value.pitch_rad_s, value.yaw_rad_s)
 
     def _on_imu(self, value: Any, _: Any) -> None:
+        keep_interpreter_state()
         a = value.acceleration_frd
         self._imu = (self._clock(), (a.forward_m_s2, a.right_m_s2, a.down_m_s2))
         self._imus += 1

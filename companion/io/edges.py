@@ -72,8 +72,8 @@ class Arm(Edge, Protocol):
     def read_takes_s(self) -> float:
         """Time within which most reads are done."""
 
-    def begin_read(self) -> None:
-        """Begin the read that the next `read` waits for; never blocks."""
+    def begin_read(self, at_s: float = 0.0) -> None:
+        """Begin the read that the next `read` waits for, at that time of the flight clock or as soon as it is wanted; never blocks."""
 
     async def read(self, timeout_s: float) -> ArmState | None:
         """One sync read; the newest state (its `read_failures` counts the misses). None before the first success."""

@@ -513,6 +513,28 @@ def test_a_read_begun_early_is_there_when_it_is_asked_for() -> None:
     fly(scenario, watchdog_ms=2000)
 
 
+def test_a_read_begins_at_its_time_or_when_it_is_wanted() -> None:
+    async def scenario(setup: Setup) -> None:
+        at_s = setup.clock() + 0.05
+        setup.arm.begin_read(at_s)
+        setup.arm.write_torque((0.0, 0.0))  # is not held up by it
+        await until(lambda: (state := setup.arm.latest()) is not None and state.written_s is not None)
+        state = setup.arm.latest()
+        assert state is not None
+        assert state.asked_s is not None
+        assert state.asked_s >= at_s
+        assert state.written_s is not None
+        assert state.written_s < state.asked_s
+        assert await setup.arm.read(0.0) is state
+        setup.arm.begin_read(setup.clock() + 3600.0)
+        wanted = await setup.arm.read(LONG_S)
+        assert wanted is not None
+        assert wanted.stamp_s > state.stamp_s
+
+    # The thread must not read by itself meanwhile.
+    fly(scenario, watchdog_ms=2000)
+
+
 def test_the_time_of_a_read_is_learnt() -> None:
     async def scenario(setup: Setup) -> None:
         taken_s = []
