@@ -11,16 +11,15 @@ does (p99 by more than a quarter and a tenth of a period, which is what two runs
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
 import json
-import os
 import random
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,20 +30,16 @@ from mcap.reader import make_reader
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.measuring.hovering import END_TIMEOUT_S, MISSION, NoFlight, await_hover, start_hover
+from benchmarks.soaking.lateness import tick_for_nothing
 from companion.analysis.log import FlightLog
-from companion.clock import flight_clock
 from companion.config.ground import topic_name
 from companion.config.loader import load_flight
 from companion.core import NOMINAL_DT_S
-from companion.realtime import FLIGHT_PRIORITY, claim_realtime
-from companion.ticker import Ticker
 from tests.broker import LOOPBACK, Broker, free_port
-from tests.support import PATIENT
 
-MISSION = Path(__file__).parents[1] / "configs/missions/hover.yaml"
 SETTLE_S = 3.0
 """From one condition to the next; not counted."""
-START_TIMEOUT_S, END_TIMEOUT_S = 60.0, 180.0
 P99_RATIO_MAX = 1.25
 P99_MORE_MAX_MS = 0.5
 NO_BROKER = "no broker"
@@ -156,43 +151,30 @@ def fly(rounds: int, slot_s: float, folder: Path, console: Console) -> tuple[lis
         name for _ in range(rounds) for name in order.sample([*conditions.all, NO_BROKER], len(conditions.all) + 1)
     ]
     hover_s = len(names) * (slot_s + 3.0 + SETTLE_S) + 10.0
-    command = [
-        *(sys.executable, "-m", "companion.cli", "fly", str(MISSION), "--sitl", "--out", str(folder / "flight")),
-        *("--set", f"mission.phases[1].duration_s={hover_s}", f"world.battery_life_s={4.0 * hover_s}"),
-        f"vehicle.ground.mqtt.url=mqtt://127.0.0.1:{conditions.port}",
-        *(f"{key}={value}" for key, value in PATIENT.items() if "mqtt" not in key),
-    ]
     empty = subprocess.Popen([sys.executable, "-m", "benchmarks.broker", "--empty-loop", str(folder / "empty.npy")])
     slots: list[Slot] = []
-    with (folder / "fly.txt").open("wb") as out:
-        flight = subprocess.Popen(command, stdout=out, stderr=out, env={**os.environ, "PYTHONUNBUFFERED": "1"})
-        try:
-            _await_hover(flight, folder)
-            for number, name in enumerate(names, 1):
-                if flight.poll() is not None:
-                    break
-                console.print(f"  {number:>2}/{len(names)}  {name}", highlight=False)
-                begin_s = time.time() + SETTLE_S
-                conditions.all[name](slot_s + SETTLE_S)
-                slots.append(Slot(name, begin_s, begin_s + slot_s))
-            if flight.poll() is None:
-                flight.send_signal(signal.SIGINT)
-            flight.wait(END_TIMEOUT_S)
-        finally:
-            for process in (flight, empty):
-                if process.poll() is None:
-                    process.terminate()
-                    process.wait(END_TIMEOUT_S)
+    flight = start_hover(folder, hover_s, conditions.broker.url)
+    try:
+        await_hover(flight, folder)
+        time.sleep(SETTLE_S)
+        for number, name in enumerate(names, 1):
+            if flight.poll() is not None:
+                break
+            console.print(f"  {number:>2}/{len(names)}  {name}", highlight=False)
+            begin_s = time.time() + SETTLE_S
+            conditions.all[name](slot_s + SETTLE_S)
+            slots.append(Slot(name, begin_s, begin_s + slot_s))
+        if flight.poll() is None:
+            flight.send_signal(signal.SIGINT)
+        flight.wait(END_TIMEOUT_S)
+    except NoFlight as error:
+        raise SystemExit(f"broker: no flight: {error}") from None
+    finally:
+        for process in (flight, empty):
+            if process.poll() is None:
+                process.terminate()
+                process.wait(END_TIMEOUT_S)
     return slots, flight.returncode
-
-
-def _await_hover(flight: subprocess.Popen[bytes], folder: Path) -> None:
-    deadline_s = time.monotonic() + START_TIMEOUT_S
-    while "  hold" not in (folder / "fly.txt").read_text():
-        if flight.poll() is not None or time.monotonic() > deadline_s:
-            raise SystemExit(f"broker: no flight: {(folder / 'fly.txt').read_text()}")
-        time.sleep(0.1)
-    time.sleep(SETTLE_S)
 
 
 def judge(slots: list[Slot], folder: Path) -> list[Row]:
@@ -240,21 +222,16 @@ def _within(ticks: Any, slots: list[Slot]) -> Any:
 
 
 def run_empty_loop(path: Path) -> None:
-    """Tick as a flight does, with its priority, and do nothing, until SIGTERM; then write wall clock and lateness (ms) of each tick."""
-    np.save(path, asyncio.run(_empty_loop()))
+    """Tick for nothing, then write wall clock (s) and lateness (ms) of each tick."""
+    offset_s = time.time() - time.monotonic()
+    starts, lateness = array("d"), array("d")
 
+    def take(start_s: float, lateness_s: float) -> None:
+        starts.append(offset_s + start_s)
+        lateness.append(1e3 * lateness_s)
 
-async def _empty_loop() -> Any:
-    over = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, over.set)
-    origin_s, origin_wall_s = time.monotonic(), time.time()
-    claim_realtime(FLIGHT_PRIORITY)
-    ticker = Ticker(NOMINAL_DT_S, flight_clock(origin_s))
-    rows = []
-    while not over.is_set():
-        tick = await ticker.next()
-        rows.append((origin_wall_s + tick.start_s, 1e3 * tick.lateness_s))
-    return np.array(rows).T
+    tick_for_nothing(take)
+    np.save(path, np.array([starts, lateness]))
 
 
 def problems_of(rows: list[Row], code: int, summary: dict[str, Any]) -> list[str]:

@@ -1,6 +1,6 @@
-"""What is done to a broker beside a flight, each in a process of its own: viewers, noise, rubbish.
+"""What is done to a broker beside a flight, each in a process of its own: viewers, one person who looks, noise, rubbish.
 
-python -m benchmarks.brokering.load viewers|noise|rubbish URL VEHICLE
+python -m benchmarks.brokering.load viewers|person|noise|rubbish URL VEHICLE
 
 The load is niced: viewers and attackers sit on other computers, and here it is the flight that is measured.
 """
@@ -13,18 +13,21 @@ import json
 import os
 import re
 import secrets
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 
 import aiohttp
 import aiomqtt
 
 from companion.config.ground import broker_address
 from companion.ground.messages import MESSAGE_MAX_BYTES, CommandName, Topic
+from tests.browser import ARGUMENTS
 
 VIEWERS = 20
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 NOISE_PER_S = 1000
 RUBBISH = 2000
 _NICE = 10
@@ -34,27 +37,61 @@ _URL = re.compile(rb"http://[^\s]+")
 async def viewers(url: str, vehicle: str) -> None:
     """`companion monitor` with 20 pages open."""
     del vehicle
+    async with _monitor(url) as address, aiohttp.ClientSession() as session, asyncio.TaskGroup() as group:
+        for _ in range(VIEWERS):
+            group.create_task(_view(session, address))
+
+
+async def person(url: str, vehicle: str) -> None:
+    """`companion monitor` with its page open in a browser; where there is none, one WebSocket. Prints what looks, and what it saw."""
+    del vehicle
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    async with _monitor(url) as address:
+        if browser is None:
+            print("a WebSocket client (no chromium here)", flush=True)
+            async with aiohttp.ClientSession() as session:
+                await _view(session, address)
+            return
+        from playwright.async_api import async_playwright
+
+        async with async_playwright() as playwright:
+            started = await playwright.chromium.launch(
+                executable_path=browser, args=list(ARGUMENTS), handle_sigterm=False
+            )
+            try:
+                page = await started.new_page(viewport={"width": 1440, "height": 900})
+                await page.goto(address)
+                print(f"headless Chromium {started.version}", flush=True)
+                await page.locator("#word", has_text="FLYING").wait_for(timeout=0)
+                print("its page showed FLYING", flush=True)
+                await asyncio.Event().wait()
+            finally:
+                await started.close()
+
+
+@contextlib.asynccontextmanager
+async def _monitor(url: str) -> AsyncIterator[str]:
+    """`companion monitor` on a free port; the address of its page, token and all."""
     command = [sys.executable, "-m", "companion.cli", "monitor", "--broker", url, "--port", "0"]
     process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE, env=_unbuffered())
     assert process.stdout is not None
     try:
-        page = None
-        while page is None:
+        address = None
+        while address is None:
             line = await process.stdout.readline()
             if not line:
                 raise SystemExit("the monitor ended at once")
             found = _URL.search(line)
-            page = found[0].decode().partition("#")[0].rstrip("/") if found else None
-        async with aiohttp.ClientSession() as session, asyncio.TaskGroup() as group:
-            for _ in range(VIEWERS):
-                group.create_task(_view(session, page))
+            address = found[0].decode() if found else None
+        yield address
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
         await process.wait()
 
 
-async def _view(session: aiohttp.ClientSession, page: str) -> None:
+async def _view(session: aiohttp.ClientSession, address: str) -> None:
+    page = address.partition("#")[0].rstrip("/")
     async with session.ws_connect(f"{page}/ws", headers={"Origin": page}) as socket:
         async for _ in socket:
             pass
@@ -117,7 +154,7 @@ async def _until_ended(load: Callable[[str, str], Awaitable[None]], url: str, ve
         await task
 
 
-LOADS = {"viewers": viewers, "noise": noise, "rubbish": rubbish}
+LOADS = {"viewers": viewers, "person": person, "noise": noise, "rubbish": rubbish}
 
 if __name__ == "__main__":
     os.nice(_NICE)

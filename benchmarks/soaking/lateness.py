@@ -6,9 +6,8 @@ import asyncio
 import json
 import os
 import signal
-import time
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from mcap.reader import make_reader
 
 from companion.clock import flight_clock
 from companion.core import NOMINAL_DT_S
+from companion.event_loop import run
 from companion.realtime import FLIGHT_PRIORITY, claim_realtime
 from companion.ticker import Ticker
 
@@ -100,23 +100,37 @@ def ticks_of_log(path: Path) -> Ticks:
     return Ticks(minutes.finish(), count, minutes.missed, max(0, wanted - count))
 
 
-def run_empty_loop(path: Path) -> None:
-    """Tick as a flight does, with its priority, and do nothing; until SIGTERM. Then write the minutes as JSON."""
-    path.write_text(json.dumps(asyncio.run(_empty_loop())))
+def tick_for_nothing(take: Callable[[float, float], None]) -> int:
+    """Tick as a flight does, with its event loop, ticker and priority, and do nothing else, until SIGTERM or until the process that
+    started this one is gone.
+
+    Args:
+        take: called with every tick's start (`time.monotonic`) and lateness, s.
+
+    Returns:
+        Deadlines that passed without a tick.
+    """
+    return run(_tick_for_nothing(take))
 
 
-async def _empty_loop() -> dict[str, Any]:
+async def _tick_for_nothing(take: Callable[[float, float], None]) -> int:
     over = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, over.set)
-    origin_s = time.monotonic()
     claim_realtime(FLIGHT_PRIORITY)
-    ticker, minutes = Ticker(NOMINAL_DT_S, flight_clock(origin_s)), Minutes()
+    ticker = Ticker(NOMINAL_DT_S, flight_clock(0.0))
     parent = os.getppid()
     while not over.is_set() and os.getppid() == parent:
         tick = await ticker.next()
-        minutes.take(tick.start_s, tick.lateness_s)
+        take(tick.start_s, tick.lateness_s)
+    return ticker.skipped
+
+
+def run_empty_loop(path: Path) -> None:
+    """`tick_for_nothing`, then write the minutes as JSON."""
+    minutes = Minutes()
+    skipped = tick_for_nothing(minutes.take)
     rows = [[m.begin_s, m.ticks, m.p50, m.p99, m.max] for m in minutes.finish()]
-    return {"minutes": rows, "missed": minutes.missed, "skipped": ticker.skipped}
+    path.write_text(json.dumps({"minutes": rows, "missed": minutes.missed, "skipped": skipped}))
 
 
 def read_minutes(rows: Iterable[list[float]]) -> list[Minute]:

@@ -30,6 +30,8 @@ class Usage:
     """Resident memory, shared pages included, 1e6 bytes."""
     cpu_s: float
     """User and system time since its start."""
+    minor_faults: int
+    """Pages that the kernel had to map in since its start, without reading from disk."""
 
 
 def family(root_pid: int) -> dict[str, int]:
@@ -70,7 +72,7 @@ def usage(pid: int) -> Usage | None:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except (OSError, IndexError):
         return None
-    return Usage(pages * _PAGE_BYTES / 1e6, (int(fields[11]) + int(fields[12])) / _CLOCK_TICKS)
+    return Usage(pages * _PAGE_BYTES / 1e6, (int(fields[11]) + int(fields[12])) / _CLOCK_TICKS, int(fields[7]))
 
 
 def pss_mb(pid: int) -> float | None:

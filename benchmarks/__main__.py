@@ -1,0 +1,257 @@
+"""Everything that is promised of timing and cost, measured beside something bare: one command, one page.
+
+    python -m benchmarks                      # everything: 14 minutes, 10 of them a hover
+    python -m benchmarks --quick              # the hover lasts one minute
+    python -m benchmarks --only core          # one part, beside what an earlier run has left of the others
+    python -m benchmarks --page               # docs/benchmarks.md from the last run; nothing is measured
+
+Leaves results.json and results.md in --out, and what each part left in a folder of its own there. Every part runs in a process of its
+own and is written down as soon as it is measured: one that fails is a line on the page and ends no other. Ctrl-C lands the flight,
+ends everything that was started, and keeps what was measured. Exit code 0 only if everything was measured and every target is met.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import json
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks.measuring.figures import problems
+from benchmarks.measuring.page import markdown, show
+from benchmarks.measuring.rows import sections
+from companion.recording.versions import versions
+
+ROOT = Path(__file__).parents[1]
+OUT = ROOT / "build" / "benchmarks"
+PAGE = ROOT / "docs" / "benchmarks.md"
+DEADLINE_S = {"core": 300.0, "joints": 120.0, "setpoint": 900.0, "hover": 1500.0}
+"""Of each part, in the order in which they run: the longest comes last."""
+LAND_S = 400.0
+"""What a part may take to end in order: its flight lands."""
+SAMPLES, QUICK_SAMPLES = 4000, 1000
+VERSIONS = ("companion", "git", "python", "mavsdk", "pymavlink", "dynamixel-sdk", "mujoco")
+
+Say = Callable[[str], None]
+
+
+# --- in the process of a part -------------------------------------------------------------------------------------------------------
+
+
+def _core(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
+    from benchmarks.measuring.core import REPEATS, measure
+
+    return measure(say, 2 if quick else REPEATS)
+
+
+def _joints(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
+    from benchmarks.measuring.bus import bare_dynamixel, bare_dynamixel_in_world
+    from benchmarks.measuring.hovering import MISSION
+    from benchmarks.measuring.latency import WARM_UP
+
+    cycles = (QUICK_SAMPLES if quick else SAMPLES) + WARM_UP
+    say("bare dynamixel-sdk, a bus of its own")
+    alone = bare_dynamixel(cycles)
+    say("bare dynamixel-sdk, the world's bus")
+    in_world = bare_dynamixel_in_world(cycles, MISSION, folder)
+    return {"alone": {**asdict(alone), "wire_ms": alone.wire_ms}, "in_world": asdict(in_world)}
+
+
+def _setpoint(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
+    from benchmarks.measuring.setpoint import measure
+
+    return measure(QUICK_SAMPLES if quick else SAMPLES, say)
+
+
+def _hover(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
+    from benchmarks.measuring.hover import HOVER_S, QUICK_HOVER_S, measure
+
+    return measure(folder, QUICK_HOVER_S if quick else HOVER_S, say)
+
+
+PARTS = {"core": _core, "joints": _joints, "setpoint": _setpoint, "hover": _hover}
+
+
+def run_part(name: str, folder: Path, quick: bool) -> int:
+    """Measure one part in this process and leave its figures in its folder."""
+
+    def say(text: str) -> None:
+        print(f"  {name}: {text}", flush=True)
+
+    try:
+        figures = PARTS[name](folder, quick, say)
+    except KeyboardInterrupt:
+        return 130
+    except Exception as error:  # whatever it was, it is one line on the page, and the other parts go on
+        print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)
+        return 1
+    _write(folder / "figures.json", json.dumps(figures, indent=1) + "\n")
+    return 0
+
+
+# --- in the process that the user started -------------------------------------------------------------------------------------------
+
+
+def measure(name: str, out: Path, quick: bool) -> dict[str, Any]:
+    """Run a part in a process of its own; its entry in the results, with why it failed if it did."""
+    folder = out / name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    words = ["--part", name, "--out", str(out), *(["--quick"] if quick else [])]
+    begun_s = time.monotonic()
+    with (folder / "stderr.txt").open("wb") as stderr:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks", *words], cwd=ROOT, stderr=stderr, start_new_session=True
+        )
+        try:
+            code = process.wait(DEADLINE_S[name])
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            _end(process)
+    entry: dict[str, Any] = {
+        "quick": quick,
+        "took_s": round(time.monotonic() - begun_s, 1),
+        "failed": None,
+        "figures": {},
+    }
+    if code is None:
+        entry["failed"] = f"it took longer than {DEADLINE_S[name]:g} s"
+    elif code != 0:
+        said = (folder / "stderr.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        entry["failed"] = said[-1] if said else f"it ended with exit code {code}"
+    else:
+        entry["figures"] = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
+    return entry
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """A part that still runs ends in order, however often Ctrl-C is pressed meanwhile; one that cannot is killed."""
+    if process.poll() is not None:
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    print("  ending what was started: a flight lands first", flush=True)
+    try:
+        process.send_signal(signal.SIGINT)
+        process.wait(LAND_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def read_results(out: Path) -> dict[str, Any]:
+    """What an earlier run has left; nothing: no parts."""
+    try:
+        found: dict[str, Any] = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {"parts": {}}
+    return found
+
+
+def write_results(results: Mapping[str, Any], out: Path) -> None:
+    """Both files, each whole or not at all."""
+    tables = tables_of(results)
+    rows = [
+        {**asdict(row), "ratios": row.ratios, "verdict": row.verdict.strip("*")}
+        for table in tables
+        for row in table.rows
+    ]
+    _write(out / "results.json", json.dumps({**results, "rows": rows}, indent=1) + "\n")
+    _write(out / "results.md", markdown(results, tables))
+
+
+def tables_of(results: Mapping[str, Any]) -> Sequence[Any]:
+    """The tables of all parts."""
+    parts: Mapping[str, Any] = results["parts"]
+    return sections(
+        {name: {"not_measured": part["failed"]} if part["failed"] else part["figures"] for name, part in parts.items()}
+    )
+
+
+def _write(path: Path, text: str) -> None:
+    scratch = path.with_suffix(".new")
+    scratch.write_text(text, encoding="utf-8")
+    scratch.replace(path)
+
+
+def about() -> dict[str, Any]:
+    """Date, computer, versions."""
+    found = versions()
+    if "git" in found:
+        found["git"] = found["git"][:12] + found["git"][40:]  # and "-dirty"
+    cpu = platform.machine()
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        cpu = next(line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model")))
+    return {
+        "date": datetime.date.today().isoformat(),
+        "computer": f"{cpu}, {os.cpu_count()} cores, Linux {platform.release()}",
+        "versions": {name: found[name] for name in VERSIONS if name in found},
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument(
+        "--only", action="append", choices=list(PARTS), metavar="NAME", help=f"this part: {', '.join(PARTS)}"
+    )
+    parser.add_argument("--quick", action="store_true", help="a minute of hover instead of ten, fewer samples")
+    parser.add_argument(
+        "--out", type=Path, default=OUT, metavar="DIR", help="for results and logs (default: build/benchmarks)"
+    )
+    parser.add_argument(
+        "--page", action="store_true", help="write docs/benchmarks.md from what lies there; measure nothing"
+    )
+    parser.add_argument("--part", choices=list(PARTS), help=argparse.SUPPRESS)
+    options = parser.parse_args(argv)
+    out: Path = options.out.resolve()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background a shell has it ignored
+    if options.part is not None:
+        return run_part(options.part, out / options.part, options.quick)
+    results = read_results(out)
+    if options.page:
+        if not results["parts"]:
+            parser.exit(2, f"benchmarks: {options.out} holds no results; run python -m benchmarks first\n")
+        _write(PAGE, markdown(results, tables_of(results)))
+        print(PAGE)
+        return 0
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    names = options.only or list(PARTS)
+    results = {"made": about(), "parts": results["parts"] if options.only else {}}
+    out.mkdir(parents=True, exist_ok=True)
+    console = Console()
+    try:
+        for number, name in enumerate(names, 1):
+            console.print(f"{number}/{len(names)} {name}", highlight=False)
+            results["parts"][name] = entry = measure(name, out, options.quick)
+            write_results(results, out)
+            if entry["failed"]:
+                console.print(
+                    f"  {name} was not measured: {entry['failed']}", style="red", highlight=False, soft_wrap=True
+                )
+    except KeyboardInterrupt:
+        console.print(f"ended; what was measured is in {options.out}", highlight=False)
+        return 130
+    tables = tables_of(results)
+    show(results, tables, console if console.is_terminal else Console(width=200))
+    print(f"{options.out}/results.md")
+    return 1 if problems(tables) or any(part["failed"] for part in results["parts"].values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""What runs beside a flight, each in a process of its own, for the same minutes.
+
+python -m benchmarks.measuring.beside empty FILE          # ticks for nothing until SIGTERM; start and lateness of each, s, as .npy
+python -m benchmarks.measuring.beside bare FILE FRAMES    # receives and sends on native MAVSDK; its latency as JSON
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from array import array
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measuring.wires import bare_mavsdk
+from benchmarks.soaking.lateness import tick_for_nothing
+
+
+def empty(path: Path) -> None:
+    """An empty loop; rows of the array: `time.monotonic` at the start of each tick, and how late it was."""
+    starts_s, lateness_s = array("d"), array("d")
+
+    def take(start_s: float, late_s: float) -> None:
+        starts_s.append(start_s)
+        lateness_s.append(late_s)
+
+    tick_for_nothing(take)
+    np.save(path, np.array([starts_s, lateness_s]))
+
+
+def bare(path: Path, frames: int) -> None:
+    """The bare loop, and the process at the other end of its wires."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    inside, wire = bare_mavsdk(frames)
+    path.write_text(json.dumps({"inside": asdict(inside), "wire": asdict(wire)}), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "empty":
+        empty(Path(sys.argv[2]))
+    else:
+        bare(Path(sys.argv[2]), int(sys.argv[3]))

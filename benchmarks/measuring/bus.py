@@ -1,0 +1,175 @@
+"""Joint read -> current write, by nothing but dynamixel-sdk."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measuring.far_end import stand_apart
+from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
+from companion.config.loader import load_flight
+from companion.event_loop import run
+from companion.sitl_process import SitlProcess
+
+# Present current, velocity and position of an XM430 lie together (126, 10 bytes); goal current is 102.
+_PRESENT_ADDRESS, _PRESENT_BYTES, _GOAL_CURRENT_ADDRESS, _GOAL_CURRENT_BYTES = 126, 10, 102, 2
+_RETURN_DELAY_ADDRESS = 9
+_BAUD_BPS = 3_000_000
+_SERVO_IDS = (1, 2)
+FAILED_MAX = 0.1
+"""Share of cycles without an answer up to which the others count; a computer that is held up as a whole misses some."""
+
+
+def _servos(parent: Connection) -> None:
+    """Two emulated servos on a pty until the parent says stop."""
+    from sitl.servo_bus import ServoBus
+    from sitl.servo_model import ServoModel
+
+    stand_apart()
+
+    async def serve() -> None:
+        async with ServoBus([ServoModel(servo_id, baud_bps=_BAUD_BPS) for servo_id in _SERVO_IDS]) as bus:
+            parent.send(bus.path)
+            await asyncio.to_thread(parent.poll, 10 * DEADLINE_S)
+
+    run(serve())
+
+
+@dataclass(frozen=True, slots=True)
+class BusCycles:
+    """Sync read, then sync write, by nothing but dynamixel-sdk."""
+
+    command_ms: Latency
+    """Read done -> write done."""
+    cycle_ms: Latency
+    """Read begun -> write done."""
+    failed: int
+    """Cycles without an answer; they do not count."""
+    request_bytes: int
+    """On the wire in one cycle: the read's packet, the answers of all servos, the write's packet."""
+    answer_bytes: int
+    write_bytes: int
+    baud_bps: int = _BAUD_BPS
+
+    @property
+    def wire_ms(self) -> float:
+        """What one cycle takes on the wire at the least: every byte is sent one after the other, 10 bits each."""
+        return 1e4 * (self.request_bytes + self.answer_bytes + self.write_bytes) / self.baud_bps
+
+
+def bare_dynamixel(cycles: int) -> BusCycles:
+    """Against two emulated servos, and nothing else in their process."""
+    spawn = multiprocessing.get_context("spawn")
+    here, there = spawn.Pipe()
+    bus = spawn.Process(target=_servos, args=(there,))
+    bus.start()
+    try:
+        if not here.poll(DEADLINE_S):
+            raise RuntimeError("the emulated servo bus did not start")
+        return _bus_cycles(here.recv(), cycles)
+    finally:
+        here.send("stop")
+        bus.join(5.0)
+        if bus.is_alive():
+            bus.terminate()
+            bus.join()
+
+
+def bare_dynamixel_in_world(cycles: int, mission: Path, folder: Path) -> BusCycles:
+    """The same against the servo bus that a flight meets: that of a simulated world, whose process has more to do.
+
+    Args:
+        cycles: how many.
+        mission: where the machine stands.
+        folder: for what the world writes.
+
+    Raises:
+        LaunchError: the world did not start.
+    """
+    world = SitlProcess(load_flight(mission), folder)
+    try:
+        return _bus_cycles(world.devices()["arm"]["port"], cycles)
+    finally:
+        world.stop()
+
+
+def _bus_cycles(path: str, cycles: int) -> BusCycles:
+    """dynamixel-sdk's sync read then sync write at 200 Hz, without a real-time priority: it asks the port again and again without a
+    pause, and with one it would keep the kernel's own thread from bringing the answer."""
+    from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
+
+    port, packet = PortHandler(path), PacketHandler(2.0)
+    if not port.openPort() or not port.setBaudRate(_BAUD_BPS):
+        raise RuntimeError(f"dynamixel-sdk cannot open {path}")
+    try:
+        for servo_id in _SERVO_IDS:
+            packet.write1ByteTxRx(
+                port, servo_id, _RETURN_DELAY_ADDRESS, 0
+            )  # 0.5 ms each by default; the companion does so, too
+        read = GroupSyncRead(port, packet, _PRESENT_ADDRESS, _PRESENT_BYTES)
+        write = GroupSyncWrite(port, packet, _GOAL_CURRENT_ADDRESS, _GOAL_CURRENT_BYTES)
+        for servo_id in _SERVO_IDS:
+            read.addParam(servo_id)
+            write.addParam(servo_id, bytes(_GOAL_CURRENT_BYTES))
+
+        def cycle() -> tuple[float, float, float] | None:
+            begun_s = time.monotonic()
+            failed = read.txRxPacket()
+            read_s = time.monotonic()
+            if failed:
+                said.append(packet.getTxRxResult(failed))
+                return None
+            for servo_id in _SERVO_IDS:
+                position = read.getData(servo_id, 132, 4)
+                write.changeParam(servo_id, (position % 2).to_bytes(_GOAL_CURRENT_BYTES, "little"))
+            write.txPacket()
+            return begun_s, read_s, time.monotonic()
+
+        said: list[str] = []
+        times: list[tuple[float, float, float]] = []
+        due_s = time.monotonic()
+        for _ in range(cycles):
+            due_s += 1.0 / RATE_HZ
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            taken = cycle()
+            if taken is not None:
+                times.append(taken)
+        sent, received = _counted(port)
+        if cycle() is None or len(said) > FAILED_MAX * cycles:
+            raise RuntimeError(f"{len(said)} of {cycles} sync reads failed: {said[-1]}")
+    finally:
+        port.closePort()
+    request, written = sent
+    return BusCycles(
+        Latency.of(written_s - read_s for _, read_s, written_s in times[WARM_UP:]),
+        Latency.of(written_s - begun_s for begun_s, _, written_s in times[WARM_UP:]),
+        len(said),
+        request,
+        sum(received),
+        written,
+    )
+
+
+def _counted(port: Any) -> tuple[list[int], list[int]]:
+    """From now on: the length of everything that is written to a port, and of everything read from it."""
+    sent: list[int] = []
+    received: list[int] = []
+    write, read = port.writePort, port.readPort
+
+    def count_write(packet: Sequence[int]) -> Any:
+        sent.append(len(packet))
+        return write(packet)
+
+    def count_read(length: int) -> Any:
+        data = read(length)
+        received.append(len(data))
+        return data
+
+    port.writePort, port.readPort = count_write, count_read
+    return sent, received

@@ -1,0 +1,85 @@
+"""What was measured beside what, and whether it is as it must be: computed from the figures, never typed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+MET, NOT_MET, NOT_MEASURED = "met", "**not met**", "not measured"
+P50_P99 = ("p50", "p99")
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A limit for some of a row's figures."""
+
+    at_most: float
+    of: Sequence[str] = P50_P99
+    """Which figures."""
+    ratio: bool = True
+    """The limit is for the ratio to what was measured beside; False: for the figure itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of a table."""
+
+    what: str
+    """With its unit."""
+    beside: str
+    """Name of what was measured beside; empty: nothing."""
+    figures: Mapping[str, float]
+    """By statistic (p50, p99, ...); a single figure is `value`. Empty: not measured."""
+    beside_figures: Mapping[str, float] = field(default_factory=dict)
+    target: Target | None = None
+    why_not: str = ""
+    """Why a figure is missing, one line."""
+
+    @property
+    def ratios(self) -> dict[str, float]:
+        """Of every statistic that both have, to one that is not 0."""
+        return {
+            name: value / self.beside_figures[name]
+            for name, value in self.figures.items()
+            if self.beside_figures.get(name)
+        }
+
+    @property
+    def verdict(self) -> str:
+        """`MET`, `NOT_MET`, `NOT_MEASURED`, or empty: there is no target."""
+        if self.target is None:
+            return "" if self.figures else NOT_MEASURED
+        judged = self.ratios if self.target.ratio else self.figures
+        values = [judged.get(name) for name in self.target.of]
+        if any(value is None for value in values):
+            return NOT_MEASURED
+        return MET if all(value is not None and value <= self.target.at_most for value in values) else NOT_MET
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One table."""
+
+    title: str
+    how: Sequence[str]
+    """What was done, a paragraph each."""
+    statistics: Sequence[str]
+    """Columns, in order."""
+    rows: Sequence[Row]
+
+
+def problems(sections: Sequence[Section]) -> list[str]:
+    """Rows that have a target and do not meet it, or were not measured, one line each."""
+    found = []
+    for row in (row for section in sections for row in section.rows):
+        if row.target is not None and row.verdict != MET:
+            beside = f" beside {row.beside}" if row.beside else ""
+            found.append(f"{row.what}{beside}: {row.verdict.strip('*')}{f': {row.why_not}' if row.why_not else ''}")
+    return found
+
+
+def figure(value: float) -> str:
+    """Three digits that count; whole numbers as they are."""
+    if value == round(value):
+        return f"{value:.0f}"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

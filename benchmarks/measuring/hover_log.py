@@ -1,0 +1,72 @@
+"""What the log of a hover says about its ticks, read one chunk at a time."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from mcap.reader import make_reader
+
+from companion.analysis.timing import Stopwatch, Timing
+from companion.record import from_jsonable
+from companion.types import Inputs, Sent
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HoverLog:
+    """The ticks of one phase; times in s."""
+
+    timing: Timing
+    start_s: Array
+    """Of each tick, on the flight clock."""
+    start_to_setpoint_s: Array
+    """Of ticks that sent a setpoint."""
+    epoch_offset_s: float
+    """Wall clock at zero of the flight clock."""
+    realtime: str | None
+    """What the flight process got of the operating system; None: the log does not say."""
+
+
+def read_hover(path: Path, phase: str, settle_s: float) -> HoverLog:
+    """Read a log.
+
+    Args:
+        path: of flight.mcap, closed by its recorder.
+        phase: name of the phase.
+        settle_s: so much of its beginning is left out.
+
+    Raises:
+        ValueError: it has no such phase, or none that lasts longer than that.
+    """
+    stopwatch = Stopwatch()
+    start_s, setpoint_s = array("d"), array("d")
+    begun_s: float | None = None
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        inputs: Inputs | None = None
+        inside = False
+        for _, channel, message in reader.iter_messages(topics=["/inputs", "/outputs", "/sent"], log_time_order=False):
+            data = json.loads(message.data)
+            if channel.topic == "/outputs":
+                inside = data["phase"] == phase
+                begun_s = data["t_s"] if inside and begun_s is None else begun_s
+            elif channel.topic == "/inputs":
+                inputs = from_jsonable(Inputs, data)
+            elif inside and begun_s is not None and inputs is not None and data["start_s"] >= begun_s + settle_s:
+                sent = from_jsonable(Sent, data)
+                stopwatch.take(inputs, sent)
+                start_s.append(sent.start_s)
+                if sent.attitude_sent:
+                    setpoint_s.append(sent.setpoint_sent_s - sent.start_s)
+    if not start_s:
+        raise ValueError(f"{path}: no tick of the phase {phase!r} after its first {settle_s:g} s")
+    offset_s = int(metadata["companion"]["epoch_offset_ns"]) * 1e-9
+    realtime = metadata.get("realtime", {}).get("got")
+    return HoverLog(stopwatch.read(), np.array(start_s), np.array(setpoint_s), offset_s, realtime)

@@ -1,0 +1,73 @@
+"""A flight that hovers over real wires for as long as somebody else measures."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.support import PATIENT, ROOT, set_options
+
+MISSION = ROOT / "configs/missions/hover.yaml"
+HOVER = "hold"
+"""Its phase that is made longer."""
+START_TIMEOUT_S, END_TIMEOUT_S = 60.0, 180.0
+BATTERY_MARGIN = 4.0
+"""The battery lives so many times as long as the hover."""
+LIMITS: dict[str, object] = {
+    **{key: value for key, value in PATIENT.items() if "mqtt" not in key},
+    "vehicle.safety.arm_timeout_s": 0.5,
+    "vehicle.safety.force_timeout_s": 0.6,
+    "vehicle.safety.guardian_timeout_s": 0.4,
+    "vehicle.safety.link_lag_max_s": 0.3,
+    "vehicle.safety.loop_stalled_s": 0.6,
+    "vehicle.safety.mocap_timeout_s": 0.4,
+    "vehicle.safety.vehicle_timeout_s": 0.6,
+    "vehicle.devices.arm.watchdog_ms": 400,
+}
+"""Wider than the vehicle file's, those of docs/soak.md: a shared machine is held up as a whole now and then. How well the flight gets
+over that is not what is measured here; how late it was is."""
+
+
+class NoFlight(Exception):
+    """It did not begin to hover; what it said."""
+
+
+def start_hover(folder: Path, hover_s: float, broker_url: str, *, report: bool = True) -> subprocess.Popen[bytes]:
+    """`companion fly`, in a process group of its own; what it prints goes to fly.txt, all else to flight/, both in the folder."""
+    command = [
+        *(sys.executable, "-m", "companion.cli", "fly", str(MISSION), "--sitl", "--mqtt", broker_url),
+        *("--out", str(folder / "flight"), *([] if report else ["--no-report"])),
+        *set_options(**LIMITS),
+        *set_options(**{"mission.phases[1].duration_s": hover_s, "world.battery_life_s": BATTERY_MARGIN * hover_s}),
+    ]
+    with said_path(folder).open("wb") as said:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+            cwd=ROOT,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        )
+
+
+def said_path(folder: Path) -> Path:
+    """What the flight printed."""
+    return folder / "fly.txt"
+
+
+def await_hover(flight: subprocess.Popen[bytes], folder: Path) -> None:
+    """Wait until it hovers.
+
+    Raises:
+        NoFlight: it has ended, or takes too long.
+    """
+    deadline_s = time.monotonic() + START_TIMEOUT_S
+    while f"  {HOVER}" not in (said := said_path(folder).read_text(encoding="utf-8", errors="replace")):
+        if flight.poll() is not None or time.monotonic() > deadline_s:
+            raise NoFlight(said.strip() or "it said nothing")
+        time.sleep(0.1)

@@ -1,0 +1,38 @@
+"""Durations as percentiles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+RATE_HZ = 200.0
+"""Of every loop that is measured."""
+WARM_UP = 100
+"""Turns of each bare loop that do not count."""
+DEADLINE_S = 30.0
+"""For everything that a bare loop waits for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Percentiles in ms."""
+
+    p50: float
+    p99: float
+    max: float
+    samples: int | None = None
+    p999: float | None = None
+
+    @classmethod
+    def of(cls, seconds: Iterable[float]) -> Latency:
+        """Percentiles of samples in s.
+
+        Raises:
+            ValueError: no samples.
+        """
+        ordered = sorted(seconds)
+        if not ordered:
+            raise ValueError("no samples: nothing came back over the wire")
+        last = len(ordered) - 1
+        p50, p99, p999, worst = (float(1e3 * ordered[round(part * last)]) for part in (0.5, 0.99, 0.999, 1.0))
+        return cls(p50, p99, worst, len(ordered), p999)

@@ -1,0 +1,237 @@
+"""The tables: which figure stands beside which, and the targets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from benchmarks.measuring import texts
+from benchmarks.measuring.figures import P50_P99, Row, Section, Target
+
+Figures = Mapping[str, Any]
+LATENESS = ("p50", "p99", "p99.9", "max")
+VALUE = ("value",)
+NO_PART = {"not_measured": "that part was not run"}
+
+
+def sections(parts: Mapping[str, Figures]) -> list[Section]:
+    """All tables.
+
+    Args:
+        parts: figures by part, as the parts return them; `{"not_measured": why}` of one that failed, missing: not run.
+    """
+    hover, setpoint, joints, core = (parts.get(name, NO_PART) for name in ("hover", "setpoint", "joints", "core"))
+    return [
+        _lateness(hover),
+        _late(hover),
+        _setpoints(hover, setpoint),
+        _joints(hover, joints),
+        _core(hover, core),
+        _cost(hover),
+    ]
+
+
+def _spread(found: Any) -> dict[str, float]:
+    """Statistics of a `Latency` as it was written down."""
+    if not isinstance(found, Mapping):
+        return {}
+    names = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
+    return {name: float(found[key]) for name, key in names.items() if found.get(key) is not None}
+
+
+def _at(found: Any, *keys: str) -> Any:
+    """Nested figures; None: not there."""
+    for key in keys:
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return found
+
+
+def _value(found: Any) -> dict[str, float]:
+    return {} if found is None else {"value": float(found)}
+
+
+def _why(*found: Any) -> str:
+    """The first reason that any of them gives for not being there."""
+    return next((str(f["not_measured"]) for f in found if isinstance(f, Mapping) and "not_measured" in f), "")
+
+
+def _lateness(hover: Figures) -> Section:
+    row = Row(
+        "lateness of a tick, ms",
+        "empty loop",
+        _spread(_at(hover, "flight", "lateness_ms")),
+        _spread(_at(hover, "empty", "lateness_ms")),
+        Target(1.5, ("p99",)),
+        _why(hover),
+    )
+    return Section("Ticks", texts.TICKS, LATENESS, [row])
+
+
+def _late(hover: Figures) -> Section:
+    why = _why(hover)
+    alone = _at(hover, "late_alone")
+    own = Row(
+        "later than two periods while the empty loop was not late",
+        "",
+        _value(None if alone is None else len(alone)),
+        {},
+        Target(0.0, VALUE, ratio=False),
+        why,
+    )
+    counted = [
+        Row(what, "empty loop", _value(_at(hover, "flight", key)), _value(_at(hover, "empty", key)), None, why)
+        for what, key in (
+            ("ticks", "ticks"),
+            ("later than one period", "later_than_one"),
+            ("later than two periods", "later_than_two"),
+            ("deadlines without a tick", "skipped"),
+        )
+    ]
+    return Section("Late ticks", texts.LATE, VALUE, [own, *counted])
+
+
+def _setpoints(hover: Figures, loops: Figures) -> Section:
+    bare, grpc, native = _at(hover, "bare"), _at(loops, "grpc") or loops, _at(loops, "native") or loops
+    flight = _spread(_at(hover, "setpoint_ms"))
+    what = "mocap to setpoint, ms: flight"
+    rows = [
+        Row(
+            what,
+            "bare loop on native MAVSDK, in the same minutes",
+            flight,
+            _spread(_at(bare, "inside")),
+            Target(1.5),
+            _why(hover, bare),
+        ),
+        Row(what, "bare loop over gRPC", flight, _spread(_at(grpc, "wire")), Target(0.2), _why(hover, loops, grpc)),
+        Row(
+            "tick begun to setpoint, ms: flight",
+            "bare loop on native MAVSDK, in the same minutes",
+            _spread(_at(hover, "start_to_setpoint_ms")),
+            _spread(_at(bare, "inside")),
+            None,
+            _why(hover, bare),
+        ),
+    ]
+    for which, end in (("inside", "to setpoint"), ("wire", "to setpoint, wire to wire")):
+        for name, key in (
+            ("the companion's edge alone", "edge"),
+            ("pymavlink echo", "pymavlink"),
+            ("bare loop over gRPC", "grpc"),
+        ):
+            loop = _at(loops, key) or loops
+            rows.append(
+                Row(
+                    f"mocap {end}, ms: {name}",
+                    "bare loop on native MAVSDK",
+                    _spread(_at(loop, which)),
+                    _spread(_at(native, which)),
+                    None,
+                    _why(loops, loop, native),
+                )
+            )
+    return Section("Motion capture to setpoint", texts.SETPOINT, P50_P99, rows)
+
+
+def _joints(hover: Figures, joints: Figures) -> Section:
+    alone, in_world = (_at(joints, name) or joints for name in ("alone", "in_world"))
+    wire_ms = _at(alone, "wire_ms")
+    limit = {} if wire_ms is None else dict.fromkeys(P50_P99, float(wire_ms))
+    bare = "bare dynamixel-sdk, the world's bus"
+    rows = [
+        Row(
+            "joint read begun to currents written, ms: flight",
+            bare,
+            _spread(_at(hover, "bus_cycle_ms")),
+            _spread(_at(in_world, "cycle_ms")),
+            Target(1.3),
+            _why(hover, joints, in_world),
+        ),
+        Row(
+            "the same, ms: bare dynamixel-sdk, a bus of its own",
+            "bytes on the wire",
+            _spread(_at(alone, "cycle_ms")),
+            limit,
+            None,
+            _why(joints, alone),
+        ),
+        Row(
+            "answers there to currents written, ms: flight",
+            bare,
+            _spread(_at(hover, "read_to_write_ms")),
+            _spread(_at(in_world, "command_ms")),
+            None,
+            _why(hover, joints, in_world),
+        ),
+    ]
+    failed = [
+        f"{found['failed']} cycles of the bare loop on {where} found no answer and do not count."
+        for found, where in ((alone, "a bus of its own"), (in_world, "the world's bus"))
+        if found.get("failed")
+    ]
+    return Section("Servo bus", (*texts.BUS, *_bytes(alone), *failed), P50_P99, rows)
+
+
+def _bytes(found: Figures) -> list[str]:
+    if "wire_ms" not in found:
+        return []
+    counts = f"{found['request_bytes']} of the read, {found['answer_bytes']} of both answers, {found['write_bytes']} of the currents"
+    baud = f"{found['baud_bps'] / 1e6:g} Mbaud"
+    return [f"Bytes on the wire: {counts}; 10 bits each at {baud}: {found['wire_ms']:.3g} ms."]
+
+
+def _us(found: Any) -> dict[str, float]:
+    return {name: 1e3 * value for name, value in _spread(found).items() if name in P50_P99}
+
+
+def _core(hover: Figures, core: Figures) -> Section:
+    raw = _at(core, "raw_tick_us")
+    raw_us = {} if raw is None else {"p50": float(raw)}
+    why = _why(core)
+    tick = _us(_at(core, "core_ms"))
+    law, whole = _at(core, "law_us"), _at(core, "tick_us")
+    rows = [
+        Row("FlightCore.step, us", "raw MuJoCo", tick, raw_us, Target(100.0, ("p50",), ratio=False), why),
+        Row("the law alone, us", "raw MuJoCo", {} if law is None else {"p50": law}, raw_us, None, why),
+        Row(
+            "a tick of the fast closed loop, plant and all, us",
+            "raw MuJoCo",
+            {} if whole is None else {"p50": whole},
+            raw_us,
+            None,
+            why,
+        ),
+        Row(
+            "FlightCore.step in the flight, us",
+            "the fast closed loop",
+            _us(_at(hover, "core_ms")),
+            tick,
+            None,
+            _why(hover, core),
+        ),
+    ]
+    return Section("Computing", texts.CORE, P50_P99, rows)
+
+
+def _cost(hover: Figures) -> Section:
+    why = _why(hover)
+
+    def of(role: str, key: str) -> dict[str, float]:
+        return _value(_at(hover, "processes", role, key))
+
+    rows = []
+    for what, key, at_most in (
+        ("CPU time of the flight process, %", "cpu_percent", 25.0),
+        ("the same, its worst second, %", "cpu_percent_worst", None),
+        ("memory of the flight process (RSS, its most), MB", "rss_mb", 150.0),
+        ("minor page faults of the flight process, a second", "minor_faults_s", None),
+    ):
+        target = None if at_most is None else Target(at_most, VALUE, ratio=False)
+        rows.append(Row(what, "empty loop", of("flight", key), of("empty loop", key), target, why))
+    for role in ("recorder", "guardian", "bare loop"):
+        rows.append(
+            Row(f"CPU time of the {role}, %", "flight", of(role, "cpu_percent"), of("flight", "cpu_percent"), None, why)
+        )
+    for role in ("recorder", "guardian"):
+        rows.append(Row(f"memory of the {role}, MB", "flight", of(role, "rss_mb"), of("flight", "rss_mb"), None, why))
+    return Section("What it costs", texts.COST, VALUE, rows)
