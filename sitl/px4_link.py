@@ -133,7 +133,8 @@ class SimulatorLink:
         if self._peer is not None:
             self._peer.close()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._peer.closed.wait(), 1.0)
+                async with asyncio.timeout(1.0):
+                    await self._peer.closed.wait()
 
     @property
     def port(self) -> int:

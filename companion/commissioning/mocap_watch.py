@@ -63,7 +63,8 @@ class MocapWatch(NatNetMocap):
     async def _wait_for_body(self) -> None:
         """Any frame will do; without one the edge's own words say what is wrong."""
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._any_frame.wait(), self._body_timeout_s)
+            async with asyncio.timeout(self._body_timeout_s):
+                await self._any_frame.wait()
             return
         self._body_timeout_s, waited_s = 0.0, self._body_timeout_s
         try:

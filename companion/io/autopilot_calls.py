@@ -32,7 +32,8 @@ class NativeCalls:
         future = self._worker.submit(call, *args)
         self._last = future
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(future), deadline_s)
+            async with asyncio.timeout(deadline_s):
+                return await asyncio.wrap_future(future)
         except TimeoutError:
             found = f"no answer within {deadline_s:g} s"
             raise device_error(self._address, expected, found, "check the link") from None

@@ -121,7 +121,8 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
     handle = mavsdk.first_autopilot_async(timeout_s, lambda system: loop.call_soon_threadsafe(resolve, system))
     try:
         # MAVSDK keeps the deadline; this one only guards against MAVSDK.
-        system = await asyncio.wait_for(found, timeout_s + 2.0)
+        async with asyncio.timeout(timeout_s + 2.0):
+            system = await found
     except TimeoutError:
         system = None
     finally:

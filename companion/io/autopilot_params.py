@@ -149,7 +149,8 @@ class ParamTransfer:
                         self._ask(name)
                     changed.clear()
                     with contextlib.suppress(TimeoutError):  # then it is time to look what is overdue
-                        await asyncio.wait_for(changed.wait(), ANSWER_S / 4)
+                        async with asyncio.timeout(ANSWER_S / 4):
+                            await changed.wait()
         except TimeoutError:
             expected = f"PX4's parameters ({len(wanted)} of them, first {wanted[0]})"
             found = f"{len(queries.answered)} within {READ_DEADLINE_S:g} s"

@@ -194,12 +194,13 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         if self.is_open:
             self.closePort()
         try:
-            # A write that cannot proceed means that nobody is there; it must not block the bus thread for ever.
+            # A write that cannot proceed means that nobody is there; it must not block the bus thread for ever. Not shorter:
+            # pyserial looks at the time after a write that succeeded, too, and the process may have been held up meanwhile.
             self.ser = serial.Serial(
                 self.port_name,
                 cflag_baud,
                 timeout=_POLL_MS * 1e-3,
-                write_timeout=0.02,
+                write_timeout=0.1,
                 exclusive=True,
                 bytesize=serial.EIGHTBITS,
             )

@@ -268,7 +268,8 @@ class RobotousForceTorque:
             collector.full.set()
         try:
             with suppress(TimeoutError):
-                await asyncio.wait_for(collector.full.wait(), deadline_s)
+                async with asyncio.timeout(deadline_s):
+                    await collector.full.wait()
         finally:
             self._collectors.remove(collector)
         return collector.samples

@@ -160,7 +160,8 @@ class NatNetMocap:
         loop = asyncio.get_running_loop()
         request = loop.getaddrinfo(self._device.server, None, family=socket.AF_INET, type=socket.SOCK_DGRAM)
         try:
-            found = await asyncio.wait_for(request, self._connect_timeout_s)
+            async with asyncio.timeout(self._connect_timeout_s):
+                found = await request
         except (TimeoutError, socket.gaierror):
             raise DeviceError(
                 f"{self._where}: the name cannot be resolved; put the Motive machine's IPv4 address into devices.mocap.server"
@@ -226,7 +227,8 @@ class NatNetMocap:
                 ) from None
             # A lost datagram is normal on UDP: the request is repeated until the deadline.
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._info_changed.wait(), min(_CONNECT_PERIOD_S, remaining_s))
+                async with asyncio.timeout(min(_CONNECT_PERIOD_S, remaining_s)):
+                    await self._info_changed.wait()
         return self._info
 
     def _check_server(self, info: ServerInfo) -> NatNetVersion:
@@ -255,7 +257,8 @@ class NatNetMocap:
     async def _wait_for_body(self) -> None:
         device = self._device
         try:
-            await asyncio.wait_for(self._body_tracked.wait(), self._body_timeout_s)
+            async with asyncio.timeout(self._body_timeout_s):
+                await self._body_tracked.wait()
             return
         except TimeoutError:
             pass

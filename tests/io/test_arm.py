@@ -31,6 +31,8 @@ from companion.types import ArmState
 from sitl.servo_bus import ServoBus
 from sitl.servo_model import ServoModel
 
+pytestmark = pytest.mark.waits
+
 KT = 1.3
 NM_PER_COUNT = KT * 2.69e-3
 JOINTS = (

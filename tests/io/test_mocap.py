@@ -23,6 +23,8 @@ from companion.io.natnet import Message, NatNetVersion
 from companion.types import MocapPose, Quat, Vec3
 from sitl.natnet import BodyPose, NatNetServer, encode_frame
 
+pytestmark = pytest.mark.waits
+
 GROUP = "239.255.42.99"
 POSE = BodyPose(1, (-1.25, 0.5, 1.0), (0.5, -0.5, 0.5, 0.5), error_m=0.00025)
 STRANGER = BodyPose(4, (3.0, 3.0, 0.0), (1.0, 0.0, 0.0, 0.0))
@@ -456,6 +458,22 @@ def test_port_in_use() -> None:
                 selfish.bind((GROUP, server.data_port))
                 text = await refusal(mocap(device_for(server, "multicast")))
                 assert f"cannot open UDP {GROUP}:{server.data_port}: another program holds the port" in text
+
+    asyncio.run(run())
+
+
+def test_given_up_in_the_moment_in_which_the_name_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        found: asyncio.Future[Any] = loop.create_future()
+        monkeypatch.setattr(loop, "getaddrinfo", lambda *_, **__: found)
+        device = MocapDevice(server="motive.invalid", interface="127.0.0.1", transport="unicast", rigid_body_id=1)
+        opening = asyncio.ensure_future(mocap(device).__aenter__())
+        await asyncio.sleep(0.0)
+        found.set_result([(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", 0))])
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
 
     asyncio.run(run())
 
