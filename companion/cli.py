@@ -4,29 +4,13 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import importlib
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion import (
-    arm_command,
-    broker_command,
-    command_command,
-    compare_command,
-    faults_command,
-    ft_command,
-    hover_command,
-    install_command,
-    latency_command,
-    mocap_command,
-    monitor_command,
-    px4_command,
-    report_command,
-    robustness_command,
-)
-from companion.campaign_command import why_unusable
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
@@ -35,6 +19,25 @@ from companion.installing.extras import lacking
 from companion.mission.check import check_mission
 from companion.planning_progress import PlanningProgress
 from companion.terminal import tell, terminal_console
+
+_WITH_MODULES = (
+    *(
+        "compare",
+        "robustness",
+        "faults",
+        "hover",
+        "install",
+        "arm",
+        "px4",
+        "mocap",
+        "ft",
+        "latency",
+        "monitor",
+        "command",
+    ),
+    *("broker", "report"),
+)
+"""Commands whose parsers stand beside what they do, in `companion.NAME_command`."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -50,8 +53,8 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `companion`."""
-    parser = _parser()
-    arguments, unknown = parser.parse_known_args(_normalised(list(sys.argv[1:] if argv is None else argv)))
+    words = _normalised(list(sys.argv[1:] if argv is None else argv))
+    arguments, unknown = _parser(words[:1]).parse_known_args(words)
     if unknown:
         tell(
             f"companion {arguments.command}: unknown arguments: {' '.join(unknown)}; see companion {arguments.command} --help"
@@ -95,7 +98,8 @@ def _normalised(argv: list[str]) -> list[str]:
     return out
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """All commands; if the first word of a command line names one, no others: to load them all takes half a second."""
     parser = _Parser(
         prog="companion", description="Flies an aerial manipulator on PX4 with adaptive impedance control."
     )
@@ -148,20 +152,10 @@ def _parser() -> argparse.ArgumentParser:
     sitl.add_argument("--px4", action="store_true", help="with a real PX4 (SITL) instead of our stub of it")
     sitl.set_defaults(run=_sitl)
 
-    compare_command.add_parser(commands)
-    robustness_command.add_parser(commands)
-    faults_command.add_parser(commands)
-    hover_command.add_parser(commands)
-    install_command.add_parser(commands)
-    arm_command.add_parser(commands)
-    px4_command.add_parser(commands)
-    mocap_command.add_parser(commands)
-    ft_command.add_parser(commands)
-    latency_command.add_parser(commands)
-    monitor_command.add_parser(commands)
-    command_command.add_parser(commands)
-    broker_command.add_parser(commands)
-    report_command.add_parser(commands)
+    alone = bool(first) and first[0] in {"replay", *commands.choices, *_WITH_MODULES}
+    for name in _WITH_MODULES:
+        if not alone or name == first[0]:
+            importlib.import_module(f"companion.{name}_command").add_parser(commands)
 
     replay = commands.add_parser(
         "replay", help="run the core on a log's inputs; exit 0 if every output is bit-identical"
@@ -208,6 +202,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _fly(arguments: argparse.Namespace) -> int:
+    from companion.campaign_command import why_unusable
     from companion.flight import run_flight
 
     if arguments.sitl not in (None, "stub", "px4"):

@@ -8,7 +8,8 @@ import threading
 from collections.abc import Collection
 from pathlib import Path
 
-from companion.config.computer import CPU_MAX
+CPU_MAX = 1023
+"""Largest number that sched_setaffinity(2) takes in its usual set (CPU_SETSIZE less one)."""
 
 
 def usable_cpus() -> tuple[int, ...]:

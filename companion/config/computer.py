@@ -7,9 +7,8 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from companion.config.base import Model
+from companion.cores import CPU_MAX
 
-CPU_MAX = 1023
-"""Largest number that sched_setaffinity(2) takes in its usual set (CPU_SETSIZE less one)."""
 Cpu = Annotated[int, Field(ge=0, le=CPU_MAX)]
 
 
