@@ -29,6 +29,9 @@ def add_parser(commands: Any) -> None:
         "nothing gets torque. Exit code 0: all is as the vehicle file says, 3: something is not.",
     )
     _add_common(scan)
+    scan.add_argument(
+        "--baud", type=int, metavar="RATE", help="look at this baud rate alone, which takes a second (default: at all)"
+    )
     scan.set_defaults(tool="scan")
 
     setup = parts.add_parser(

@@ -35,8 +35,8 @@ LED = Register(65, 1, "LED")
 
 PING_BYTES: Final = 14
 _WRITE_TIMEOUT_S = 1.0
-_REPLY_TIMEOUT_MS: Final = 30.0
-"""An FTDI adapter with its factory latency timer holds an answer back by 16 ms."""
+_REPLY_TIMEOUT_MS: Final = 100.0
+"""An FTDI adapter with its factory latency timer holds an answer back by 16 ms, a busy computer by more. Who is not there costs it."""
 _ERROR_NUMBER: Final = 0x7F
 
 

@@ -10,11 +10,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from companion.commissioning.arm_bus import BAUDS
 from companion.commissioning.arm_result import finish
 from companion.commissioning.arm_scan import Judgement, judge, scan, scan_json
 from companion.commissioning.arm_screen import ask, people_console, say, show_rows
 from companion.commissioning.arm_servo import Scan, settings
 from companion.commissioning.arm_setup import ServoPlan, SetupPlan, carry_out, plan
+from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
 from companion.exit_codes import EXIT_ABORTED
 from companion.preflight.rows import Level
@@ -25,10 +27,12 @@ def run_scan(arguments: argparse.Namespace, vehicle: Vehicle) -> int:
 
     Raises:
         DeviceError: the port does not open.
-        ConfigError: the proposed change does not fit the vehicle file.
+        ConfigError: the proposed change does not fit the vehicle file; --baud is no rate of these servos.
     """
+    if arguments.baud not in (None, *BAUDS):
+        raise ConfigError([f"--baud {arguments.baud}: expected one of {', '.join(map(str, BAUDS))}"])
     people = people_console(arguments.json)
-    found = _scan(people, vehicle)
+    found = _scan(people, vehicle, arguments.baud)
     judged = judge(found, vehicle)
     _show_servos(people, found, judged)
     show_rows(people, judged.rows, {f"arm.scan.joint{n}": f"joint {n}: settings" for n in (1, 2)})
@@ -121,7 +125,7 @@ def _left(people: Console, vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
     """What is not as it was to be, by another look at the bus, one line each."""
     say(people, "reading back")
     arm, device = vehicle.arm, vehicle.devices.arm
-    servos = {servo.servo_id: servo for servo in scan(device, everywhere=False).servos if servo.is_xm430}
+    servos = {servo.servo_id: servo for servo in scan(device, only=device.baud).servos if servo.is_xm430}
     lines: list[str] = []
     for one in wanted.servos:
         servo_id = arm.joints[one.joint].servo_id
@@ -138,11 +142,12 @@ def _left(people: Console, vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
     return lines
 
 
-def _scan(people: Console, vehicle: Vehicle) -> Scan:
+def _scan(people: Console, vehicle: Vehicle, baud: int | None = None) -> Scan:
     device = vehicle.devices.arm
-    say(people, f"{device.port}: every servo at every baud rate; nothing is written, nothing gets torque")
+    where = "every baud rate" if baud is None else f"{baud} baud alone"
+    say(people, f"{device.port}: every servo at {where}; nothing is written, nothing gets torque")
     with people.status("looking for servos") as status:
-        return scan(device, progress=lambda text: status.update(f"looking for servos at {text}"))
+        return scan(device, progress=lambda text: status.update(f"looking for servos at {text}"), only=baud)
 
 
 def _show_servos(people: Console, found: Scan, judged: Judgement) -> None:

@@ -54,7 +54,7 @@ class Judgement:
 
 
 def scan(
-    device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None, sysfs: Path = SYSFS, everywhere: bool = True
+    device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None, sysfs: Path = SYSFS, only: int | None = None
 ) -> Scan:
     """Ping at every baud rate and read what answers. Nothing is written, nothing gets torque.
 
@@ -62,19 +62,19 @@ def scan(
         device: its port; its baud rate is tried first.
         progress: told what is being tried.
         sysfs: where the kernel tells latency timers.
-        everywhere: False: at the device's baud rate alone.
+        only: the one baud rate to look at; None: all.
 
     Raises:
         DeviceError: the port does not open, or dies.
     """
-    usual = [device.baud, *(baud for baud in reversed(bus.BAUDS) if baud != device.baud)]
-    bauds = usual if everywhere else usual[:1]
+    all_bauds = [device.baud, *(baud for baud in reversed(bus.BAUDS) if baud != device.baud)]
+    bauds = all_bauds if only is None else [only]
     servos: list[FoundServo] = []
     garbled: list[int] = []
     tried: list[int] = []
     with ServoTalk(device.port) as talk:
         for baud in bauds:
-            if baud < bus.FACTORY_BAUD and len(servos) > 1:
+            if only is None and baud < bus.FACTORY_BAUD and len(servos) > 1:
                 break  # 5 s for a rate that nobody sets on purpose
             progress(f"{baud} baud")
             talk.open(baud)
@@ -134,7 +134,8 @@ def _changes(found: Scan, who: Assignment, arm: Arm, device: ArmDevice) -> dict[
 
 def _who_rows(found: Scan, who: Assignment, arm: Arm, one_at_a_time: bool) -> Iterator[Row]:
     told = [f"{servo.servo_id} at {servo.baud} baud" for servo in found.servos]
-    read = ", ".join(told) if told else f"nobody answers, from {min(found.bauds)} to {max(found.bauds)} baud"
+    one_rate = f"{found.bauds[0]} baud" if len(found.bauds) == 1 else ""
+    read = ", ".join(told) if told else f"nobody answers, {f'at {one_rate}' if one_rate else _span(found.bauds)}"
     wanted = " and ".join(str(joint.servo_id) for joint in arm.joints)
     missing = [index for index, servo in enumerate(who.joints) if servo is None]
     one = f"connect only the servo of joint 1: {_SETUP} --joint 1; then only that of joint 2: {_SETUP} --joint 2"
@@ -154,9 +155,10 @@ def _who_rows(found: Scan, who: Assignment, arm: Arm, one_at_a_time: bool) -> It
         yield IDS.bad(read, wanted, one)
     elif missing:
         ids = " and ".join(str(arm.joints[index].servo_id) for index in missing)
-        yield IDS.bad(
-            read, wanted, f"servo {ids} does not answer at any baud rate: check its power and both plugs of its cable"
-        )
+        fix = f"servo {ids} does not answer at any baud rate: check its power and both plugs of its cable"
+        if one_rate:
+            fix = f"servo {ids} does not answer at {one_rate}: companion arm scan without --baud looks at all rates"
+        yield IDS.bad(read, wanted, fix)
     else:
         yield IDS.good(read, wanted)
     strange = [servo for servo in found.servos if not servo.is_xm430]
@@ -169,6 +171,10 @@ def _who_rows(found: Scan, who: Assignment, arm: Arm, one_at_a_time: bool) -> It
             yield MODEL.bad(f"id {servo.servo_id}: model {servo.model}", "XM430-W210", fix)
     if found.servos and not strange:
         yield MODEL.good("XM430-W210", "XM430-W210")
+
+
+def _span(bauds: tuple[int, ...]) -> str:
+    return f"from {min(bauds)} to {max(bauds)} baud"
 
 
 def _baud_rows(found: Scan, device: ArmDevice) -> Iterator[Row]:

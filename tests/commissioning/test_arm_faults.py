@@ -28,6 +28,8 @@ OUT_OF_THE_BOX = {
     f"arm.scan.joint{n}.{name}" for n in (1, 2) for name in ("return_delay_time", "operating_mode")
 }  # fmt: skip
 HAND = "world.arm_hand=true"
+FILES = "3000000"
+"""The shipped vehicle file's baud rate: to look at it alone takes a second."""
 
 
 def test_servos_out_of_their_boxes_are_set_up_and_nothing_else_is_wrong(tmp_path: Path) -> None:
@@ -37,26 +39,24 @@ def test_servos_out_of_their_boxes_are_set_up_and_nothing_else_is_wrong(tmp_path
         assert {row_of(found, name)["fix"] for name in OUT_OF_THE_BOX} == {"companion arm setup"}
         code, left = one.json("setup")
         assert (code, left["outcome"]) == (EXIT_REFUSED, "not written"), "nobody could be asked"
-        assert bad_ids(one.json("scan")[1]) == OUT_OF_THE_BOX
+        assert bad_ids(one.json("scan", "--baud", FILES)[1]) == OUT_OF_THE_BOX
         code, done = one.json("setup", "--yes")
         assert (code, done["outcome"]) == (EXIT_OK, "written")
         changes = {change["register"]: (change["before"], change["after"]) for change in done["servos"][0]["changes"]}
         assert changes == {9: ("500 us", "0 us"), 11: ("3 (position)", "0 (current)")}
         assert one.json("setup", "--yes")[1]["outcome"] == "nothing to do"
-        assert one.json("scan")[0] == EXIT_OK
+        assert one.json("scan", "--baud", FILES)[0] == EXIT_OK
         one.assert_check_passes_the_arm()
 
 
 def test_a_wrong_id_is_found_and_the_file_or_the_servo_gives_way(tmp_path: Path) -> None:
     with rig(tmp_path, "world.servos=[{}, {id: 7}]") as one:
         assert not one.check_rows()["arm.device"]["ok"]
-        code, found = one.json("scan")
-        assert code == EXIT_REFUSED
+        before = one.vehicle.read_text(encoding="utf-8")
+        code, found = one.json("scan", "--write")
+        assert code == EXIT_REFUSED, "settings are still those of the box"
         assert row_of(found, "arm.scan.ids")["fix"].startswith("companion arm setup gives servo 7 the id 2")
         assert keys(found) == {"arm.joints[1].servo_id": 7}
-
-        before = one.vehicle.read_text(encoding="utf-8")
-        assert one.json("scan", "--write")[0] == EXIT_REFUSED, "settings are still those of the box"
         assert load_vehicle(one.vehicle).arm.joints[1].servo_id == 7
         assert Path(f"{one.vehicle}.bak").read_text(encoding="utf-8") == before
         one.assert_check_passes_the_arm()
@@ -77,6 +77,10 @@ def test_a_wrong_baud_rate_is_found_and_set_last(tmp_path: Path) -> None:
             (2, 1000000, 2),
         }
         assert row_of(found, "arm.scan.baud")["fix"] == "companion arm setup brings every servo to 3000000"
+        alone = one.json("scan", "--baud", "57600")[1]
+        assert (alone["bauds"], [servo["id"] for servo in alone["servos"]]) == ([57600], [4])
+        fix = "servo 1 and 2 does not answer at 57600 baud: companion arm scan without --baud looks at all rates"
+        assert row_of(one.json("scan", "--baud", FILES)[1], "arm.scan.ids")["fix"] == fix.replace("57600", FILES)
         code, done = one.json("setup", "--yes")
         assert code == EXIT_OK
         assert [[c["register"] for c in servo["changes"]] for servo in done["servos"]] == [[9, 11, 7, 8], [9, 11, 8]]
@@ -86,7 +90,7 @@ def test_a_wrong_baud_rate_is_found_and_set_last(tmp_path: Path) -> None:
 def test_servos_that_agree_on_another_baud_rate_may_be_what_the_file_says(tmp_path: Path) -> None:
     with rig(tmp_path, "world.servos=[{baud: 1000000, return_delay_us: 0, operating_mode: 0}, "
              "{baud: 1000000, return_delay_us: 0, operating_mode: 0}]") as one:  # fmt: skip
-        code, found = one.json("scan")
+        code, found = one.json("scan", "--baud", "1000000")
         assert (code, bad_ids(found), keys(found)) == (EXIT_REFUSED, {"arm.scan.baud"}, {"devices.arm.baud": 1000000})
         assert one.json("scan", "--write")[0] == EXIT_OK
         one.assert_check_passes_the_arm()
@@ -96,7 +100,7 @@ def test_two_servos_with_one_id_are_set_up_one_at_a_time(tmp_path: Path) -> None
     """As they come: both id 1 at 57600 baud. Nobody can write to one of them alone before one is unplugged."""
     (tmp_path / "both").mkdir()
     with rig(tmp_path / "both", "world.servos=[{baud: 57600}, {baud: 57600, id: 1}]") as one:
-        code, found = one.json("scan")
+        code, found = one.json("scan", "--baud", "57600")
         assert code == EXIT_REFUSED and found["garbled_at"] == [57600]
         assert "companion arm setup --joint 1" in row_of(found, "arm.scan.collision")["fix"]
         code, refused = one.json("setup", "--yes")
@@ -109,7 +113,7 @@ def test_two_servos_with_one_id_are_set_up_one_at_a_time(tmp_path: Path) -> None
         with rig(tmp_path / str(joint), f"world.servos={servos}") as one:
             code, done = one.json("setup", "--yes", "--joint", str(joint))
             assert (code, done["outcome"]) == (EXIT_OK, "written")
-            code, found = one.json("scan")
+            code, found = one.json("scan", "--baud", FILES)
             assert [(servo["id"], servo["baud"]) for servo in found["servos"]] == [(joint, 3000000)]
             assert code == EXIT_REFUSED and bad_ids(found) == {"arm.scan.ids"}, "the other one is not there"
 
@@ -179,7 +183,7 @@ def test_ctrl_c_leaves_the_arm_limp(tmp_path: Path) -> None:
             running.signal(signal.SIGINT)
             ended = running.end()
         assert ended.code == EXIT_ABORTED and ended.err_lines == ["companion arm: interrupted"], ended
-        limp = scan(load_vehicle(one.vehicle, [f"vehicle.devices.arm.port={one.port}"]).devices.arm, everywhere=False)
+        limp = scan(load_vehicle(one.vehicle, [f"vehicle.devices.arm.port={one.port}"]).devices.arm, only=int(FILES))
         assert [servo.as_json()["torque_on"] for servo in limp.servos] == [False, False]
         assert [servo.as_json()["watchdog"] for servo in limp.servos] == ["off", "off"]
         one.sandbox.assert_nobody_left()
@@ -204,7 +208,7 @@ def test_an_adapter_with_the_factory_latency_timer_is_found(tmp_path: Path) -> N
             timer.parent.mkdir(parents=True, exist_ok=True)
             timer.write_text(latency, encoding="utf-8")
             vehicle = load_vehicle(SHIPPED, [f"vehicle.devices.arm.port={bus.path}"])
-            found = await asyncio.to_thread(scan, vehicle.devices.arm, sysfs=tmp_path, everywhere=False)
+            found = await asyncio.to_thread(scan, vehicle.devices.arm, sysfs=tmp_path, only=int(FILES))
             return {row.id: row.fix for row in judge(found, vehicle).rows if not row.ok and row.read.endswith(" ms")}
 
     assert asyncio.run(look("16\n")).keys() == {"arm.scan.usb_latency"}
@@ -223,6 +227,14 @@ def test_a_port_that_is_not_there_is_one_line(tmp_path: Path, tool: str, capsys:
     )
     err = capsys.readouterr().err.splitlines()
     assert code == EXIT_REFUSED and len(err) == 1 and f"{tmp_path}/none: no such port" in err[0]
+
+
+def test_a_baud_rate_that_the_servos_do_not_have_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    from companion.cli import main
+
+    assert main(["arm", "scan", "--baud", "3000001", "--vehicle", str(SHIPPED)]) == EXIT_BAD_INPUT
+    expected = "--baud 3000001: expected one of 9600, 57600, 115200, 1000000, 2000000, 3000000, 4000000\n"
+    assert capsys.readouterr().err == expected
 
 
 def test_keys_at_a_terminal_move_the_arm_and_q_lets_go(tmp_path: Path) -> None:
