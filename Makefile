@@ -32,20 +32,23 @@ debian:
 	  export DEBIAN_FRONTEND=noninteractive; \
 	  { $$as apt-get -qq update && $$as apt-get -qq install -y --no-install-recommends $$missing; } >/dev/null 2>&1 && exit 0; \
 	fi; \
-	echo "not installed:$$missing; tests that need them are skipped (on Debian: apt install$$missing)"
+	echo "not installed:$$missing; tests that need them are skipped, with CI set they fail (on Debian: apt install$$missing)"
 
 lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# In turn: what computes, what waits for real processes, what flies. TESTS=thorough: property tests draw all of their examples.
 unit: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not flight and not waits" --durations=10
-	$(BIN)/python -m pytest -n 3 -m waits --durations=10
-	$(BIN)/python -m pytest -m flight --durations=10
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not flight and not waits" --durations=10
+	$(BIN)/python -m pytest -n $$($(BIN)/python -m tests.at_a_time waits) --dist loadgroup -m waits --durations=10
+	$(BIN)/python -m pytest -n $$($(BIN)/python -m tests.at_a_time flights) --dist loadgroup -m "flight and not alone" --durations=10
+	$(BIN)/python -m pytest -m alone
 
-bench: install
-	$(BIN)/python benchmarks/wire_latency.py
+# 14 minutes, ten of them a hover; one minute of it: make bench BENCH=--quick
+bench: install debian
+	@$(BIN)/python -m benchmarks $(BENCH)
 
 docs: install
 	@$(BIN)/mkdocs build --strict --quiet

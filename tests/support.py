@@ -47,6 +47,17 @@ vehicle file allows; what these limits are for is tested where time is simulated
 of a test speaks to whatever broker this computer may have.
 """
 
+LOW_HOVER: dict[str, object] = {
+    "mission.phases[0].height_m": 0.5,
+    "mission.phases[0].duration_s": 2.0,
+    "mission.phases[1].duration_s": 1.0,
+}
+"""Of every flight of `HOVER` that does not say otherwise: in the air and on the ground again, in less than half of its time. From 2.0 s
+to 3.0 s of the mission, 3.2 s to 4.2 s after arming, it hovers.
+"""
+HOVERS_S = 3.5
+"""After arming: it hovers."""
+
 SUMMARY_KEYS: dict[str, Any] = {
     "outcome": None,
     "controller": None,
@@ -100,10 +111,15 @@ class Sandbox:
 
     def start(self, *arguments: object, report: bool = False) -> Running:
         """`companion ARGUMENTS`, in a process group of its own, as a terminal would start it; flights are `PATIENT`,
-        and leave a report only if it is asked for."""
+        and leave a report only if it is asked for. A check watches for as long as the preflight of such a flight."""
         given = " ".join(map(str, arguments))
-        more = {key: value for key, value in PATIENT.items() if key not in given} if arguments[:1] == ("fly",) else {}
-        no_report = ["--no-report"] if more and not report else []
+        usual: dict[str, object] = {}
+        if arguments[:1] == ("fly",):
+            usual = PATIENT | LOW_HOVER if arguments[1:2] == (HOVER,) else PATIENT
+        elif arguments[:1] == ("check",):
+            usual = {PREFLIGHT: PATIENT[PREFLIGHT]}
+        more = {key: value for key, value in usual.items() if key not in given}
+        no_report = ["--no-report"] if arguments[:1] == ("fly",) and not report else []
         return Running(self, (*arguments, *no_report, *set_options(**more)))
 
     def run(self, *arguments: object, report: bool = False) -> Ended:

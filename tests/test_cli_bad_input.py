@@ -1,4 +1,7 @@
-"""Bad command lines and bad files, through the real command: exit 2, one useful line per problem, nothing started, nothing left."""
+"""Bad command lines and bad files: exit 2, one useful line per problem, nothing started, nothing left.
+
+Through the command's entry point, in this process; a few of each sort as a user's shell starts it.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.cli import main
 from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from tests.support import CATCH, ROOT, Ended, Sandbox, sandbox_in
 
@@ -29,10 +33,32 @@ def files_in(folder: Path) -> dict[str, bytes | None]:
     return {str(path.relative_to(folder)): None if path.is_dir() else path.read_bytes() for path in folder.rglob("*")}
 
 
-def assert_refused(sandbox: Sandbox, arguments: tuple[str, ...], patterns: tuple[str, ...]) -> None:
+Command = Callable[..., Ended]
+
+
+@pytest.fixture
+def companion(sandbox: Sandbox, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """The command in this process, at home in the sandbox; what it would start carries the sandbox's mark."""
+    monkeypatch.chdir(sandbox.cwd)
+    for name, value in sandbox.environment.items():
+        monkeypatch.setenv(name, value)
+
+    def run(*arguments: str) -> Ended:
+        capfd.readouterr()
+        try:
+            code = main(arguments)
+        except SystemExit as left:
+            code = left.code if isinstance(left.code, int) else -1
+        out, err = capfd.readouterr()
+        return Ended(code, out, err)
+
+    return run
+
+
+def assert_refused(sandbox: Sandbox, run: Command, arguments: tuple[str, ...], patterns: tuple[str, ...]) -> None:
     """Exit 2 with exactly these lines; the sandbox holds the same files as before and no process."""
     before = files_in(sandbox.cwd)
-    ended = sandbox.run(*arguments)
+    ended = run(*arguments)
     sandbox.assert_nobody_left()
     assert_lines(ended, patterns)
     assert files_in(sandbox.cwd) == before
@@ -115,10 +141,24 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-@pytest.mark.parametrize("case", COMMAND_LINES)
-def test_bad_command_line(sandbox: Sandbox, case: str) -> None:
-    arguments, patterns = COMMAND_LINES[case]
-    assert_refused(sandbox, arguments, patterns)
+FROM_A_SHELL = (
+    "no command",
+    "unknown option",
+    "missing mission",
+    "bad preset",
+    "replay of no log",
+    "a world of a bad mission",
+)
+
+
+@pytest.mark.parametrize("case", [case for case in COMMAND_LINES if case != "a world of a bad mission"])
+def test_bad_command_line(sandbox: Sandbox, companion: Command, case: str) -> None:
+    assert_refused(sandbox, companion, *COMMAND_LINES[case])
+
+
+@pytest.mark.parametrize("case", FROM_A_SHELL)
+def test_bad_command_line_from_a_shell(sandbox: Sandbox, case: str) -> None:
+    assert_refused(sandbox, sandbox.run, *COMMAND_LINES[case])
 
 
 def replaced(old: str, new: str) -> Callable[[str], str]:
@@ -187,17 +227,17 @@ BAD_FILES: dict[str, tuple[str, Callable[[str], str], tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("case", BAD_FILES)
 @pytest.mark.parametrize("command", ["fly", "check"])
-def test_bad_file(sandbox: Sandbox, case: str, command: str) -> None:
+def test_bad_file(sandbox: Sandbox, companion: Command, case: str, command: str) -> None:
     name, edit, patterns = BAD_FILES[case]
     path = sandbox.cwd / name
     path.write_text(edit(path.read_text(encoding="utf-8")), encoding="utf-8")
-    assert_refused(sandbox, FLY if command == "fly" else ("check", "mission.yaml", "--plan-only"), patterns)
+    assert_refused(sandbox, companion, FLY if command == "fly" else ("check", "mission.yaml", "--plan-only"), patterns)
 
 
-def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox) -> None:
+def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox, companion: Command) -> None:
     (sandbox.cwd / "out").mkdir()
     (sandbox.cwd / "out/flight.mcap").write_bytes(b"an earlier flight")
-    assert_refused(sandbox, FLY, (r"--out out: there is a flight\.mcap already; choose another folder",))
+    assert_refused(sandbox, companion, FLY, (r"--out out: there is a flight\.mcap already; choose another folder",))
 
 
 def test_the_good_files_that_the_bad_ones_are_made_of_pass(sandbox: Sandbox) -> None:

@@ -19,7 +19,7 @@ from pymavlink import mavutil
 
 from companion.analysis.log import FlightLog
 from companion.config.loader import load_flight
-from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
 from companion.sitl_process import SitlProcess
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options
 
@@ -39,6 +39,7 @@ def events_of(summary: dict[str, Any]) -> list[str]:
     return [event["id"] for event in summary["events"]]
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_given_up_while_the_world_starts(sandbox: Sandbox, number: signal.Signals) -> None:
     with sandbox.start(*FLY) as running:
@@ -67,6 +68,7 @@ def motive_that_never_answers() -> Iterator[tuple[socket.socket, list[str]]]:
         yield motive, set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in there.items()})
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signal.Signals) -> None:
     with (
@@ -82,6 +84,7 @@ def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signa
     assert not (sandbox.cwd / "out/flight.mcap").exists()
 
 
+@pytest.mark.waits
 def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
     with (
         motive_that_never_answers() as (motive, options),
@@ -92,6 +95,7 @@ def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
         sandbox.assert_nobody_left(DEADLINE_S)
 
 
+@pytest.mark.waits
 def test_given_up_before_arming(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("  wait\n")  # it weighs the net for a second
@@ -148,17 +152,6 @@ def test_killed_launcher_leaves_a_flight_that_lands_by_itself(sandbox: Sandbox) 
 
 
 @pytest.mark.flight
-def test_a_terminal_that_goes_away_does_not_disturb_the_flight(sandbox: Sandbox) -> None:
-    with sandbox.start(*FLY) as running:
-        running.wait_for("  wait\n")
-        running.close_output()
-        ended = running.end()
-    sandbox.assert_nobody_left()
-    assert (ended.code, ended.err) == (EXIT_OK, "")
-    assert read_summary(sandbox.cwd / "out")["outcome"] == "completed"
-
-
-@pytest.mark.flight
 def test_world_that_dies_in_flight_is_named_in_one_line(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("  take-off\n")
@@ -190,6 +183,7 @@ def test_flight_process_that_dies_in_flight_is_named_in_one_line(tmp_path: Path)
     assert summary["outcome"] == "aborted"
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize(
     ("package", "line"),
     [
@@ -215,6 +209,7 @@ def test_process_that_cannot_start_is_named_in_one_line(tmp_path: Path, package:
     assert summary["outcome"] == "refused"
 
 
+@pytest.mark.waits
 def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
     # Armed, it would stay until its rotors stand: longer than the launcher waits.
     world = SitlProcess(load_flight(HOVER), tmp_path)

@@ -22,6 +22,7 @@ from pymavlink import mavutil
 from companion.exit_codes import EXIT_OK, EXIT_REFUSED
 from tests.support import CATCH, DEADLINE_S, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
+pytestmark = pytest.mark.xdist_group("the world that refuses")
 QUICK = {"discovery_timeout_s": 1.0}
 
 
@@ -133,6 +134,10 @@ WRONG = {
 }
 
 
+AT_EACH_DEVICE = ("arm baud rate", "mocap body never seen", "force port that is not there")
+
+
+@pytest.mark.waits
 @pytest.mark.parametrize("case", WRONG)
 def test_refuses(sandbox: Sandbox, world: World, case: str) -> None:
     wrong = WRONG[case]
@@ -152,6 +157,7 @@ WRONG_START = {
 }
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("case", WRONG_START)
 def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: World, case: str) -> None:
     wrong = WRONG_START[case]
@@ -164,6 +170,7 @@ def assert_one_line(ended: Ended, pattern: str) -> None:
     assert re.search(pattern, ended.err_lines[0]), (pattern, ended.err)
 
 
+@pytest.mark.waits
 def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as nobody:
         autopilot = {"address": f"udpout://127.0.0.1:{nobody.getsockname()[1]}", **QUICK}
@@ -173,6 +180,7 @@ def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, w
     )
 
 
+@pytest.mark.waits
 def test_refuses_a_busy_udp_port(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as busy:
         port = busy.getsockname()[1]
@@ -182,18 +190,21 @@ def test_refuses_a_busy_udp_port(sandbox: Sandbox, world: World) -> None:
     )
 
 
+@pytest.mark.waits
 def test_refuses_an_arm_port_that_another_program_holds(sandbox: Sandbox, world: World) -> None:
     with serial.Serial(world.devices["arm"]["port"], 3000000, exclusive=True):
         ended = refused(sandbox, world, *world.addresses())
     assert_one_line(ended, r"^arm bus /dev/pts/\d+: port is busy; another program .*: close that one$")
 
 
+@pytest.mark.waits
 def test_refuses_a_force_port_that_another_program_holds(sandbox: Sandbox, world: World) -> None:
     with serial.Serial(world.devices["force"]["port"], 115200, exclusive=True):
         ended = refused(sandbox, world, *world.addresses())
     assert_one_line(ended, r"^force sensor /dev/pts/\d+: in use by another program; close it")
 
 
+@pytest.mark.waits
 def test_refuses_an_arm_bus_without_any_servo(sandbox: Sandbox, world: World) -> None:
     with silent_pty() as port:
         ended = refused(sandbox, world, *world.addresses(arm={"port": port}))
@@ -202,6 +213,7 @@ def test_refuses_an_arm_bus_without_any_servo(sandbox: Sandbox, world: World) ->
     )
 
 
+@pytest.mark.waits
 def test_refuses_a_silent_force_sensor(sandbox: Sandbox, world: World) -> None:
     with silent_pty() as port:
         ended = refused(sandbox, world, *world.addresses(force={"port": port}))
@@ -210,6 +222,7 @@ def test_refuses_a_silent_force_sensor(sandbox: Sandbox, world: World) -> None:
     )
 
 
+@pytest.mark.waits
 def test_refuses_a_silent_mocap_server(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as silent:
         port = silent.getsockname()[1]
@@ -253,6 +266,7 @@ def as_float_bits(value: int) -> float:
     return float(struct.unpack("<f", struct.pack("<i", value))[0])
 
 
+@pytest.mark.waits
 def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world: World) -> None:
     with px4_param(fresh_world, "EKF2_EV_CTRL", 0):
         ended = refused(sandbox, fresh_world, *fresh_world.addresses())
@@ -263,6 +277,7 @@ def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world:
         assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
 
 
+@pytest.mark.waits
 def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox, tmp_path: Path) -> None:
     refuses = ("world.faults=[{kind: arming_refused, phase: ground}]",)
     with sandbox_in(tmp_path / "world") as around, World(around, CATCH, refuses) as world:
@@ -271,8 +286,16 @@ def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox
 
 
 @pytest.mark.flight
-def test_after_all_refusals_the_same_world_flies(sandbox: Sandbox, world: World) -> None:
-    ended = sandbox.run("fly", HOVER, "--out", "out", *world.addresses(), "--set", "mission.phases[1].duration_s=0.5")
+def test_after_refusals_the_same_world_flies_though_its_terminal_goes_away(
+    sandbox: Sandbox, world: World, tmp_path: Path
+) -> None:
+    for case in AT_EACH_DEVICE:
+        with sandbox_in(tmp_path / case) as its:
+            assert_one_line(refused(its, world, *world.addresses(**WRONG[case].but)), WRONG[case].line)
+    with sandbox.start("fly", HOVER, "--out", "out", *world.addresses()) as running:
+        running.wait_for("  wait\n")
+        running.close_output()
+        ended = running.end()
     sandbox.assert_nobody_left()
     assert (ended.code, ended.err) == (EXIT_OK, ""), ended
     assert read_summary(sandbox.cwd / "out")["outcome"] == "completed"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 
 import pytest
 from hypothesis import given
@@ -22,6 +23,7 @@ STEP_S = 0.02
 FOLDED: Vec2 = (165.0, 140.0)
 
 
+@cache
 def arm_with(walls: tuple[Vec2, Vec2] = ((60.0, 175.0), (-10.0, 150.0))) -> Arm:
     return load_vehicle(SHIPPED, [f"vehicle.arm.joints[{i}].angle_deg={list(walls[i])}" for i in (0, 1)]
                         + [f"vehicle.safety.fold_arm_deg={[sum(wall) / 2 for wall in walls]}"]).arm  # fmt: skip

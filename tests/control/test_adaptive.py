@@ -116,6 +116,7 @@ def test_lateral_force_is_limited_by_tilt(config: FlightConfig) -> None:
 
 
 norms = st.floats(0, 1e4)
+LAW = law(load_flight("configs/missions/catch.yaml"))
 
 
 @settings(max_examples=300)
@@ -124,11 +125,10 @@ def test_adaptive_gains_stay_nonnegative_for_any_input(
     inputs: list[tuple[float, float, float, bool]], dt_s: float
 ) -> None:
     """Property: H and zeta stay >= 0 and rho stays within its cap, whatever ||s||, ||xi|| and ||chi_dd|| do."""
-    controller = law(load_flight("configs/missions/catch.yaml"))
-    adaptation = Adaptation(controller)
+    adaptation = Adaptation(LAW)
     for norm_s, x, acceleration, frozen in inputs:
         regressor = (1.0, x, x * x, acceleration)
-        assert 0.0 <= adaptation.rho(regressor) <= controller.rho_max
+        assert 0.0 <= adaptation.rho(regressor) <= LAW.rho_max
         adaptation.advance(dt_s, norm_s, regressor, frozen)
         assert min(adaptation.h) >= 0.0
         assert adaptation.zeta >= 0.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from companion.control.manipulator import Manipulator
 from companion.frames import quat_from_euler_zyx
 from companion.types import Vec2, Vec3, Vec8
 from sitl.model import BASE_INERTIA_KG_M2, JOINT_ARMATURE_KG_M2
+from tests.pinocchio_or_skip import pin
 from tests.sitl.test_world_dynamics import oracle
 
 Array = NDArray[np.float64]

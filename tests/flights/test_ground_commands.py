@@ -36,8 +36,12 @@ from companion.types import OperatorCommand, Outcome, SafetyAction
 from tests.broker import loopback_broker
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options
 
-HOLD_S = 60.0
-"""Of the mission: time for all that is commanded in it, on a loaded machine."""
+HIGH_AND_LONG = {
+    "mission.phases[0].height_m": 1.0,
+    "mission.phases[0].duration_s": 3.0,
+    "mission.phases[1].duration_s": 60.0,
+}
+"""Room to be held in, and time for all that is commanded, on a loaded machine."""
 
 
 class Station:
@@ -128,7 +132,7 @@ def test_started_held_let_go_on_and_landed_from_the_ground(sandbox: Sandbox, tmp
     ground = load_flight(HOVER).vehicle
     vehicle = topic_name(ground.ground.topic, ground.name)
     with loopback_broker(tmp_path) as broker:
-        options = set_options(**{"vehicle.ground.mqtt.url": broker.url, "mission.phases[1].duration_s": HOLD_S})
+        options = set_options(**{"vehicle.ground.mqtt.url": broker.url, **HIGH_AND_LONG})
 
         async def on_the_ground() -> None:
             async with aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:

@@ -73,6 +73,7 @@ def answer(page: Any, command: str) -> str:
     return found
 
 
+@pytest.mark.alone
 @pytest.mark.flight
 def test_the_catch_is_watched_held_and_landed_from_the_page(tmp_path: Path) -> None:
     with (

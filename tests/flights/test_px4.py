@@ -17,7 +17,7 @@ from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.sitl_process import PX4_FOLDER
 from companion.types import PhaseKind
 from sitl.px4_process import VARIABLE
-from tests.support import CATCH, HOVER, Sandbox, read_summary, sandbox_in
+from tests.support import CATCH, HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in
 
 REAL = [
     pytest.mark.px4,
@@ -119,7 +119,7 @@ def test_motion_capture_that_comes_back_too_late_is_a_landing(sandbox: Sandbox, 
 
 def test_a_dead_link_is_landed_by_px4_itself(sandbox: Sandbox, autopilot: str) -> None:
     """Nothing gets through: the offboard-loss failsafe."""
-    fault = "world.faults=[{kind: link_loss, t_s: 6}]"
+    fault = f"world.faults=[{{kind: link_loss, t_s: {HOVERS_S}}}]"
     ended = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "out", "--set", fault)
     sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
     assert ended.code in (EXIT_ABORTED, EXIT_LOST), (ended.out, ended.err)  # PX4 lands without vision here
@@ -142,6 +142,7 @@ def test_a_px4_that_dies_in_the_air_is_one_clear_line(sandbox: Sandbox, autopilo
     assert re.search(rf"PX4: px4 -i \d was ended by SIGKILL; see {re.escape(str(log))}", ended.err), ended.err
 
 
+@pytest.mark.waits
 def test_without_a_px4_it_says_how_to_get_one_and_waits_until_it_is_given_up(tmp_path: Path) -> None:
     nowhere = {VARIABLE: "", "PATH": str(tmp_path)}
     with sandbox_in(tmp_path / "sandbox", nowhere) as sandbox:
@@ -154,6 +155,7 @@ def test_without_a_px4_it_says_how_to_get_one_and_waits_until_it_is_given_up(tmp
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
 
 
+@pytest.mark.waits
 def test_a_name_that_is_no_px4_refuses_the_flight_in_one_line(tmp_path: Path) -> None:
     with sandbox_in(tmp_path / "sandbox", {VARIABLE: str(tmp_path / "nowhere")}) as sandbox:
         ended = sandbox.run("fly", HOVER, "--sitl=px4", "--out", "out")
@@ -163,6 +165,7 @@ def test_a_name_that_is_no_px4_refuses_the_flight_in_one_line(tmp_path: Path) ->
     assert ended.err.startswith(f"sitl: {VARIABLE}=")
 
 
+@pytest.mark.waits
 def test_a_fault_of_the_stub_refuses_the_flight_in_one_line(tmp_path: Path) -> None:
     fault = "world.faults=[{kind: arming_refused, t_s: 1}]"
     with sandbox_in(tmp_path / "sandbox", {VARIABLE: ""}) as sandbox:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +41,8 @@ def kill_the_companion(sandbox: Sandbox, first: Running) -> None:
     first.process.wait()
 
 
-def fly_until_hover(sandbox: Sandbox, world: World) -> None:
-    with sandbox.start("fly", HOVER, "--out", "first", *LONG, *world.addresses()) as first:
+def fly_until_hover(sandbox: Sandbox, world: World, options: Sequence[str]) -> None:
+    with sandbox.start("fly", HOVER, "--out", "first", *options, *world.addresses()) as first:
         first.wait_for(IN_FLIGHT)
         kill_the_companion(sandbox, first)
 
@@ -68,7 +68,7 @@ class Paused:
 @pytest.mark.parametrize("arm_opens", [True, False])
 def test_started_again_in_the_air_it_lands_what_it_finds(sandbox: Sandbox, arm_opens: bool) -> None:
     with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:
-        fly_until_hover(sandbox, world)
+        fly_until_hover(sandbox, world, LONG)
         # Limp, the arm may hang past its walls, and then its edge refuses it.
         walls = set_options(**{"vehicle.arm.joints[1].angle_deg": [-170.0, 150.0]})
         but: dict[str, Any] = {} if arm_opens else {"arm": {"port": "/dev/pts/none"}}
@@ -100,7 +100,7 @@ def test_started_again_in_the_air_it_lands_what_it_finds(sandbox: Sandbox, arm_o
 def test_left_alone_px4_lands_by_itself_and_the_next_companion_judges_it_as_any_other_start(sandbox: Sandbox) -> None:
     """Disarmed by the time, the arm limp, and not where the next mission begins."""
     with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:
-        fly_until_hover(sandbox, world)
+        fly_until_hover(sandbox, world, set_options(**{"mission.phases[1].duration_s": 10.0}))
         wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
         assert not world.crashes
         elsewhere = set_options(**{"mission.start.position_m": [0.6, 0.0]})

@@ -14,9 +14,9 @@ import pytest
 from companion.exit_codes import EXIT_ABORTED, EXIT_OK
 from sitl.campaign import row_of
 from tests.flights.test_fast_flights import configured, flown
-from tests.support import CATCH, HOVER, Ended, Sandbox, read_summary, sandbox_in, set_options
+from tests.support import CATCH, HOVER, HOVERS_S, Ended, Sandbox, read_summary, sandbox_in, set_options
 
-pytestmark = pytest.mark.flight
+pytestmark = [pytest.mark.flight, pytest.mark.xdist_group("the catch over wires")]
 PAYLOAD_KG = 0.2
 
 
@@ -79,7 +79,7 @@ def test_the_fast_loop_says_what_the_wires_say(the_catch: Flown) -> None:
 
 def test_a_lost_arm_lands_it(tmp_path_factory: pytest.TempPathFactory) -> None:
     with sandbox_in(tmp_path_factory.mktemp("arm")) as sandbox:
-        fault = set_options(**{"world.faults": [{"kind": "servo_loss", "t_s": 5}]})
+        fault = set_options(**{"world.faults": [{"kind": "servo_loss", "t_s": HOVERS_S}]})
         ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *fault)
         sandbox.assert_nobody_left()
         summary = read_summary(sandbox.cwd / "out")

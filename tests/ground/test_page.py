@@ -12,8 +12,6 @@ from companion.ground.messages import Presence, Stream
 from tests.ground.page_browser import Page, chromium, events_of, playing, watching
 from tests.ground.page_stand import BROKER, NAME, Stand, ack, event, flown, hello, retained, state, told
 
-pytestmark = pytest.mark.waits
-
 SAFE = {"hold", "land", "abort"}
 HOSTILE = "<img src=x onerror='window.pwned = 1'><script>window.pwned = 1</script>"
 

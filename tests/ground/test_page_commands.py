@@ -10,8 +10,6 @@ import pytest
 from tests.ground.page_browser import Page, chromium, playing, watching
 from tests.ground.page_stand import NAME, Message, Stand, ack, flown, retained, state, told
 
-pytestmark = pytest.mark.waits
-
 NONCE = "0123456789abcdef" * 2
 NO_ANSWER = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch"
 

@@ -18,8 +18,6 @@ from tests.ground.page_browser import SIZES, Page, chromium, events_of, watching
 from tests.ground.page_stand import BROKER, Stand, event, flown, hello, retained, told
 from tests.support import CATCH
 
-pytestmark = pytest.mark.waits
-
 TOUCH_PX = 56.0
 LARGE_PX, LARGE_BOLD_PX = 24.0, 18.66
 """WCAG 2.2, 1.4.3: text of this size needs 3 : 1, all other 4.5 : 1."""

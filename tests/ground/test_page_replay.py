@@ -22,8 +22,6 @@ from tests.ground.page_browser import Page, chromium, watching
 from tests.ground.page_stand import Message, Stand, flown, hello, preflight, sent_at, state
 from tests.support import CATCH, sandbox_in
 
-pytestmark = pytest.mark.waits
-
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:

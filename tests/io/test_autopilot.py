@@ -41,6 +41,8 @@ from tests.io.autopilot_peer import (
     free_udp_port,
 )
 
+pytestmark = pytest.mark.waits
+
 LEAN_RAD = 0.2
 DO_SET_MODE, NAV_LAND, ARM_DISARM = 176, 21, 400
 

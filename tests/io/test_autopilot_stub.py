@@ -16,6 +16,8 @@ from companion.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus,
 from tests.io.autopilot_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 
+pytestmark = pytest.mark.waits
+
 POSITION_WORLD_M = (-1.0, 0.5, 0.25)
 YAW_RAD = 0.4
 

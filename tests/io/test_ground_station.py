@@ -44,6 +44,8 @@ from tests.io.ground_peer import GroundPeer
 from tests.io.stub_rig import standing_stub
 from tests.support import CATCH
 
+pytestmark = pytest.mark.waits
+
 DEADLINE_S = 30.0
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.2)
 HOLD_MODE = (4 << 16) | (3 << 24)
@@ -300,6 +302,13 @@ def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> 
 
                 await send_setpoints(autopilot, px4, 400, each)
                 assert await autopilot.read_param("COM_RC_IN_MODE") == 4
+
+                def told() -> bool:
+                    said.extend(station.take_messages())
+                    return any("relay has ended" in line for line in said)
+
+                # A killed process ends when the kernel comes to it.
+                await until(told, "the relay's end")
                 assert [line for line in said if "relay has ended" in line] == [
                     f"ground station {ground.address}: the relay has ended, nothing is forwarded any more"
                 ]

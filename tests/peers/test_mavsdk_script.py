@@ -15,6 +15,8 @@ from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from tests.sitl.px4_rig import Rig
 
+pytestmark = pytest.mark.waits
+
 SCRIPT = Path(__file__).with_name("mavsdk_mission.py")
 DEADLINE_S = 150.0
 

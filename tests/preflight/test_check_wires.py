@@ -23,6 +23,8 @@ from sitl.servo_model import ServoModel, ServoRefusal
 from sitl.servo_protocol import StatusError
 from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
+pytestmark = pytest.mark.waits
+
 OPERATING_MODE, MODE_POSITION = 11, 3
 
 

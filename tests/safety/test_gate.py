@@ -13,6 +13,7 @@ from companion.config.vehicle import Vehicle
 from companion.frames import quat_from_euler_zyx, tilt_rad
 from companion.safety.gate import Gate
 from companion.types import AttitudeSetpoint, Vec2
+from tests.examples import examples
 
 NAN = math.nan
 LEVEL = quat_from_euler_zyx(0, 0, 0.4)
@@ -121,7 +122,7 @@ def test_after_a_silence_the_first_thrust_may_be_any() -> None:
 number = st.floats(allow_nan=True, allow_infinity=True, width=32)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 @given(
     st.lists(
         st.tuples(number, number, number, number, number, number, number, number, number, st.floats(0.0, 0.3)),

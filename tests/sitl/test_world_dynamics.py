@@ -6,7 +6,6 @@ import math
 
 import mujoco
 import numpy as np
-import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from companion.config.world import World as WorldConfig
 from companion.control.manipulator import Manipulator
 from sitl.model import BASE_INERTIA_KG_M2, JOINT_ARMATURE_KG_M2, base_mass_kg
 from sitl.world import PHYSICS_DT_S, World
+from tests.pinocchio_or_skip import pin
 
 Array = NDArray[np.float64]
 NO_PAYLOAD = WorldConfig(payload_kg=0.0, joint_friction_nm=0.0, joint_damping_nms=0.0)

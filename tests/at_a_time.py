@@ -1,0 +1,31 @@
+"""`python -m tests.at_a_time waits|flights`: how many tests of a kind run at a time.
+
+A flight takes about half a core, a waiting test a third. Where the flight, the guardian and the simulated world get real-time priority,
+they go on in time whatever else two cores have to do. Without it their limits are met by fewer.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from companion.realtime import FLIGHT_PRIORITY
+
+AT_A_TIME = {"waits": (3, 4), "flights": (1, 2)}
+"""Without and with real-time priority, on two cores or more."""
+
+
+def at_a_time(kind: str) -> int:
+    """Asks the kernel, and leaves this process with real-time priority if it may have it."""
+    alone, together = AT_A_TIME[kind]
+    if len(os.sched_getaffinity(0)) < 2:
+        return 1
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FLIGHT_PRIORITY))
+    except OSError:
+        return alone
+    return together
+
+
+if __name__ == "__main__":
+    print(at_a_time(sys.argv[1]))
