@@ -1,6 +1,7 @@
 """What runs beside a flight, each in a process of its own, for the same minutes.
 
 python -m benchmarks.measuring.beside empty FILE          # ticks for nothing until SIGTERM; start and lateness of each, s, as .npy
+python -m benchmarks.measuring.beside plain FILE          # the same on asyncio's own event loop
 python -m benchmarks.measuring.beside bare FILE FRAMES    # receives and sends on native MAVSDK; its latency as JSON
 """
 
@@ -19,15 +20,17 @@ from benchmarks.measuring.wires import bare_mavsdk
 from benchmarks.soaking.lateness import tick_for_nothing
 
 
-def empty(path: Path) -> None:
-    """An empty loop; rows of the array: `time.monotonic` at the start of each tick, and how late it was."""
+def empty(path: Path, *, plain: bool) -> None:
+    """An empty loop; `plain`: on asyncio's own event loop.
+
+    Rows of the array: `time.monotonic` at the start of each tick, and how late it was."""
     starts_s, lateness_s = array("d"), array("d")
 
     def take(start_s: float, late_s: float) -> None:
         starts_s.append(start_s)
         lateness_s.append(late_s)
 
-    tick_for_nothing(take)
+    tick_for_nothing(take, plain=plain)
     np.save(path, np.array([starts_s, lateness_s]))
 
 
@@ -39,7 +42,7 @@ def bare(path: Path, frames: int) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "empty":
-        empty(Path(sys.argv[2]))
+    if sys.argv[1] in ("empty", "plain"):
+        empty(Path(sys.argv[2]), plain=sys.argv[1] == "plain")
     else:
         bare(Path(sys.argv[2]), int(sys.argv[3]))

@@ -82,6 +82,7 @@ def measure(folder: Path, hover_s: float, say: Callable[[str], None]) -> Figures
         )
         _await_viewer(person, folder / "person.txt")
         empty = stack.enter_context(_beside("empty", folder, *_loop("empty", folder / "empty.npy")))
+        stack.enter_context(_beside("plain", folder, *_loop("plain", folder / "plain.npy")))
         flight = start_hover(folder, hover_s, broker.url, report=False)
         stack.callback(_land, flight)
         try:
@@ -211,9 +212,11 @@ def _judge(
     begin_s, end_s = float(start_s[0]), float(start_s[-1]) - SETTLE_S
     inside = (start_s >= begin_s) & (start_s <= end_s)
     late_s = log.timing.lateness_s[inside]
-    beside = np.load(folder / "empty.npy")
-    beside = beside[:, (beside[0] >= begin_s) & (beside[0] <= end_s)]
-    if not len(late_s) or not beside.shape[1]:
+    beside, plain = (
+        loop[:, (loop[0] >= begin_s) & (loop[0] <= end_s)]
+        for loop in (np.load(folder / f"{name}.npy") for name in ("empty", "plain"))
+    )
+    if not len(late_s) or not beside.shape[1] or not plain.shape[1]:
         raise PartError(f"the hover was too short to be measured: the flight ended with exit code {code}")
     return {
         "exit_code": code,
@@ -226,6 +229,7 @@ def _judge(
         "limits": LIMITS,
         "flight": _ticks(start_s[inside], late_s),
         "empty": _ticks(*beside),
+        "plain": _ticks(*plain),
         "late_alone": late_alone(start_s[inside], late_s, *beside),
         **_latencies(log),
         "bare": _bare(folder),

@@ -56,15 +56,21 @@ def _why(*found: Any) -> str:
 
 
 def _lateness(hover: Figures) -> Section:
-    row = Row(
-        "lateness of a tick, ms",
-        "empty loop",
-        _spread(_at(hover, "flight", "lateness_ms")),
-        _spread(_at(hover, "empty", "lateness_ms")),
-        Target(1.5, ("p99",)),
-        _why(hover),
-    )
-    return Section("Ticks", texts.TICKS, LATENESS, [row])
+    rows = [
+        Row(
+            "lateness of a tick, ms",
+            beside,
+            _spread(_at(hover, "flight", "lateness_ms")),
+            _spread(_at(hover, key, "lateness_ms")),
+            target,
+            _why(hover),
+        )
+        for beside, key, target in (
+            ("empty asyncio loop", "plain", Target(1.5, ("p99",))),
+            ("empty loop", "empty", None),
+        )
+    ]
+    return Section("Ticks", texts.TICKS, LATENESS, rows)
 
 
 def _late(hover: Figures) -> Section:

@@ -9,9 +9,12 @@ def _paragraphs(text: str) -> tuple[str, ...]:
 
 TICKS = _paragraphs("""
 Hover over real wires in the simulated world, with guardian, recorder, a broker, and the monitor with a viewer, all on this
-computer. The empty loop ran for the same minutes in a process of its own: the same ticker, event loop, rate and priority, and
-nothing to do. A tick is late by what it begins after the moment that it was due at. Ticks of the flight ride on the frames of
-motion capture: there it is the moment at which the frame arrived.
+computer. Two empty loops ran for the same minutes, each in a process of its own: the same ticker, rate and priority, and nothing to
+do. The empty asyncio loop is what `asyncio.run` gives anybody: it waits in epoll, in whole milliseconds. The other one has the
+flight's own event loop, which waits in select; that one the flight cannot beat, it is what a flight is with nothing in it.
+
+A tick is late by what it begins after the moment that it was due at. Ticks of the flight ride on the frames of motion
+capture: there it is the moment at which the kernel received the frame.
 """)
 
 LATE = _paragraphs("""

@@ -100,17 +100,18 @@ def ticks_of_log(path: Path) -> Ticks:
     return Ticks(minutes.finish(), count, minutes.missed, max(0, wanted - count))
 
 
-def tick_for_nothing(take: Callable[[float, float], None]) -> int:
+def tick_for_nothing(take: Callable[[float, float], None], *, plain: bool = False) -> int:
     """Tick as a flight does, with its event loop, ticker and priority, and do nothing else, until SIGTERM or until the process that
     started this one is gone.
 
     Args:
         take: called with every tick's start (`time.monotonic`) and lateness, s.
+        plain: on asyncio's own event loop instead.
 
     Returns:
         Deadlines that passed without a tick.
     """
-    return run(_tick_for_nothing(take))
+    return (asyncio.run if plain else run)(_tick_for_nothing(take))
 
 
 async def _tick_for_nothing(take: Callable[[float, float], None]) -> int:
