@@ -81,6 +81,8 @@ class Flight:
         self._core = FlightCore(config)
         self._missed = 0
         self._period_s = NOMINAL_DT_S
+        self._phase = ""
+        """As the launcher was told last."""
         self._ground: str | None = None
         """What the launcher was last told of the way to the ground stations."""
 
@@ -187,8 +189,9 @@ class Flight:
     def _report(self, tick: int, outputs: Outputs, sent: Sent) -> None:
         for event in outputs.events:
             self._tell(tick, outputs, event)
-        if tick % STATUS_EVERY and outputs.outcome is None:
+        if tick % STATUS_EVERY and outputs.outcome is None and outputs.phase == self._phase:
             return
+        self._phase = outputs.phase
         for text in self._edges.autopilot.take_messages():
             self._recorder.client.text(outputs.t_s, Severity.WARNING, "px4", text)
             status.send(self._channel, {"type": "px4", "text": text})
