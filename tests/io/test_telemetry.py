@@ -180,6 +180,8 @@ def test_no_broker_at_all_is_told_once_and_costs_no_sample(tmp_path: Path) -> No
     with flight_with(tmp_path, url) as flight:
         flight.wait(lambda: flight.recorder.client.ground is not None, "the flight is not told")
         assert flight.recorder.client.ground == f"no broker at {url}, trying: Connection refused"
+        # Its thread yields to everything; 21 s of ticks in a moment could be over before it has written its line.
+        flight.wait(lambda: any("no broker" in line for line in log_lines(flight.path)), "not in the log")
         flight.fly(len(ROWS))
         report = flight.finish()
     assert (report.samples, report.dropped, report.error) == (len(ROWS), 0, None)
