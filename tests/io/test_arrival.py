@@ -35,6 +35,8 @@ def test_a_datagram_that_waited_is_as_old_as_it_is() -> None:
         time.sleep(0.05)  # the reader is busy
         data, notes, _, _ = receiver.recvmsg(100, STAMP_ROOM_BYTES)
         assert data == b"1"
+        if not notes:
+            pytest.skip("no stamps here: an emulated kernel")
         assert before_s - 0.001 < arrived_s(notes, clock) < sent_s + 0.045
 
 
