@@ -172,7 +172,7 @@ def _mocap(config: FlightConfig, clock: Clock, some: SomeEdges) -> NatNetMocap:
     def on_pose(pose: MocapPose) -> None:
         if valve.on_frame is not None:
             valve.on_frame(pose.stamp_s)
-            # A tick that this frame has started comes first: PX4 fuses the pose by its stamp, the setpoint is for now.
+            # A tick that this frame has started comes first; PX4's estimate waits for the pose some tenths of a millisecond.
             asyncio.get_running_loop().call_soon(pass_on, pose)
         else:
             pass_on(pose)

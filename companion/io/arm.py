@@ -227,7 +227,9 @@ class DynamixelArm:
         sent: Pair = (0, 0)
         later: _Read | None = None
         while True:
-            wait_s = watchdog_s / _KEEPALIVES_PER_WATCHDOG if later is None else later.at_s - self._clock()
+            wait_s = watchdog_s / _KEEPALIVES_PER_WATCHDOG
+            if later is not None:
+                wait_s = min(wait_s, later.at_s - self._clock())
             try:
                 job = self._jobs.get(timeout=max(0.0, wait_s))
             except queue.Empty:
@@ -243,8 +245,11 @@ class DynamixelArm:
                     continue
             elif job is _NOW and later is None:
                 continue  # it has begun meanwhile
-            reading, later = later, None
+            reading = later
+            if job is None and later is not None and later.at_s > self._clock():
+                reading = None  # far off: meanwhile the watchdogs are kept quiet, and an old torque is taken back
             if reading is not None:
+                later = None
                 reading.begun = True
             tripped = self._read_once(bus)
             if reading is not None:

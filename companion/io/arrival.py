@@ -13,8 +13,8 @@ from companion.clock import Clock
 _SO_TIMESTAMPNS: Final = 35  # <asm-generic/socket.h>: of x86 and ARM; Python has no name for it
 _TIMESPEC: Final = struct.Struct("=qq")
 STAMP_ROOM_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size)
-_WAITED_MAX_S: Final = 0.5
-"""More than this is no wait: the wall clock was set between arrival and reading."""
+_WAITED_MAX_S = 0.1
+"""More than this counts as no wait: the wall clock may have been set meanwhile, and no good frame may look lost for that."""
 
 
 def stamp_arrivals(opened: socket.socket) -> None:

@@ -537,6 +537,17 @@ def test_a_read_begins_at_its_time_or_when_it_is_wanted() -> None:
     fly(scenario, watchdog_ms=2000)
 
 
+def test_a_read_that_is_far_off_keeps_no_torque_alive() -> None:
+    async def scenario(setup: Setup) -> None:
+        setup.arm.write_torque((0.5, 0.5))
+        await until(lambda: register(setup.servos[0], 102, 2) != 0)
+        setup.arm.begin_read(setup.clock() + 3600.0)
+        await until(lambda: [register(servo, 102, 2) for servo in setup.servos] == [0, 0])
+        assert [register(servo, 98) for servo in setup.servos] == [5, 5]  # by us: no watchdog had to trip
+
+    fly(scenario)
+
+
 def test_the_time_of_a_read_is_learnt() -> None:
     async def scenario(setup: Setup) -> None:
         taken_s = []

@@ -9,7 +9,10 @@ import time
 import pytest
 
 from companion.clock import flight_clock
+from companion.config.loader import load_flight
+from companion.io import arrival
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
+from tests.support import CATCH
 
 _SO_TIMESTAMPNS = 35
 
@@ -20,7 +23,8 @@ def note(seconds_ago: float) -> list[tuple[int, int, bytes]]:
     return [(socket.SOL_SOCKET, _SO_TIMESTAMPNS, stamp)]
 
 
-def test_a_datagram_that_waited_is_as_old_as_it_is() -> None:
+def test_a_datagram_that_waited_is_as_old_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrival, "_WAITED_MAX_S", 60.0)  # this computer may be busier than a flight's
     clock = flight_clock()
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
@@ -45,10 +49,15 @@ def test_without_a_stamp_it_has_just_arrived() -> None:
     assert arrived_s([(socket.SOL_SOCKET, _SO_TIMESTAMPNS, b"short")], lambda: 7.25) == 7.25
 
 
-@pytest.mark.parametrize("seconds_ago", [-3600.0, -0.1, 0.6, 3600.0])
+@pytest.mark.parametrize("seconds_ago", [-3600.0, -0.1, 0.11, 3600.0])
 def test_a_wall_clock_that_was_set_dates_nothing(seconds_ago: float) -> None:
     assert arrived_s(note(seconds_ago), lambda: 7.25) == 7.25
 
 
-def test_a_stamp_of_a_moment_ago_counts() -> None:
+def test_a_stamp_of_a_moment_ago_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrival, "_WAITED_MAX_S", 60.0)
     assert arrived_s(note(0.2), lambda: 7.25) <= 7.05
+
+
+def test_a_wall_clock_that_was_set_makes_no_frame_look_lost() -> None:
+    assert load_flight(CATCH).vehicle.safety.mocap_timeout_s > arrival._WAITED_MAX_S
