@@ -1,17 +1,51 @@
-"""Property tests draw anew wherever people work, and draw the same on CI: there the change is judged, not the draw."""
+"""What every test starts from, whoever starts it: the same examples of property tests, and default signal handling.
+
+`make test` draws the same examples everywhere. `make explore` (`--hypothesis-profile=explore`) draws many, at random.
+"""
 
 from __future__ import annotations
 
 import functools
-import os
+import signal
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
+from hypothesis.internal.constants_ast import Constants
 
-settings.register_profile("ci", derandomize=True)
-if os.environ.get("CI"):
-    settings.load_profile("ci")
+_LOADED_COMPUTER = [HealthCheck.too_slow]
+"""Neither this check nor a deadline may fail a test: both measure the computer."""
+settings.register_profile(
+    "test",
+    derandomize=True,
+    database=None,
+    max_examples=50,
+    deadline=None,
+    suppress_health_check=_LOADED_COMPUTER,
+)
+settings.register_profile(
+    "explore",
+    derandomize=False,
+    database=None,
+    max_examples=1000,
+    deadline=None,
+    print_blob=True,
+    suppress_health_check=_LOADED_COMPUTER,
+)
+settings.load_profile("test")
+
+# A process that a shell without job control starts in the background ignores SIGINT, and so do its children. The tests' children
+# are started as a terminal would start them.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.pthread_sigmask(signal.SIG_SETMASK, ())
+
+
+def pytest_configure() -> None:
+    """Draw no constants from the modules that happen to be imported: which these are depends on the tests run before."""
+    if settings.get_current_profile_name() == "test":
+        nothing = Constants()
+        providers._get_local_constants = lambda: nothing
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.ticker import EARLY_S, LATE_S, Ticker, TickTime
@@ -112,7 +112,6 @@ def test_frames_of_another_rate_are_not_ridden_on(rate_hz: float) -> None:
     assert gaps_of(ticks) == pytest.approx([P] * (len(ticks) - 1))
 
 
-@settings(max_examples=60, deadline=None)
 @given(frames_s=st.lists(st.floats(0.0, 1.0), max_size=2000), seed_s=st.floats(0.0, P))
 def test_whatever_arrives_ticks_stay_about_a_period_apart(frames_s: list[float], seed_s: float) -> None:
     regular_s = [seed_s + n * P for n in range(100)]  # first in step, then anything

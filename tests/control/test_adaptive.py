@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.controller import AdaptiveConfig
@@ -119,7 +119,6 @@ norms = st.floats(0, 1e4)
 LAW = law(load_flight("configs/missions/catch.yaml"))
 
 
-@settings(max_examples=300)
 @given(st.lists(st.tuples(norms, norms, st.floats(0, 3), st.booleans()), max_size=40), st.floats(1e-4, 1.0))
 def test_adaptive_gains_stay_nonnegative_for_any_input(
     inputs: list[tuple[float, float, float, bool]], dt_s: float

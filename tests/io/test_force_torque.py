@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.clock import flight_clock
@@ -21,7 +21,6 @@ from companion.io.force_torque import RobotousForceTorque
 from companion.io.rft import Command, PacketScanner, Wrench
 from companion.types import ForceSample
 from sitl.force_torque import ForceTorqueServer
-from tests.examples import examples
 
 WAIT_S = 20.0
 # 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
@@ -61,7 +60,6 @@ def test_data_field_that_does_not_fit() -> None:
         rft.pack(bytes(9), rft.COMMAND_BYTES)
 
 
-@settings(max_examples=examples(1500), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     sent=st.lists(wrenches, min_size=1, max_size=6),
     gaps=st.lists(st.binary(max_size=25).map(lambda noise: noise.replace(b"\x55", b"\xaa")), min_size=6, max_size=6),
@@ -81,7 +79,6 @@ def test_no_packet_is_missed_however_the_stream_is_cut(sent: list[Wrench], gaps:
     assert scanner.skipped_bytes == sum(map(len, gaps[: len(sent)]))
 
 
-@settings(max_examples=examples(1500), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(noise=st.binary(max_size=200), sent=st.tuples(wrenches, wrenches, wrenches))
 def test_any_noise_is_overcome(noise: bytes, sent: tuple[Wrench, Wrench, Wrench]) -> None:
     scanner = PacketScanner(rft.RESPONSE_BYTES)
@@ -94,7 +91,6 @@ def test_any_noise_is_overcome(noise: bytes, sent: tuple[Wrench, Wrench, Wrench]
         rft.decode_text(field)
 
 
-@settings(max_examples=examples(500), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(wrench=wrenches, position=st.integers(0, 18), change=st.integers(1, 255))
 def test_one_wrong_byte_is_always_noticed(wrench: Wrench, position: int, change: int) -> None:
     packet = bytearray(rft.encode_wrench(Command.START, wrench))

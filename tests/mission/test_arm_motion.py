@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from companion.mission.arm_motion import ArmLimits, plan_arm
@@ -16,8 +16,6 @@ LIMITS = ArmLimits((math.radians(90.0), math.radians(90.0)), math.radians(180.0)
 limit = st.floats(0.1, 20.0)
 limits_of_any_kind = st.builds(ArmLimits, st.tuples(limit, limit), limit, st.floats(0.5, 200.0))
 delta = st.floats(-3.2, 3.2)
-
-patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=150)
 
 
 def used(delta_rad: Vec2, limits: ArmLimits, move: Move) -> list[float]:
@@ -34,7 +32,6 @@ def used(delta_rad: Vec2, limits: ArmLimits, move: Move) -> list[float]:
     return worst
 
 
-@patient
 @given(st.tuples(delta, delta), limits_of_any_kind, st.one_of(st.just(0.0), st.floats(0.1, 60.0)))
 def test_any_move_keeps_its_limits_and_ends_at_rest(delta_rad: Vec2, limits: ArmLimits, duration_s: float) -> None:
     assume(max(map(abs, delta_rad)) > 1e-6)
@@ -52,7 +49,6 @@ def test_any_move_keeps_its_limits_and_ends_at_rest(delta_rad: Vec2, limits: Arm
     assert acceleration == pytest.approx((0.0, 0.0), abs=1e-6 * limits.jerk_max_rad_s3 * motion.duration_s)
 
 
-@patient
 @given(st.tuples(delta, delta), limits_of_any_kind, st.floats(0.1, 60.0))
 def test_value_speed_and_acceleration_do_not_jump(delta_rad: Vec2, limits: ArmLimits, duration_s: float) -> None:
     assume(max(map(abs, delta_rad)) > 1e-6)

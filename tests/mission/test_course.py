@@ -44,7 +44,7 @@ def assert_rates_are_derivatives(samples: list[Reference]) -> None:
             assert abs(vb - va) < 0.05, "a step"
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.sampled_from(["catch", "circuit"]),
     st.floats(0.0, 17.0),

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from minsnap_trajectories import Waypoint, generate_trajectory
 from numpy.polynomial import Polynomial
@@ -29,8 +29,8 @@ limit = st.floats(0.2, 5.0)
 limits_of_any_kind = st.builds(VehicleLimits, limit, limit, st.floats(0.5, 20.0))
 length = st.floats(-3.0, 3.0)
 
-patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=25)
-"""A loaded machine is no failure of the plan."""
+costly = settings(max_examples=25)
+"""One example solves and samples a whole path."""
 
 
 @st.composite
@@ -49,7 +49,7 @@ def curve(points_m: tuple[Vec3, ...], limits: VehicleLimits) -> Curve:
     return Curve(1.0, duration_s, way.least_scale_s, way.knots, way.pieces, points_m[-1])
 
 
-@patient
+@costly
 @given(ways(), limits_of_any_kind)
 def test_a_path_passes_its_points_with_four_continuous_derivatives(
     points_m: tuple[Vec3, ...], limits: VehicleLimits
@@ -77,7 +77,7 @@ def test_a_path_passes_its_points_with_four_continuous_derivatives(
             assert [axis.deriv(order)(at) for axis in end] == pytest.approx([0.0] * 3, abs=1e-6 * size)
 
 
-@patient
+@costly
 @given(ways(), limits_of_any_kind)
 def test_a_path_without_a_duration_uses_its_limits_and_keeps_them(
     points_m: tuple[Vec3, ...], limits: VehicleLimits
@@ -93,7 +93,7 @@ def test_a_path_without_a_duration_uses_its_limits_and_keeps_them(
     assert max(used) >= 0.98, "slower than it must be"
 
 
-@patient
+@costly
 @given(ways())
 def test_the_fast_solution_is_the_librarys(points_m: tuple[Vec3, ...]) -> None:
     shares = tuple(0.3 + 0.17 * index for index in range(len(points_m) - 1))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -40,10 +40,6 @@ length = st.floats(-5.0, 5.0)
 duration = st.floats(0.2, 20.0)
 angle = st.floats(-3.0, 3.0)
 point = st.tuples(length, length, length)
-
-
-patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=60)
-"""A loaded machine is no failure of the plan."""
 
 
 def values(reference: Reference) -> tuple[float, ...]:
@@ -113,7 +109,6 @@ def missions(draw: st.DrawFn) -> Mission:
     return Mission.model_validate(document)
 
 
-@patient
 @given(missions(), point, angle, st.one_of(st.none(), st.tuples(angle, angle)))
 def test_any_plan_is_smooth_and_without_gaps(
     mission: Mission, start: Vec3, yaw_rad: float, arm_rad: Vec2 | None
@@ -127,7 +122,6 @@ def test_any_plan_is_smooth_and_without_gaps(
     assert plan.reference(0.0).position_world_m == pytest.approx(start)
 
 
-@patient
 @given(point, st.tuples(length, length, length), angle, st.tuples(angle, angle), st.floats(0.05, 1.0))
 def test_any_landing_is_smooth_and_ends_folded_below_the_floor(
     position: Vec3, velocity: Vec3, yaw_rad: float, arm_rad: Vec2, speed_m_s: float

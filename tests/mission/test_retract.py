@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.loader import load_vehicle
@@ -32,7 +32,6 @@ def away_m(p: Vec3) -> float:
     return math.hypot(p[0] - ANCHOR[0], p[1] - ANCHOR[1])
 
 
-@settings(max_examples=150, deadline=None)
 @given(inside, velocity, angle, st.tuples(angle, angle))
 def test_from_anywhere(position: Vec3, speed: Vec3, yaw_rad: float, arm_rad: Vec2) -> None:
     plan = retract_from(position, speed, yaw_rad, arm_rad, FOLD, VEHICLE)
@@ -51,7 +50,6 @@ def test_from_anywhere(position: Vec3, speed: Vec3, yaw_rad: float, arm_rad: Vec
     assert end.velocity_world_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
 @given(inside, angle)
 def test_at_rest_it_stays_in_the_room_and_beside_the_anchor(position: Vec3, yaw_rad: float) -> None:
     plan = retract_from(position, (0.0, 0.0, 0.0), yaw_rad, FOLD, FOLD, VEHICLE)

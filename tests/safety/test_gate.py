@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.loader import load_vehicle
@@ -13,7 +13,6 @@ from companion.config.vehicle import Vehicle
 from companion.frames import quat_from_euler_zyx, tilt_rad
 from companion.safety.gate import Gate
 from companion.types import AttitudeSetpoint, Vec2
-from tests.examples import examples
 
 NAN = math.nan
 LEVEL = quat_from_euler_zyx(0, 0, 0.4)
@@ -122,7 +121,6 @@ def test_after_a_silence_the_first_thrust_may_be_any() -> None:
 number = st.floats(allow_nan=True, allow_infinity=True, width=32)
 
 
-@settings(max_examples=examples(400), deadline=None)
 @given(
     st.lists(
         st.tuples(number, number, number, number, number, number, number, number, number, st.floats(0.0, 0.3)),

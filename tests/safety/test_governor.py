@@ -7,7 +7,7 @@ import re
 from functools import cache
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.loader import FlightConfig, load_flight
@@ -97,7 +97,6 @@ anchors = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None)
 @given(anchors, st.lists(strategies, min_size=1, max_size=8))
 def test_any_stream_keeps_inside_and_smooth(
     overrides: tuple[str, ...], stream: list[tuple[Vec3, Vec3, Vec3, int, float, str, bool]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.safety.rules import RULES
@@ -81,7 +81,6 @@ def test_nobody_lets_it_go_on_while_something_stands(now: SafetyAction) -> None:
 any_event = st.sampled_from(EVENTS).map(lambda pair: event(*pair))
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(st.lists(any_event, max_size=4), st.floats(0.0, 40.0)), max_size=30))
 def test_no_way_leads_down_from_a_landing(ticks: list[tuple[list[Event], float]]) -> None:
     state, t_s = SupervisorState(), 0.0

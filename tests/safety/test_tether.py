@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import cache
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.loader import FlightConfig, load_flight
@@ -130,7 +130,6 @@ def ring_distance_m(clearance_of: Vehicle, ray: Vec3) -> float:
     return least if above < 0.0 else -max(above, 0.0)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.floats(-math.pi, math.pi),
     st.floats(math.radians(-30), math.radians(89)),

@@ -9,14 +9,13 @@ import struct
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.io import natnet
 from companion.io.natnet import Frame, Malformed, Message, NatNetVersion
 from companion.types import Quat
 from sitl.natnet import CLOCK_FREQUENCY_HZ, BodyPose, NatNetServer, encode_frame, encode_model_definitions
-from tests.examples import examples
 
 VERSIONS: tuple[NatNetVersion, ...] = ("3.0", "4.1")
 NAMES = {1: "quad", 5: "ball"}
@@ -192,7 +191,6 @@ def test_every_truncation_is_refused(version: NatNetVersion) -> None:
             assert isinstance(parse(honest, version), Malformed)
 
 
-@settings(max_examples=examples(2000), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     version=st.sampled_from(VERSIONS),
     rich=st.booleans(),
@@ -205,7 +203,6 @@ def test_flipped_bits(version: NatNetVersion, rich: bool, flips: list[tuple[int,
     believable(parse(bytes(datagram), version))
 
 
-@settings(max_examples=examples(2000), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(version=st.sampled_from(VERSIONS), payload=st.binary(max_size=400), lead=st.integers(0, 200))
 def test_random_payloads(version: NatNetVersion, payload: bytes, lead: int) -> None:
     believable(parse(payload, version))

@@ -8,7 +8,7 @@ import os
 import termios
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl.servo_bus import ServoBus, ServoLine
@@ -24,7 +24,6 @@ from sitl.servo_protocol import (
     stuff,
     unstuff,
 )
-from tests.examples import examples
 
 AMP = 2.69e-3
 
@@ -214,7 +213,6 @@ def recovers(line: ServoLine) -> bool:
     return line.feed(_PING).endswith(status(1, line.servos[0].alert, bytes((6, 4, line.servos[0].firmware))))
 
 
-@settings(max_examples=examples(1500), deadline=None)
 @given(st.binary(max_size=120))
 def test_random_bytes_never_raise(noise: bytes) -> None:
     line = line_of(ServoModel(1), ServoModel(2))
@@ -222,7 +220,6 @@ def test_random_bytes_never_raise(noise: bytes) -> None:
     assert recovers(line)
 
 
-@settings(max_examples=examples(1500), deadline=None)
 @given(
     st.sampled_from(list(Instruction)).filter(lambda i: i != Instruction.STATUS) | st.integers(0, 255),
     st.sampled_from([0, 1, 2, 254]),
@@ -236,7 +233,6 @@ def test_random_instructions_never_raise(instruction: int, packet_id: int, param
         assert abs(current) <= 1193 * AMP + 1e-9
 
 
-@settings(max_examples=examples(1500), deadline=None)
 @given(st.lists(st.tuples(st.integers(0, len(_TRAFFIC) * 8 - 1)), max_size=4), st.integers(0, len(_TRAFFIC)), st.data())
 def test_damaged_traffic_never_raises(flips: list[tuple[int]], cut: int, data: st.DataObject) -> None:
     damaged = bytearray(_TRAFFIC)
