@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+MINUTES ?= 10
 
-.PHONY: install fly test lint unit debian bench docs clean
+.PHONY: install fly test lint explore debian bench docs clean
 
 install: $(STAMP)
 
@@ -18,13 +19,23 @@ $(STAMP): pyproject.toml constraints.txt
 fly: install
 	@$(BIN)/companion fly configs/missions/catch.yaml --sitl
 
-test: debian lint unit
+# All stages, whatever comes of them, and a summary. The same examples, checks and skips for everybody.
+test: install debian
+	@$(BIN)/python -m tests.stages
 
-# What tests need beside Python: a real broker and a real browser. Nobody is asked for a password.
+lint: install
+	@$(BIN)/python -m tests.stages format lint types
+
+# Property tests and damaged input at every wire, at random, for whoever changes a parser: make explore MINUTES=10
+explore: install
+	@$(BIN)/python -m tests.explore $(MINUTES)
+
+# What tests need beside Python: a broker, a browser, udevadm. Nobody is asked for a password.
 debian:
-	@PATH="$$PATH:/usr/sbin"; missing=; \
+	@PATH="$$PATH:/usr/sbin:/sbin"; missing=; \
 	command -v mosquitto >/dev/null || missing="$$missing mosquitto"; \
 	command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || missing="$$missing chromium"; \
+	command -v udevadm >/dev/null || missing="$$missing udev"; \
 	test -n "$$missing" || exit 0; \
 	if ! command -v apt-get >/dev/null; then as=none; elif test "$$(id -u)" = 0; then as=; elif sudo -n true 2>/dev/null; then as="sudo -n"; else as=none; fi; \
 	if test "$$as" != none; then \
@@ -32,19 +43,7 @@ debian:
 	  export DEBIAN_FRONTEND=noninteractive; \
 	  { $$as apt-get -qq update && $$as apt-get -qq install -y --no-install-recommends $$missing; } >/dev/null 2>&1 && exit 0; \
 	fi; \
-	echo "not installed:$$missing; tests that need them are skipped, with CI set they fail (on Debian: apt install$$missing)"
-
-lint: install
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
-	$(BIN)/mypy
-
-# In turn: what computes, what waits for real processes, what flies. TESTS=thorough: property tests draw all of their examples.
-unit: install
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not flight and not waits" --durations=10
-	$(BIN)/python -m pytest -n $$($(BIN)/python -m tests.at_a_time waits) --dist loadgroup -m waits --durations=10
-	$(BIN)/python -m pytest -n $$($(BIN)/python -m tests.at_a_time flights) --dist loadgroup -m "flight and not alone" --durations=10
-	$(BIN)/python -m pytest -m alone
+	echo "not installed:$$missing; the tests that need them are skipped (on Debian: apt install$$missing)"
 
 # 14 minutes, ten of them a hover; one minute of it: make bench BENCH=--quick
 bench: install debian

@@ -2,6 +2,7 @@
 
     python -m benchmarks.fuzz                                     # every target, 1,000,000 inputs each
     python -m benchmarks.fuzz natnet yaml --inputs 20000 --jobs 2
+    python -m benchmarks.fuzz --minutes 5 --seed 7                # every target, as many inputs as there is time for
     python -m benchmarks.fuzz natnet --seed 1 --index 4711        # one input again
 
 Exit 0: nothing found; 1: findings, each saved as a file that `tests/fuzz` feeds from then on; 2: bad options.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import multiprocessing
 import sys
 import time
@@ -50,12 +52,12 @@ class Row:
 class Worker:
     """A process that feeds a range of inputs; its index is visible from outside even if it dies."""
 
-    def __init__(self, name: str, seed: int, first: int, last: int) -> None:
+    def __init__(self, name: str, seed: int, first: int, last: int, until_s: float) -> None:
         self.name, self.seed, self.first = name, seed, first
         context = multiprocessing.get_context("spawn")
         self.index: Any = RawValue(c_longlong, first)
         self.result, sender = context.Pipe(duplex=False)
-        self.process = context.Process(target=_work, args=(name, seed, first, last, self.index, sender))
+        self.process = context.Process(target=_work, args=(name, seed, first, last, until_s, self.index, sender))
         self.process.start()
         sender.close()
         self._seen, self._seen_s = first, time.monotonic()
@@ -85,24 +87,24 @@ class Worker:
         return Stretch(index - self.first, 0.0, 0.0, index, (0, 0), (finding,))
 
 
-def _work(name: str, seed: int, first: int, last: int, index: Any, sender: Connection) -> None:
+def _work(name: str, seed: int, first: int, last: int, until_s: float, index: Any, sender: Connection) -> None:
     logging.getLogger("companion").setLevel(logging.CRITICAL + 1)  # the edges say what they refuse, a million times
 
     def tell(now: int) -> None:
         index.value = now
 
     with target_class(name)() as target:
-        stretch = run(target, seed, first, last, tell)
+        stretch = run(target, seed, first, last, tell, until_s)
     sender.send(stretch)
 
 
-def fuzz(name: str, inputs: int, seed: int, jobs: int, progress: Progress) -> Row:
-    """One target, its inputs shared out over processes."""
+def fuzz(name: str, inputs: int, seed: int, jobs: int, progress: Progress, until_s: float = math.inf) -> Row:
+    """One target, its inputs shared out over processes, until the deadline on the monotonic clock."""
     total = max(jobs, round(inputs * target_class(name).share))
     bounds = [total * k // jobs for k in range(jobs + 1)]
     start_s = time.monotonic()
     bar = progress.add_task(name, total=total)
-    workers = [Worker(name, seed, bounds[k], bounds[k + 1]) for k in range(jobs)]
+    workers = [Worker(name, seed, bounds[k], bounds[k + 1], until_s) for k in range(jobs)]
     stretches: dict[int, Stretch] = {}
     try:
         while len(stretches) < jobs:
@@ -166,12 +168,23 @@ def again(name: str, seed: int, index: int) -> int:
     return int(found is not None)
 
 
+def _fuzz_all(names: Sequence[str], options: argparse.Namespace, progress: Progress) -> list[Row]:
+    end_s = time.monotonic() + 60.0 * options.minutes
+    rows = []
+    for done, name in enumerate(names):
+        now_s = time.monotonic()
+        until_s = now_s + max(0.0, end_s - now_s) / (len(names) - done)
+        rows.append(fuzz(name, options.inputs, options.seed, options.jobs, progress, until_s))
+    return rows
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"all, or of {', '.join(NAMES)}")
     parser.add_argument(
         "--inputs", type=int, default=1_000_000, help="for each target; the -wire ones take a share of it"
     )
+    parser.add_argument("--minutes", type=float, default=math.inf, help="for all targets together")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--index", type=int, help="feed this one input of one target only")
@@ -180,6 +193,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [name for name in wanted if name not in NAMES]
     if unknown:
         parser.error(f"no target {unknown[0]!r}; there are all, {', '.join(NAMES)}")
+    if not options.minutes > 0.0:
+        parser.error("--minutes is more than 0")
     if options.inputs < 1 or options.jobs < 1 or options.seed < 0 or (options.index is not None and options.index < 0):
         parser.error("--inputs and --jobs are 1 or more, --seed and --index 0 or more")
     if options.index is not None:
@@ -187,7 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error("--index wants one target")
         return again(wanted[0], options.seed, options.index)
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
-        rows = [fuzz(name, options.inputs, options.seed, options.jobs, progress) for name in wanted]
+        rows = _fuzz_all(wanted, options, progress)
     Console(width=None if sys.stdout.isatty() else 120).print(table(rows))
     found = [finding for row in rows for finding in row.findings]
     for finding in found:

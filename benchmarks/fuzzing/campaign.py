@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 import signal
 import time
@@ -21,7 +22,7 @@ CPU_LIMIT_S = 5.0
 FINDINGS_MAX = 5
 """Of one process; then it stops."""
 MEMORY_SHARE, MEMORY_BYTES = 0.05, 5 * 2**20
-"""The resident set may grow by the larger of the two from 10 % of the inputs to the end."""
+"""The resident set may grow by the larger of the two from 10 % of the inputs, or of the time, to the end."""
 _WARM_UP_SHARE = 0.1
 _TELL_EVERY = 64
 
@@ -84,7 +85,7 @@ class Stretch:
     """CPU and waiting of the slowest input, wall clock."""
     slowest_index: int
     memory_bytes: tuple[int, int]
-    """Resident set after 10 % of the inputs and at the end."""
+    """Resident set after 10 % of the inputs, or of the time, and at the end."""
     findings: tuple[Finding, ...]
 
 
@@ -93,8 +94,15 @@ def generator(target: str, seed: int, index: int) -> Random:
     return Random(zlib.crc32(target.encode()) << 96 | (seed & 0xFFFFFFFF) << 64 | index)
 
 
-def run(target: Target, seed: int, first: int, last: int, tell: Callable[[int], None] = lambda index: None) -> Stretch:
-    """Feed inputs `first` to `last` - 1.
+def run(
+    target: Target,
+    seed: int,
+    first: int,
+    last: int,
+    tell: Callable[[int], None] = lambda index: None,
+    until_s: float = math.inf,
+) -> Stretch:
+    """Feed inputs `first` to `last` - 1, or as many as there is time for.
 
     Args:
         target: entered.
@@ -102,19 +110,27 @@ def run(target: Target, seed: int, first: int, last: int, tell: Callable[[int], 
         first: index.
         last: index, exclusive.
         tell: called with the index before it is fed, now and then.
+        until_s: deadline on the monotonic clock; no input is started after it.
     """
     findings: list[Finding] = []
     start_s = time.monotonic()
     warm_index = first + int(_WARM_UP_SHARE * (last - first))
+    warm_s = start_s + _WARM_UP_SHARE * (until_s - start_s)
+    warm = False
     memory, files = _resident_bytes(), _open_files()
     slowest_s, slowest_index = 0.0, first
-    index = first
+    done = 0
     for index in range(first, last):
-        if index == warm_index:
+        now_s = time.monotonic()
+        if now_s >= until_s:
+            break
+        if not warm and (index == warm_index or now_s >= warm_s):
+            warm = True
             memory, files = _resident_bytes(), _open_files()
         if index % _TELL_EVERY == 0:
             tell(index)
         data = target.make(generator(target.name, seed, index))
+        done += 1
         begun_s = time.monotonic()
         text = feed_watched(target, data)
         took_s = time.monotonic() - begun_s
@@ -130,7 +146,6 @@ def run(target: Target, seed: int, first: int, last: int, tell: Callable[[int], 
         findings.append(Finding(target.name, seed, None, text))
     if end_files > files:
         findings.append(Finding(target.name, seed, None, f"open files grew from {files} to {end_files}"))
-    done = index + 1 - first if last > first else 0
     return Stretch(done, time.monotonic() - start_s, slowest_s, slowest_index, (memory, end), tuple(findings))
 
 

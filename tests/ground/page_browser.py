@@ -6,26 +6,16 @@ import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import pytest
 from playwright.sync_api import sync_playwright
 
 from companion.ground.messages import VERSION, Events, Preflight, PreflightRow, Stream
+from tests.browser import ARGUMENTS
+from tests.browser import chromium as chromium_path
 from tests.ground.page_stand import NAME, SESSION, Message, Stand, told
 from tests.support import DEADLINE_S
 
-CHROMIUM = Path("/usr/bin/chromium")
-ARGUMENTS = (
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
 SIZES = {"desktop": (1440, 900), "small": (1024, 768), "tablet": (768, 1024)}
 _marks = itertools.count()
 
@@ -33,10 +23,9 @@ _marks = itertools.count()
 @contextmanager
 def chromium() -> Iterator[Any]:
     """The browser; without it the test is skipped with a reason."""
-    if not CHROMIUM.exists():
-        pytest.skip(f"{CHROMIUM} is not installed: apt install chromium")
+    path = chromium_path()
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=list(ARGUMENTS))
+        browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
         yield browser
         browser.close()
 

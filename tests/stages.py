@@ -1,0 +1,153 @@
+"""`python -m tests.stages [STAGE ...]`: run the stages of `make test`, all of them, and sum them up.
+
+A stage that fails does not stop the others. The last line counts tests; each check (format, lint, types) counts as one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.at_a_time import AT_A_TIME
+
+_BIN = Path(sys.executable).parent
+_PYTEST = (sys.executable, "-m", "pytest")
+_TOGETHER = {"waiting": "waits", "flights": "flights"}
+"""Stages whose number of simultaneous tests depends on the computer, with their names in `tests.at_a_time`."""
+_INTERRUPTED = 130
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One command."""
+
+    name: str
+    command: tuple[str, ...]
+    tests: bool
+    """Whether the command is pytest, which lists its results."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What came of one stage."""
+
+    stage: Stage
+    ok: bool
+    duration_s: float
+    passed: int
+    failed: int
+    failed_tests: tuple[str, ...] = ()
+    """Node ids. Empty if the stage failed as a whole."""
+    skipped: Mapping[str, int] = field(default_factory=dict)
+    """Number of tests by reason."""
+
+
+STAGES = (
+    Stage("format", (str(_BIN / "ruff"), "format", "--check", "."), tests=False),
+    Stage("lint", (str(_BIN / "ruff"), "check", "."), tests=False),
+    Stage("types", (str(_BIN / "mypy"),), tests=False),
+    Stage("computing", (*_PYTEST, "-n", "3", "--dist", "worksteal", "-m", "not flight and not waits"), tests=True),
+    Stage("waiting", (*_PYTEST, "--dist", "loadgroup", "-m", "waits"), tests=True),
+    Stage("flights", (*_PYTEST, "--dist", "loadgroup", "-m", "flight and not alone"), tests=True),
+    Stage("alone", (*_PYTEST, "-m", "alone"), tests=True),
+)
+"""In turn: what checks the text, what computes, what waits for real processes, what flies."""
+
+
+def _shown(words: Iterable[str]) -> str:
+    """Return the command as one types it here, in the project's folder."""
+    here = f"{Path.cwd()}/"
+    return shlex.join(word.removeprefix(here) for word in words)
+
+
+def run(stage: Stage) -> Result:
+    """Run one stage; its output goes where ours goes."""
+    print(f"\n=== {stage.name}: {_shown(stage.command)}", flush=True)
+    begun_s = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        tally = Path(folder) / "tally.json"
+        more = (*_at_a_time(stage), "-p", "tests.tally", "--tally", str(tally), "--durations=10") if stage.tests else ()
+        code = subprocess.run((*stage.command, *more), check=False).returncode
+        duration_s = time.monotonic() - begun_s
+        if not tally.exists():
+            return Result(stage, code == 0, duration_s, int(code == 0), int(code != 0))
+        counts = json.loads(tally.read_text(encoding="utf-8"))
+    failed = max(len(counts["failed"]), int(code != 0))
+    return Result(stage, code == 0, duration_s, counts["passed"], failed, tuple(counts["failed"]), counts["skipped"])
+
+
+def _at_a_time(stage: Stage) -> tuple[str, ...]:
+    kind = _TOGETHER.get(stage.name)
+    if kind is None:
+        return ()
+    assert kind in AT_A_TIME
+    asked = (sys.executable, "-m", "tests.at_a_time", kind)
+    return ("-n", subprocess.run(asked, check=True, stdout=subprocess.PIPE, encoding="ascii").stdout.strip())
+
+
+def summary(results: Sequence[Result]) -> str:
+    """Sum up: a line for each stage, the reasons of skipped tests, each failure with the command that repeats it, the total."""
+    lines = [f"\n{'stage':<10} {'result':<7} {'passed':>7} {'failed':>7} {'skipped':>7} {'seconds':>8}"]
+    for one in results:
+        counts = (one.passed, one.failed, sum(one.skipped.values())) if one.stage.tests else ("", "", "")
+        words = " ".join(f"{count:>7}" for count in counts)
+        lines.append(f"{one.stage.name:<10} {'passed' if one.ok else 'FAILED':<7} {words} {one.duration_s:>8.1f}")
+    reasons: Counter[str] = Counter()
+    for one in results:
+        reasons.update(one.skipped)
+    lines += [f"skipped: {count} x {reason}" for reason, count in reasons.most_common()]
+    again = [line for one in results if not one.ok for line in _again(one)]
+    if again:
+        lines += ["failed; run one again:", *(f"  {line}" for line in again)]
+    passed, failed = sum(one.passed for one in results), sum(one.failed for one in results)
+    return "\n".join([*lines, f"{passed} passed, {failed} failed, {reasons.total()} skipped"])
+
+
+def _again(result: Result) -> Iterable[str]:
+    if result.stage.tests and result.failed_tests:
+        return (_shown((*_PYTEST, "-n0", test)) for test in result.failed_tests)
+    if result.stage.tests:
+        return [_shown((sys.executable, "-m", "tests.stages", result.stage.name))]
+    return [_shown(result.stage.command)]
+
+
+def run_all(stages: Iterable[Stage]) -> int:
+    """Run the stages in turn and print the summary; returns the exit code."""
+    results: list[Result] = []
+    interrupted = False
+    try:
+        for stage in stages:
+            results.append(run(stage))
+    except KeyboardInterrupt:
+        interrupted = True
+        print("\ninterrupted; the stages below had ended")
+    print(summary(results), flush=True)
+    if interrupted:
+        return _INTERRUPTED
+    return int(not all(result.ok for result in results))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = [stage.name for stage in STAGES]
+    parser.add_argument("stages", nargs="*", metavar="STAGE", help=f"of {', '.join(names)}; all if none is named")
+    wanted = parser.parse_args(arguments).stages or names
+    unknown = [name for name in wanted if name not in names]
+    if unknown:
+        parser.error(f"no stage {unknown[0]!r}; there are {', '.join(names)}")
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if a shell started us in the background
+    return run_all(stage for stage in STAGES if stage.name in wanted)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,113 @@
+"""`make test` runs every stage and sums them up; and it draws the same examples for everybody."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.stages import Stage, run_all
+from tests.support import ROOT
+
+PYTHON = sys.executable.removeprefix(f"{ROOT}/")
+OWN = """
+import pytest
+
+def test_right(): pass
+def test_wrong(): assert False
+@pytest.mark.skipif(True, reason="no broker here")
+def test_absent(): pass
+"""
+
+
+@pytest.fixture
+def tests_file(tmp_path: Path) -> Path:
+    path = tmp_path / "test_own.py"
+    path.write_text(OWN, encoding="utf-8")
+    return path
+
+
+def pytest_of(path: Path) -> tuple[str, ...]:
+    return (sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", str(path.parent), str(path))
+
+
+def test_a_failed_stage_hides_no_other(tests_file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    broken = (sys.executable, "-c", "raise SystemExit(3)")
+    stages = [
+        Stage("lint", broken, tests=False),
+        Stage("types", (sys.executable, "-c", ""), tests=False),
+        Stage("computing", pytest_of(tests_file), tests=True),
+        Stage("alone", broken, tests=True),
+    ]
+    assert run_all(stages) == 1
+    lines = capfd.readouterr().out.splitlines()
+    assert lines[-1] == "2 passed, 3 failed, 1 skipped"
+    table = [line.split() for line in lines[lines.index("") :]]
+    assert [words[:5] for words in table if words[:1] == ["computing"]] == [["computing", "FAILED", "1", "1", "1"]]
+    assert [words[1] for words in table if words[:1] in (["lint"], ["types"], ["alone"])] == [
+        "FAILED",
+        "passed",
+        "FAILED",
+    ]
+    assert "skipped: 1 x no broker here" in lines
+    again = lines[lines.index("failed; run one again:") + 1 : -1]
+    assert again == [
+        f"  {PYTHON} -c 'raise SystemExit(3)'",
+        f"  {PYTHON} -m pytest -n0 test_own.py::test_wrong",
+        f"  {PYTHON} -m tests.stages alone",
+    ]
+
+
+def test_all_green_is_exit_0(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_all([Stage("types", (sys.executable, "-c", ""), tests=False)]) == 0
+    assert capfd.readouterr().out.splitlines()[-1] == "1 passed, 0 failed, 0 skipped"
+
+
+DRAWS = """
+import os, pathlib
+from hypothesis import given, strategies as st
+
+if os.environ.get("CI"):
+    import many_constants
+
+drawn = []
+
+@given(st.integers(), st.text(), st.floats())
+def test_draws(number, text, value):
+    drawn.append(ascii((number, text, value)))
+
+def test_write():
+    pathlib.Path(os.environ["DRAWN"]).write_text("\\n".join(drawn), encoding="utf-8")
+"""
+
+
+def test_everybody_draws_the_same_examples(tmp_path: Path) -> None:
+    """Whatever the environment, the time zone, the hash seed, and the modules imported before."""
+    (tmp_path / "test_draws.py").write_text(DRAWS, encoding="utf-8")
+    constants = "\n".join(f"A{k} = {k * 7919}; B{k} = 'word {k}'; C{k} = {k}.125" for k in range(100, 400))
+    (tmp_path / "many_constants.py").write_text(constants, encoding="utf-8")
+    circumstances: list[dict[str, str]] = [
+        {"PYTHONHASHSEED": "1"},
+        {"PYTHONHASHSEED": "2", "CI": "1", "TZ": "Asia/Kolkata", "LC_ALL": "C", "HOME": "/proc/none"},
+    ]
+    drawn = []
+    for k, more in enumerate(circumstances):
+        path = tmp_path / f"drawn_{k}"
+        own = {key: value for key, value in os.environ.items() if key != "CI"}
+        environment = {**own, "PYTHONPATH": str(ROOT), "DRAWN": str(path), **more}
+        command = (*pytest_of(tmp_path / "test_draws.py"), "-p", "tests.conftest", "-p", "no:cacheprovider")
+        subprocess.run(command, cwd=tmp_path, env=environment, check=True)
+        drawn.append(path.read_text(encoding="utf-8").splitlines())
+    assert len(drawn[0]) == 50
+    assert drawn[0] == drawn[1]
+
+
+def test_children_start_with_default_signal_handling() -> None:
+    """Also where these tests were started in the background, by a shell without job control."""
+    code = "import signal; print(int(signal.getsignal(signal.SIGINT) is signal.default_int_handler))"
+    assert subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE).stdout == b"1\n"
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == set()
