@@ -78,5 +78,6 @@ class FlightGuard:
             local_port=ids.local_port,
             pose_stamp_s=self._pose_stamp_s,
             position_world_m=self._position_world_m,
+            peer=ids.peer,
         )
         self._client.beat(self._last)

@@ -30,6 +30,8 @@ _IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING}
 class MemoryWire:
     """The guardian's wire to the stub."""
 
+    lost = False
+
     def __init__(self, px4: Px4Stub) -> None:
         self.schedule = Schedule(False)
         self._px4 = px4

@@ -7,6 +7,7 @@ flight: `READY`, or `PROBLEM` and a line for people, ten times a second.
 from __future__ import annotations
 
 import math
+import socket
 import struct
 from dataclasses import dataclass
 
@@ -20,7 +21,8 @@ HANGS = "the flight process hangs"
 MAX_BYTES = 1024
 
 _LIFTING, _PILOT, _GOODBYE = 1, 2, 4
-_BEAT = struct.Struct("<cBBBBHIddddddd")
+_BEAT = struct.Struct("<cBBBBH4sHIddddddd")
+_NO_PEER = (bytes(4), 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +53,14 @@ class Beat:
     """Of the last motion-capture pose with the body in view, on the flight clock; -inf: none yet."""
     position_world_m: Vec3
     """Of that pose."""
+    peer: tuple[str, int] | None = None
+    """IPv4 address and UDP port of PX4, proved by the flight process; None: not UDP."""
 
 
 def pack(beat: Beat) -> bytes:
     """A beat as a datagram."""
     flags = _LIFTING * beat.lifting | _PILOT * beat.pilot | _GOODBYE * beat.goodbye
+    host, port = _NO_PEER if beat.peer is None else (socket.inet_aton(beat.peer[0]), beat.peer[1])
     return _BEAT.pack(
         BEAT,
         flags,
@@ -63,6 +68,8 @@ def pack(beat: Beat) -> bytes:
         beat.own_system,
         beat.own_component,
         beat.local_port,
+        host,
+        port,
         beat.tick & 0xFFFFFFFF,
         beat.t_s,
         beat.origin_s,
@@ -76,7 +83,7 @@ def unpack(datagram: bytes) -> Beat | None:
     """The beat in a datagram; None if it is none, or not a sane one."""
     if len(datagram) != _BEAT.size or datagram[:1] != BEAT:
         return None
-    _, flags, autopilot, system, component, port, tick, *times, x, y, z = _BEAT.unpack(datagram)
+    _, flags, autopilot, system, component, local_port, host, port, tick, *times, x, y, z = _BEAT.unpack(datagram)
     t_s, origin_s, mission_t_s, pose_stamp_s = times
     if not all(map(math.isfinite, (t_s, origin_s, mission_t_s, x, y, z))) or math.isnan(pose_stamp_s):
         return None
@@ -91,7 +98,8 @@ def unpack(datagram: bytes) -> Beat | None:
         autopilot_system=autopilot,
         own_system=system,
         own_component=component,
-        local_port=port,
+        local_port=local_port,
         pose_stamp_s=pose_stamp_s,
         position_world_m=(x, y, z),
+        peer=None if (host, port) == _NO_PEER else (socket.inet_ntoa(host), port),
     )

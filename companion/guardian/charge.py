@@ -124,6 +124,10 @@ class Charge:
         for message in messages:
             self._px4.take(t_s, message)
 
+    def link_reopened(self) -> None:
+        """Ask for the streams again with the next step: PX4 may have restarted, or the port is a new one to it."""
+        self._spoken_s = None
+
     def step(self, t_s: float) -> None:
         """Every hundredth of a second."""
         if self._spoken_s is None:

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.io import autopilot_messages as messages
+from companion.io.ground_frames import autopilot_heartbeat
 from companion.types import AutopilotRequest, MocapPose
 
 Message = Any
@@ -19,6 +20,7 @@ Message = Any
 _NET = re.compile(r"(udpin|udpout|tcpout)://([^:/?]+):(\d+)")
 _SERIAL = re.compile(r"(serial|serial_flowcontrol)://(/[^:]+):(\d+)")
 _MAX_BYTES = 65535
+_ROUND_DATAGRAMS = 1000
 _CONNECT_TIMEOUT_S = 0.5
 _TYPE_MASK_IGNORE_RATES = 7
 # One NaN: PX4 takes EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
@@ -31,6 +33,10 @@ class Wire(Protocol):
     @property
     def ready(self) -> bool:
         """It is known where PX4 is."""
+
+    @property
+    def lost(self) -> bool:
+        """The connection has ended: it wakes every wait and carries nothing."""
 
     def fileno(self) -> int:
         """What to wait on."""
@@ -48,24 +54,30 @@ class Wire(Protocol):
 class UdpWire:
     """UDP. Bound to where PX4 sends (`udpin`), or sending to it (`udpout`), from the port that the flight process spoke from.
 
-    PX4 keeps the first partner of a UDP link, so the old port matters.
+    PX4 keeps the first partner of a UDP link, so the old port matters. Once PX4's address is known the socket is connected to it: the
+    kernel then drops datagrams of every other sender.
+
+    Args:
+        local: address to bind; None: any.
+        remote: PX4's address; None: the sender of the first valid HEARTBEAT of an autopilot.
     """
 
+    lost = False
+
     def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None) -> None:
-        self._remote = remote
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._remote: tuple[str, int] | None = None
+        self.ready = False
+        """PX4's address is known."""
         try:
             self._socket.setblocking(False)
             if local is not None:
                 self._socket.bind(local)
+            if remote is not None:
+                self._pin(remote)
         except OSError:
             self._socket.close()
             raise
-
-    @property
-    def ready(self) -> bool:
-        """A `udpin` link hears PX4 first."""
-        return self._remote is not None
 
     def fileno(self) -> int:
         """The socket."""
@@ -73,28 +85,33 @@ class UdpWire:
 
     def send(self, data: bytes) -> None:
         """To PX4, once it is known where it is."""
-        if self._remote is not None:
-            with contextlib.suppress(OSError):
-                self._socket.sendto(data, self._remote)
+        with contextlib.suppress(OSError):
+            self._socket.send(data)
 
     def receive(self) -> list[bytes]:
-        """Datagrams; a `udpin` link learns its partner from the first."""
+        """Datagrams of PX4's address; before it is known, what proves it and nothing else."""
         found: list[bytes] = []
-        while len(found) < 1000:
+        for _ in range(_ROUND_DATAGRAMS):
             try:
-                data, address = self._socket.recvfrom(_MAX_BYTES)
+                data, sender = self._socket.recvfrom(_MAX_BYTES)
             except (BlockingIOError, InterruptedError):
                 break
             except OSError:  # an ICMP error of an earlier send
                 continue
-            if self._remote is None and data[:1] in (b"\xfd", b"\xfe"):
-                self._remote = address
-            found.append(data)
+            if not self.ready and autopilot_heartbeat(data) is not None:
+                self._pin(sender)
+            if sender == self._remote:
+                found.append(data)
         return found
 
     def close(self) -> None:
         """Close it."""
         self._socket.close()
+
+    def _pin(self, remote: tuple[str, int]) -> None:
+        self._socket.connect(remote)
+        self._remote = remote
+        self.ready = True
 
 
 class TcpWire:
@@ -103,6 +120,7 @@ class TcpWire:
     ready = True
 
     def __init__(self, remote: tuple[str, int]) -> None:
+        self.lost = False
         self._socket = socket.create_connection(remote, _CONNECT_TIMEOUT_S)
         self._socket.setblocking(False)
 
@@ -116,10 +134,15 @@ class TcpWire:
             self._socket.send(data)
 
     def receive(self) -> list[bytes]:
-        """What waits."""
-        with contextlib.suppress(OSError):
-            return [self._socket.recv(_MAX_BYTES)]
-        return []
+        """What waits. An end of the stream or an error of the connection loses the link."""
+        try:
+            data = self._socket.recv(_MAX_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return []
+        except OSError:
+            data = b""
+        self.lost = not data
+        return [data] if data else []
 
     def close(self) -> None:
         """Close it."""
@@ -134,7 +157,9 @@ class SerialWire:
     def __init__(self, path: str, baud: int, flow_control: bool) -> None:
         import serial  # only here: the other links do not need it
 
-        self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, rtscts=flow_control)
+        self.lost = False
+        # exclusive: flock, as the flight process holds it on the same device
+        self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, rtscts=flow_control, exclusive=True)
         self._errors = (OSError, serial.SerialException)
 
     def fileno(self) -> int:
@@ -148,10 +173,13 @@ class SerialWire:
             self._port.write(data)
 
     def receive(self) -> list[bytes]:
-        """What waits."""
-        with contextlib.suppress(*self._errors):
-            return [self._port.read(_MAX_BYTES)]
-        return []
+        """What waits. A port that is readable without data (unplugged, hung up) loses the link."""
+        try:
+            data = self._port.read(_MAX_BYTES)
+        except self._errors:
+            self.lost = True
+            return []
+        return [data] if data else []
 
     def close(self) -> None:
         """Close it."""
@@ -166,23 +194,25 @@ def address_problem(address: str) -> str | None:
     return f"autopilot {address}: the guardian can take over udpin, udpout, tcpout and serial only; use one of them"
 
 
-def open_wire(address: str, local_port: int) -> Wire:
+def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None) -> Wire:
     """Open the link that the flight process has let go of.
 
     Args:
         address: as in `devices.autopilot.address`.
         local_port: of the flight process's UDP socket, 0 if not known.
+        peer: PX4's UDP address as the flight process proved it; None: not known.
 
     Raises:
-        OSError: it is not free, or not there.
+        OSError: it is not free (the flight process may still hold it), or not there.
     """
     net = _NET.fullmatch(address)
     if net is not None:
         kind, host, port = net[1], net[2], int(net[3])
         if kind == "udpin":
-            return UdpWire((host, port), None)
+            return UdpWire((host, port), peer)
         if kind == "udpout":
-            return UdpWire(("", local_port) if local_port else None, (socket.gethostbyname(host), port))
+            remote = peer or (socket.gethostbyname(host), port)
+            return UdpWire(("", local_port) if local_port else None, remote)
         return TcpWire((host, port))
     port_of = _SERIAL.fullmatch(address)
     if port_of is None:

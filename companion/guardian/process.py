@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import os
 import select
 import signal
@@ -35,6 +36,8 @@ MOCAP_FRESH_S = 0.5
 KILL_TIMEOUT_S = 1.0
 LINK_TIMEOUT_S = 30.0
 """A link that cannot be opened for this long is given up, and the vehicle with it."""
+REOPEN_PERIOD_S = 0.5
+"""Pause before a link that ended (TCP closed, serial port unplugged) is opened again."""
 STATUS_PERIOD_S = 0.5
 ERROR_CHARS, ERRORS_TOLD_MAX = 300, 20
 _MAX_BEATS = 512
@@ -113,6 +116,10 @@ class Guardian:
         self._status_s = float("-inf")
         self._errors: set[str] = set()
         """Errors of its own that have been told."""
+        self._no_link = False
+        """The link is not open, and that has been reported."""
+        self._reopen_s = float("-inf")
+        """When a link that ended may be opened again, by `time.monotonic`."""
         self._silent_s = 0.0
         """Longest silence while the rotors may lift."""
 
@@ -197,26 +204,52 @@ class Guardian:
             link.wire.close()
 
     def _open_link(self, last: Beat) -> Link | None:
-        """The flight process's link; asked for again while something still holds it."""
+        """The flight process's link; tried again while something still holds it. None: not free within LINK_TIMEOUT_S."""
         deadline_s = time.monotonic() + LINK_TIMEOUT_S
-        told = False
         while True:
-            try:
-                wire: Wire = open_wire(self._settings.autopilot_address, last.local_port)
+            wire = self._try_wire(last)
+            if wire is not None:
                 return Link(wire, (last.own_system, last.own_component), last.autopilot_system)
-            except OSError as error:
-                now_s = time.monotonic()
-                if not told:
-                    told = True
-                    text = f"autopilot {self._settings.autopilot_address}: {error}; trying again"
-                    now = now_s - last.origin_s
-                    self._tell(
-                        last, Told(now, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text)
-                    )
-                if now_s > deadline_s:
-                    return None
+            if time.monotonic() > deadline_s:
+                return None
             self._sign_of_life(0)
             time.sleep(PERIOD_S)
+
+    def _try_wire(self, last: Beat) -> Wire | None:
+        """Open the wire. The first failure is reported. Never beside a flight process that lives: two readers share out the bytes."""
+        try:
+            if not self._flight.wait(0.0):
+                raise OSError(errno.EBUSY, "the killed flight process still holds it")
+            wire = open_wire(self._settings.autopilot_address, last.local_port, last.peer)
+        except OSError as error:
+            self._report_no_link(last, error.strerror or str(error))
+            return None
+        self._no_link = False
+        return wire
+
+    def _report_no_link(self, last: Beat, found: str) -> None:
+        if not self._no_link:
+            self._no_link = True
+            text = f"autopilot {self._settings.autopilot_address}: {found}; trying again"
+            now_s = time.monotonic() - last.origin_s
+            self._tell(last, Told(now_s, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+
+    def _mend_link(self, last: Beat, link: Link, charge: Charge, waiting: select.poll) -> None:
+        """Close a link that has ended, so that it wakes no wait, and open it again every REOPEN_PERIOD_S."""
+        now_s = time.monotonic()
+        if not link.wire.lost or now_s < self._reopen_s:
+            return
+        self._reopen_s = now_s + REOPEN_PERIOD_S
+        if not self._no_link:
+            self._report_no_link(last, "the connection has ended")
+            waiting.unregister(link.wire.fileno())
+            link.wire.close()
+            return
+        wire = self._try_wire(last)
+        if wire is not None:
+            link.wire = wire
+            waiting.register(wire.fileno(), select.POLLIN)
+            charge.link_reopened()
 
     def _land(self, last: Beat, link: Link) -> bool:
         mocap = self._mocap
@@ -242,6 +275,7 @@ class Guardian:
                     mocap.serve(now_s)
             with self._surviving(last, charge, "PX4's messages"):
                 charge.take_messages(t_s, link.receive())
+                self._mend_link(last, link, charge, waiting)
             if now_s - step_s >= PERIOD_S:
                 step_s = now_s
                 with self._surviving(last, charge, "the landing"):

@@ -26,15 +26,16 @@ from companion.clock import Clock
 from companion.config.vehicle import AutopilotDevice
 from companion.io import autopilot_messages as messages
 from companion.io.autopilot_calls import NATIVE_CALL_DEADLINE_S, NativeCalls
+from companion.io.autopilot_claim import LinkClaim, Peer
 from companion.io.autopilot_inbox import Inbox, ask_for_streams
 from companion.io.autopilot_link import (
     add_connection,
     check_address,
     device_error,
     first_autopilot,
-    pin_udp,
+    pin_new_udp,
     quiet_native_log,
-    udp_ports,
+    udp_sockets,
 )
 from companion.io.autopilot_origin import ensure_origin
 from companion.io.autopilot_params import ParamTransfer
@@ -62,6 +63,8 @@ class LinkIdentity:
     own_component: int
     local_port: int
     """UDP port that MAVSDK speaks from; 0: not UDP, or not known."""
+    peer: Peer | None = None
+    """PX4's UDP address, the only one that MAVSDK hears; None: not UDP."""
 
 
 class MavsdkAutopilot:
@@ -98,6 +101,7 @@ class MavsdkAutopilot:
         self._system_id = 0
         self._own_ids = (0, 0)
         self._local_port = 0
+        self._claim: LinkClaim | None = None
 
     async def __aenter__(self) -> Self:
         """Open the link, find PX4, ask for the streams, give PX4 a global origin if it has none and is not armed.
@@ -112,16 +116,16 @@ class MavsdkAutopilot:
         try:
             configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
             self._own_ids = (int(configuration.system_id), int(configuration.component_id))
-            ports = udp_ports()
             self._mavsdk = Mavsdk(configuration)
+            self._claim = claim = LinkClaim(address)
+            await claim.find_px4(self._device.discovery_timeout_s)
             self._connection = await self._calls.run(
                 *("the connection to open", _CONNECT_DEADLINE_S, add_connection),
                 *(self._mavsdk, address, self._forwarding),
             )
+            self._local_port = claim.pin()
             system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
-            new = udp_ports() - ports
-            self._local_port = new.pop() if len(new) == 1 else 0
             self._direct = MavlinkDirect(system)
             self._mocap = Mocap(system)
             telemetry = Telemetry(system)
@@ -133,6 +137,7 @@ class MavsdkAutopilot:
             await ask_for_streams(address, self._calls, telemetry, self._direct, self._system_id)
             self._open = True
             await self.ensure_origin()
+            claim.refuse_rivals()
         except BaseException:
             await self._close()
             raise
@@ -146,7 +151,8 @@ class MavsdkAutopilot:
 
     def identity(self) -> LinkIdentity:
         """Who speaks to whom on the open link."""
-        return LinkIdentity(self._system_id, *self._own_ids, self._local_port)
+        peer = self._claim.peer if self._claim is not None else None
+        return LinkIdentity(self._system_id, *self._own_ids, self._local_port, peer)
 
     async def forward_to(self, port: int) -> int:
         """Forward between PX4 and that UDP port of 127.0.0.1; the port of 127.0.0.1 that MAVSDK speaks from to it.
@@ -160,18 +166,15 @@ class MavsdkAutopilot:
         self._require_open()
         assert self._forwarding, "made without forwarding"
         address = f"udpout://127.0.0.1:{port}"
-        before = udp_ports()
+        before = frozenset(udp_sockets())
         expected = "the connection for forwarding to open"
         self._second = await self._calls.run(expected, _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address, True)
-        new = udp_ports() - before
         try:
-            own_port = new.pop() if len(new) == 1 else 0
-            pin_udp(own_port, ("127.0.0.1", port))
+            return pin_new_udp(before, ("127.0.0.1", port))
         except OSError as error:
             self._drop_second()
             fix = "mount /proc, or fly without ground.qgroundcontrol"
             raise device_error(address, "MAVSDK's socket in /proc", error.strerror or str(error), fix) from None
-        return own_port
 
     def vehicle(self) -> VehicleState | None:
         """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
@@ -241,8 +244,10 @@ class MavsdkAutopilot:
         self._direct.send_command_async(command, answered)
 
     def take_messages(self) -> list[str]:
-        """Refusals and STATUSTEXTs since the last call, oldest first; texts as `autopilot_texts` tells them."""
-        return self._desk.take_messages(self._clock())
+        """Refusals and STATUSTEXTs since the last call, oldest first, and a second sender that claims to be PX4."""
+        texts = self._desk.take_messages(self._clock())
+        rival = self._claim.take_rival() if self._claim is not None else None
+        return texts if rival is None else [*texts, rival]
 
     async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
         """Values of PX4's parameters by name, int or float as PX4 stores them; a name that PX4 does not have is left out.
@@ -348,6 +353,8 @@ class MavsdkAutopilot:
             self._mavsdk.remove_connection(self._connection)  # takes 0.2 ms; from here on nothing can leave
             self._connection = None
         self._drop_second()
+        if self._claim is not None:
+            self._claim.close()
         # Shielded: a second Ctrl-C must not leave MAVSDK half destroyed.
         await asyncio.shield(asyncio.get_running_loop().run_in_executor(None, self._tear_down))
 

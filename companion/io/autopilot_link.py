@@ -10,7 +10,8 @@ import re
 import socket
 import stat
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Container
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,12 @@ def device_error(address: str, expected: str, found: str, fix: str) -> DeviceErr
     return DeviceError(f"autopilot {address}: expected {expected}, found {found}; {fix}")
 
 
+def no_heartbeat(address: str, timeout_s: float) -> DeviceError:
+    """No autopilot is heard."""
+    fix = "power the autopilot, check cable, baud or PX4's MAVLink target address and port"
+    return device_error(address, f"a PX4 heartbeat within {timeout_s:g} s", "none", fix)
+
+
 def check_address(address: str) -> None:
     """Look at the address before MAVSDK does: it shares a busy UDP port silently and reports bad ones without a reason.
 
@@ -52,9 +59,39 @@ def check_address(address: str) -> None:
     port = int(match["port"])
     if not 0 < port <= 65535:
         raise device_error(address, "a port from 1 to 65535", str(port), "correct devices.autopilot.address")
-    if match["net"] in ("udpin", "tcpin"):
-        kind = socket.SOCK_DGRAM if match["net"] == "udpin" else socket.SOCK_STREAM
-        _check_bindable(address, match["host"], port, kind)
+    if match["net"] == "tcpin":
+        bind_alone(address, match["host"], port, socket.SOCK_STREAM).close()
+
+
+@dataclass(frozen=True, slots=True)
+class AddressParts:
+    """An address taken apart."""
+
+    kind: str
+    """udpin, udpout, tcpin, tcpout, serial or serial_flowcontrol."""
+    host: str
+    """Path of the device on a serial link."""
+    port: int
+    """Baud rate on a serial link."""
+
+    @property
+    def serial(self) -> bool:
+        """The link is a serial port."""
+        return self.kind in ("serial", "serial_flowcontrol")
+
+
+def parse_address(address: str) -> AddressParts:
+    """Parts of an address that `check_address` accepts.
+
+    Raises:
+        ValueError: `check_address` does not accept it.
+    """
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
+        raise ValueError(f"expected an address like {_FORMS}, got {address!r}")
+    if match["serial"]:
+        return AddressParts(match["serial"], match["path"], int(match["baud"]))
+    return AddressParts(match["net"], match["host"], int(match["port"]))
 
 
 def _check_serial(address: str, path: str) -> None:
@@ -70,16 +107,23 @@ def _check_serial(address: str, path: str) -> None:
         raise device_error(address, f"permission to read and write {path}", "none", fix)
 
 
-def _check_bindable(address: str, host: str, port: int, kind: socket.SocketKind) -> None:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                fix = "stop that program (another companion, QGroundControl, a MAVLink router?) or use another port"
-                raise device_error(address, f"port {port} to be free", "another program on it", fix) from None
-            fix = "use an address of this machine, 0.0.0.0 for all"
-            raise device_error(address, f"a local address in {host}", error.strerror or str(error), fix) from None
+def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> socket.socket:
+    """Bind a local port that no other socket has.
+
+    Raises:
+        DeviceError: the port is busy, or the host is not this machine.
+    """
+    bound = socket.socket(socket.AF_INET, kind)
+    try:
+        bound.bind((host, port))
+    except OSError as error:
+        bound.close()
+        if error.errno == errno.EADDRINUSE:
+            fix = "stop that program (another companion, QGroundControl, a MAVLink router?) or use another port"
+            raise device_error(address, f"port {port} to be free", "another program on it", fix) from None
+        fix = "use an address of this machine, 0.0.0.0 for all"
+        raise device_error(address, f"a local address in {host}", error.strerror or str(error), fix) from None
+    return bound
 
 
 def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> Any:
@@ -128,43 +172,58 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
     finally:
         mavsdk.cancel_first_autopilot(handle)
     if system is None:
-        fix = "power the autopilot, check cable, baud or PX4's MAVLink target address and port"
-        raise device_error(address, f"a PX4 heartbeat within {timeout_s:g} s", "none", fix)
+        raise no_heartbeat(address, timeout_s)
     kind = system.autopilot_type()
     if kind != AutopilotKind.PX4:
         raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion speaks no other's modes")
     return system
 
 
-def udp_ports() -> set[int]:
-    """Local ports of the UDP sockets that this process holds; empty where /proc does not tell."""
-    return set(_udp_sockets())
+@dataclass(frozen=True, slots=True)
+class UdpSocket:
+    """A UDP (IPv4) socket of this process."""
+
+    descriptor: int
+    port: int
+    """Local port."""
 
 
-def pin_udp(local_port: int, peer: tuple[str, int]) -> None:
-    """Let the UDP socket of this process on that port hear `peer` alone: the kernel throws away what comes from anywhere else.
-
-    MAVSDK binds a `udpout` connection to all addresses and listens to everybody who finds its port.
-
-    Raises:
-        OSError: the socket is not found, or cannot be connected.
-    """
-    descriptor = _udp_sockets().get(local_port)
-    if descriptor is None:
-        raise OSError(errno.ENOENT, "no such socket")
-    with socket.socket(fileno=os.dup(descriptor)) as twin:
-        twin.connect(peer)
-
-
-def _udp_sockets() -> dict[int, int]:
-    """Descriptors of this process's UDP (IPv4) sockets by local port."""
+def udp_sockets() -> dict[int, UdpSocket]:
+    """UDP (IPv4) sockets of this process by inode; empty where /proc does not show them."""
     try:
         own = {link: int(name) for name in os.listdir("/proc/self/fd") if (link := _link_of(name)) is not None}
         table = Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]
     except OSError:
         return {}
     rows = (line.split() for line in table)
-    return {int(row[1].rpartition(":")[2], 16): own[link] for row in rows if (link := f"socket:[{row[9]}]") in own}
+    return {
+        int(row[9]): UdpSocket(own[link], int(row[1].rpartition(":")[2], 16))
+        for row in rows
+        if (link := f"socket:[{row[9]}]") in own
+    }
+
+
+def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> int:
+    """Let the one UDP socket that MAVSDK has opened since hear `peer` alone: the kernel drops datagrams of every other sender.
+
+    MAVSDK itself takes messages from every sender that finds its port, on a `udpout` connection too.
+
+    Args:
+        before: inodes of `udp_sockets` before MAVSDK opened the connection.
+        peer: IPv4 address and port.
+
+    Returns:
+        Local port of the socket.
+
+    Raises:
+        OSError: the socket is not found, or cannot be connected.
+    """
+    new = [found for inode, found in udp_sockets().items() if inode not in before]
+    if len(new) != 1:
+        raise OSError(errno.ENOENT, f"{len(new)} new sockets")
+    with socket.socket(fileno=os.dup(new[0].descriptor)) as twin:
+        twin.connect(peer)
+    return new[0].port
 
 
 def _link_of(descriptor: str) -> str | None:

@@ -47,6 +47,8 @@ REFUSED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 611, 43003})
 _COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
 _COMMAND_OFFSET = 28
 """Of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
+_AUTOPILOT_OFFSET = 5
+"""Of the uint8 `autopilot` in the payload of HEARTBEAT."""
 
 FAST_STREAMS = frozenset(
     getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
@@ -148,6 +150,21 @@ def frames(datagram: bytes) -> Iterator[Frame | None]:
         if frame is None:
             return
         at += len(frame.data)
+
+
+def autopilot_heartbeat(datagram: bytes) -> int | None:
+    """System id of the autopilot (component 1) whose HEARTBEAT with a right checksum is in the datagram; None if there is none."""
+    for frame in frames(datagram):
+        if frame is None or frame.message_id != mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            continue
+        autopilot = int.from_bytes(frame.payload[_AUTOPILOT_OFFSET : _AUTOPILOT_OFFSET + 1], "little")
+        if (
+            frame.component == mavlink.MAV_COMP_ID_AUTOPILOT1
+            and autopilot != mavlink.MAV_AUTOPILOT_INVALID
+            and frame.intact()
+        ):
+            return frame.system
+    return None
 
 
 def _frame_at(datagram: bytes, at: int) -> Frame | None:

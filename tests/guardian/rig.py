@@ -77,8 +77,11 @@ class Cameras:
 class Rig:
     """One guardian with everything around it; `with` starts it and ends what is left by pid."""
 
-    def __init__(self, folder: Path, *, timeout_s: float = 0.2, disk_full: bool = False) -> None:
+    def __init__(
+        self, folder: Path, *, timeout_s: float = 0.2, disk_full: bool = False, address: str | None = None
+    ) -> None:
         self._folder = folder
+        self._address = address
         self._timeout_s = timeout_s
         self.port = free_udp_port()
         self.peer = Px4Peer(self.port)
@@ -95,7 +98,7 @@ class Rig:
         body = config.vehicle.devices.mocap.rigid_body_id
         self.cameras = Cameras(body).__enter__()
         devices: dict[str, dict[str, Any]] = {
-            "autopilot": {"address": f"udpin://127.0.0.1:{self.port}"},
+            "autopilot": {"address": self._address or f"udpin://127.0.0.1:{self.port}"},
             "mocap": {
                 "server": "127.0.0.1",
                 "interface": "127.0.0.1",
@@ -174,6 +177,7 @@ class Rig:
             local_port=self.port,
             pose_stamp_s=t_s - pose_age_s,
             position_world_m=POSITION_M,
+            peer=self.peer.address,
         )
         self.beats.send(words.pack(beat))
 

@@ -29,6 +29,7 @@ beats = st.builds(
     local_port=st.integers(0, 65535),
     pose_stamp_s=finite | st.just(-math.inf),
     position_world_m=st.tuples(finite, finite, finite),
+    peer=st.none() | st.tuples(st.ip_addresses(v=4).map(str), st.integers(1, 65535)),
 )
 
 

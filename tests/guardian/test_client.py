@@ -131,13 +131,14 @@ def test_when_the_rotors_may_turn(
     pair: Pair, waiting: Outputs, armed: bool, request_: AutopilotRequest, kind: PhaseKind, lifting: bool
 ) -> None:
     client, guardian = pair
-    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 14540), 77.0)
+    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 14540, ("10.0.0.7", 14580)), 77.0)
     guard.tick(inputs(armed=armed), dataclasses.replace(waiting, request=request_, phase_kind=kind))
     beat = words.unpack(guardian.recv(words.MAX_BYTES))
     assert beat is not None
     assert beat.lifting is lifting
     assert (beat.tick, beat.t_s, beat.origin_s) == (9, 5.0, 77.0)
     assert (beat.autopilot_system, beat.own_system, beat.own_component, beat.local_port) == (1, 1, 195, 14540)
+    assert beat.peer == ("10.0.0.7", 14580)
     assert (beat.pose_stamp_s, beat.position_world_m) == (4.9, (1.0, 2.0, 3.0))
 
 

@@ -18,7 +18,8 @@ from companion.config.vehicle import AutopilotDevice
 from companion.frames import quat_from_euler_zyx
 from companion.guardian.link import Link, SerialWire, TcpWire, UdpWire, Wire, address_problem, open_wire
 from companion.io.autopilot import MavsdkAutopilot
-from companion.io.autopilot_link import udp_ports
+from companion.io.autopilot_claim import LinkClaim
+from companion.io.autopilot_link import UdpSocket, udp_sockets
 from companion.types import MocapPose
 from tests.io.autopilot_peer import Px4Peer, free_udp_port
 from tests.support import DEADLINE_S, wait_until
@@ -37,8 +38,8 @@ def wait_readable(wire: Wire) -> None:
 
 
 @contextmanager
-def opened(address: str, local_port: int = 0) -> Iterator[Wire]:
-    wire = open_wire(address, local_port)
+def opened(address: str, local_port: int = 0, peer: tuple[str, int] | None = None) -> Iterator[Wire]:
+    wire = open_wire(address, local_port, peer)
     try:
         yield wire
     finally:
@@ -58,15 +59,23 @@ def test_addresses_that_cannot(address: str) -> None:
     assert address in str(address_problem(address))
 
 
-def test_udpin_learns_where_px4_is() -> None:
+@pytest.mark.parametrize(
+    "data",
+    [b"\xfd", b"no MAVLink", heartbeat()[:-1], heartbeat()[:-1] + b"\x00", heartbeat(255, 190), heartbeat(1, 154)],
+    ids=["one byte", "text", "cut", "checksum", "ground station", "gimbal"],
+)
+def test_udpin_takes_nobody_for_px4_but_the_sender_of_a_valid_heartbeat(data: bytes) -> None:
     port = free_udp_port()
-    with opened(f"udpin://127.0.0.1:{port}") as wire, closing(socket.socket(type=socket.SOCK_DGRAM)) as px4:
+    with (
+        opened(f"udpin://127.0.0.1:{port}") as wire,
+        closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger,
+        closing(socket.socket(type=socket.SOCK_DGRAM)) as px4,
+    ):
         px4.settimeout(DEADLINE_S)
-        assert not wire.ready
         wire.send(b"lost")
-        px4.sendto(b"no MAVLink", ("127.0.0.1", port))
+        stranger.sendto(data, ("127.0.0.1", port))
         wait_readable(wire)
-        assert wire.receive() == [b"no MAVLink"]
+        assert wire.receive() == []
         assert not wire.ready
         px4.sendto(heartbeat(), ("127.0.0.1", port))
         wait_readable(wire)
@@ -74,6 +83,24 @@ def test_udpin_learns_where_px4_is() -> None:
         assert wire.ready
         wire.send(b"heard")
         assert px4.recv(100) == b"heard"
+
+
+@pytest.mark.parametrize("kind", ["udpin", "udpout"])
+def test_only_the_address_that_the_flight_proved_is_heard(kind: str) -> None:
+    with (
+        closing(socket.socket(type=socket.SOCK_DGRAM)) as px4,
+        closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger,
+    ):
+        for one in (px4, stranger):
+            one.bind(("127.0.0.1", 0))
+        peer = px4.getsockname()
+        port = free_udp_port()
+        where = f"127.0.0.1:{port if kind == 'udpin' else peer[1]}"
+        with opened(f"{kind}://{where}", port, peer) as wire:
+            stranger.sendto(heartbeat(), ("127.0.0.1", port))
+            px4.sendto(heartbeat(1, 1) + b"of PX4", ("127.0.0.1", port))
+            wait_readable(wire)
+            assert wire.receive() == [heartbeat(1, 1) + b"of PX4"]
 
 
 def test_udpin_is_not_to_be_had_while_the_flight_holds_it() -> None:
@@ -124,6 +151,43 @@ def test_serial() -> None:
     finally:
         os.close(slave)
         os.close(master)
+
+
+def test_a_serial_port_that_another_process_holds_is_not_opened() -> None:
+    master, slave = os.openpty()
+    try:
+        with closing(LinkClaim(f"serial://{os.ttyname(slave)}:921600")), pytest.raises(OSError, match="exclusively"):
+            open_wire(f"serial://{os.ttyname(slave)}:921600", 0)
+        with opened(f"serial://{os.ttyname(slave)}:921600"):
+            pass
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+def test_a_serial_port_that_hangs_up_is_lost() -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    with opened(f"serial://{os.ttyname(slave)}:921600") as wire:
+        os.close(slave)
+        assert (wire.receive(), wire.lost) == ([], False)
+        os.close(master)
+        wait_readable(wire)
+        assert (wire.receive(), wire.lost) == ([], True)
+        wire.send(b"into the void")
+
+
+def test_a_tcp_connection_that_ends_is_lost() -> None:
+    with (
+        closing(socket.create_server(("127.0.0.1", 0))) as server,
+        opened(f"tcpout://127.0.0.1:{server.getsockname()[1]}") as wire,
+    ):
+        connection, _ = server.accept()
+        assert (wire.receive(), wire.lost) == ([], False)
+        connection.close()
+        wait_readable(wire)
+        assert (wire.receive(), wire.lost) == ([], True)
+        wire.send(b"into the void")
 
 
 def test_only_px4_itself_is_listened_to_and_noise_does_no_harm() -> None:
@@ -189,7 +253,8 @@ def test_it_says_what_mavsdk_says() -> None:
 
 
 def test_the_ports_of_this_process() -> None:
-    before = udp_ports()
+    before = udp_sockets()
     with closing(socket.socket(type=socket.SOCK_DGRAM)) as one:
         one.bind(("127.0.0.1", 0))
-        assert udp_ports() - before == {one.getsockname()[1]}
+        new = [found for inode, found in udp_sockets().items() if inode not in before]
+        assert new == [UdpSocket(one.fileno(), one.getsockname()[1])]

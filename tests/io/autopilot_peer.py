@@ -32,7 +32,9 @@ def free_udp_port() -> int:
 class Px4Peer:
     """Heartbeats at 10 Hz to `port` on loopback; streams what SET_MESSAGE_INTERVAL asked for; records all that arrives."""
 
-    def __init__(self, port: int, autopilot: int = mavlink.MAV_AUTOPILOT_PX4) -> None:
+    def __init__(
+        self, port: int, autopilot: int = mavlink.MAV_AUTOPILOT_PX4, at: tuple[str, int] = ("127.0.0.1", 0)
+    ) -> None:
         self.remote = ("127.0.0.1", port)
         self.autopilot = autopilot
         self.base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -60,7 +62,7 @@ class Px4Peer:
         self._in = mavlink.MAVLink(None)
         self._in.robust_parsing = True
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", 0))
+        self._socket.bind(at)
         self._socket.settimeout(0.01)
         self._thread = threading.Thread(target=self._run, name="px4-peer")
 
@@ -74,6 +76,12 @@ class Px4Peer:
         self._stop.set()
         self._thread.join(10.0)
         self._socket.close()
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Where it sends from."""
+        host, port = self._socket.getsockname()
+        return host, port
 
     def of(self, name: str) -> list[Any]:
         """All messages of one type so far."""

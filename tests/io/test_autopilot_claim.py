@@ -1,0 +1,154 @@
+"""Who is at the two ends of the link to PX4: one process at the near one, one address that has proved to be PX4 at the far one."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import tty
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+import serial
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.clock import flight_clock
+from companion.config.vehicle import AutopilotDevice
+from companion.io.autopilot import MavsdkAutopilot
+from companion.io.edges import DeviceError
+from companion.types import MocapPose
+from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from tests.io.test_autopilot import edge, eventually, refused
+
+pytestmark = pytest.mark.waits
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+
+
+def forged_heartbeat() -> bytes:
+    message = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, 12, ARMED, 4 << 16 | 6 << 24, 4, 3)
+    packed: bytes = message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
+    return packed
+
+
+@contextmanager
+def serial_port() -> Iterator[str]:
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        yield os.ttyname(slave)
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+def test_a_serial_port_that_another_program_has_locked_is_refused_by_every_name(tmp_path: Path) -> None:
+    with serial_port() as port, serial.Serial(port, exclusive=True):
+        by_id = tmp_path / "by-id"
+        by_id.symlink_to(port)
+        for name in (port, by_id):
+            text = asyncio.run(refused(f"serial://{name}:921600", 0.2))
+            assert f"expected the serial port {name} to be free, found another program on it; stop that program" in text
+
+
+def test_a_second_flight_on_the_same_serial_port_is_refused_and_the_first_keeps_it() -> None:
+    async def main(port: str) -> str:
+        address = f"serial://{port}:921600"
+        first = MavsdkAutopilot(AutopilotDevice(address=address, discovery_timeout_s=60.0), flight_clock())
+        entering = asyncio.create_task(first.__aenter__())
+        await eventually(lambda: _is_locked(port), "the first has the port")
+        text = await refused(address, 0.2)
+        assert not entering.done()
+        entering.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await entering
+        return text
+
+    with serial_port() as port:
+        assert "to be free, found another program on it" in asyncio.run(main(port))
+        assert not _is_locked(port), "what was refused or ended holds nothing"
+
+
+def _is_locked(port: str) -> bool:
+    try:
+        serial.Serial(port, exclusive=True).close()
+    except serial.SerialException:
+        return True
+    return False
+
+
+def test_two_senders_that_claim_to_be_px4_are_refused_by_address() -> None:
+    port = free_udp_port()
+    with Px4Peer(port) as one, Px4Peer(port) as other:
+        with pytest.raises(DeviceError) as caught:
+            asyncio.run(_enter(port))
+        text = str(caught.value)
+        assert "expected PX4 (system 1) at one address, found " in text
+        assert all(f"{host}:{at}" in text for host, at in (one.address, other.address))
+
+
+async def _enter(port: int) -> None:
+    async with edge(port):
+        pass
+
+
+def test_a_stranger_in_px4s_name_changes_nothing_and_is_reported_once() -> None:
+    async def main() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as px4, closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
+            async with edge(port) as autopilot:
+                assert autopilot.identity().peer == px4.address
+                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+                texts: list[str] = []
+                armed: list[bool] = []
+
+                def forged() -> bool:
+                    stranger.sendto(forged_heartbeat(), ("127.0.0.1", port))
+                    texts.extend(autopilot.take_messages())
+                    status = autopilot.status()
+                    armed.append(status is not None and status.armed)
+                    return len(armed) > 100
+
+                await eventually(forged, "a hundred forged heartbeats")
+                _, at = stranger.getsockname()
+                assert [text for text in texts if f":{at} claims to be PX4 (system 1)" in text] == texts
+                assert (len(texts), any(armed)) == (1, False)
+
+    asyncio.run(main())
+
+
+def test_what_is_not_mavlink_from_a_stranger_is_not_reported() -> None:
+    async def main() -> None:
+        port = free_udp_port()
+        with Px4Peer(port), closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
+            async with edge(port) as autopilot:
+                for data in (b"\xfd", forged_heartbeat()[:-1], b"", os.urandom(100)):
+                    stranger.sendto(data, ("127.0.0.1", port))
+                assert [autopilot.take_messages() for _ in range(10)] == [[]] * 10
+
+    asyncio.run(main())
+
+
+def test_px4_that_restarts_at_the_same_address_is_heard_again() -> None:
+    async def main() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as px4:
+            where = px4.address
+            async with edge(port) as autopilot:
+                px4.__exit__(None, None, None)
+                for tick in range(20):  # what is sent now comes back as ICMP errors
+                    autopilot.send_vision(MocapPose(1.0 + tick, None, tick, (0.0, 0.0, 0.0), LEVEL, True, 0.0))
+                    await asyncio.sleep(0.005)
+                with Px4Peer(port, at=where) as again:
+                    again.base_mode = ARMED
+
+                    def armed() -> bool:
+                        status = autopilot.status()
+                        return status is not None and status.armed
+
+                    await eventually(armed, "PX4 is heard after its restart")
+
+    asyncio.run(main())
