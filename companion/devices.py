@@ -110,7 +110,7 @@ async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]
         some.force = await stack.enter_async_context(_force(config, clock))
         ground = None
         if ground_address is not None:
-            ground = await stack.enter_async_context(GroundStation(ground_address, autopilot))
+            ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
         some.arm = await stack.enter_async_context(_arm(config, clock))
         yield Edges(some.vision, autopilot, some.mocap, some.arm, some.force, ground=ground)
 
@@ -180,6 +180,16 @@ def _mocap(config: FlightConfig, clock: Clock, some: SomeEdges) -> NatNetMocap:
             valve.watch(pose)
 
     return NatNetMocap(config.vehicle.devices.mocap, clock, on_pose)
+
+
+def _ground(config: FlightConfig, address: str, autopilot: MavsdkAutopilot) -> GroundStation:
+    ground = config.vehicle.ground
+    return GroundStation(
+        address,
+        autopilot,
+        while_armed=ground.qgroundcontrol_while_armed,
+        console=ground.qgroundcontrol_console,
+    )
 
 
 def _autopilot(config: FlightConfig, clock: Clock) -> MavsdkAutopilot:

@@ -91,6 +91,10 @@ class Ground(Model):
     """null: no telemetry, no commands over MQTT."""
     qgroundcontrol: Annotated[str, AfterValidator(_a_station)] | None = None
     """MAVLink is forwarded to and from here: udpout://HOST:14550; absent: not forwarded."""
+    qgroundcontrol_while_armed: bool = False
+    """Forward while PX4 is armed too what may stop rotors or change the flight: forced disarm, parameters, missions, files."""
+    qgroundcontrol_console: bool = False
+    """Forward SERIAL_CONTROL, which is PX4's console, while PX4 is disarmed."""
 
     @model_validator(mode="after")
     def _speakable(self) -> Self:

@@ -17,10 +17,10 @@ from pymavlink.generator.mavcrc import x25crc
 _V1, _V2 = 0xFE, 0xFD
 _V1_HEADER_BYTES, _V2_HEADER_BYTES, _CHECKSUM_BYTES, _SIGNATURE_BYTES = 6, 10, 2, 13
 _FLAG_SIGNED = 1
-_REQUEST_EVENT = 412
+REQUEST_EVENT = 412
 """By events.xml of MAVLink, which pymavlink's dialect does not contain; its CRC_EXTRA is 33."""
 _CRC_EXTRA: dict[int, int] = {number: message.crc_extra for number, message in mavlink.mavlink_map.items()}
-_CRC_EXTRA[_REQUEST_EVENT] = 33
+_CRC_EXTRA[REQUEST_EVENT] = 33
 _NAMES: dict[int, str] = {number: message.msgname for number, message in mavlink.mavlink_map.items()}
 
 UP_RATE_HZ = 100.0
@@ -40,11 +40,11 @@ GROUND_MESSAGES = frozenset(
         *("MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_SET_CURRENT"),
         *("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_ERASE", "LOG_REQUEST_END", "LOGGING_ACK"),
     )
-) | {_REQUEST_EVENT}
+) | {REQUEST_EVENT}
 """What a ground station says in its own right. No setpoints, no estimates of the vehicle's pose, no sensor readings, no answers."""
 REFUSED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 611, 43003})
 """Would slow the streams that the flight lives on (511), or move the estimate: SET_GLOBAL_ORIGIN, EXTERNAL_POSITION_ESTIMATE."""
-_COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
+COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
 _COMMAND_OFFSET = 28
 """Of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
 _AUTOPILOT_OFFSET = 5
@@ -193,48 +193,7 @@ def _checksum(data: bytes, extra: int) -> int:
     return int(checksum.crc)
 
 
-class Door:
-    """What a ground station may say to the vehicle.
-
-    Args:
-        vehicle_system: MAVLink system id of PX4, which is the companion's too.
-    """
-
-    def __init__(self, vehicle_system: int) -> None:
-        self.refused: Counter[str] = Counter()
-        """How many were not let through, by the reason in words."""
-        self._vehicle_system = vehicle_system
-        self._systems: set[int] = set()
-        self._bucket = Bucket(UP_RATE_HZ, UP_BURST)
-
-    def admit(self, datagram: bytes, now_s: float) -> list[bytes]:
-        """The frames to pass on, each as one datagram."""
-        passed = []
-        for frame in frames(datagram):
-            reason = self._objection(frame, now_s)
-            if reason is None and frame is not None:
-                passed.append(frame.data)
-            else:
-                self.refused[str(reason)] += 1
-        return passed
-
-    def _objection(self, frame: Frame | None, now_s: float) -> str | None:
-        if frame is None or not frame.intact():
-            return "no MAVLink"
-        if frame.system in (0, self._vehicle_system):
-            return f"in the vehicle's name (system id {frame.system})"
-        if frame.message_id not in GROUND_MESSAGES:
-            return f"{frame.name}, which is not a ground station's to say"
-        if frame.message_id in _COMMANDS and _command(frame.payload) in REFUSED_COMMANDS:
-            return f"command {_command(frame.payload)}, which the flight does not allow"
-        if frame.system not in self._systems:
-            if len(self._systems) >= GROUND_SYSTEMS_MAX:
-                return f"from a fifth ground station (system id {frame.system})"
-            self._systems.add(frame.system)
-        return None if self._bucket.take(now_s) else f"more than {UP_RATE_HZ:g} messages a second"
-
-
-def _command(payload: bytes) -> int:
+def command_of(payload: bytes) -> int:
     """MAV_CMD; MAVLink 2 cuts zeros off the end of a payload."""
     return int.from_bytes(payload[_COMMAND_OFFSET : _COMMAND_OFFSET + 2], "little")
 

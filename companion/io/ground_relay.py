@@ -5,8 +5,8 @@ throws away what comes from anywhere else, and the channel to the flight process
 time, not the flight. It ends when the channel does.
 
 On the channel, `pack_plain` of: to the flight process `{"port": N}` once, or `{"error": text}`; later `{"text": text}`. From it
-`{"vehicle_port": N}` once; later `{"texts": [[severity, text], ...]}`, `{"situation": text}`, `{"t_ms": N, "values": {...}}`,
-`{"bye": true}`.
+`{"vehicle_port": N}` once; later `{"arming": true}` when it asks PX4 to arm, `{"texts": [[severity, text], ...]}`,
+`{"situation": text}`, `{"t_ms": N, "values": {...}}`, `{"bye": true}`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.io.ground_frames import Door, Thinner
+from companion.io.ground_door import Door
+from companion.io.ground_frames import Thinner
 from companion.io.ground_words import COMPONENT, Texts, heartbeat_message, value_messages
 from companion.record import pack_plain, unpack_plain
 
@@ -48,6 +49,8 @@ class Relay:
         channel: to the flight process.
         vehicle: UDP, bound on loopback; connected once MAVSDK's port is known.
         ground: UDP, connected to the ground station.
+        door: what the ground station may say.
+        vehicle_system: MAVLink system id of the vehicle.
         own: system and component id that MAVSDK speaks with; the system is the vehicle's.
         name: the ground station's address for people.
     """
@@ -57,6 +60,7 @@ class Relay:
         channel: socket.socket,
         vehicle: socket.socket,
         ground: socket.socket,
+        door: Door,
         vehicle_system: int,
         own: tuple[int, int],
         name: str,
@@ -67,7 +71,7 @@ class Relay:
         self._open = False
         """MAVSDK's port is known."""
         self._bye = False
-        self._door, self._thinner, self._texts = Door(vehicle_system), Thinner(own), Texts()
+        self._door, self._thinner, self._texts = door, Thinner(own), Texts()
         self._encoder = mavlink.MAVLink(None, srcSystem=vehicle_system, srcComponent=COMPONENT)
         self._situation: str | None = None
         self._beat_s = self._report_s = 0.0
@@ -87,6 +91,7 @@ class Relay:
                 break
             if self._vehicle.fileno() in ready:
                 for datagram in _received(self._vehicle):
+                    self._door.state.hear(datagram, now_s)
                     for frame in self._thinner.pick(datagram, now_s):
                         self._to_ground(frame)
             if self._ground.fileno() in ready:
@@ -121,6 +126,8 @@ class Relay:
         if "vehicle_port" in said:
             self._vehicle.connect(("127.0.0.1", said["vehicle_port"]))
             self._open = True
+        if "arming" in said:
+            self._door.state.expect_arming(time.monotonic())
         for severity, text in said.get("texts", ()):
             self._texts.say(severity, text)
         self._situation = said.get("situation", self._situation)
@@ -188,6 +195,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--system", type=int, required=True, help="MAVLink system id of the vehicle")
     parser.add_argument("--own", type=int, nargs=2, required=True, help="system and component id of MAVSDK")
     parser.add_argument("--name", required=True, help="the ground station's address for people")
+    parser.add_argument("--while-armed", action="store_true", help="pass everything while PX4 is armed too")
+    parser.add_argument("--console", action="store_true", help="pass SERIAL_CONTROL while PX4 is not armed")
     a = parser.parse_args(argv)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the flight process
@@ -205,7 +214,8 @@ def main(argv: list[str] | None = None) -> int:
             channel.send(pack_plain({"error": error.strerror or str(error)}))
             return 1
         channel.send(pack_plain({"port": vehicle.getsockname()[1]}))
-        Relay(channel, vehicle, ground, a.system, (a.own[0], a.own[1]), a.name).run()
+        door = Door(a.system, while_armed=a.while_armed, console=a.console)
+        Relay(channel, vehicle, ground, door, a.system, (a.own[0], a.own[1]), a.name).run()
     return 0
 
 

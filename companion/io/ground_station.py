@@ -21,7 +21,7 @@ from companion.io import ground_words as words
 from companion.io.autopilot import LinkIdentity
 from companion.io.edges import DeviceError
 from companion.record import pack_plain, unpack_plain
-from companion.types import Inputs, Outputs
+from companion.types import AutopilotRequest, Inputs, Outputs
 
 VALUES_EVERY = 50
 """Ticks: 4 Hz of a control loop of 200 Hz."""
@@ -69,10 +69,13 @@ class GroundStation:
     Args:
         address: `udpout://HOST:PORT`.
         autopilot: open.
+        while_armed: as `ground.qgroundcontrol_while_armed`.
+        console: as `ground.qgroundcontrol_console`.
     """
 
-    def __init__(self, address: str, autopilot: Forwarder) -> None:
+    def __init__(self, address: str, autopilot: Forwarder, *, while_armed: bool = False, console: bool = False) -> None:
         self.address = address
+        self._while_armed, self._console = while_armed, console
         self._autopilot = autopilot
         self._channel: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -90,8 +93,8 @@ class GroundStation:
     def line(self) -> str:
         """What a person is to know when it is on: one line."""
         return (
-            f"MAVLink goes to and from {self.address}: whoever speaks from there can change PX4's mode and parameters, but never"
-            " what the companion knows"
+            f"MAVLink goes to and from {self.address}: whoever speaks from there can change PX4's mode and, while it is disarmed, its"
+            f" parameters{', and all of it in flight' if self._while_armed else ''}, but never what the companion knows"
         )
 
     async def __aenter__(self) -> Self:
@@ -123,6 +126,8 @@ class GroundStation:
             return
         texts = [words.event_text(event) for event in outputs.events]
         said: dict[str, Any] = {}
+        if outputs.request is AutopilotRequest.ARM:
+            said["arming"] = True
         if outputs.phase != self._phase:
             self._phase = outputs.phase
             text = words.phase_text(outputs.phase)
@@ -198,6 +203,8 @@ class GroundStation:
             *("--host", ip, "--port", str(port), "--system", str(identity.autopilot_system)),
             *("--own", str(identity.own_system), str(identity.own_component)),
             *("--name", self.address.removeprefix("udpout://")),
+            *(["--while-armed"] if self._while_armed else []),
+            *(["--console"] if self._console else []),
         ]
         try:
             self._process = subprocess.Popen(

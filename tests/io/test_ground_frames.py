@@ -12,7 +12,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from companion.io.ground_frames import GROUND_SYSTEMS_MAX, STREAM_RATE_HZ, UP_BURST, UP_RATE_HZ, Door, Thinner
+from companion.io.ground_door import Door
+from companion.io.ground_frames import GROUND_SYSTEMS_MAX, STREAM_RATE_HZ, UP_BURST, UP_RATE_HZ, Thinner
 from companion.io.ground_words import TEXTS_WAITING_MAX, VALUE_NAMES, Texts, event_text, value_messages, values
 from companion.types import Event, SafetyAction, Severity
 from tests.analysis.synthetic_flight import synthetic_flight
@@ -35,6 +36,17 @@ def command_int(number: int) -> Any:
     return mavlink.MAVLink_command_int_message(VEHICLE, 1, 0, number, 0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0.0)
 
 
+def px4_heartbeat(*, armed: bool, system: int = VEHICLE) -> bytes:
+    base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
+    return packed(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, base_mode, 0, 4, 3), system, 1)
+
+
+def door_of(*, armed: bool, while_armed: bool = False, console: bool = False) -> Door:
+    door = Door(VEHICLE, while_armed=while_armed, console=console)
+    door.state.hear(px4_heartbeat(armed=armed), 0.0)
+    return door
+
+
 def signed(message: Any) -> bytes:
     encoder = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
     encoder.signing.secret_key = bytes(range(32))
@@ -53,9 +65,132 @@ def signed(message: Any) -> bytes:
     ],
 )
 def test_what_a_ground_station_says_passes_unchanged(data: bytes) -> None:
-    door = Door(VEHICLE)
+    door = door_of(armed=False)
     assert door.admit(data, 0.0) == [data]
     assert not door.refused
+
+
+def long(number: int, *params: float) -> Any:
+    return mavlink.MAVLink_command_long_message(VEHICLE, 1, number, 0, *params, *[0.0] * (7 - len(params)))
+
+
+def integer(number: int, *params: float) -> Any:
+    four = [*params, *[0.0] * (4 - len(params))]
+    return mavlink.MAVLink_command_int_message(VEHICLE, 1, 0, number, 0, 0, *four, 0, 0, 0.0)
+
+
+def set_mode(main: int, sub: int, base_mode: int = 1) -> Any:
+    return mavlink.MAVLink_set_mode_message(VEHICLE, base_mode, main << 16 | sub << 24)
+
+
+_NAN = math.nan
+_DANGEROUS = {
+    "forced disarm": long(400, 0.0, 21196.0),
+    "forced disarm as COMMAND_INT": integer(400, 0.0, 21196.0),
+    "forced disarm, not quite": long(400, 0.4, 21195.6),
+    "arm": long(400, 1.0),
+    "forced arm": long(400, 1.0, 21196.0),
+    "disarm, NaN": long(400, _NAN, _NAN),
+    "restart": long(246, 1.0),
+    "restart as COMMAND_INT": integer(246, 1.0),
+    "flight termination": long(185, 1.0),
+    "motor test": long(310, 1.0, 1.0),
+    "actuator": long(187, 1.0),
+    "failure injection": long(420, 0.0, 1.0),
+    "take off": long(22),
+    "return": long(20),
+    "reposition somewhere": long(192, -1.0, 1.0, 0.0, _NAN, 47.0, 8.0, 500.0),
+    "reposition as COMMAND_INT": integer(192, -1.0, 1.0, 0.0, _NAN),
+    "set home": long(179, 1.0),
+    "calibration": long(241, 1.0),
+    "parameters reset": long(245, 2.0),
+    "mission start": long(300),
+    "mode MANUAL": long(176, 1.0, 1.0),
+    "mode ACRO": long(176, 1.0, 5.0),
+    "mode OFFBOARD": long(176, 1.0, 6.0),
+    "mode MISSION": long(176, 1.0, 4.0, 4.0),
+    "mode RETURN": integer(176, 1.0, 4.0, 5.0),
+    "mode TERMINATION": long(176, 1.0, 10.0),
+    "mode, not PX4's": long(176, 128.0, 3.0),
+    "mode, NaN": long(176, _NAN, 3.0),
+    "SET_MODE MANUAL": set_mode(1, 0),
+    "SET_MODE MISSION": set_mode(4, 4),
+    "SET_MODE, not PX4's": set_mode(3, 0, 128),
+    "PARAM_SET": mavlink.MAVLink_param_set_message(VEHICLE, 1, b"COM_OF_LOSS_T", 60.0, 9),
+    "mission upload": mavlink.MAVLink_mission_count_message(VEHICLE, 1, 3),
+    "mission item": mavlink.MAVLink_mission_item_int_message(VEHICLE, 1, 0, 0, 16, 1, 1, *[0.0] * 4, 0, 0, 0.0),
+    "mission cleared": mavlink.MAVLink_mission_clear_all_message(VEHICLE, 1),
+    "mission item chosen": mavlink.MAVLink_mission_set_current_message(VEHICLE, 1, 2),
+    "file transfer": mavlink.MAVLink_file_transfer_protocol_message(0, VEHICLE, 1, [8] * 251),
+    "logs erased": mavlink.MAVLink_log_erase_message(VEHICLE, 1),
+    "log data": mavlink.MAVLink_log_request_data_message(VEHICLE, 1, 1, 0, 90),
+}
+_CONSOLE = mavlink.MAVLink_serial_control_message(10, 2, 0, 0, 6, [*b"reboot", *[0] * 64])
+
+
+@pytest.mark.parametrize("v1", [False, True], ids=["MAVLink 2", "MAVLink 1"])
+@pytest.mark.parametrize("name", _DANGEROUS)
+def test_what_may_stop_rotors_or_change_the_flight_waits_until_px4_is_disarmed(name: str, v1: bool) -> None:
+    data = packed(_DANGEROUS[name], v1=v1)
+    door = door_of(armed=True)
+    assert door.admit(data, 0.1) == []
+    assert all(reason.endswith("while PX4 is armed") for reason in door.refused)
+    assert door_of(armed=True, while_armed=True).admit(data, 0.1) == [data], "asked for"
+    assert door_of(armed=False).admit(data, 0.1) == [data]
+
+
+@pytest.mark.parametrize("v1", [False, True], ids=["MAVLink 2", "MAVLink 1"])
+@pytest.mark.parametrize(
+    "message",
+    [
+        *(_HEARTBEAT, _READ, long(21), integer(21), long(400), integer(400), long(512, 148.0), long(520, 1.0)),
+        *(long(176, 1.0, 4.0, 6.0), long(176, 209.0, 4.0, 3.0), integer(176, 1.0, 3.0), long(176, 1.0, 2.0)),
+        *(set_mode(4, 6), set_mode(4, 3, 209), set_mode(3, 0), set_mode(7, 0)),
+        long(192, -1.0, 1.0, 0.0, _NAN, _NAN, _NAN, _NAN),
+        mavlink.MAVLink_manual_control_message(VEHICLE, 0, 0, 500, 0, 0),
+        mavlink.MAVLink_mission_request_list_message(VEHICLE, 1),
+    ],
+    ids=lambda message: str(message)[:60],
+)
+def test_what_lands_holds_or_reads_passes_while_px4_is_armed(message: Any, v1: bool) -> None:
+    data = packed(message, v1=v1)
+    assert door_of(armed=True).admit(data, 0.1) == [data]
+
+
+@pytest.mark.parametrize(
+    ("armed", "while_armed", "console", "passes"),
+    [
+        (False, False, False, False),
+        (False, False, True, True),
+        (True, False, True, False),
+        (True, True, True, False),
+        (False, True, False, False),
+    ],
+)
+def test_px4s_console_is_open_on_the_ground_alone_and_only_when_asked_for(
+    armed: bool, while_armed: bool, console: bool, passes: bool
+) -> None:
+    data = packed(_CONSOLE)
+    door = door_of(armed=armed, while_armed=while_armed, console=console)
+    assert door.admit(data, 0.1) == ([data] if passes else [])
+
+
+def test_px4_counts_as_armed_until_it_says_that_it_is_not_and_when_it_falls_silent() -> None:
+    data = packed(_DANGEROUS["forced disarm"])
+    door = Door(VEHICLE)
+    assert door.admit(data, 0.0) == [], "nothing heard yet"
+    door.state.hear(px4_heartbeat(armed=False, system=7), 0.0)
+    door.state.hear(px4_heartbeat(armed=False)[:-1], 0.0)
+    assert door.admit(data, 0.1) == [], "another system's, and one that is cut"
+    door.state.hear(px4_heartbeat(armed=False), 0.2)
+    assert door.admit(data, 0.3) == [data]
+    assert door.admit(data, 3.3) == [], "silent for more than 3 s"
+    door.state.hear(px4_heartbeat(armed=False), 4.0)
+    door.state.expect_arming(4.1)
+    door.state.hear(px4_heartbeat(armed=False), 4.2)
+    assert door.admit(data, 4.3) == [], "the companion has asked for arming"
+    door.state.hear(px4_heartbeat(armed=False), 8.0)
+    assert door.admit(data, 8.1) == [data], "PX4 did not arm"
 
 
 _QUAT = (1.0, 0.0, 0.0, 0.0)
@@ -73,7 +208,7 @@ _FORGED = [
 @pytest.mark.parametrize("system", [0, VEHICLE])
 @pytest.mark.parametrize("component", [1, 190, 195])
 def test_nothing_passes_in_the_vehicles_name(message: Any, system: int, component: int) -> None:
-    door = Door(VEHICLE)
+    door = door_of(armed=False)
     for v1 in (False, True):
         assert door.admit(packed(message, system, component, v1=v1), 0.0) == []
     assert door.refused == {f"in the vehicle's name (system id {system})": 2}
@@ -97,7 +232,7 @@ def test_nothing_passes_in_the_vehicles_name(message: Any, system: int, componen
     ids=lambda message: message.get_type(),
 )
 def test_setpoints_estimates_sensors_and_the_flights_streams_are_not_the_grounds_to_touch(message: Any) -> None:
-    door = Door(VEHICLE)
+    door = door_of(armed=False)
     assert door.admit(packed(message), 0.0) == []
     assert door.refused.total() == 1
 
@@ -110,7 +245,7 @@ def test_a_forged_frame_inside_of_another_or_behind_rubbish_does_not_get_out() -
     )
     whole = bytes(broken)
     broken[-1] ^= 0xFF
-    door = Door(VEHICLE)
+    door = door_of(armed=False)
     for data in (bytes(broken), whole[:-1], b"\x00" + forged, forged[:-1], bytes([0xFD, 40]) + forged, b""):
         assert door.admit(data, 0.0) == []
     # Whole, it is a file transfer whose content is its own affair; forged frames behind it are judged by themselves.
@@ -119,7 +254,7 @@ def test_a_forged_frame_inside_of_another_or_behind_rubbish_does_not_get_out() -
 
 def test_rubbish_of_every_kind_passes_nothing_and_breaks_nothing() -> None:
     random_bytes = random.Random(7)
-    door = Door(VEHICLE)
+    door = door_of(armed=False)
     good = packed(_READ)
     for _ in range(3000):
         data = bytearray(random_bytes.choice((good, random_bytes.randbytes(random_bytes.randrange(300)))))
@@ -134,7 +269,7 @@ def test_rubbish_of_every_kind_passes_nothing_and_breaks_nothing() -> None:
 
 
 def test_a_flood_is_cut_to_the_rate_and_counted() -> None:
-    door = Door(VEHICLE)
+    door = door_of(armed=False)
     data = packed(_READ)
     passed = sum(len(door.admit(data, i / 1000.0)) for i in range(10_000))
     assert passed == pytest.approx(UP_BURST + 10 * UP_RATE_HZ, abs=2)
@@ -142,7 +277,7 @@ def test_a_flood_is_cut_to_the_rate_and_counted() -> None:
 
 
 def test_many_system_ids_make_no_end_of_systems() -> None:
-    door = Door(VEHICLE)
+    door = door_of(armed=False)
     passed = [system for system in range(2, 256) if door.admit(packed(_HEARTBEAT, system), float(system))]
     assert passed == list(range(2, 2 + GROUND_SYSTEMS_MAX))
 

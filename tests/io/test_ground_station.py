@@ -126,12 +126,37 @@ def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() ->
     asyncio.run(fly())
 
 
+@pytest.mark.parametrize("kind", ["COMMAND_LONG", "COMMAND_INT"])
+def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4(kind: str) -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        with GroundPeer() as ground, Px4Peer(port) as px4:
+            px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+            async with link(port, ground.address) as (_, station):
+                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
+                if kind == "COMMAND_LONG":
+                    ground.say(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 0.0, 21196.0, *[0.0] * 5))
+                else:
+                    forced = (0.0, 21196.0, 0.0, 0.0)
+                    ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, *forced, 0, 0, 0.0))
+                ground.say(mavlink.MAVLink_command_long_message(1, 1, 21, 0, *[0.0] * 7))
+                await until(lambda: bool(px4.commands(21)), "LAND, which was sent after it")
+                assert px4.commands(400) == []
+                assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
+                told: list[str] = []
+                await until(lambda: told.extend(station.take_messages()) or len(told) > 1, "what was refused")  # type: ignore[func-returns-value]
+                assert any("1 command 400 while PX4 is armed" in text for text in told), told
+
+    asyncio.run(fly())
+
+
 def test_a_mode_that_the_ground_chose_reaches_px4_and_the_companion_sees_it() -> None:
     async def fly() -> None:
         port = free_udp_port()
         with GroundPeer() as ground:
             async with standing_stub(port), link(port, ground.address) as (autopilot, _):
                 await until(lambda: autopilot.status() is not None, "a heartbeat")
+                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
                 custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
                 for main, sub, mode in ((1.0, 0.0, FlightMode.MANUAL), (4.0, 3.0, FlightMode.HOLD)):
                     fields = (custom, main, sub, 0.0, 0.0, 0.0, 0.0)
