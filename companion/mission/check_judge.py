@@ -15,6 +15,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.frames import quat_from_euler_zyx
 from companion.safety.governor import BODY_TOP_M, SafeSet
+from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 from companion.types import PhaseKind, Quat, Reference, Vec2, Vec3
 
@@ -60,6 +61,7 @@ class Judge:
         self._vehicle = vehicle
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._safe = SafeSet(vehicle)
+        self._stop_model = StopModel(vehicle.tether)
         self._watch = TetherWatch(vehicle)
         airframe, tether = vehicle.airframe, vehicle.tether
         self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg
@@ -157,10 +159,10 @@ class Judge:
 
     def _stop(self, position: Vec3, reference: Reference, kind: PhaseKind) -> Iterator[Violation]:
         """Where it would come to rest after a fault at this instant."""
-        tether, safe = self._vehicle.tether, self._safe
+        safe = self._safe
         speed = math.hypot(*reference.velocity_world_m_s)
-        share_s = tether.react_time_s + 0.5 * speed / tether.stop_deceleration_m_s2
-        x_m, y_m, z_m = (p + v * share_s for p, v in zip(position, reference.velocity_world_m_s, strict=True))
+        stop_s = self._stop_model.time_s(speed)
+        x_m, y_m, z_m = (p + v * stop_s for p, v in zip(position, reference.velocity_world_m_s, strict=True))
         floor_m = self._vehicle.airframe.ground_clearance_m
         if kind is PhaseKind.LANDING:
             z_m = max(z_m, floor_m)  # the floor is where it is going
@@ -176,7 +178,7 @@ class Judge:
                     f"{STOP}{limit}",
                     beyond_m,
                     f"could not stop within the {what}",
-                    f"{speed:.2f} m/s take {speed * share_s:.2f} m to stop, {beyond_m:.2f} m too far",
+                    f"{speed:.2f} m/s take {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far",
                     "fly slower towards its edge or turn round earlier",
                 )
 

@@ -1,11 +1,11 @@
 """The governor: a reference that cannot leave the tether sphere and the room, whatever it is asked to follow. Pure.
 
 The safe set is convex: a ball about the anchor (length less margin less lever of the attachment) and a box (the room less the rotors).
-A state (p, v) of the reference is *safe* if p, and the point q = p + v |v| / (2 a) at which it could stand when braked straight at a,
-both lie in the set, and the speed is within its limit. Braking keeps q where it is, and p moves on the segment from p to q, which lies
-in a convex set with its ends: from a safe state braking is always possible and stays safe. So it is enough to accept a step towards
-what is asked only if the state after it is safe, and otherwise to mix in as much braking as that takes. No constraint needs a
-look-ahead, and nothing can be asked that breaks them.
+A state (p, v) of the reference is *safe* if p, and the point q at which the vehicle would come to rest after a fault
+(`companion.safety.stop`), both lie in the set, and the speed is within its limit. Braking straight at a never moves q outward, and p
+and q stay on the segment from the first p to the first q, which lies in a convex set with its ends: from a safe state braking is always
+possible and stays safe. So it is enough to accept a step towards what is asked only if the state after it is safe, and otherwise to mix
+in as much braking as that takes. No constraint needs a look-ahead, and no reference can break them.
 
 A reference that is safe itself, and goes on from where the last one was, passes untouched: the same object. A plan that was accepted by
 the mission check, which asks the same `SafeSet`, is never bent.
@@ -19,12 +19,14 @@ from dataclasses import dataclass
 from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
 from companion.frozen import quick
+from companion.safety.stop import StopModel
 from companion.types import Reference, TetherState, Vec3
 
 BODY_TOP_M = 0.15
 """Rotors and markers above the body's origin."""
-BELOW_STANDING_M = 0.3
-"""A landing's reference goes on below the floor until touch-down is felt: so far below standing height the set reaches."""
+BELOW_STANDING_M = 0.6
+"""The set reaches this far below standing height: a landing's reference goes on below the floor until touchdown is detected, and its
+predicted stop lies lower still."""
 JUMP_M = 0.002
 """A reference that is nowhere farther from where the last one leads goes on from it."""
 CATCH_UP_PER_S = 2.5
@@ -81,6 +83,22 @@ class SafeSet:
                 "correct tether.anchor_world_m or tether.length_m"
             )
 
+    def holds(self, p: Vec3) -> bool:
+        """Return whether the point lies in ball and box."""
+        return self.holds_within(p, self.radius_m, self.high_m[2])
+
+    def holds_within(self, p: Vec3, radius_m: float, top_m: float) -> bool:
+        """The same for a smaller ball and a lower ceiling."""
+        low, high, (ax, ay, az) = self.low_m, self.high_m, self.anchor_m
+        x, y, z = p
+        return (
+            low[0] - _TOLERANCE <= x <= high[0] + _TOLERANCE
+            and low[1] - _TOLERANCE <= y <= high[1] + _TOLERANCE
+            and low[2] - _TOLERANCE <= z <= top_m + _TOLERANCE
+            and (x - ax) * (x - ax) + (y - ay) * (y - ay) + (z - az) * (z - az)
+            <= (radius_m + _TOLERANCE) * (radius_m + _TOLERANCE)
+        )
+
     def breach_walls_m(self, p: Vec3) -> float:
         """How far a point of the body's origin is outside the box, along one axis; negative: inside."""
         return max(max(low - x, x - high) for x, low, high in zip(p, self.low_m, self.high_m, strict=True))
@@ -104,7 +122,8 @@ class Governor:
     def __init__(self, vehicle: Vehicle, limits: Limits) -> None:
         self._set = SafeSet(vehicle)
         self.stop_deceleration_m_s2 = vehicle.tether.stop_deceleration_m_s2
-        """With which q is computed, and with which it brakes."""
+        """With which it brakes."""
+        self._stop = StopModel(vehicle.tether)
         self.acceleration_max_m_s2 = max(limits.acceleration_max_m_s2, self.stop_deceleration_m_s2)
         """The velocity of the governed reference never changes faster."""
         self.speed_max_m_s = max(limits.speed_max_m_s, vehicle.safety.land_speed_m_s)
@@ -159,8 +178,7 @@ class Governor:
         px, py, pz = p
         vx, vy, vz = v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
-        reach = speed * self._half_per_a
-        safe = self._admits(px, py, pz) and self._admits(px + vx * reach, py + vy * reach, pz + vz * reach)
+        safe = self._admits_state(p, v, speed)
         fast = speed > self.speed_max_m_s * (1.0 + 1e-6)
         last = self._p
         if last is None:
@@ -182,12 +200,14 @@ class Governor:
             return ()
         reasons = []
         if not safe:
-            ends = (p, (px + vx * reach, py + vy * reach, pz + vz * reach))
-            if any(math.dist(end, self._set.anchor_m) > self._radius_m + _TOLERANCE for end in ends) or (
-                self._restrained and any(end[2] > self._top_m + _TOLERANCE for end in ends)
+            stop = _ahead(p, v, self._stop.time_s(speed))
+            if (
+                self._set.breach_tether_m(p) > _TOLERANCE
+                or self._set.breach_tether_m(stop) > _TOLERANCE
+                or not self._admits_restrained(p, v, speed)
             ):
                 reasons.append("tether")
-            if any(self._set.breach_walls_m(end) > _TOLERANCE for end in ends):
+            if any(self._set.breach_walls_m(end) > _TOLERANCE for end in (p, stop)):
                 reasons.append("geofence")
         if fast:
             reasons.append("speed")
@@ -195,22 +215,21 @@ class Governor:
             reasons.append("acceleration")
         return tuple(reasons)
 
-    def _admits(self, x: float, y: float, z: float) -> bool:
-        low, high, (ax, ay, az) = self._set.low_m, self._set.high_m, self._set.anchor_m
-        return (
-            low[0] - _TOLERANCE <= x <= high[0] + _TOLERANCE
-            and low[1] - _TOLERANCE <= y <= high[1] + _TOLERANCE
-            and low[2] - _TOLERANCE <= z <= self._top_m + _TOLERANCE
-            and (x - ax) * (x - ax) + (y - ay) * (y - ay) + (z - az) * (z - az)
-            <= (self._radius_m + _TOLERANCE) * (self._radius_m + _TOLERANCE)
-        )
+    def _admits_state(self, p: Vec3, v: Vec3, speed: float) -> bool:
+        """The present set holds p, and the safe set the predicted stop."""
+        stop = _ahead(p, v, self._stop.time_s(speed))
+        return self._set.holds(stop) and self._admits_restrained(p, v, speed)
+
+    def _admits_restrained(self, p: Vec3, v: Vec3, speed: float) -> bool:
+        """Ball and ceiling as they are now hold p and the end of straight braking; without restraint the latter follows."""
+        return self._admits(p) and (not self._restrained or self._admits(_ahead(p, v, speed * self._half_per_a)))
+
+    def _admits(self, p: Vec3) -> bool:
+        return self._set.holds_within(p, self._radius_m, self._top_m)
 
     def _safe(self, p: Vec3, v: Vec3) -> bool:
         speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-        if speed > self.speed_max_m_s * (1.0 + 1e-6):
-            return False
-        reach = speed * self._half_per_a
-        return self._admits(*p) and self._admits(p[0] + v[0] * reach, p[1] + v[1] * reach, p[2] + v[2] * reach)
+        return speed <= self.speed_max_m_s * (1.0 + 1e-6) and self._admits_state(p, v, speed)
 
     # -- taut ------------------------------------------------------------------------------------------------------
 
@@ -224,12 +243,11 @@ class Governor:
             self._radius_m, self._top_m = self._set.radius_m, self._set.high_m[2]
 
     def _tighten(self) -> None:
-        """The set still holds p and q, so that braking stays possible."""
+        """The set still holds p and the end of straight braking, so that braking stays possible and nothing farther is."""
         p, v = self._p, self._v
         if p is None:
             return
-        reach = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]) * self._half_per_a
-        q = (p[0] + v[0] * reach, p[1] + v[1] * reach, p[2] + v[2] * reach)
+        q = _ahead(p, v, math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]) * self._half_per_a)
         anchor = self._set.anchor_m
         self._radius_m = min(self._radius_m, max(math.dist(p, anchor), math.dist(q, anchor)))
         self._top_m = min(self._top_m, max(p[2], q[2]))
@@ -253,7 +271,7 @@ class Governor:
             follow = feed = (0.0, 0.0, 0.0)
             if not self._restrained:
                 target = self._nearest(target, INSIDE_M)
-        if self._restrained and not self._admits(*target):
+        if self._restrained and not self._admits(target):
             # What is asked for lies outward: sliding along to the place nearest to it would help nobody.
             wish_p, wish_v = brake_p, brake_v
         else:
@@ -330,6 +348,10 @@ def _share_within(inside: Vec3, p: Vec3, centre: Vec3, radius_m: float) -> float
     if a <= 0.0 or c > 0.0 or (c == 0.0 and b >= 0.0):
         return 0.0
     return min(1.0, (math.sqrt(b * b - a * c) - b) / a)
+
+
+def _ahead(p: Vec3, v: Vec3, time_s: float) -> Vec3:
+    return (p[0] + v[0] * time_s, p[1] + v[1] * time_s, p[2] + v[2] * time_s)
 
 
 def _clamped(p: Vec3, low: Vec3, high: Vec3) -> Vec3:

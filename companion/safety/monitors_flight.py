@@ -28,6 +28,7 @@ from companion.safety.rules import (
     TRACKING_HOLD,
     TRACKING_WARN,
 )
+from companion.safety.stop import StopModel
 from companion.types import ControlLog, TetherState, Vec3, VehicleState
 
 CRASH_TILT_RAD = math.radians(70.0)
@@ -47,7 +48,7 @@ class FlightMonitor:
         self._x_m = (room.x_m[0] + inset_m, room.x_m[1] - inset_m)
         self._y_m = (room.y_m[0] + inset_m, room.y_m[1] - inset_m)
         self._top_m = room.z_m[1] - BODY_TOP_M + s.geofence_tolerance_m
-        self._react_s, self._braking_m_s2 = tether.react_time_s, tether.stop_deceleration_m_s2
+        self._stop = StopModel(tether)
         self._turns_max = tether.turns_max
         self._clearance_min_m = tether.clearance_min_m
         self._saturated_s = 0.0
@@ -102,10 +103,8 @@ class FlightMonitor:
         (x_low, x_high), (y_low, y_high), top = self._x_m, self._y_m, self._top_m
         if not (x_low <= x <= x_high and y_low <= y <= y_high and z <= top):
             findings.found(GEOFENCE_LEFT, "at ({:.2f}, {:.2f}, {:.2f}) m the rotors are outside the room", x, y, z)
-        react_s, twice = self._react_s, 0.5 / self._braking_m_s2
-        x += vx * (react_s + abs(vx) * twice)
-        y += vy * (react_s + abs(vy) * twice)
-        z += vz * (react_s + abs(vz) * twice)
+        stop_s = self._stop.time_s(math.sqrt(vx * vx + vy * vy + vz * vz))
+        x, y, z = x + vx * stop_s, y + vy * stop_s, z + vz * stop_s
         if not (x_low <= x <= x_high and y_low <= y <= y_high and z <= top):
             text = "would come to rest at ({:.2f}, {:.2f}, {:.2f}) m, the rotors outside the room"
             findings.found(GEOFENCE_NEAR, text, x, y, z)

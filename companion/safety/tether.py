@@ -11,6 +11,7 @@ import math
 
 from companion.config.vehicle import Tether, Vehicle
 from companion.frames import quat_rotate
+from companion.safety.stop import StopModel
 from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
 from companion.types import Quat, TetherState, Vec2, Vec3
@@ -41,13 +42,6 @@ def slack_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> floa
 def allowed_m(tether: Tether) -> float:
     """Largest distance from the anchor that a plan may use."""
     return tether.length_m - tether.margin_m
-
-
-def stop_distance_m(tether: Tether, outward_m_s: float) -> float:
-    """How far the machine goes on outwards before it can stand: v t_react + v^2 / (2 a); 0 when it does not move outwards."""
-    if outward_m_s <= 0.0:
-        return 0.0
-    return outward_m_s * (tether.react_time_s + 0.5 * outward_m_s / tether.stop_deceleration_m_s2)
 
 
 class Winding:
@@ -91,8 +85,7 @@ class TetherWatch:
         self._anchor = tether.anchor_world_m
         self._attachment = tether.attachment_body_m
         self._length_m = tether.length_m
-        self._react_s = tether.react_time_s
-        self._half_per_a = 0.5 / tether.stop_deceleration_m_s2
+        self._stop = StopModel(tether)
         self._taut_slack_m = tether.taut_slack_m
         self._separation_m = tether.separation_m
         self._clearance = Clearance(vehicle)
@@ -155,7 +148,7 @@ class TetherWatch:
         outward = -(vx * ux + vy * uy + vz * uz)
         stop_slack = slack
         if outward > 0.0:
-            stop_slack -= outward * (self._react_s + outward * self._half_per_a)
+            stop_slack -= self._stop.distance_m(outward)
 
         # The line in the body's frame, straight and hanging as deep as its length lets it.
         straight = (xx * ux + yx * uy + zx * uz, xy * ux + yy * uy + zy * uz, xz * ux + yz * uy + zz * uz)

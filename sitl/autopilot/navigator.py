@@ -13,8 +13,11 @@ from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
 from sitl.autopilot.position_control import GRAVITY_M_S2, PositionControl, heading_rad
 from sitl.autopilot.setpoints import PositionTarget
+from sitl.autopilot.smoothing import Smoothing
 from sitl.autopilot.types import AttitudeTarget, Estimate
 
+_STOP_AHEAD_S = 0.6
+"""Constant of Navigator::preproject_stop_point (PX4 1.16): the delay until the full deceleration acts."""
 _BLIND_DESCENT_M_S2 = 0.3
 """FlightTaskDescend without vertical velocity: this much less than 1 g of thrust."""
 _DESCENT_SLEW_M_S2 = 1.0
@@ -44,6 +47,8 @@ class Navigator:
         self._state: NavState | None = None
         self._ramp_since_s = 0.0
         self._hold_ned_m: Vec3 = (0.0, 0.0, 0.0)
+        self._way = Smoothing((0.0, 0.0), (0.0, 0.0))
+        """To the point that the mode holds."""
         self._yaw_rad = 0.0
         self._descent_m_s = 0.0
         self._descending = False
@@ -64,6 +69,7 @@ class Navigator:
             self.settle(landed)
         if landed or previous is None or previous is NavState.OFFBOARD:
             self.control.reset()
+        self._way = Smoothing(estimate.position_ned_m[:2], estimate.velocity_ned_m_s[:2])
         if state is NavState.LOITER and came_from_takeoff:
             return
         self._yaw_rad = heading_rad(estimate.attitude_ned_frd)
@@ -120,14 +126,15 @@ class Navigator:
                 return PositionTarget(acceleration_ned_m_s2=(None, None, _BLIND_DESCENT_M_S2))
             return PositionTarget(velocity_ned_m_s=(None, None, self._descent(dt_s, estimate, home_ned_m)))
         if self._state is NavState.RTL and home_ned_m is not None and not self._descending:
-            x, y, z = estimate.position_ned_m
+            x, y, _ = estimate.position_ned_m
             self._hold_ned_m = (home_ned_m[0], home_ned_m[1], self._hold_ned_m[2])
             self._descending = math.hypot(x - home_ned_m[0], y - home_ned_m[1]) < _HOME_RADIUS_M
-        x, y, z = self._hold_ned_m
+        self._way.step(dt_s, self._hold_ned_m[:2], self._params)
+        (x, y), (vx, vy), (ax, ay) = self._way.position_m, self._way.velocity_m_s, self._way.acceleration_m_s2
         if self._descending:
             speed = self._descent(dt_s, estimate, home_ned_m)
-            return PositionTarget((x, y, None), (None, None, speed), yaw_rad=self._yaw_rad)
-        return PositionTarget((x, y, z), yaw_rad=self._yaw_rad)
+            return PositionTarget((x, y, None), (vx, vy, speed), (ax, ay, None), yaw_rad=self._yaw_rad)
+        return PositionTarget((x, y, self._hold_ned_m[2]), (vx, vy, None), (ax, ay, None), yaw_rad=self._yaw_rad)
 
     def _descent(self, dt_s: float, estimate: Estimate, home_ned_m: Vec3 | None) -> float:
         """Landing speed by height above home (MPC_LAND_ALT1/2), approached smoothly."""
@@ -174,5 +181,5 @@ class Navigator:
     def _stopping_point(self, estimate: Estimate) -> Vec3:
         x, y, z = estimate.position_ned_m
         vx, vy, _ = estimate.velocity_ned_m_s
-        reach = math.hypot(vx, vy) / (2.0 * max(self._params.real("MPC_ACC_HOR"), 0.1))
-        return (x + vx * reach, y + vy * reach, z)
+        ahead_s = _STOP_AHEAD_S + math.hypot(vx, vy) / (2.0 * max(self._params.real("MPC_ACC_HOR"), 0.1))
+        return (x + vx * ahead_s, y + vy * ahead_s, z)

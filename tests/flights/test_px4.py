@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -13,7 +14,9 @@ from typing import Any
 import pytest
 
 from companion.analysis.log import FlightLog
+from companion.config.loader import load_flight
 from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.safety.stop import StopModel
 from companion.sitl_process import PX4_FOLDER
 from companion.types import PhaseKind
 from sitl.px4_process import VARIABLE
@@ -31,8 +34,16 @@ OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
 E_P_MAX_M = 0.02
 """After the catch of 0.2 kg; measured: 7 mm on the stub, 9 to 13 mm on PX4 1.16.1."""
 E_Q_MAX_DEG = 2.0
-DRIFT_MAX_M = 0.7
-"""After a take-over; measured: 0.18 to 0.26 m on the stub, 0.34 to 0.45 m on PX4 1.16.1."""
+LINE_TO_THE_WALL = (
+    "mission.catch=null",
+    "mission.limits.speed_max_m_s=1.2",
+    "mission.limits.acceleration_max_m_s2=1.2",
+    "mission.phases=[{type: takeoff, height_m: 1.0, duration_s: 3.0}, "
+    "{type: line, to_m: [1.6, 0, 1.0], duration_s: 6.0}, {type: land, speed_m_s: 0.35}]",
+)
+"""Rotors 0.15 m from the wall at its end; 0.5 s less and the mission check refuses it."""
+NEAREST_STOP_S = 9.6
+"""After arming, on that line: the predicted stop is nearest to the wall."""
 LANDED_M = 0.4
 """Of the body's origin, which stands 0.3 m high."""
 
@@ -92,9 +103,31 @@ def test_the_guardian_lands_after_the_catch(sandbox: Sandbox, autopilot: str, ki
     assert ids[-4:] == ["guardian_took_over", "guardian_land", "guardian_touchdown", "guardian_landed"]
     assert_landed_where_it_was(sandbox)
     assert_log_reaches_the_take_over(sandbox)
-    fault = witness(sandbox)["flight_fault"]
+    assert_stopped_as_modelled(sandbox, kind)
+
+
+@pytest.mark.parametrize("kind", ["kill_flight", "stop_flight"])
+def test_the_guardian_stops_before_the_wall(sandbox: Sandbox, autopilot: str, kind: str) -> None:
+    """The fastest line to the wall that the mission check accepts, and the fault where the predicted stop is nearest to it."""
+    fault = f"world.faults=[{{kind: {kind}, t_s: {NEAREST_STOP_S}}}]"
+    ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", *LINE_TO_THE_WALL, fault)
+    assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
+    assert_stopped_as_modelled(sandbox, kind)
+    vehicle = load_flight(HOVER).vehicle
+    reach_m = max(x for _, (x, _, _), *_ in witness(sandbox)["course"]) + vehicle.airframe.radius_m
+    assert reach_m <= vehicle.room.x_m[1]
+
+
+def assert_stopped_as_modelled(sandbox: Sandbox, kind: str) -> None:
+    """It drifts no farther than the stop model says for its speed when the fault began."""
+    seen = witness(sandbox)
+    fault = seen["flight_fault"]
     assert fault["kind"] == kind
-    assert fault["drift_m"] < DRIFT_MAX_M
+    times_s = [t_s for t_s, *_ in seen["course"]]
+    drifts_m = [math.dist(seen["course"][0][1][:2], position[:2]) for _, position, *_ in seen["course"]]
+    speed_m_s = drifts_m[1] / (times_s[1] - times_s[0])
+    assert speed_m_s > 0.3
+    assert max(drifts_m) <= StopModel(load_flight(HOVER).vehicle.tether).distance_m(speed_m_s)
     assert fault["worst_tilt_deg"] < 30.0
 
 
