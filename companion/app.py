@@ -138,7 +138,7 @@ class Flight:
         edges.vision.open = outputs.mocap_trusted
         core_s = self._clock()
         # The setpoint first: handing over the currents wakes the bus thread, which wants the interpreter for itself.
-        attitude_sent = outputs.attitude is not None and edges.autopilot.send_attitude(outputs.attitude)
+        attitude_sent = edges.autopilot.send_attitude(outputs.attitude)
         setpoint_s = self._clock()
         torque_sent: Vec2 | None = None
         if outputs.arm_torque_nm is not None and edges.arm is not None:

@@ -138,6 +138,9 @@ class AutopilotDevice(Model):
     address: str
     """MAVSDK connection: udpin://0.0.0.0:14540, serial:///dev/ttyAMA0:921600, ..."""
     discovery_timeout_s: Positive = 10.0
+    setpoint_path: Literal["direct", "offboard"] = "direct"
+    """How SET_ATTITUDE_TARGET leaves: direct (MAVSDK's MavlinkDirect: only when the flight loop sends), or offboard (MAVSDK's Offboard
+    plugin: its thread repeats the last setpoint at 20 Hz, also while the flight loop hangs)."""
 
 
 class MocapDevice(Model):

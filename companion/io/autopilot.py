@@ -40,6 +40,7 @@ from companion.io.autopilot_link import (
 from companion.io.autopilot_origin import ensure_origin
 from companion.io.autopilot_params import ParamTransfer
 from companion.io.autopilot_requests import RequestDesk
+from companion.io.autopilot_setpoints import SetpointPath, setpoint_path
 from companion.io.edges import DeviceError
 from companion.preflight.observations import EstimatorReport, StateCounts
 from companion.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, MocapPose, VehicleState
@@ -70,13 +71,10 @@ class LinkIdentity:
 class MavsdkAutopilot:
     """The `Autopilot` edge.
 
-    Setpoints go out as SET_ATTITUDE_TARGET through MavlinkDirect, not through MAVSDK's Offboard plugin. That plugin re-sends its last
-    setpoint at 20 Hz from a C++ thread for as long as the process lives, so PX4's offboard-loss failsafe would never fire for a hung
-    companion; it also takes Euler angles only. Here nothing leaves unless the flight loop sends it. The price was measured: 0.03 to
-    0.06 ms more from datagram to wire (p50; 0.1 ms at p99), of a tick of 5 ms. benchmarks/wire_latency.py measures both.
+    Attitude setpoints leave by the way that `devices.autopilot.setpoint_path` names: see `autopilot_setpoints`.
 
     Args:
-        device: its address.
+        device: its address, and how setpoints go there.
         clock: the flight clock.
         forwarding: a second connection is wanted, see `forward_to`.
     """
@@ -93,6 +91,7 @@ class MavsdkAutopilot:
         self._second: Any = None
         self._restore_log: Callable[[], None] | None = None
         self._direct: Any = None
+        self._setpoints: SetpointPath | None = None
         self._mocap: Any = None
         self._info: Any = None
         self._params: ParamTransfer | None = None
@@ -127,6 +126,7 @@ class MavsdkAutopilot:
             system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
             self._direct = MavlinkDirect(system)
+            self._setpoints = setpoint_path(self._device.setpoint_path, system, self._direct)
             self._mocap = Mocap(system)
             telemetry = Telemetry(system)
             self._params = ParamTransfer(
@@ -192,14 +192,18 @@ class MavsdkAutopilot:
         """Messages of the fast state since the link was opened."""
         return self._inbox.counts()
 
-    def send_attitude(self, setpoint: AttitudeSetpoint) -> bool:
-        """Send SET_ATTITUDE_TARGET at once. False: the link is closed or refused it.
+    def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
+        """Send SET_ATTITUDE_TARGET at once; None: from now on nothing leaves. False: nothing was sent.
 
         Raises:
             ValueError: a value that must never leave (not finite, not a unit quaternion, thrust outside 0 to 1).
         """
-        fields = messages.attitude_target_json(setpoint, int(self._clock() * 1e3), self._system_id)
-        return self._open and self._send("SET_ATTITUDE_TARGET", fields)
+        if not self._open or self._setpoints is None:
+            return False
+        if setpoint is None:
+            self._setpoints.stop()
+            return False
+        return self._setpoints.send(setpoint, self._clock())
 
     def send_vision(self, pose: MocapPose) -> bool:
         """Send VISION_POSITION_ESTIMATE at once. False: the link is closed or refused it.

@@ -143,8 +143,8 @@ def vehicle_state(
     )
 
 
-def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> str:
-    """SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored.
+def attitude_target_ned(setpoint: AttitudeSetpoint) -> Quat:
+    """Attitude FRD -> NED of a setpoint that may leave.
 
     Raises:
         ValueError: a value is not finite, the quaternion is not of unit norm, or thrust is outside 0 to 1.
@@ -156,7 +156,18 @@ def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_s
         raise ValueError(f"attitude setpoint {setpoint.attitude_wxyz} is not a unit quaternion")
     if not 0.0 <= setpoint.thrust <= 1.0:
         raise ValueError(f"thrust setpoint {setpoint.thrust} is outside 0 to 1")
-    q = attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz)
+    return attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz)
+
+
+def attitude_target_deg(setpoint: AttitudeSetpoint) -> Vec3:
+    """Roll, pitch, yaw (ZYX, FRD -> NED) in degrees of a setpoint that may leave; raises as `attitude_target_ned` does."""
+    roll_rad, pitch_rad, yaw_rad = euler_zyx_from_quat(quat_normalize(attitude_target_ned(setpoint)))
+    return math.degrees(roll_rad), math.degrees(pitch_rad), math.degrees(yaw_rad)
+
+
+def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> str:
+    """SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises as `attitude_target_ned` does."""
+    q = attitude_target_ned(setpoint)
     return (
         f'{{"time_boot_ms":{time_boot_ms & 0xFFFFFFFF},"target_system":{target_system},'
         f'"target_component":{MAV_COMP_ID_AUTOPILOT1},"type_mask":{_TYPE_MASK_IGNORE_RATES},'

@@ -45,8 +45,8 @@ class Autopilot(Edge, Protocol):
     def status(self) -> AutopilotStatus | None:
         """Latest slow state."""
 
-    def send_attitude(self, setpoint: AttitudeSetpoint) -> bool:
-        """Send at once, synchronously (hot path). False: the link refused it."""
+    def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
+        """Send at once, synchronously (hot path). None: from now on nothing leaves. False: nothing was sent."""
 
     def send_vision(self, pose: MocapPose) -> bool:
         """Send VISION_POSITION_ESTIMATE at once, synchronously."""

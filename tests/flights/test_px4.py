@@ -44,6 +44,7 @@ LINE_TO_THE_WALL = (
 """Rotors 0.15 m from the wall at its end; 0.5 s less and the mission check refuses it."""
 NEAREST_STOP_S = 9.6
 """After arming, on that line: the predicted stop is nearest to the wall."""
+GUARDIAN_LANDS = ["guardian_land", "guardian_touchdown", "guardian_landed"]
 LANDED_M = 0.4
 """Of the body's origin, which stands 0.3 m high."""
 
@@ -129,6 +130,21 @@ def assert_stopped_as_modelled(sandbox: Sandbox, kind: str) -> None:
     assert speed_m_s > 0.3
     assert max(drifts_m) <= StopModel(load_flight(HOVER).vehicle.tether).distance_m(speed_m_s)
     assert fault["worst_tilt_deg"] < 30.0
+
+
+@pytest.mark.parametrize("kind", ["kill_flight", "hold_gil"])
+def test_through_mavsdks_offboard_plugin_the_guardian_lands_as_well(
+    sandbox: Sandbox, autopilot: str, kind: str
+) -> None:
+    """The other setpoint path. A process that holds the interpreter leaves a thread behind that repeats the last setpoint."""
+    fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
+    path = "vehicle.devices.autopilot.setpoint_path=offboard"
+    ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault, path)
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
+    assert event_ids(read_summary(sandbox.cwd / "out"))[-3:] == GUARDIAN_LANDS
+    assert_landed_where_it_was(sandbox)
+    assert_stopped_as_modelled(sandbox, kind)
 
 
 def assert_log_reaches_the_take_over(sandbox: Sandbox) -> None:
