@@ -5,16 +5,26 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 MINUTES ?= 10
 
-.PHONY: install fly test lint explore debian bench docs clean
+.PHONY: install lock fly test lint explore debian bench docs clean
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml requirements/all.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if v >= (3, 11) else f"companion needs Python 3.11 or newer, this is {v.major}.{v.minor}; name another: make PYTHON=python3.12 install")'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "python venv failed: on Debian, apt install python3-venv"; exit 1; }
 	@echo "installing into $(VENV) ..."
-	@PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all]'
+	@PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --require-hashes -r requirements/all.txt
+	@PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
+
+# Versions of constraints.txt, with everything they need and the hash of every file: after a change of pyproject.toml or constraints.txt.
+lock:
+	@test -x build/lock/bin/uv || { $(PYTHON) -m venv build/lock && build/lock/bin/python -m pip install --quiet uv; }
+	@for what in flight all; do \
+	  extras=; test $$what = flight || extras=--all-extras; \
+	  echo 'setuptools>=77' | build/lock/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
+	    --no-emit-index-url --constraints constraints.txt $$extras pyproject.toml - --output-file requirements/$$what.txt || exit 1; \
+	done
 
 fly: install
 	@$(BIN)/companion fly configs/missions/catch.yaml --sitl
