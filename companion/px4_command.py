@@ -152,6 +152,7 @@ def jsonable(comparison: Comparison, result: WriteResult | None, backup: Path | 
         "differs": [{"name": d.name, "px4": d.px4, "file": d.file, "reboot": d.reboot} for d in comparison.differences],
         "absent": list(comparison.absent),
         "absent_port": list(comparison.absent_port),
+        "measured": [{"name": d.name, "px4": d.px4, "file": d.file} for d in comparison.measured],
         **done,
     }
 
@@ -163,9 +164,14 @@ def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
         for d in (comparison.differences if result is None else result.written)
     ]
     told += [f"{name:16}  PX4 does not have it" for name in comparison.absent]
+    differ = len(told)
     told += [f"{name:16}  no such serial port in this PX4, left out" for name in comparison.absent_port]
+    told += [
+        f"{d.name:16}  {value_text(d.px4):>12}, measured on each installation, left as it is (the file: {value_text(d.file)})"
+        for d in comparison.measured
+    ]
     if result is None:
-        told.append("nothing differs" if comparison.same else f"{len(told) - len(comparison.absent_port)} differ")
+        told.append("nothing differs" if comparison.same else f"{differ} differ")
         return told
     told.append(f"{len(result.written)} of {len(comparison.differences)} written, each read back")
     if result.problem is not None:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from companion.io.edges import DeviceError
+from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.params_file import Value, same
-from companion.px4.wanted import BY_NAME
+from companion.px4.wanted import BY_NAME, NO_VEHICLE
 from companion.types import AutopilotStatus
 
 
@@ -57,6 +58,8 @@ class Comparison:
     """In the file, but PX4 does not have them; those of another version of PX4 (`Wanted.only`) do not count."""
     absent_port: tuple[str, ...]
     """The same, of a serial port that this PX4 does not have: a simulator, or a board without TELEM2. Nothing is wrong with that."""
+    measured: tuple[Difference, ...] = ()
+    """Accepted values other than the file's, of what is measured on each installation: left as they are. Nothing is wrong with that."""
 
     @property
     def same(self) -> bool:
@@ -75,16 +78,31 @@ class WriteResult:
 
 def compare(wanted: Mapping[str, Value], found: Mapping[str, Value]) -> Comparison:
     """A file's values against PX4's. Pure."""
-    differences, absent, absent_port = [], [], []
+    differences: list[Difference] = []
+    measured: list[Difference] = []
+    absent, absent_port = [], []
+    of_port = {name for name in wanted if name in BY_NAME and BY_NAME[name].hardware}
+    has_port = of_port <= found.keys()
     for name, value in wanted.items():
-        if name in found:
-            if not same(value, found[name]):
-                differences.append(Difference(name, found[name], value))
-        elif name in BY_NAME and BY_NAME[name].hardware:
+        if name in of_port and not has_port:
             absent_port.append(name)
+        elif name in found:
+            if not same(value, found[name]):
+                difference = Difference(name, found[name], value)
+                (measured if _is_measured(difference) else differences).append(difference)
         elif name not in BY_NAME or not BY_NAME[name].only:
             absent.append(name)
-    return Comparison(tuple(differences), tuple(absent), tuple(absent_port))
+    return Comparison(tuple(differences), tuple(absent), tuple(absent_port), tuple(measured))
+
+
+def _is_measured(difference: Difference) -> bool:
+    """Somebody measured what PX4 holds, and the file only has the project's value to begin with."""
+    wanted = BY_NAME.get(difference.name)
+    if wanted is None or not wanted.measured or wanted.value is None or wanted.limits is None:
+        return False
+    low, high = wanted.limits(NO_VEHICLE)
+    begun = same(difference.file, wanted.value) and not same(difference.px4, PX4_DEFAULTS[difference.name])
+    return begun and low <= difference.px4 <= high
 
 
 async def write(link: ParamLink, differences: Iterable[Difference]) -> WriteResult:

@@ -49,6 +49,8 @@ class Wanted:
     """Of the serial port TELEM2; looked at only on a serial link, and PX4's simulator does not have all of them."""
     file: bool = True
     """Part of configs/px4/indoor_mocap.params."""
+    measured: bool = False
+    """Measured on each installation: a value within `limits` that is not PX4's own default is left as it is."""
     only: str = ""
     """The version that has it, where not both do; on another it is left out, and nothing is wrong with that."""
 
@@ -77,11 +79,11 @@ class Wanted:
             return f"{self.value:g}"
         if vehicle is None and self.limits_text:
             return self.limits_text
-        low, high = self.limits(vehicle) if vehicle is not None else self.limits(_NO_VEHICLE)
+        low, high = self.limits(vehicle) if vehicle is not None else self.limits(NO_VEHICLE)
         return " to ".join(f"{end:.3f}".rstrip("0").rstrip(".") for end in (low, high))
 
 
-_NO_VEHICLE: Vehicle = None  # type: ignore[assignment]
+NO_VEHICLE: Vehicle = None  # type: ignore[assignment]
 """For limits that do not look at it."""
 
 
@@ -147,6 +149,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "ms from exposure to arrival; an estimate that is wrong in time swings with the machine",
             reboot=True,
             limits=_between(0.0, 30.0),
+            measured=True,
         ),
         Wanted("EKF2_ASP_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=_between(0.0, 50.0)),
         Wanted("EKF2_GPS_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=_between(0.0, 50.0), only="1.16"),

@@ -149,3 +149,26 @@ def test_a_parameter_of_another_version_is_left_out() -> None:
     assert comparison.same
     assert comparison.absent == ()
     assert not compare({"SENS_GPS0_DELAY": 5}, {"SENS_GPS0_DELAY": 110}).same, "where it is, it counts"
+
+
+def test_what_is_measured_on_each_installation_and_a_port_that_is_not_there_do_not_differ() -> None:
+    """As `companion sitl --px4` shows it: its motion capture is 10 ms late, and a simulator has MAV_1_RATE but no TELEM2."""
+    simulated = {**file_values(), "EKF2_EV_DELAY": 10.0, "MAV_1_RATE": 0}
+    del simulated["SER_TEL2_BAUD"]
+    found = compare(file_values(), simulated)
+    assert found.same
+    assert [(one.name, one.px4, one.file) for one in found.measured] == [("EKF2_EV_DELAY", 10.0, 5.0)]
+    assert set(found.absent_port) == {"MAV_1_CONFIG", "MAV_1_MODE", "MAV_1_RATE", "SER_TEL2_BAUD"}
+    assert "MAV_1_RATE" in {one.name for one in compare(file_values(), {**file_values(), "MAV_1_RATE": 0}).differences}
+
+
+@pytest.mark.parametrize("found_ms", [0.0, 31.0])
+def test_a_delay_that_nobody_measured_or_that_cannot_be_flown_differs(found_ms: float) -> None:
+    found = compare(file_values(), {**file_values(), "EKF2_EV_DELAY": found_ms})
+    assert [one.name for one in found.differences] == ["EKF2_EV_DELAY"]
+    assert found.measured == ()
+
+
+def test_a_file_that_holds_a_measured_value_itself_is_written() -> None:
+    wanted = {"EKF2_EV_DELAY": 12.0}
+    assert [one.name for one in compare(wanted, {"EKF2_EV_DELAY": 10.0}).differences] == ["EKF2_EV_DELAY"]
