@@ -64,6 +64,8 @@ class Row:
     run: int
     outcome: str
     as_it_must: bool
+    e_p_before_m: float | None
+    """Root mean square before the catch."""
     e_p_m: float | None
     """Root mean square after the catch."""
     e_q_deg: float | None
@@ -100,11 +102,12 @@ def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
     if not (folder / "summary.json").exists():
         return None
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    post, latency = summary["rms"]["post"], summary["latency_ms"]["mocap_to_setpoint"]
+    before, post = summary["rms"]["pre"], summary["rms"]["post"]
+    latency = summary["latency_ms"]["mocap_to_setpoint"]
     known: dict[str, Any] = {
         "case": case.name, "autopilot": autopilot, "version": summary["autopilot"]["version"], "run": run,
         "outcome": summary["outcome"], "as_it_must": summary["outcome"] == case.outcome,
-        "e_p_m": post["e_p_m"], "e_q_deg": post["e_q_deg"], "e_alpha_deg": post["e_alpha_deg"],
+        "e_p_before_m": before["e_p_m"], "e_p_m": post["e_p_m"], "e_q_deg": post["e_q_deg"], "e_alpha_deg": post["e_alpha_deg"],
         "latency_p50_ms": latency["p50"], "latency_p99_ms": latency["p99"], "modes": "",
     }  # fmt: skip
     witness = json.loads((folder / WITNESS).read_text(encoding="utf-8")) if (folder / WITNESS).exists() else None
@@ -158,9 +161,9 @@ def markdown(rows: Sequence[Row]) -> str:
     lines = [
         f"PX4 {' and '.join(versions)}; each cell: smallest to largest of the runs.",
         "",
-        "| flight | autopilot | ended as it must | e_p after the catch, mm | e_q, deg | arm error, deg "
+        "| flight | autopilot | ended as it must | e_p before the catch, mm | after it, mm | e_q, deg | arm error, deg "
         "| mocap to setpoint, ms (p50, p99) | modes |",
-        "|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for case in CASES:
         for autopilot in AUTOPILOTS:
@@ -186,6 +189,7 @@ def _flight_line(case: Case, autopilot: str, rows: Sequence[Row]) -> str:
         case.name,
         autopilot,
         _count(rows),
+        _spread([row.e_p_before_m for row in rows], 1e3, 1),
         _spread([row.e_p_m for row in rows], 1e3, 1),
         _spread([row.e_q_deg for row in rows], 1.0, 2),
         _spread([row.e_alpha_deg for row in rows], 1.0, 2),
