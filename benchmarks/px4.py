@@ -114,7 +114,7 @@ def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
     if case.fault and witness is not None and witness["course"]:
         known |= _course_of(witness["course"])
     if autopilot == "px4":
-        log = Px4Log.read(newest(folder))
+        log = Px4Log.read(newest(folder), summary["autopilot"].get("clock_begun_s", 0.0))
         known["modes"] = log.modes()
         if case.fault and witness is not None and witness["fault_begun_s"] is not None:
             known |= asdict(log.after(witness["fault_begun_s"]))

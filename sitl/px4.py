@@ -19,7 +19,7 @@ from sitl.autopilot.types import ImuSample
 from sitl.ends import Noticed
 from sitl.faults import Autopilot as FaultyAutopilot
 from sitl.px4_link import HilSensors, Px4Error, SimulatorLink
-from sitl.px4_process import HOW_TO_GET_IT, MODEL, Installation, Instance, Px4Process, find
+from sitl.px4_process import HOW_TO_GET_IT, HOW_TO_START_IT, MODEL, Installation, Instance, Px4Process, find
 from sitl.px4_relay import Relay
 from sitl.px4_store import restore, stored
 from sitl.px4_vehicle import BEFORE_BOOT, NOT_EVERYWHERE, parameters
@@ -28,8 +28,10 @@ from sitl.world import World
 
 BOOT_DEADLINE_S = 30.0
 END_DEADLINE_S = 6.0
+BY_HAND_DEADLINE_S = 10.0
+"""For a PX4 that somebody has started by hand: it asks for the world twice in a millisecond."""
 USER_DEADLINE_S = 300.0
-"""For somebody who starts PX4 by hand."""
+"""For somebody who is asked to start it once more."""
 SAMPLE_S = 0.004
 OF_THE_STUB: Mapping[FaultKind, str] = {
     "autopilot_reboot": "restarts PX4 in the middle of a step",
@@ -139,7 +141,12 @@ class RealPx4:
         Raises:
             Px4Error: PX4 is not to be had, or does not become what it must be.
         """
-        await self._boot()
+        if self._process is None:
+            self._tell(
+                f"px4 was not found: looking for {BY_HAND_DEADLINE_S:g} s for one that was started by hand, on TCP "
+                f"{self._link.port}"
+            )
+        await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._witness.version()
         self._tell(f"PX4 {self._version}, instance {self.number}: setting its parameters")
         wanted = parameters(self._config, self._world.hover_command)
@@ -148,31 +155,36 @@ class RealPx4:
             await self._restart(changed)
             left = await self._settle(wanted)
             if left:
+                fix = f"see {self._folder}" if self._process is not None else "start it both times in the same folder"
                 raise Px4Error(
-                    f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; see {self._folder}"
+                    f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; {fix}"
                 )
         await self._witness.write(self._config.spoiled_px4_params())
         await self._witness.show_modes()
         self._flies = True
 
-    async def _boot(self) -> None:
-        if self._process is None:
-            self._tell(
-                f"waiting for a PX4 on TCP {self._link.port} (px4 was not found): start one with PX4_SIM_MODEL={MODEL} px4 -i "
-                f"{self.number}, or {HOW_TO_GET_IT}"
-            )
-        deadline_s = BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S
-        end_s = time.monotonic() + deadline_s
+    async def _boot(self, deadline_s: float) -> None:
+        """Until PX4 computes; `deadline_s` is for its coming, `BOOT_DEADLINE_S` for its boot.
+
+        Raises:
+            Px4Error: it has ended, or one of the two has passed.
+        """
+        found, end_s = "nobody there", time.monotonic() + deadline_s
         while not await self._link.until_in_step(0.2):
             if self._process is not None and not self._process.running:
                 raise Px4Error(self._process.epitaph())
+            if self._link.connected and found == "nobody there":
+                found, deadline_s = "no answer to the world's sensors", BOOT_DEADLINE_S
+                end_s = time.monotonic() + deadline_s
             if time.monotonic() > end_s:
-                found = "no answer to the world's sensors" if self._link.connected else "nobody there"
-                where = f"; see {self._process.log}" if self._process is not None else ""
+                how = f"see {self._process.log}" if self._process is not None else self._how()
                 raise Px4Error(
-                    f"PX4: expected it on TCP {self._link.port} within {deadline_s:g} s, found {found}{where}"
+                    f"PX4: expected it on TCP {self._link.port} within {deadline_s:g} s, found {found}; {how}"
                 )
         await self._witness.until_heard()
+
+    def _how(self) -> str:
+        return f"{HOW_TO_GET_IT}; or {HOW_TO_START_IT.format(model=MODEL, number=self.number)}"
 
     async def _settle(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
         """Write what differs; what did, in PX4's types."""
@@ -193,7 +205,10 @@ class RealPx4:
     async def _restart(self, changed: Mapping[str, Value]) -> None:
         """The same PX4 in the same folder, or somebody who starts it again."""
         if self._process is None:
-            self._tell("the vehicle's parameters are set; PX4 must start again for them: end it and start it once more")
+            self._tell(
+                "the vehicle's parameters are set; PX4 must start again for them: end it and start it once more, in the same folder, "
+                "where it keeps them"
+            )
             if not await self._link.until_gone(USER_DEADLINE_S):
                 raise Px4Error(f"PX4: expected it to be restarted within {USER_DEADLINE_S:g} s, found it still running")
         else:
@@ -204,7 +219,7 @@ class RealPx4:
             restore(self._folder, store)
             await self._link.until_gone(1.0)
             self._start({})
-        await self._boot()
+        await self._boot(BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S)
 
     def sense(self, imu: ImuSample) -> None:
         """HIL_SENSOR, with the truth of this moment behind it."""
@@ -258,6 +273,7 @@ class RealPx4:
             "build": None if version is None else version.build,
             "instance": self.number,
             "unanswered": self._link.unanswered,
+            "clock_begun_s": self._link.clock_begun_s,
         }
 
     async def _end(self) -> None:

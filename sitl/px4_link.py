@@ -1,7 +1,8 @@
 """The world as PX4's external simulator: MAVLink 2 over TCP, HIL_SENSOR out, HIL_ACTUATOR_CONTROLS in, in lockstep.
 
 PX4 is the client. Its clock is the `time_usec` of the last HIL_SENSOR and nothing else, so that it computes exactly as long as the
-world lets it: a sample, then its answer, then the next sample. Motion capture does not go this way.
+world lets it: a sample, then its answer, then the next sample. The clock begins anew with each PX4 that connects. Motion capture does
+not go this way.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from companion.types import Quat, Vec3
 from sitl.autopilot.types import ImuSample, RotorCommands
 
 CLOCK_ORIGIN_S = 1.0
-"""PX4's clock at world time 0: it must not begin at zero."""
+"""PX4's clock at its first sample, however old the world is: it must not begin at zero, and one that begins at some minutes keeps EKF2
+from its first estimate (PX4 1.16.1: at 300 s for some 10 s, at 1000 s for longer than the preflight waits)."""
 ANSWER_PATIENCE_S = 2.0
 """One sample without an answer: the next one is sent all the same."""
 ANSWER_DEADLINE_S = 10.0
@@ -64,7 +66,9 @@ class HilSensors:
         self._number = 0
 
     def message(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> Any:
-        """HIL_SENSOR at the sample's world time; height above the floor and attitude (world ENU, body FLU) are the true ones."""
+        """HIL_SENSOR; the sample's time counts from PX4's first one, height above the floor and attitude (world ENU, body FLU) are
+        the true ones.
+        """
         gauss = self._random.gauss
         fields = _ACCEL_AND_GYRO
         field: Vec3 = (0.0, 0.0, 0.0)
@@ -88,7 +92,7 @@ class HilSensors:
 
 
 def clock_us(t_s: float) -> int:
-    """PX4's clock at a world time."""
+    """PX4's clock, by the world time since its first sample."""
     return round((t_s + CLOCK_ORIGIN_S) * 1e6)
 
 
@@ -109,6 +113,8 @@ class SimulatorLink:
         self.unanswered = 0
         """Samples that PX4 left without an answer, in all."""
         self.connections = 0
+        self.clock_begun_s: float | None = None
+        """World time of the first sample of the PX4 that is there; None before it. PX4's clock counts from it, at `CLOCK_ORIGIN_S`."""
         self._listener = listener
         self._sensors = sensors
         self._server: asyncio.Server | None = None
@@ -171,7 +177,9 @@ class SimulatorLink:
         """One sample to PX4; nothing happens while there is none. `answered` waits for what it makes of it."""
         if self._peer is None:
             return
-        message = self._sensors.message(imu, height_m, attitude_wxyz)
+        if self.clock_begun_s is None:
+            self.clock_begun_s = imu.t_s
+        message = self._sensors.message(imu._replace(t_s=imu.t_s - self.clock_begun_s), height_m, attitude_wxyz)
         # A PX4 that boots does not answer yet; one that rests does not answer for a while.
         self._waits_for_us = int(message.time_usec) if self.answers and not self._rests else None
         self._peer.write(message.pack(self._encoder))
@@ -213,6 +221,7 @@ class SimulatorLink:
             return False
         self._peer = peer
         self.connections += 1
+        self.clock_begun_s = None
         self.answers = 0
         self._silent_s = 0.0
         self._rests = False

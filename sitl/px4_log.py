@@ -1,6 +1,6 @@
 """What a real PX4's own log (ULog) says of a flight: modes, arming, what reached it and when, on PX4's clock.
 
-PX4's clock is the world's, plus `sitl.px4_link.CLOCK_ORIGIN_S`: times here are world times. Needs `pyulog`.
+PX4's clock begins with `sitl.px4_link.CLOCK_ORIGIN_S` at its first sample: times here are world times. Needs `pyulog`.
 """
 
 from __future__ import annotations
@@ -78,8 +78,12 @@ class Px4Log:
     parameters: dict[str, float | int]
 
     @staticmethod
-    def read(path: Path) -> Px4Log:
+    def read(path: Path, clock_begun_s: float = 0.0) -> Px4Log:
         """Read a ULog.
+
+        Args:
+            path: of the log.
+            clock_begun_s: world time at which PX4's clock began, `autopilot.clock_begun_s` of `summary.json`.
 
         Raises:
             Px4Error: no pyulog, no such file, or not one of a flight.
@@ -100,11 +104,12 @@ class Px4Log:
         if missing:
             raise Px4Error(f"{path}: expected the log of a flight, found no {missing[0]} in it")
         position = topics["vehicle_local_position"]
+        origin_s = CLOCK_ORIGIN_S - clock_begun_s
         return Px4Log(
-            tuple(_changes(topics["vehicle_status"])),
-            _times(topics.get("vehicle_visual_odometry")),
-            _times(topics.get("vehicle_attitude_setpoint")),
-            _times(position),
+            tuple(_changes(topics["vehicle_status"], origin_s)),
+            _times(topics.get("vehicle_visual_odometry"), origin_s),
+            _times(topics.get("vehicle_attitude_setpoint"), origin_s),
+            _times(position, origin_s),
             np.stack([np.asarray(position[axis], float) for axis in "xyz"], axis=1),
             dict(log.initial_parameters),
         )
@@ -145,15 +150,16 @@ def newest(flight: Path) -> Path:
     return logs[-1]
 
 
-def _times(topic: dict[str, Any] | None) -> Array:
+def _times(topic: dict[str, Any] | None, origin_s: float) -> Array:
+    """World times of a topic; `origin_s` is PX4's clock at world time 0."""
     if topic is None:
         return np.zeros(0)
-    return np.asarray(topic["timestamp"], float) * 1e-6 - CLOCK_ORIGIN_S
+    return np.asarray(topic["timestamp"], float) * 1e-6 - origin_s
 
 
-def _changes(status: dict[str, Any]) -> Iterable[Change]:
+def _changes(status: dict[str, Any], origin_s: float) -> Iterable[Change]:
     before: tuple[Any, ...] | None = None
-    rows = zip(_times(status), status["nav_state"], status["arming_state"], status["failsafe"], strict=True)
+    rows = zip(_times(status, origin_s), status["nav_state"], status["arming_state"], status["failsafe"], strict=True)
     for t_s, nav_state, arming_state, failsafe in rows:
         now = (int(nav_state), int(arming_state) == _ARMED, bool(failsafe))
         if now != before:

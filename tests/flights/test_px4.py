@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import re
 import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,8 +21,8 @@ from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.safety.stop import StopModel
 from companion.sitl_process import PX4_FOLDER
 from companion.types import PhaseKind
-from sitl.px4_process import VARIABLE
-from tests.support import CATCH, HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in
+from sitl.px4_process import MODEL, VARIABLE, Instance, find
+from tests.support import CATCH, DEADLINE_S, HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in
 
 REAL = [
     pytest.mark.px4,
@@ -192,16 +194,72 @@ def test_a_px4_that_dies_in_the_air_is_one_clear_line(sandbox: Sandbox, autopilo
 
 
 @pytest.mark.waits
-def test_without_a_px4_it_says_how_to_get_one_and_waits_until_it_is_given_up(tmp_path: Path) -> None:
+def test_without_a_px4_the_flight_is_refused_within_seconds_and_told_how_to_get_one(tmp_path: Path) -> None:
     nowhere = {VARIABLE: "", "PATH": str(tmp_path)}
     with sandbox_in(tmp_path / "sandbox", nowhere) as sandbox:
-        with sandbox.start("fly", HOVER, "--sitl=px4", "--out", "out") as running:
-            running.wait_for("waiting for a PX4 on TCP 456")
-            running.wait_for("make px4_sitl_default none")
-            running.signal(signal.SIGINT)
-            ended = running.end()
+        ended = sandbox.run("fly", HOVER, "--sitl=px4", "--out", "out")
         sandbox.assert_nobody_left()
-    assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
+    assert "looking for 10 s for one that was started by hand, on TCP 456" in ended.out
+    assert ended.code == EXIT_REFUSED, (ended.out, ended.err)
+    assert len(ended.err_lines) == 1, ended.err
+    for said in (
+        "within 10 s, found nobody there",
+        "PX4_SITL",
+        "none_iris px4 -i ",
+        "same folder",
+        "px4_sitl_default none",
+    ):
+        assert said in ended.err
+
+
+_OLD_WORLD = """
+import sys
+
+if "sitl" in sys.orig_argv:
+    from sitl.px4_link import SimulatorLink
+
+    send = SimulatorLink.send
+    SimulatorLink.send = lambda self, imu, *rest: send(self, imu._replace(t_s=imu.t_s + 1000.0), *rest)
+"""
+"""The world's clock as a PX4 finds it that comes 1000 s late."""
+
+
+@contextlib.contextmanager
+def px4_by_hand(number: int, rootfs: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """As a person starts it, in a folder of its own."""
+    installation = find()
+    assert installation is not None
+    rootfs.mkdir(exist_ok=True)
+    command = [str(installation.binary), "-i", str(number), "-d", str(installation.etc)]
+    environment = {**os.environ, "PX4_SIM_MODEL": MODEL}
+    with (
+        open(rootfs / "px4.txt", "ab") as said,
+        subprocess.Popen(command, cwd=rootfs, env=environment, stdin=subprocess.DEVNULL, stdout=said) as process,
+    ):
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])
+def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: str) -> None:
+    """Ended when the world asks for it, started once more in the same folder."""
+    (tmp_path / "sitecustomize.py").write_text(_OLD_WORLD, encoding="utf-8")
+    by_hand = {VARIABLE: "", "PATH": str(tmp_path / "empty"), "PYTHONPATH": str(tmp_path)}
+    with Instance.claim() as free:
+        number = free.number  # the world will find the same
+    with sandbox_in(tmp_path / "sandbox", by_hand) as sandbox:
+        with sandbox.start("fly", HOVER, f"--sitl={autopilot}", "--out", "out") as running:
+            running.wait_for(f"by hand, on TCP 456{number}")
+            with px4_by_hand(number, tmp_path / "rootfs") as px4:
+                running.wait_for("start it once more, in the same folder")
+                px4.terminate()
+                px4.wait(DEADLINE_S)
+            with px4_by_hand(number, tmp_path / "rootfs"):
+                ended = running.end()
+        sandbox.assert_nobody_left()
+    assert ended.code == EXIT_OK, (ended.out, ended.err)
 
 
 @pytest.mark.waits

@@ -74,7 +74,9 @@ def test_each_sample_is_answered_before_the_next_one_and_the_answer_is_its_own()
                 for i in range(first, first + 200):
                     under_test.send(sample(i), 0.3, LEVEL)
                     await under_test.answered()
-                    assert under_test.rotors[0] == pytest.approx((px4_link.clock_us(i * PERIOD_S) // 4000) % 100 / 100)
+                    assert under_test.clock_begun_s is not None
+                    clock_us = px4_link.clock_us(i * PERIOD_S - under_test.clock_begun_s)
+                    assert under_test.rotors[0] == pytest.approx((clock_us // 4000) % 100 / 100)
                 assert under_test.armed
                 stamps = [message.time_usec for message in peer.sensors]
                 assert {later - earlier for earlier, later in itertools.pairwise(stamps)} == {4000}
@@ -137,8 +139,7 @@ def test_one_sample_without_an_answer_does_not_end_the_flight(monkeypatch: pytes
     async def scenario() -> None:
         async with link() as under_test:
             with await connected(under_test, lambda m: None if m.time_usec == px4_link.clock_us(1.0) else [0.5] * 4):
-                await boot(under_test)
-                for i in (249, 250, 251):
+                for i in range(await boot(under_test), 500):
                     under_test.send(sample(i), 0.3, LEVEL)
                     await under_test.answered()
                 assert under_test.unanswered == 1
@@ -161,6 +162,28 @@ def test_a_px4_that_leaves_stops_the_rotors_and_may_come_back() -> None:
                 await boot(under_test, i + 1)
                 assert under_test.rotors[0] == 0.25
                 assert under_test.connections == 2
+
+    asyncio.run(scenario())
+
+
+def test_the_clock_of_a_px4_begins_anew_however_late_it_connects() -> None:
+    """A real one whose clock begins at some minutes has no estimate for a long time."""
+    late = 75_000  # 300 s
+
+    async def scenario() -> None:
+        async with link() as under_test:
+            for begun in (late, 3 * late):
+                with await connected(under_test, lambda message: [0.5] * 4) as peer:
+                    i = await boot(under_test, begun)
+                    under_test.send(sample(i), 0.3, LEVEL)
+                    await under_test.answered()
+                    stamps = [message.time_usec for message in peer.sensors]
+                    assert stamps[0] == px4_link.clock_us(0.0)
+                    assert {later - earlier for earlier, later in itertools.pairwise(stamps)} == {4000}
+                    assert under_test.clock_begun_s is not None
+                    assert begun * PERIOD_S <= under_test.clock_begun_s <= i * PERIOD_S
+                assert await under_test.until_gone(DEADLINE_S)
+            assert under_test.unanswered == 0
 
     asyncio.run(scenario())
 
