@@ -22,7 +22,8 @@ from pymavlink import mavutil
 from companion.exit_codes import EXIT_OK, EXIT_REFUSED
 from tests.support import CATCH, DEADLINE_S, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
-pytestmark = pytest.mark.xdist_group("the world that refuses")
+SHARED = pytest.mark.xdist_group("the world that refuses")
+"""Tests that share one world run in one process."""
 QUICK = {"discovery_timeout_s": 1.0}
 
 
@@ -137,6 +138,7 @@ WRONG = {
 AT_EACH_DEVICE = ("arm baud rate", "mocap body never seen", "force port that is not there")
 
 
+@SHARED
 @pytest.mark.waits
 @pytest.mark.parametrize("case", WRONG)
 def test_refuses(sandbox: Sandbox, world: World, case: str) -> None:
@@ -145,24 +147,17 @@ def test_refuses(sandbox: Sandbox, world: World, case: str) -> None:
     assert_one_line(ended, wrong.line)
 
 
-WRONG_START = {
-    "arm far from the mission's start": Wrong(
-        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) deg within 10 deg; move it there by hand",
-        also={"mission.start.arm_deg": [150.0, 140.0]},
-    ),
-    "vehicle far from the mission's start": Wrong(
-        r"^start place in motion capture's axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m .*; carry it there",
-        also={"mission.start.position_m": [-0.5, 0.0]},
-    ),
-}
-
-
 @pytest.mark.waits
-@pytest.mark.parametrize("case", WRONG_START)
-def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: World, case: str) -> None:
-    wrong = WRONG_START[case]
-    ended = refused(sandbox, fresh_world, *fresh_world.addresses(), *set_options(**wrong.also))
-    assert_one_line(ended, wrong.line)
+def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: World) -> None:
+    """The arm and the vehicle both stand elsewhere: one line for each, and no other."""
+    start = {"mission.start.arm_deg": [150.0, 140.0], "mission.start.position_m": [-0.5, 0.0]}
+    ended = refused(sandbox, fresh_world, *fresh_world.addresses(), *set_options(**start))
+    assert len(ended.err_lines) == 2, ended.err
+    for pattern in (
+        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) deg within 10 deg; move it there by hand",
+        r"^start place in motion capture's axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m .*; carry it there",
+    ):
+        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
 
 
 def assert_one_line(ended: Ended, pattern: str) -> None:
@@ -170,6 +165,7 @@ def assert_one_line(ended: Ended, pattern: str) -> None:
     assert re.search(pattern, ended.err_lines[0]), (pattern, ended.err)
 
 
+@SHARED
 @pytest.mark.waits
 def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as nobody:
@@ -180,6 +176,7 @@ def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, w
     )
 
 
+@SHARED
 @pytest.mark.waits
 def test_refuses_a_busy_udp_port(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as busy:
@@ -190,6 +187,7 @@ def test_refuses_a_busy_udp_port(sandbox: Sandbox, world: World) -> None:
     )
 
 
+@SHARED
 @pytest.mark.waits
 def test_refuses_an_arm_port_that_another_program_holds(sandbox: Sandbox, world: World) -> None:
     with serial.Serial(world.devices["arm"]["port"], 3000000, exclusive=True):
@@ -197,6 +195,7 @@ def test_refuses_an_arm_port_that_another_program_holds(sandbox: Sandbox, world:
     assert_one_line(ended, r"^arm bus /dev/pts/\d+: port is busy; another program .*: close that one$")
 
 
+@SHARED
 @pytest.mark.waits
 def test_refuses_a_force_port_that_another_program_holds(sandbox: Sandbox, world: World) -> None:
     with serial.Serial(world.devices["force"]["port"], 115200, exclusive=True):
@@ -204,6 +203,7 @@ def test_refuses_a_force_port_that_another_program_holds(sandbox: Sandbox, world
     assert_one_line(ended, r"^force sensor /dev/pts/\d+: in use by another program; close it")
 
 
+@SHARED
 @pytest.mark.waits
 def test_refuses_an_arm_bus_without_any_servo(sandbox: Sandbox, world: World) -> None:
     with silent_pty() as port:
@@ -213,6 +213,7 @@ def test_refuses_an_arm_bus_without_any_servo(sandbox: Sandbox, world: World) ->
     )
 
 
+@SHARED
 @pytest.mark.waits
 def test_refuses_a_silent_force_sensor(sandbox: Sandbox, world: World) -> None:
     with silent_pty() as port:
@@ -222,6 +223,7 @@ def test_refuses_a_silent_force_sensor(sandbox: Sandbox, world: World) -> None:
     )
 
 
+@SHARED
 @pytest.mark.waits
 def test_refuses_a_silent_mocap_server(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as silent:
@@ -285,6 +287,7 @@ def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox
     assert_one_line(ended, r"^PX4 did not arm; PX4 said: ARM refused: temporarily rejected")
 
 
+@SHARED
 @pytest.mark.flight
 def test_after_refusals_the_same_world_flies_though_its_terminal_goes_away(
     sandbox: Sandbox, world: World, tmp_path: Path
