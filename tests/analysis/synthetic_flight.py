@@ -91,13 +91,15 @@ def reference_at(t_s: float) -> tuple[Vec3, Vec2]:
     return (x, 0.0, 0.15 + 0.85 * up), arm
 
 
-def synthetic_flight(seed: int = 1, end_s: float = LANDED_S) -> Iterator[tuple[Inputs, Outputs, Sent]]:
+def synthetic_flight(
+    seed: int = 1, end_s: float = LANDED_S, rate_hz: float = RATE_HZ
+) -> Iterator[tuple[Inputs, Outputs, Sent]]:
     """Ticks up to `end_s` of the mission clock."""
     noise = random.Random(seed)
-    period_s = 1.0 / RATE_HZ
+    period_s = 1.0 / rate_hz
     caught = False
     last_kind: PhaseKind | None = None
-    for tick in range(round((GROUND_S + end_s) * RATE_HZ) + 1):
+    for tick in range(round((GROUND_S + end_s) * rate_hz) + 1):
         t_s = tick * period_s
         mission_t_s = max(0.0, t_s - GROUND_S)
         name, kind = ("ground", PhaseKind.GROUND) if t_s < GROUND_S else phase_at(mission_t_s)
@@ -180,11 +182,13 @@ def synthetic_flight(seed: int = 1, end_s: float = LANDED_S) -> Iterator[tuple[I
         yield inputs, outputs, sent
 
 
-def record_flight(path: Path, *, config: dict[str, Any] | None = CONFIG, end_s: float = LANDED_S) -> RecorderReport:
+def record_flight(
+    path: Path, *, config: dict[str, Any] | None = CONFIG, end_s: float = LANDED_S, rate_hz: float = RATE_HZ
+) -> RecorderReport:
     """Write a synthetic flight through the real recorder process."""
     config_json = "" if config is None else json.dumps(config)
     recorder = RecorderProcess.start(path, config_json=config_json, epoch_offset_ns=1_700_000_000_000_000_000)
-    for inputs, outputs, sent in synthetic_flight(end_s=end_s):
+    for inputs, outputs, sent in synthetic_flight(end_s=end_s, rate_hz=rate_hz):
         # Faster than real time the channel would drop, as it must in flight; here every tick matters.
         select.select([], [recorder.client], [], 60.0)
         recorder.client.record(inputs, outputs, sent)

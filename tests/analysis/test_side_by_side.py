@@ -450,14 +450,15 @@ def test_the_page_tells_the_figures_the_settings_and_the_events(tmp_path: Path) 
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three flights as the recorder writes them, in folders of their own: a whole one with its report, the same with other gains,
-    and one that ended before its catch.
+    and one that ended before its catch. At 50 Hz: what is tested is what becomes of files, not of figures.
     """
     root = tmp_path_factory.mktemp("reported")
     configs = {"whole": IN_WORLD, "gains": configured(controller__preset="paper"), "short": IN_WORLD}
     for name, config in configs.items():
         (root / name).mkdir()
         log = root / name / "flight.mcap"
-        assert record_flight(log, config=config, end_s=5.0 if name == "short" else LANDED_S).error is None
+        end_s = 5.0 if name == "short" else LANDED_S
+        assert record_flight(log, config=config, end_s=end_s, rate_hz=50.0).error is None
     assert main(["report", str(root / "whole/flight.mcap")]) == EXIT_OK
     return root
 
