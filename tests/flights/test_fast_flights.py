@@ -77,10 +77,13 @@ def test_nothing_thrown_is_no_catch() -> None:
 FOLDED_DEG = (165.0, 140.0)
 
 
-@pytest.mark.parametrize("at_s", [2.5, 4.0, 6.0, 9.0, 16.0, 19.0])
+@pytest.mark.parametrize("at_s", [2.5, 6.0, 9.0, 19.0])
 @pytest.mark.parametrize("kind", ["mocap_loss", "servo_loss", "link_loss"])
 def test_a_lost_device_lands_it(kind: str, at_s: float) -> None:
-    """At any time of the flight; the fault's clock starts at arming, 1.2 s before take-off."""
+    """In take-off, on the way to the catch, after it, and above the start with the landing to come.
+
+    The clock of the fault starts at arming, 1.2 s before take-off.
+    """
     result = FastFlight(configured(f"world.faults=[{{kind: {kind}, t_s: {at_s}}}]")).run()
     last, truth = result.outputs[-1], result.truth[-1]
     assert last.outcome is Outcome.ABORTED

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.missions import Row, fly, summary
 
-COUNT = 25
+COUNT = 12
 PHASES_MAX = 2
 
 
