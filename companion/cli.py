@@ -178,12 +178,17 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
     )
 
 
-def _load(arguments: argparse.Namespace) -> FlightConfig:
+def _load(arguments: argparse.Namespace, *, hardware: bool) -> FlightConfig:
     for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
         if path is not None and not path.strip():
             raise ConfigError([f"companion {arguments.command}: {name}: expected the name of a file, got an empty one"])
     return load_flight(
-        arguments.mission, arguments.vehicle, arguments.controller, arguments.preset, arguments.overrides
+        arguments.mission,
+        arguments.vehicle,
+        arguments.controller,
+        arguments.preset,
+        arguments.overrides,
+        hardware=hardware,
     )
 
 
@@ -198,7 +203,8 @@ def _check(arguments: argparse.Namespace) -> int:
     if arguments.sitl not in (None, "stub", "px4"):
         tell(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
-    return check_command.run(arguments, _load(arguments), _problems)
+    hardware = arguments.sitl is None and not arguments.plan_only
+    return check_command.run(arguments, _load(arguments, hardware=hardware), _problems)
 
 
 def _fly(arguments: argparse.Namespace) -> int:
@@ -218,7 +224,7 @@ def _fly(arguments: argparse.Namespace) -> int:
         arguments.overrides += [f"vehicle.ground.qgroundcontrol={arguments.qgroundcontrol}"]
     if arguments.wait_for_start:
         arguments.overrides += ["mission.start.takeoff=by_operator"]
-    config = _load(arguments)
+    config = _load(arguments, hardware=arguments.sitl is None)
     problems = [*_problems(config), *_nobody_could_start(config)]
     if problems:
         for line in problems:
@@ -250,7 +256,7 @@ def _nobody_could_start(config: FlightConfig) -> list[str]:
 
 
 def _sitl(arguments: argparse.Namespace) -> int:
-    config = _load(arguments)
+    config = _load(arguments, hardware=False)
     # In place of this process: signals reach the world itself, and there is nobody whom it could outlive.
     file = os.memfd_create("sitl-config", 0)
     os.write(file, config.model_dump_json().encode())

@@ -26,7 +26,7 @@ from companion.config.document import (
 from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import ANY_INTERFACE, Vehicle
 from companion.config.world import World
 from companion.config.yaml_strict import read_document
 
@@ -63,6 +63,8 @@ def load_flight(
     controller_law: str | None = None,
     preset: str | None = None,
     overrides: Sequence[str] = (),
+    *,
+    hardware: bool = False,
 ) -> FlightConfig:
     """Read, override and check everything.
 
@@ -72,6 +74,7 @@ def load_flight(
         controller_law: law instead of the one that the mission names (a key of `PRESETS`).
         preset: built-in preset of that law, or of the mission's, instead of the mission's choice.
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked.
+        hardware: the vehicle file's addresses are used: no SITL replaces them. Then each must name one network.
 
     Raises:
         ConfigError: one line per problem of all files together.
@@ -85,6 +88,8 @@ def load_flight(
     vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, lines)
     if vehicle_file is not None:
         vehicle = _check(Vehicle, vehicle_file, "vehicle", parsed, lines)
+        if hardware and vehicle is not None:
+            lines += _open_to_every_network(vehicle, vehicle_file)
 
     controller: ControllerConfig | None = None
     controller_file: Document | None = None
@@ -150,6 +155,19 @@ def _check(
     """One document, overridden and validated; what is wrong with it is appended to `lines`."""
     _override(document, section, overrides, lines)
     return _validated(model, document, lines)
+
+
+def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
+    """Motion capture must not be taken from every network that this computer is on: any sender there could claim Motive's address."""
+    interface = vehicle.devices.mocap.interface
+    if interface != ANY_INTERFACE:
+        return []
+    location = ("devices", "mocap", "interface")
+    text = (
+        f'{key_path(location)}: expected the address of this computer on the camera network, got "{interface}" (every network); '
+        "`ip -4 address` shows it, `companion mocap check` proposes it; only a flight with --sitl does not need it"
+    )
+    return problem_lines([Problem(RANK_VALUE, document.origin(location), text)])
 
 
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:

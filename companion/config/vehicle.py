@@ -143,13 +143,16 @@ class AutopilotDevice(Model):
     plugin: its thread repeats the last setpoint at 20 Hz, also while the flight loop hangs)."""
 
 
+ANY_INTERFACE = "0.0.0.0"
+
+
 class MocapDevice(Model):
     """OptiTrack Motive over NatNet."""
 
     server: str
     """Address of the Motive machine."""
-    interface: str = "0.0.0.0"
-    """Local address that receives."""
+    interface: str = ANY_INTERFACE
+    """Local address that receives: this computer's on the camera network. `fly` and `check` refuse 0.0.0.0 (all) without `--sitl`."""
     transport: Literal["multicast", "unicast"] = "multicast"
     multicast_group: str = "239.255.42.99"
     command_port: Annotated[int, Field(gt=0, le=65535)] = 1510

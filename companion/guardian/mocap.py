@@ -12,7 +12,9 @@ import socket
 from companion.guardian.settings import MocapSettings
 from companion.io import natnet
 from companion.io.mocap_pose import VERSIONS, mocap_pose
-from companion.io.natnet import Malformed, Message, NatNetVersion
+from companion.io.natnet import Malformed, Message, NatNetVersion, RigidBody
+from companion.io.natnet_source import join_source
+from companion.safety.stream_watch import StreamWatch
 from companion.types import MocapPose
 
 CONNECT_PERIOD_S = 0.25
@@ -49,8 +51,7 @@ class MocapClient:
             self._command = self._open(settings.interface, 0)
             if settings.transport == "multicast":
                 data = self._open(settings.multicast_group, settings.data_port)
-                membership = socket.inet_aton(settings.multicast_group) + socket.inet_aton(settings.interface)
-                data.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+                join_source(data, settings.multicast_group, settings.interface, self._server[0])
         except OSError as error:
             for opened in self.sockets:
                 opened.close()
@@ -58,6 +59,8 @@ class MocapClient:
         self._version: NatNetVersion | None = None
         self._clock_frequency_hz: int | None = None
         self._last_number: int | None = None
+        self._last_body: RigidBody | None = None
+        self._streams = StreamWatch()
         self._heard_s = float("-inf")
         self._spoke_s = float("-inf")
         self.tracked_s = float("-inf")
@@ -147,9 +150,14 @@ class MocapClient:
         if isinstance(frame, Malformed):
             self.trouble = frame.reason
             return None
+        if frame.number == self._last_number and frame.body == self._last_body:
+            return None  # the network has doubled the datagram
+        if self._streams.update(frame.number, now_s):
+            self.trouble = "two servers at one address: frame numbers come in two sequences"
+            return None
         if not natnet.is_newer(frame.number, self._last_number, now_s - self._heard_s):
             return None
-        self._last_number = frame.number
+        self._last_number, self._last_body = frame.number, frame.body
         self._heard_s = now_s
         pose = mocap_pose(frame, now_s - origin_s, self._settings.up_axis)
         if pose is not None and pose.tracking_valid:

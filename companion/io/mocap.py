@@ -18,7 +18,9 @@ from companion.io import natnet
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.io.edges import DeviceError
 from companion.io.mocap_pose import VERSIONS, mocap_pose
-from companion.io.natnet import Frame, Malformed, Message, NatNetVersion, ServerInfo
+from companion.io.natnet import Frame, Malformed, Message, NatNetVersion, RigidBody, ServerInfo
+from companion.io.natnet_source import join_source
+from companion.safety.stream_watch import StreamWatch
 from companion.types import MocapPose
 
 _LOG = logging.getLogger(__name__)
@@ -88,6 +90,8 @@ class NatNetMocap:
         self._latest: MocapPose | None = None
         self._last_number: int | None = None
         self._last_frame_s = 0.0
+        self._last_body: RigidBody | None = None
+        self._streams = StreamWatch()
         self._seen_ids: tuple[int, ...] | None = None
         self._names: dict[int, str] = {}
         self._frames = 0
@@ -178,8 +182,7 @@ class NatNetMocap:
         data = self._bind(device.multicast_group, device.data_port, "multicast_group", shared=True)
         self._data_socket = data
         try:
-            membership = socket.inet_aton(device.multicast_group) + socket.inet_aton(device.interface)
-            data.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+            join_source(data, device.multicast_group, device.interface, self._server_ip)
         except OSError as error:
             raise DeviceError(
                 f"{self._where}: cannot join {device.multicast_group} on {device.interface} ({error}); "
@@ -368,9 +371,15 @@ class NatNetMocap:
         if isinstance(frame, Malformed):
             self._count_malformed(frame)
             return None
-        if not natnet.is_newer(frame.number, self._last_number, arrived_s - self._last_frame_s):
+        if frame.number == self._last_number and frame.body == self._last_body:
+            self._out_of_order += 1  # the network has doubled the datagram
+            return None
+        # While two streams are mixed every frame is delivered, in whatever order: the monitor must see it.
+        two = self._streams.update(frame.number, arrived_s)
+        if not two and not natnet.is_newer(frame.number, self._last_number, arrived_s - self._last_frame_s):
             self._out_of_order += 1
             return None
+        self._last_body = frame.body
         self._last_number = frame.number
         self._last_frame_s = arrived_s
         self._seen_ids = frame.body_ids

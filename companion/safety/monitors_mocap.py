@@ -21,8 +21,10 @@ from companion.safety.rules import (
     MOCAP_SLOW,
     MOCAP_SWAPPED,
     MOCAP_TOO_LATE,
+    MOCAP_TWO_STREAMS,
     YAW_DISAGREES,
 )
+from companion.safety.stream_watch import StreamWatch
 from companion.types import Inputs, MocapPose, Quat, VehicleState
 
 FUSED_WITHIN_M = 0.10
@@ -71,6 +73,7 @@ class MocapMonitor:
         self._apart = (0.0, 0.0)
         self._same_since_s: float | None = None
         self._moved = False
+        self._streams = StreamWatch()
         self._window_awake_s: float | None = None
         self._window_frames = 0
         self._rate_hz: float | None = None
@@ -95,7 +98,11 @@ class MocapMonitor:
             and situation.airborne
             and awake_s - self._same_since_s > s.mocap_frozen_s
         )
-        self.trusted = self._plausible and not frozen
+        two_streams = self._streams.two(awake_s)
+        self.trusted = self._plausible and not frozen and not two_streams
+        if two_streams:
+            text = "motion capture comes in two sequences of frame numbers: two servers at one address; neither is believed"
+            findings.found(MOCAP_TWO_STREAMS, text)
         if frozen:
             findings.found(MOCAP_FROZEN, "motion capture repeats the same pose, the vehicle moves")
         self._tell_rate(awake_s, findings)
@@ -115,6 +122,7 @@ class MocapMonitor:
         gone_s = awake_s - self._frame_awake_s
         self._frame, self._frame_awake_s = pose, awake_s
         self._window_frames += 1
+        self._streams.update(pose.frame_number, awake_s)
         self.repeats = (
             before is not None
             and pose.position_world_m == before.position_world_m

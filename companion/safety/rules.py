@@ -134,6 +134,15 @@ MOCAP_FROZEN = _rule(
     None,
     _PX4_LANDS,
 )
+MOCAP_TWO_STREAMS = _rule(
+    "mocap_two_streams",
+    Part.MOCAP,
+    "frame numbers step back again and again: two servers at one address",
+    (),
+    0.0,
+    _PX4_LANDS,
+    _PX4_LANDS,
+)
 ESTIMATE_DISAGREES = _rule(
     "estimate_disagrees",
     Part.MOCAP,

@@ -168,6 +168,19 @@ BAD_MISSION = [
 ]  # fmt: skip
 
 
+def test_motion_capture_from_every_network_is_refused_unless_the_world_is_simulated(project: Path) -> None:
+    line = (
+        f'{VEHICLE}:63:16: devices.mocap.interface: expected the address of this computer on the camera network, got "0.0.0.0" (every network); '
+        "`ip -4 address` shows it, `companion mocap check` proposes it; only a flight with --sitl does not need it"
+    )
+    assert lines_of(lambda: load_flight(CATCH, hardware=True)) == [line]
+    assert load_flight(CATCH).vehicle.devices.mocap.interface == "0.0.0.0"
+    given = load_flight(CATCH, overrides=["vehicle.devices.mocap.interface=192.168.1.20"], hardware=True)
+    assert given.vehicle.devices.mocap.interface == "192.168.1.20"
+    told = lines_of(lambda: load_flight(CATCH, overrides=["vehicle.devices.mocap.interface=0.0.0.0"], hardware=True))
+    assert told[0].startswith("--set vehicle.devices.mocap.interface")
+
+
 @pytest.mark.parametrize(("old", "new", "expected"), BAD_MISSION, ids=[repr(new)[:40] for _, new, _ in BAD_MISSION])
 def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]) -> None:
     path = project / CATCH

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import socket
+import time
 import tty
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -14,7 +15,11 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from tests.guardian.rig import ARMED, DISARMED, LAND_MODE, OFFBOARD_MODE, Rig
+from companion.guardian.mocap import MocapClient
+from companion.guardian.settings import MocapSettings
+from companion.types import MocapPose
+from sitl.natnet import BodyPose, encode_frame
+from tests.guardian.rig import ARMED, ATTITUDE, DISARMED, LAND_MODE, OFFBOARD_MODE, Cameras, Rig
 from tests.support import DEADLINE_S, wait_until
 
 pytestmark = pytest.mark.waits
@@ -154,3 +159,31 @@ def test_nothing_is_opened_beside_a_flight_process_that_still_lives(
         assert os.path.realpath(tmp_path / "autopilot") not in open_files
         rig.flight.kill()
         wait_until(lambda: NAV_LAND in cable.hears(master, ARMED, OFFBOARD_MODE), rig.log.read_text)
+
+
+def test_of_two_streams_of_motion_capture_at_one_address_none_is_passed_on() -> None:
+    with Cameras(1) as cameras, closing(socket.socket(type=socket.SOCK_DGRAM)) as forger:
+        settings = MocapSettings("127.0.0.1", "127.0.0.1", "unicast", "239.255.42.99", cameras.port, 1511, 1, "z")
+        with closing(MocapClient(settings)) as client:
+            seen: list[MocapPose] = []
+
+            def read() -> bool:
+                client.serve(time.monotonic())
+                seen.extend(client.poses(time.monotonic()))
+                return len(seen) > 10
+
+            wait_until(read, lambda: f"no poses: {client.trouble}")
+            assert client.trouble is None
+            ours = client.sockets[0].getsockname()
+            number = 1_000_000
+
+            def forged() -> bool:
+                nonlocal number
+                number += 1
+                body = BodyPose(1, (0.0, 0.0, 1.0), ATTITUDE)
+                forger.sendto(encode_frame("4.1", number, 1.0, (body,), None, {}), ours)
+                seen.clear()
+                read()
+                return client.trouble is not None and "two servers at one address" in client.trouble and not seen
+
+            wait_until(forged, lambda: f"{client.trouble}, {seen[-1:]}")

@@ -8,7 +8,7 @@ import math
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from typing import Any, Literal
 
 import pytest
@@ -20,6 +20,7 @@ from companion.io import natnet
 from companion.io.edges import DeviceError, Mocap
 from companion.io.mocap import NatNetMocap
 from companion.io.natnet import Message, NatNetVersion
+from companion.safety.stream_watch import StreamWatch
 from companion.types import MocapPose, Quat, Vec3
 from sitl.natnet import BodyPose, NatNetServer, encode_frame
 
@@ -125,6 +126,51 @@ def test_unicast_client_of_a_multicast_server() -> None:
             mocap(device_for(server)) as edge,
         ):
             assert edge.latest() is not None
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("ahead", [0, 50, 1_000_000], ids=["the same numbers", "a little ahead", "far ahead"])
+def test_a_second_stream_at_the_servers_address_does_not_displace_the_first_unseen(ahead: int) -> None:
+    """What is delivered steps back again and again: `mocap_two_streams` is raised by that."""
+
+    async def run() -> None:
+        inbox = Inbox()
+        async with NatNetServer() as server, streaming(server, POSE), mocap(device_for(server), inbox) as edge:
+            assert edge._command_socket is not None
+            ours = edge._command_socket.getsockname()
+            forged = BodyPose(1, (0.0, 0.5, 1.0), POSE.quat_wxyz)
+            watch = StreamWatch()
+            with closing(socket.socket(type=socket.SOCK_DGRAM)) as forger:
+                for _ in range(2000):
+                    pose = await inbox.next()
+                    if watch.update(pose.frame_number, pose.stamp_s):
+                        break
+                    if pose.position_world_m == POSE.position_m:
+                        number = pose.frame_number + ahead
+                        frame = encode_frame(server.version, number, pose.stamp_s, (forged,), None, {})
+                        forger.sendto(frame, ours)
+                else:
+                    pytest.fail("two streams looked like one")
+
+    asyncio.run(run())
+
+
+def test_multicast_of_another_sender_is_dropped_by_the_kernel() -> None:
+    async def run() -> None:
+        inbox = Inbox()
+        async with (
+            NatNetServer(multicast_group=GROUP) as server,
+            streaming(server, POSE),
+            mocap(device_for(server, "multicast"), inbox) as edge,
+        ):
+            with closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
+                stranger.bind(("127.0.0.9", 0))
+                stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+                for _ in range(20):
+                    stranger.sendto(b"anything", (GROUP, server.data_port))
+                    await inbox.next()
+            assert edge.health().foreign == 0
 
     asyncio.run(run())
 

@@ -152,7 +152,8 @@ def test_ctrl_c_during_a_check_leaves_nothing(sandbox: Sandbox) -> None:
     master, slave = os.openpty()
     try:
         tty.setraw(slave)
-        options = set_options(**{"vehicle.devices.force.port": os.ttyname(slave)})
+        networks = {"vehicle.devices.mocap.interface": "127.0.0.1"}
+        options = set_options(**{"vehicle.devices.force.port": os.ttyname(slave)}, **networks)
         with sandbox.start("check", HOVER, *options) as running:
             assert os.read(master, 1)  # it speaks to the sensor
             running.signal(signal.SIGINT)

@@ -125,6 +125,12 @@ def jumping(i: Inputs) -> Inputs:
     return moved("mocap", (0.4, 0.0, 0.0))(i) if i.tick == 100 else i
 
 
+def two_streams(i: Inputs) -> Inputs:
+    """Every other frame is another server's; its numbers are its own."""
+    assert i.mocap is not None
+    return put("mocap", frame_number=i.mocap.frame_number + 1_000_000)(i) if i.tick % 2 else i
+
+
 FAULTS: dict[str, Fault] = {
     "mocap_not_finite": Fault(put("mocap", position_world_m=(NAN, 0.0, 1.0)), also=frozenset({"mocap_lost"})),
     "vehicle_not_finite": Fault(
@@ -141,6 +147,7 @@ FAULTS: dict[str, Fault] = {
     "mocap_jump": Fault(jumping),
     "mocap_swapped": Fault(moved("mocap", (0.0, 0.3, 0.0)), also=frozenset({"mocap_jump"})),
     "mocap_frozen": Fault(frozen_values("mocap", "position_world_m", "attitude_wxyz")),
+    "mocap_two_streams": Fault(two_streams),
     "estimate_disagrees": Fault(drifting),
     "yaw_disagrees": Fault(turning),
     "vehicle_state_lost": Fault(stopped("vehicle")),
