@@ -21,6 +21,7 @@ from companion.config.document import ConfigError, problem_lines
 from companion.config.explain import validate
 from companion.config.world import World
 from companion.config.yaml_strict import read_document
+from companion.config.yaml_text import flow_text
 from companion.types import Outcome
 
 Row = dict[str, Any]
@@ -102,29 +103,18 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
         remark: lines for the head of the file.
     """
     lines = [f"# {line}".rstrip() for line in remark.splitlines()]
-    lines += [f"mission: {cases.mission}", f"controller: {cases.controller}", f"preset: {cases.preset}", "cases:"]
+    lines += [*(f"{key}: {flow_text(getattr(cases, key))}" for key in ("mission", "controller", "preset")), "cases:"]
     for case in cases.cases:
-        lines += ["", f"  - name: {case.name}", "    world:"]
-        lines += [f"      {key}: {_flow(value)}" for key, value in case.knobs().items()]
-        lines.append(f"    kept: {_flow(case.kept.model_dump(mode='json', exclude_none=True))}")
+        lines += ["", f"  - name: {flow_text(case.name)}", "    world:"]
+        lines += [f"      {key}: {flow_text(value)}" for key, value in case.knobs().items()]
+        lines.append(f"    kept: {flow_text(case.kept.model_dump(mode='json', exclude_none=True))}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _flow(value: Any) -> str:
-    """A plain value in YAML's flow style, by the words of YAML 1.2."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_flow(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_flow(item) for item in value) + "]"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return "null" if value is None else str(value)
 
 
 def overrides_of(knobs: Mapping[str, Any]) -> list[str]:
     """The same world as `--set` options."""
     return [
-        f"world.{key}={_flow(value).replace(' ', '') if key != 'faults' else _flow(value)}"
+        f"world.{key}={flow_text(value).replace(' ', '') if key != 'faults' else flow_text(value)}"
         for key, value in knobs.items()
     ]
 

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.commissioning.yaml_edit import EditError, edited, scalar_text
+from companion.commissioning.yaml_edit import EditError, edited
 from companion.config.base import Location
 from companion.config.document import ConfigError, Data, Document, Origin, key_path, problem_lines
 from companion.config.explain import validate
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import parse_value, read_document
+from companion.config.yaml_text import flow_text
 
 _BOM = "\ufeff"
 
@@ -172,8 +173,8 @@ def _lines(open_steps: Location, change: Change, shown: str) -> list[tuple[str, 
             lines.append((f"{_indent(way[:depth], dash)}{step}:", ""))
             dash = False
     at = change.origin
-    was = f"{shown}:{at.line}: was {scalar_text(change.old)}" if at is not None else "new"
-    name = f"- {scalar_text(change.new)}" if isinstance(last, int) else f"{last}: {scalar_text(change.new)}"
+    was = f"{shown}:{at.line}: was {flow_text(change.old)}" if at is not None else "new"
+    name = f"- {flow_text(change.new)}" if isinstance(last, int) else f"{last}: {flow_text(change.new)}"
     return [*lines, (f"{_indent(way, dash)}{name}", was)]
 
 

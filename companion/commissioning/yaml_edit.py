@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -13,10 +12,9 @@ from typing import NamedTuple
 import yaml
 
 from companion.config.base import Location
-from companion.config.document import Data, Origin, key_path
-from companion.config.yaml_strict import StrictLoader, parse_value
-
-_PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./+-]*(?::[A-Za-z0-9_./+-]+)*")
+from companion.config.document import Data, key_path
+from companion.config.yaml_strict import StrictLoader
+from companion.config.yaml_text import flow_text
 
 
 class EditError(Exception):
@@ -46,19 +44,6 @@ def edited(text: str, changes: Mapping[Location, Data]) -> str:
         # One after the other: each change moves what stands behind it.
         text = _edited(text, location, value)
     return text
-
-
-def scalar_text(value: Data) -> str:
-    """A value in flow style, on one line, as it is read back by the same loader."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {scalar_text(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(scalar_text, value)) + "]"
-    if isinstance(value, bool) or value is None or not isinstance(value, str):
-        return json.dumps(value)
-    if _PLAIN.fullmatch(value) and parse_value(value, Origin("")) == value:
-        return value
-    return json.dumps(value, ensure_ascii=False)
 
 
 def _edited(text: str, location: Location, value: Data) -> str:
@@ -96,7 +81,7 @@ def _child(node: yaml.Node, step: str | int) -> yaml.Node | None:
 def _replaced(text: str, node: yaml.Node, value: Data, location: Location) -> list[Edit]:
     if _is_flow(node):
         begin, end = node.start_mark.index, node.end_mark.index
-        new = scalar_text(value)
+        new = flow_text(value)
         if end > begin and text[end - 1] == "\n":  # a block of text ends with its line
             new += "\n"
         if begin == end:  # nothing stands behind the key
@@ -135,11 +120,11 @@ def _added(text: str, parent: yaml.MappingNode, steps: Location, value: Data) ->
         end = parent.end_mark.index - 1
         comma = ", " if parent.value else ""
         before = text[:end].rstrip(" ")
-        return before + f"{comma}{steps[0]}: {scalar_text(value)}" + text[len(before) :]
+        return before + f"{comma}{flow_text(steps[0])}: {flow_text(value)}" + text[len(before) :]
     newline = "\r\n" if "\r\n" in text else "\n"
     column = parent.value[0][0].start_mark.column
-    lines = [f"{' ' * (column + 2 * depth)}{step}:" for depth, step in enumerate(steps)]
-    lines[-1] += f" {scalar_text(value)}"
+    lines = [f"{' ' * (column + 2 * depth)}{flow_text(step)}:" for depth, step in enumerate(steps)]
+    lines[-1] += f" {flow_text(value)}"
     at = _line_end(text, _last_line_of_plain_values(parent))
     separator = newline if at == len(text) and not text.endswith("\n") else ""
     return text[:at] + separator + newline.join(lines) + newline + text[at:]

@@ -80,6 +80,13 @@ def test_cases_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
         cases.named(["nobody"])
 
 
+def test_a_file_of_cases_takes_any_name_of_a_mission(tmp_path: Path) -> None:
+    mission = "my flights: #1/on the \x85 line.yaml"
+    cases = robustness.Cases(mission=mission, controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
+    write_cases(cases, tmp_path / "cases.yaml", "")
+    assert read_cases(tmp_path / "cases.yaml") == cases
+
+
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [

@@ -1,0 +1,34 @@
+"""Values as YAML text on one line, for files that a person goes on editing. Pure."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from typing import Any
+
+import yaml
+
+from companion.config.document import Origin
+from companion.config.yaml_strict import parse_value
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./+-]*(?::[A-Za-z0-9_./+-]+)*")
+
+
+def flow_text(value: Any) -> str:
+    """Return a value in flow style, on one line, as `parse_value` reads it back.
+
+    Args:
+        value: None, bool, int, float, str, or lists, tuples and dicts of them. A string that is no plain word is quoted, and every
+            character that YAML would fold, break at or strip is escaped.
+    """
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{flow_text(key)}: {flow_text(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(flow_text, value)) + "]"
+    if not isinstance(value, str):
+        return json.dumps(value)
+    if _PLAIN.fullmatch(value) and parse_value(value, Origin("")) == value:
+        return value
+    quoted: str = yaml.dump(str(value), default_style='"', allow_unicode=True, width=math.inf)
+    return quoted.removesuffix("\n")
