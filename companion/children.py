@@ -1,4 +1,4 @@
-"""Child processes: ended for sure, and what can be said of one that ended by itself."""
+"""Child processes: the signals that they inherit, ended for sure, and what can be said of one that ended by itself."""
 
 from __future__ import annotations
 
@@ -11,6 +11,18 @@ from pathlib import Path
 
 class LaunchError(Exception):
     """A process of the flight could not be started; one line."""
+
+
+def use_default_signals() -> None:
+    """Undo which signals the parent left ignored or blocked, so that Ctrl-C and `kill -INT` work however we were started.
+
+    A shell without job control starts `companion ... &` with SIGINT ignored, and children inherit that. With SIGCHLD ignored, the
+    exit code of a child is lost. SIGHUP stays as it is: `nohup` means it.
+    """
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGCHLD):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from companion.children import use_default_signals
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
@@ -53,6 +54,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `companion`."""
+    use_default_signals()
     words = _normalised(list(sys.argv[1:] if argv is None else argv))
     arguments, unknown = _parser(words[:1]).parse_known_args(words)
     if unknown:

@@ -31,6 +31,8 @@ CATCH = ROOT / "configs/missions/catch.yaml"
 HOVER = ROOT / "configs/missions/hover.yaml"
 DEADLINE_S = 90.0
 """For everything that a test waits for: far beyond what it takes, on a loaded machine too."""
+IN_BACKGROUND = ("sh", "-c", 'trap "" INT TERM CHLD; exec "$@"', "sh")
+"""Starts a program with signals ignored, as it may inherit them."""
 _MARK = "COMPANION_TEST_MARK"
 PREFLIGHT = "vehicle.safety.preflight_s"
 PATIENT: dict[str, object] = {
@@ -109,9 +111,10 @@ class Sandbox:
         own = {"TMPDIR": str(self.tmp), "XDG_CONFIG_HOME": str(self.config), _MARK: self._mark, "COLUMNS": "200"}
         return {**os.environ, **own, **self._environment}
 
-    def start(self, *arguments: object, report: bool = False) -> Running:
-        """`companion ARGUMENTS`, in a process group of its own, as a terminal would start it; flights are `PATIENT`,
-        and leave a report only if it is asked for. A check watches for as long as the preflight of such a flight."""
+    def start(self, *arguments: object, report: bool = False, background: bool = False) -> Running:
+        """`companion ARGUMENTS`, in a process group of its own, as a terminal would start it, or a shell without job control in the
+        background; flights are `PATIENT`, and leave a report only if it is asked for. A check watches for as long as the preflight of
+        such a flight."""
         given = " ".join(map(str, arguments))
         usual: dict[str, object] = {}
         if arguments[:1] == ("fly",):
@@ -120,7 +123,7 @@ class Sandbox:
             usual = {PREFLIGHT: PATIENT[PREFLIGHT]}
         more = {key: value for key, value in usual.items() if key not in given}
         no_report = ["--no-report"] if arguments[:1] == ("fly",) and not report else []
-        return Running(self, (*arguments, *no_report, *set_options(**more)))
+        return Running(self, (*arguments, *no_report, *set_options(**more)), IN_BACKGROUND if background else ())
 
     def run(self, *arguments: object, report: bool = False) -> Ended:
         """`companion ARGUMENTS` to its end."""
@@ -175,9 +178,9 @@ def sandbox_in(folder: Path, environment: Mapping[str, str] | None = None) -> It
 class Running:
     """A `companion` command that runs; its output is read as it comes."""
 
-    def __init__(self, sandbox: Sandbox, arguments: Sequence[object]) -> None:
+    def __init__(self, sandbox: Sandbox, arguments: Sequence[object], started_by: Sequence[str] = ()) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "companion.cli", *map(str, arguments)],
+            [*started_by, sys.executable, "-m", "companion.cli", *map(str, arguments)],
             cwd=sandbox.cwd,
             env=sandbox.environment,
             stdin=subprocess.DEVNULL,

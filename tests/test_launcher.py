@@ -69,11 +69,12 @@ def motive_that_never_answers() -> Iterator[tuple[socket.socket, list[str]]]:
 
 
 @pytest.mark.waits
+@pytest.mark.parametrize("background", [False, True], ids=["terminal", "background"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signal.Signals) -> None:
+def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signal.Signals, background: bool) -> None:
     with (
         motive_that_never_answers() as (motive, options),
-        sandbox.start("fly", HOVER, "--out", "out", *options) as running,
+        sandbox.start("fly", HOVER, "--out", "out", *options, background=background) as running,
     ):
         assert motive.recv(100)  # the flight process speaks to it
         running.signal(number)

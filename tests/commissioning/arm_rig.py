@@ -38,8 +38,8 @@ class Rig:
         patient = [word for one in (*PATIENT, *overrides) for word in ("--set", one)]
         return ["--vehicle", str(self.vehicle), *self.world.addresses(), *patient]
 
-    def start(self, *words: str) -> Running:
-        return self.sandbox.start("arm", *words, *self.options())
+    def start(self, *words: str, background: bool = False) -> Running:
+        return self.sandbox.start("arm", *words, *self.options(), background=background)
 
     def run(self, *words: str) -> Ended:
         return self.sandbox.run("arm", *words, *self.options())

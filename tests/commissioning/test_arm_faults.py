@@ -189,9 +189,10 @@ def test_ctrl_c_leaves_the_arm_limp(tmp_path: Path) -> None:
         one.sandbox.assert_nobody_left()
 
 
-def test_ctrl_c_during_zero_puts_the_lights_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("background", [False, True], ids=["terminal", "background"])
+def test_ctrl_c_during_zero_puts_the_lights_out(tmp_path: Path, background: bool) -> None:
     with rig(tmp_path) as one:
-        with one.start("zero") as running:
+        with one.start("zero", background=background) as running:
             running.wait_for("1/3  hold the whole arm")
             running.signal(signal.SIGINT)
             ended = running.end()
