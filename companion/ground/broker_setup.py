@@ -168,7 +168,8 @@ def _hash_passwords(path: Path) -> None:
             [tool, "-U", str(path)],
             stdin=subprocess.DEVNULL,
             capture_output=True,
-            text=True,
+            encoding="utf-8",
+            errors="replace",
             timeout=_HASH_DEADLINE_S,
             check=False,
         )

@@ -243,7 +243,12 @@ def _active(unit: str) -> bool:
     if tool is None:
         return False
     ended = subprocess.run(
-        [tool, "is-active", unit], capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S, check=False
+        [tool, "is-active", unit],
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        timeout=COMMAND_TIMEOUT_S,
+        check=False,
     )
     return ended.stdout.strip() in ("active", "activating", "deactivating", "reloading")
 
@@ -264,7 +269,8 @@ def _run(command: Command, tell: Tell) -> None:
                 [tool, *command.words[1:]],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
-                text=True,
+                encoding="utf-8",
+                errors="replace",
                 timeout=COMMAND_TIMEOUT_S,
                 env={**os.environ, "LC_ALL": "C", "PATH": _TOOLS},
                 check=False,
