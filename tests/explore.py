@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
@@ -39,9 +40,9 @@ def properties(seed: int, until_s: float) -> int:
         *("--hypothesis-profile", "explore", "--hypothesis-seed", str(seed)),
     ]
     print(f"\n=== {shlex.join(words)}", flush=True)
-    return subprocess.run(
-        [*words, "-q", "-r", "fE", "-p", "tests.explore", f"--until={until_s}"], check=False
-    ).returncode
+    files = [str(path) for path in Path("tests").rglob("test_*.py") if "hypothesis" in path.read_text(encoding="utf-8")]
+    more = ("-q", "-r", "fE", "-p", "tests.explore", f"--until={until_s}", *sorted(files))
+    return subprocess.run([*words, *more], check=False).returncode
 
 
 def damaged_input(seed: int, minutes: float) -> int:
