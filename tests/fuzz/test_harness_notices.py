@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import time
 from random import Random
 from types import TracebackType
 from typing import ClassVar, Self
@@ -84,6 +85,12 @@ def test_what_piles_up_is_found(failing: bytes, text: str) -> None:
         findings = run(target, 1, 0, 600).findings
     assert [finding.index for finding in findings] == [None]
     assert findings[0].text.startswith(text)
+
+
+def test_a_run_ends_at_its_deadline() -> None:
+    with Broken(b"") as target:
+        assert run(target, 1, 0, 10**9, until_s=time.monotonic() + 0.2).inputs < 10**9
+        assert run(target, 1, 0, 10**9, until_s=time.monotonic()).inputs == 0
 
 
 def test_a_target_that_bears_everything_has_no_findings() -> None:
