@@ -77,13 +77,22 @@ def run(stage: Stage) -> Result:
     with tempfile.TemporaryDirectory() as folder:
         tally = Path(folder) / "tally.json"
         more = (*_at_a_time(stage), "-p", "tests.tally", "--tally", str(tally), "--durations=10") if stage.tests else ()
-        code = subprocess.run((*stage.command, *more), check=False).returncode
+        code = _wait(subprocess.Popen((*stage.command, *more)))
         duration_s = time.monotonic() - begun_s
         if not tally.exists():
             return Result(stage, code == 0, duration_s, int(code == 0), int(code != 0))
         counts = json.loads(tally.read_text(encoding="utf-8"))
     failed = max(len(counts["failed"]), int(code != 0))
     return Result(stage, code == 0, duration_s, counts["passed"], failed, tuple(counts["failed"]), counts["skipped"])
+
+
+def _wait(process: subprocess.Popen[bytes]) -> int:
+    """Return the exit code. After Ctrl-C, which the stage gets as well, it has time to end in order: it has processes of its own."""
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        process.wait()
+        raise
 
 
 def _at_a_time(stage: Stage) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.stages import Stage, run_all
-from tests.support import ROOT
+from tests.support import DEADLINE_S, ROOT
 
 PYTHON = sys.executable.removeprefix(f"{ROOT}/")
 OWN = """
@@ -65,6 +65,22 @@ def test_a_failed_stage_hides_no_other(tests_file: Path, capfd: pytest.CaptureFi
 def test_all_green_is_exit_0(capfd: pytest.CaptureFixture[str]) -> None:
     assert run_all([Stage("types", (sys.executable, "-c", ""), tests=False)]) == 0
     assert capfd.readouterr().out.splitlines()[-1] == "1 passed, 0 failed, 0 skipped"
+
+
+def test_ctrl_c_lets_the_stage_end_in_order(tmp_path: Path) -> None:
+    """The stage takes two seconds to end."""
+    slow = "import pathlib, signal, sys, time\ntry:\n    print('works', flush=True); signal.pause()\nfinally:\n"
+    slow += "    time.sleep(2.0); pathlib.Path(sys.argv[1]).touch()\n"
+    stage = f"Stage('types', (sys.executable, '-c', {slow!r}, {str(tmp_path / 'ended')!r}), tests=False)"
+    code = f"import signal, sys; from tests.stages import *; sys.exit(run_all([{stage}]))"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, start_new_session=True) as process:
+        assert process.stdout is not None
+        while process.stdout.readline() != b"works\n":
+            pass
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(DEADLINE_S) == 130
+        assert process.stdout.read().splitlines()[-1] == b"0 passed, 0 failed, 0 skipped"
+    assert (tmp_path / "ended").exists()
 
 
 DRAWS = """
