@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -25,6 +26,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--until", type=float, default=float("inf"), help="start no test after this, on the monotonic clock [s]"
     )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Shuffle, so that each test has its turn also where there is never time for all. Every worker shuffles alike."""
+    Random(config.getoption("--hypothesis-seed")).shuffle(items)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
