@@ -333,7 +333,7 @@ async def fly(
                     os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
                 outcome = await hand_over(edges.autopilot, channel, clock, guardian)
             if guardian is not None and outcome is not Outcome.LOST:
-                guardian.goodbye()
+                guardian.goodbye(edges.autopilot.status())
         finally:
             report = await asyncio.to_thread(recorder.finish)
         recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}

@@ -208,7 +208,7 @@ class FlightCore:
             return
         elif action is SafetyAction.TERMINATE:
             stages.finish(Outcome.CRASHED)
-            stages.enter(Stage.STAND_DOWN, i)
+            stages.enter(Stage.AUTOPILOT_LAND, i, flipped=True)
         elif action is SafetyAction.AUTOPILOT_LAND:
             if stage in seq.LIFTING:
                 stages.finish(Outcome.ABORTED)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from companion.guardian.beat import Beat
 from companion.guardian.client import GuardianClient
 from companion.io.autopilot import LinkIdentity
-from companion.types import AutopilotRequest, Inputs, Outputs, PhaseKind
+from companion.types import AutopilotRequest, AutopilotStatus, Inputs, Outputs, PhaseKind
 
 _IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
 _PILOT_EVENT = "pilot_took_over"
@@ -54,9 +54,13 @@ class FlightGuard:
         if self._last is not None:
             self._client.beat(self._last)
 
-    def goodbye(self) -> None:
-        """The flight is over, and ended as it should."""
-        if self._last is not None:
+    def goodbye(self, now: AutopilotStatus | None) -> None:
+        """The flight is over. While PX4 is armed no goodbye is said: the guardian takes over once this process has ended.
+
+        Args:
+            now: PX4's newest status; None if it was never heard.
+        """
+        if self._last is not None and not (now is not None and now.armed):
             self._beat(self._inputs, self._outputs, goodbye=True)
 
     def _beat(self, inputs: Inputs, outputs: Outputs, *, goodbye: bool) -> None:

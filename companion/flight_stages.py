@@ -13,10 +13,12 @@ from companion.mission.autopilot_landing import AutopilotLanding
 from companion.mission.check import check_start
 from companion.mission.course import Course
 from companion.mission.plan import Plan
+from companion.mission.rotor_stop import RotorStop
 from companion.mission.sequencer import Stage
 from companion.mission.settled import SettledEstimate
-from companion.mission.touchdown import STILL_M_S, Sinking, Touchdown
+from companion.mission.touchdown import Touchdown
 from companion.safety.monitors import unfused
+from companion.safety.rules import PILOT_TOOK_OVER
 from companion.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, SafetyAction, Severity
 
 NO_TOUCHDOWN_S = 5.0
@@ -36,7 +38,7 @@ class FlightStages:
         self._pilot = pilot
         self._clearance_m = config.vehicle.airframe.ground_clearance_m
         self._touchdown = Touchdown(self._clearance_m)
-        self._sinking = Sinking()
+        self._stop = RotorStop(self._clearance_m)
         self._settled = SettledEstimate()
         self._tare_start_s: float | None = None
         self.waits_for_start = config.mission.start.takeoff == "by_operator"
@@ -77,10 +79,12 @@ class FlightStages:
         """Something happened; ids are listed in docs/safety.md."""
         self.events.append(Event(i.t_s if t_s is None else t_s, event_id, severity, action, text))
 
-    def enter(self, stage: Stage, i: Inputs, *, pilot_flies: bool = False) -> None:
-        """Go to a stage; `pilot_flies`: a landing by PX4 is only watched."""
+    def enter(self, stage: Stage, i: Inputs, *, pilot_flies: bool = False, flipped: bool = False) -> None:
+        """Go to a stage. Of a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is known already."""
         if stage is Stage.AUTOPILOT_LAND:
-            self._landing = AutopilotLanding(i.t_s, self._clearance_m, pilot_flies)
+            self._landing = AutopilotLanding(i.t_s, self._clearance_m, pilot_flies, flipped=flipped)
+        elif stage in seq.DISARMING:
+            self._stop = RotorStop(self._clearance_m)
         self.stage = stage
         self._stage_s = i.t_s
 
@@ -194,14 +198,7 @@ class FlightStages:
             case Stage.AUTOPILOT_LAND:
                 return self._autopilot_land(i)
             case Stage.STAND_DOWN:
-                if not seq.is_armed(i.status):
-                    self.enter(Stage.DONE, i)
-                elif elapsed > seq.DISARM_TIMEOUT_S:
-                    text = "PX4 did not disarm: its rotors may turn; disarm it by its switch or from a ground station"
-                    self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, text)
-                    self.enter(Stage.DONE, i)
-                else:
-                    return AutopilotRequest.DISARM
+                return self._stand_down(i, elapsed)
             case Stage.DONE:
                 pass
         return AutopilotRequest.NONE
@@ -325,20 +322,45 @@ class FlightStages:
             self.finish(Outcome.ABORTED)
             self.enter(Stage.AUTOPILOT_LAND, i)
 
+    def _stand_down(self, i: Inputs, elapsed_s: float) -> AutopilotRequest:
+        if not seq.is_armed(i.status):
+            self.enter(Stage.DONE, i)
+        elif not self._left_to_pilot(i) and elapsed_s > seq.DISARM_TIMEOUT_S:
+            text = "PX4 did not disarm: its rotors may turn; disarm it by its switch or from a ground station"
+            self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, text)
+            self.enter(Stage.DONE, i)
+        elif self.stage is Stage.STAND_DOWN:
+            self._stop.update(i)
+            return AutopilotRequest.DISARM if self._stop.may_disarm else AutopilotRequest.NONE
+        return AutopilotRequest.NONE
+
     def _disarm(self, i: Inputs, elapsed_s: float) -> AutopilotRequest:
         if not seq.is_armed(i.status):
             self.enter(Stage.DONE, i)
             return AutopilotRequest.NONE
-        if elapsed_s > seq.DISARM_TIMEOUT_S:
-            self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, "PX4 did not disarm")
+        if self._left_to_pilot(i):
+            return AutopilotRequest.NONE
+        if elapsed_s > seq.DISARM_TIMEOUT_S or not seq.in_offboard(i.status):
+            text = "PX4 did not disarm" if seq.in_offboard(i.status) else "PX4 left OFFBOARD before it was disarmed"
+            self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, text)
             self.finish(Outcome.ABORTED)
             self.enter(Stage.AUTOPILOT_LAND, i)
-        sink_m_s = self._sinking.update(i.t_s, i.mocap)
+            return AutopilotRequest.NONE
+        self._stop.update(i)
         if seq.on_ground(i.status):
-            return AutopilotRequest.DISARM
-        # No thrust for seconds, and motion capture has seen nothing fall: it stands, PX4's land detector or not.
-        stands = sink_m_s is not None and sink_m_s < STILL_M_S
-        return AutopilotRequest.FORCE_DISARM if stands and elapsed_s > seq.FORCE_DISARM_S else AutopilotRequest.NONE
+            return AutopilotRequest.DISARM if self._stop.may_disarm else AutopilotRequest.NONE
+        return AutopilotRequest.FORCE_DISARM if self._stop.may_force else AutopilotRequest.NONE
+
+    def _left_to_pilot(self, i: Inputs) -> bool:
+        """A pilot took over while PX4 was to be disarmed: from now on nothing is sent, and the pilot's own disarm is waited for."""
+        if not seq.people_fly(i.status):
+            return False
+        text = "a pilot took over before PX4 was disarmed; nothing is sent any more"
+        if not any(event.id == PILOT_TOOK_OVER.id for event in self.events):
+            self.tell(i, PILOT_TOOK_OVER.id, Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text)
+        self.finish(Outcome.ABORTED)
+        self.enter(Stage.AUTOPILOT_LAND, i, pilot_flies=True)
+        return True
 
     def _autopilot_land(self, i: Inputs) -> AutopilotRequest:
         assert self._landing is not None
@@ -348,7 +370,7 @@ class FlightStages:
             severity = Severity.INFO if step.text == "touch-down" else Severity.CRITICAL
             self.tell(i, "autopilot_landing", severity, SafetyAction.AUTOPILOT_LAND, step.text)
         if step.ended:
-            if not step.landed:
+            if not step.landed and self.outcome is not Outcome.CRASHED:
                 self.outcome = Outcome.LOST
             self.enter(Stage.DONE, i)
         return step.request

@@ -10,7 +10,7 @@ from companion import status
 from companion.clock import Clock
 from companion.config.loader import FlightConfig
 from companion.flight_guard import FlightGuard
-from companion.mission.sequencer import on_ground, people_fly
+from companion.mission.sequencer import people_fly
 from companion.types import AutopilotRequest, AutopilotStatus, Outcome
 
 HAND_OVER_S = 30.0
@@ -31,7 +31,7 @@ class Lander(Protocol):
 
 
 async def hand_over(autopilot: Lander, channel: socket.socket, clock: Clock, guardian: FlightGuard | None) -> Outcome:
-    """Ask PX4 to land, and watch; people who fly are left alone, for as long as they do.
+    """Ask PX4 to land, and watch; people who fly are left alone, for as long as they do. PX4 disarms by itself: COM_DISARM_LAND.
 
     Args:
         autopilot: open.
@@ -50,7 +50,7 @@ async def hand_over(autopilot: Lander, channel: socket.socket, clock: Clock, gua
         if people_fly(now):
             start_s = clock()
         else:
-            autopilot.request(AutopilotRequest.DISARM if on_ground(now) else AutopilotRequest.LAND)
+            autopilot.request(AutopilotRequest.LAND)
         status.send(channel, {"type": "handed over"})
         if guardian is not None:
             guardian.still_here()

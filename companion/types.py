@@ -85,7 +85,7 @@ class AutopilotRequest(Enum):
     ARM = "arm"
     LAND = "land"  # PX4's own LAND mode
     DISARM = "disarm"
-    FORCE_DISARM = "force_disarm"  # against PX4's land detector: for a vehicle that stands by every other measure
+    FORCE_DISARM = "force_disarm"  # against PX4's land detector; when it is allowed: companion.mission.rotor_stop
 
 
 class Outcome(Enum):
@@ -160,6 +160,8 @@ class AutopilotStatus:
     battery_voltage_v: float | None
     battery_remaining: float | None
     """0 to 1."""
+    system_status: int | None = None
+    """HEARTBEAT.system_status (MAV_STATE); None if unknown, as in logs written before it was recorded."""
 
 
 @quick

@@ -44,6 +44,7 @@ from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
+from sitl.autopilot.telemetry import system_status
 from sitl.autopilot.types import AttitudeTarget
 from sitl.fast_guardian import TAKE_OVER_S, Landing, StandIn
 from sitl.fast_link import FastLink
@@ -343,6 +344,7 @@ class FastFlight:
             _ON_GROUND if self.px4.land.landed else _IN_AIR,
             battery_voltage_v(remaining) - self.plant.battery_sag_v(),
             remaining,
+            system_status(self.px4),
         )
 
     def _read_arm(self, t_s: float) -> ArmState:

@@ -137,7 +137,7 @@ class StandIn:
             mission_t_s=outputs.mission_t_s,
             lifting=armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR,
             pilot=self._pilot,
-            goodbye=outputs.outcome is not None,
+            goodbye=outputs.outcome is not None and not armed,
             autopilot_system=self._px4.params.integer("MAV_SYS_ID"),
             own_system=_OWN[0],
             own_component=_OWN[1],

@@ -11,6 +11,7 @@ import pytest
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.core import FlightCore
+from companion.mission.rotor_stop import DISARM_STILL_S
 from companion.mission.sequencer import PEOPLE_CHOOSE
 from companion.types import (
     AutopilotRequest,
@@ -66,7 +67,8 @@ EVERY = list(itertools.product(FlightMode, LandedState, ("high", "standing")))
 def test_every_mode_landed_state_and_height(mode: FlightMode, landed: LandedState, where: str) -> None:
     height = HIGH if where == "high" else STANDING
     outputs = stepped([found(mode, landed, height, tick) for tick in range(150)])
-    stands = landed is LandedState.ON_GROUND and where == "standing"
+    ours = mode in (FlightMode.OFFBOARD, FlightMode.LAND)
+    stands = landed is LandedState.ON_GROUND and where == "standing" and ours
     assert ids(outputs).count("reattached") == 1
     event = next(event for event in outputs[0].events if event.id == "reattached")
     assert event.severity is Severity.CRITICAL
@@ -77,7 +79,9 @@ def test_every_mode_landed_state_and_height(mode: FlightMode, landed: LandedStat
         assert requests == {AutopilotRequest.NONE}
         assert "people choose" in event.text
     elif stands:
-        assert requests == {AutopilotRequest.DISARM}
+        assert requests == {AutopilotRequest.NONE, AutopilotRequest.DISARM}
+        first = next(o for o in outputs if o.request is AutopilotRequest.DISARM)
+        assert first.t_s - outputs[0].t_s >= DISARM_STILL_S, "it must have stood still"
         assert event.action is SafetyAction.LAND
     else:
         assert requests == {AutopilotRequest.LAND}
@@ -102,7 +106,7 @@ def test_whatever_else_is_wrong_it_lands(mode: FlightMode, command: OperatorComm
 def test_armed_by_somebody_else_while_the_companion_waits_it_does_not_take_off() -> None:
     """On the ground, in the mode that the companion itself has asked for."""
     flight = FastFlight(configured())
-    inputs = flight.run(limit_s=1.7).inputs
+    inputs = flight.run(limit_s=2.1).inputs
     core, outputs = FlightCore(flight.config), []
     for i in inputs:
         if i.t_s > 1.5:

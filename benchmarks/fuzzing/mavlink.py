@@ -74,7 +74,7 @@ class MavlinkTarget(Target):
         self._check(state.vehicle(), state.yaw_rad())
         for message in self._received(self._corpus[0]):
             state.take(3.0, message)
-            armed_and_mode = messages.armed_and_mode(_fields_json(message))
+            armed_and_mode = messages.heartbeat_state(_fields_json(message))[:2]
             status = state.status()
             if armed_and_mode == (True, FlightMode.OFFBOARD) and status is not None and status.heartbeat_stamp_s == 3.0:
                 return
@@ -87,7 +87,7 @@ class MavlinkTarget(Target):
     def _convert(self, message: Any) -> None:
         kind = message.get_type()
         if kind == "HEARTBEAT":
-            armed, mode = messages.armed_and_mode(_fields_json(message))
+            armed, mode, _ = messages.heartbeat_state(_fields_json(message))
             if not isinstance(armed, bool) or not isinstance(mode, FlightMode):
                 raise Wrong(f"heartbeat: {armed}, {mode}")
         elif kind == "COMMAND_ACK":

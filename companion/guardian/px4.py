@@ -7,12 +7,9 @@ from typing import Any
 
 from companion.frames import attitude_enu_flu_from_ned_frd, euler_zyx_from_quat
 from companion.io import autopilot_messages as messages
-from companion.mission.sequencer import PEOPLE_CHOOSE
+from companion.mission.sequencer import people_fly
 from companion.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
 
-MAV_STATE_CRITICAL = 5
-"""HEARTBEAT.system_status while one of PX4's failsafes acts."""
-MAV_STATE_EMERGENCY = 6
 # SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
 _NO_MANOEUVRES = (511, 512)
 
@@ -52,8 +49,8 @@ class Px4State:
         """None before the first heartbeat."""
         if self._heartbeat is None:
             return None
-        stamp_s, armed, mode, _ = self._heartbeat
-        return AutopilotStatus(stamp_s, armed, mode, messages.landed_state(self._landed), None, None)
+        stamp_s, armed, mode, system = self._heartbeat
+        return AutopilotStatus(stamp_s, armed, mode, messages.landed_state(self._landed), None, None, system)
 
     def vehicle(self) -> VehicleState | None:
         """None before position, attitude and IMU have come, or when they are not finite."""
@@ -63,11 +60,8 @@ class Px4State:
 
     @property
     def pilot(self) -> bool:
-        """A mode flies that only people choose, and that no failsafe has chosen."""
-        if self._heartbeat is None:
-            return False
-        _, armed, mode, system = self._heartbeat
-        return armed and mode in PEOPLE_CHOOSE and system not in (MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY)
+        """PX4 is armed in a mode that people chose."""
+        return people_fly(self.status())
 
     def yaw_rad(self) -> float | None:
         """Heading in the world (ENU)."""

@@ -52,7 +52,7 @@ class Inbox:
         self._vehicle_key: tuple[Any, ...] | None = None
         self._vehicle: VehicleState | None = None
         self._heartbeat_read: tuple[float, str] | None = None
-        self._armed_and_mode: tuple[bool, FlightMode] = (False, FlightMode.UNKNOWN)
+        self._state: tuple[bool, FlightMode, int | None] = (False, FlightMode.UNKNOWN, None)
         self._estimator_read: tuple[float, str] | None = None
         self._estimator_report: EstimatorReport | None = None
 
@@ -95,8 +95,8 @@ class Inbox:
             return None
         if heartbeat is not self._heartbeat_read:
             self._heartbeat_read = heartbeat
-            self._armed_and_mode = messages.armed_and_mode(heartbeat[1])
-        armed, mode = self._armed_and_mode
+            self._state = messages.heartbeat_state(heartbeat[1])
+        armed, mode, system_status = self._state
         voltage_v, remaining = messages.battery(*self._battery)
         return AutopilotStatus(
             heartbeat_stamp_s=heartbeat[0],
@@ -105,6 +105,7 @@ class Inbox:
             landed=messages.landed_state(self._landed),
             battery_voltage_v=voltage_v,
             battery_remaining=remaining,
+            system_status=system_status,
         )
 
     def estimator(self) -> EstimatorReport | None:

@@ -80,11 +80,12 @@ _COMMANDS: dict[AutopilotRequest, tuple[int, float, float]] = {
 }
 
 
-def armed_and_mode(heartbeat_json: str) -> tuple[bool, FlightMode]:
-    """Armed flag and flight mode of a HEARTBEAT's fields (`base_mode`, `custom_mode`)."""
+def heartbeat_state(heartbeat_json: str) -> tuple[bool, FlightMode, int]:
+    """Armed flag, flight mode and MAV_STATE of a HEARTBEAT's fields (`base_mode`, `custom_mode`, `system_status`)."""
     fields = json.loads(heartbeat_json)
     base_mode = int(fields["base_mode"])
-    return bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED), flight_mode(base_mode, int(fields["custom_mode"]))
+    armed = bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
+    return armed, flight_mode(base_mode, int(fields["custom_mode"])), int(fields["system_status"])
 
 
 def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:

@@ -3,8 +3,9 @@
 PX4 lands on its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; then it only descends at constant
 thrust and never finds that it stands (measured). So the companion watches for touch-down as long as the dead-reckoned height can be
 trusted, takes OFFBOARD back with zero thrust once the vehicle stands, and disarms. No single source decides: PX4's estimate and motion
-capture must both see a vehicle that stands while PX4 wants it down, and if PX4 alone never notices, it is disarmed all the same. Pure;
-time is an argument.
+capture must both see a vehicle that stands while PX4 wants it down, and if PX4 alone never notices, it is disarmed all the same.
+`companion.mission.rotor_stop` decides when a stop of the rotors may be requested, also of a vehicle that is flipped. Pure; time is an
+argument.
 """
 
 from __future__ import annotations
@@ -12,20 +13,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.mission.sequencer import FORCE_DISARM_S, PEOPLE_CHOOSE, in_offboard, is_armed, on_ground
+from companion.mission.rotor_stop import ESTIMATE_TRUSTED_S, FORCE_DISARM_S, RotorStop, fresh_pose, hears_px4
+from companion.mission.sequencer import in_offboard, is_armed, on_ground, people_chose
 from companion.mission.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking
 from companion.types import AutopilotRequest, FlightMode, Inputs
 
-TRUST_ESTIMATE_S = 4.2
-"""After the last good mocap pose: PX4's height still counts."""
 ZERO_THRUST_STREAM_S = 0.6
 """Zero-thrust setpoints flow for this long before OFFBOARD is asked for: no older setpoint may take effect."""
 BEGUN_S = 1.0
 """PX4 takes a moment from LAND to a descent: until then a vehicle that does not sink proves nothing."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
-_MOCAP_FRESH_S = 0.3
-_HEARTBEAT_FRESH_S = 2.5
+FLIPPED = "flipped: PX4 is told to disarm at once"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +50,18 @@ class AutopilotLanding:
         clearance_m: height of the body's origin when the vehicle stands.
         pilot: a pilot took over: watch only, ask for nothing. One who takes over later is seen by PX4's mode.
         estimate_known: PX4 had motion capture until now; False: until poses come its estimate counts for nothing.
+        flipped: the vehicle is known to be flipped, and has been for long enough.
     """
 
-    def __init__(self, start_s: float, clearance_m: float, pilot: bool, *, estimate_known: bool = True) -> None:
+    def __init__(
+        self,
+        start_s: float,
+        clearance_m: float,
+        pilot: bool,
+        *,
+        estimate_known: bool = True,
+        flipped: bool = False,
+    ) -> None:
         self._start_s = start_s
         self._clearance_m = clearance_m
         self._pilot = pilot
@@ -63,8 +71,10 @@ class AutopilotLanding:
         self._standing_since_s: float | None = None
         self._touched_s: float | None = None
         self._landing_since_s: float | None = None
-        self._unnoticed_since_s: float | None = None
+        self._zero_thrust_since_s: float | None = None
+        self._was_flipped = False
         self._pose_s = start_s if estimate_known else -math.inf
+        self._stop = RotorStop(clearance_m, self._pose_s, flipped=flipped)
 
     @property
     def pilot(self) -> bool:
@@ -74,12 +84,14 @@ class AutopilotLanding:
     def step(self, i: Inputs) -> LandingStep:
         """One tick."""
         elapsed = i.t_s - self._start_s
-        heard = i.status is not None and i.t_s - i.status.heartbeat_stamp_s < _HEARTBEAT_FRESH_S
+        heard = hears_px4(i)
+        self._stop.update(i)
         if not self._pilot and heard and self._pilot_takes_over(i):
             self._pilot = True
             return LandingStep(AutopilotRequest.NONE, False, False, False, "a pilot took over")
         if heard and not is_armed(i.status) and elapsed > 0.5:
-            return LandingStep(AutopilotRequest.NONE, False, True, True)
+            text = "the vehicle was flipped; it is disarmed" if self._was_flipped else None
+            return LandingStep(AutopilotRequest.NONE, False, True, True, text)
         if elapsed > TIMEOUT_S and not (self._pilot and heard):  # a pilot may fly on for as long as they like
             return LandingStep(AutopilotRequest.NONE, False, True, False, "the landing could not be confirmed")
         if not heard and self._stands_by_mocap(i):
@@ -87,13 +99,17 @@ class AutopilotLanding:
             return LandingStep(AutopilotRequest.NONE, False, True, True, text)
         if self._pilot:
             return LandingStep(AutopilotRequest.NONE, False, False, False)
+        if self._stop.flipped:
+            text = None if self._was_flipped else FLIPPED
+            self._was_flipped = True
+            return LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False, text)
         if self._touched_s is None and heard and self._touches(i):
             self._touched_s = i.t_s
             return LandingStep(AutopilotRequest.LAND, True, False, False, "touch-down")
         if self._touched_s is None:
-            done = on_ground(i.status) and elapsed > 1.0
+            done = on_ground(i.status) and elapsed > 1.0 and self._stop.may_disarm
             return LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND, False, False, False)
-        if on_ground(i.status):
+        if on_ground(i.status) and self._stop.may_disarm:
             return LandingStep(AutopilotRequest.DISARM, True, False, False)
         if self._unnoticed(i):
             return LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False)
@@ -104,13 +120,14 @@ class AutopilotLanding:
         """A mode in which somebody steers; or, once PX4 was landing, any that only people choose."""
         mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
         self._was_landing = self._was_landing or mode is FlightMode.LAND
-        return mode is FlightMode.MANUAL or (self._was_landing and mode in PEOPLE_CHOOSE)
+        chosen = i.status is not None and people_chose(i.status)
+        return mode is FlightMode.MANUAL or (self._was_landing and chosen)
 
     def _touches(self, i: Inputs) -> bool:
         """PX4 is landing, the height that it believes in says that the vehicle stands, and motion capture does not contradict."""
-        fresh = i.mocap is not None and i.mocap.tracking_valid and i.t_s - i.mocap.stamp_s < _MOCAP_FRESH_S
-        if fresh and i.mocap is not None:
-            self._pose_s = i.mocap.stamp_s
+        pose = fresh_pose(i)
+        if pose is not None:
+            self._pose_s = pose.stamp_s
         sink_m_s = self._sinking.update(i.t_s, i.mocap)
         vehicle = i.vehicle
         landing = i.status is not None and i.status.mode in (FlightMode.LAND, FlightMode.OTHER)
@@ -119,31 +136,28 @@ class AutopilotLanding:
         elif self._landing_since_s is None:
             self._landing_since_s = i.t_s
         begun = self._landing_since_s is not None and i.t_s - self._landing_since_s > BEGUN_S
-        if vehicle is None or not begun or i.t_s - self._pose_s > TRUST_ESTIMATE_S:
+        if vehicle is None or not begun or i.t_s - self._pose_s > ESTIMATE_TRUSTED_S:
             return False
         height, sink = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
         stands = self._height.update(i.t_s, height, sink, height - 1.0)
-        return stands and not (fresh and self._flies_by_mocap(i, sink_m_s))
+        return stands and not (pose is not None and self._flies_by_mocap(i, sink_m_s))
 
     def _flies_by_mocap(self, i: Inputs, sink_m_s: float | None) -> bool:
         high = i.mocap is not None and i.mocap.position_world_m[2] > self._clearance_m + NEVER_ABOVE_M
         return high or sink_m_s is None or sink_m_s > STILL_M_S
 
     def _unnoticed(self, i: Inputs) -> bool:
-        """OFFBOARD with no thrust for so long, and motion capture sees nothing fall: it stands, whatever PX4's detector says."""
-        falls = self._flies_by_mocap(i, self._sinking.update(i.t_s, i.mocap))
-        if falls or not in_offboard(i.status):
-            self._unnoticed_since_s = None
-            return False
-        if self._unnoticed_since_s is None:
-            self._unnoticed_since_s = i.t_s
-        return i.t_s - self._unnoticed_since_s > FORCE_DISARM_S
+        """It has stood in OFFBOARD without thrust for `FORCE_DISARM_S`, and PX4's land detector has not noticed."""
+        if not in_offboard(i.status):
+            self._zero_thrust_since_s = None
+        elif self._zero_thrust_since_s is None:
+            self._zero_thrust_since_s = i.t_s
+        since_s = self._zero_thrust_since_s
+        return since_s is not None and i.t_s - since_s >= FORCE_DISARM_S and self._stop.may_force
 
     def _stands_by_mocap(self, i: Inputs) -> bool:
-        pose = i.mocap
-        fresh = pose is not None and pose.tracking_valid and i.t_s - pose.stamp_s < _MOCAP_FRESH_S
-        low = pose is not None and pose.position_world_m[2] < self._clearance_m + HEIGHT_MARGIN_M
-        if not (fresh and low):
+        pose = fresh_pose(i)
+        if pose is None or pose.position_world_m[2] >= self._clearance_m + HEIGHT_MARGIN_M:
             self._standing_since_s = None
             return False
         if self._standing_since_s is None:

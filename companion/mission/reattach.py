@@ -6,28 +6,25 @@ before the companion does. Nothing is ever lifted then.
 
 from __future__ import annotations
 
+from companion.mission.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
 from companion.mission.sequencer import on_ground, people_fly
-from companion.mission.touchdown import MOCAP_FRESH_S
 from companion.types import Inputs
-
-STANDS_WITHIN_M = 0.25
-"""Of standing height, by motion capture: further up PX4's word that it stands is not taken."""
 
 
 def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     """Whether the vehicle is to be treated as flying, and in words what was found and what is done about it.
 
-    One that stands with rotors that turn is disarmed, but not against people: in a mode that only they choose it counts as flying.
+    A vehicle that stands with its rotors turning is disarmed. It counts as flying if people chose its mode, if the mode is neither
+    OFFBOARD nor LAND, or if motion capture does not see how high it is.
 
     Args:
         i: with PX4 armed.
         clearance_m: height of the body's origin when the vehicle stands.
     """
-    pose, vehicle = i.mocap, i.vehicle
-    height_m = None
-    if pose is not None and pose.tracking_valid and i.t_s - pose.stamp_s < MOCAP_FRESH_S:
-        height_m = pose.position_world_m[2]
-    stands = on_ground(i.status) and (height_m is None or height_m < clearance_m + STANDS_WITHIN_M)
+    pose, vehicle = fresh_pose(i), i.vehicle
+    height_m = pose.position_world_m[2] if pose is not None else None
+    low = height_m is not None and height_m < clearance_m + LOW_WITHIN_M
+    stands = low and on_ground(i.status) and i.status is not None and i.status.mode in OWN_MODES
     if height_m is None and vehicle is not None:
         height_m = vehicle.position_world_m[2]
     where = "at an unknown height" if height_m is None else f"at a height of {height_m:.2f} m"

@@ -26,8 +26,7 @@ SPOOL_SHARE = 0.7
 SPOOL_TO_FULL_S = 0.4
 TOUCHDOWN_RAMP_S = 0.4
 DISARM_TIMEOUT_S = 8.0
-FORCE_DISARM_S = 4.0
-"""Without thrust, standing by every measure, and PX4 does not notice: it is told."""
+HEARTBEAT_FRESH_S = 2.5
 
 
 class Stage(Enum):
@@ -50,12 +49,15 @@ BEFORE_LIFT = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD, Stage.ARM})
 BEFORE_ARMING = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD})
 """Whoever armed PX4 now, the companion did not."""
 LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
+DISARMING = frozenset({Stage.DISARM, Stage.STAND_DOWN})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
 """Stages in which PX4 must be in OFFBOARD, by the companion's belief."""
 PILOT_FLIES = "a pilot flies"
 """Name of the phase in which nothing is sent because somebody else has the vehicle."""
 PEOPLE_CHOOSE = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
-"""Modes that only people choose: theirs is the machine, nothing is sent against them."""
+"""Modes that only people choose, unless one of PX4's failsafes has: a pilot flies, and nothing is sent against a pilot."""
+FAILSAFE_STATES = frozenset({5, 6, 8})
+"""MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION: HEARTBEAT.system_status while one of PX4's failsafes acts."""
 
 
 def in_offboard(status: AutopilotStatus | None) -> bool:
@@ -73,6 +75,16 @@ def on_ground(status: AutopilotStatus | None) -> bool:
     return status is not None and status.landed is LandedState.ON_GROUND
 
 
+def failsafe_chose(status: AutopilotStatus) -> bool:
+    """One of PX4's failsafes acts, and the mode is one that it can choose. In MANUAL a pilot steers, failsafe or not."""
+    return status.system_status in FAILSAFE_STATES and status.mode is not FlightMode.MANUAL
+
+
+def people_chose(status: AutopilotStatus) -> bool:
+    """PX4 is in a mode that only people choose, and no failsafe has chosen it."""
+    return status.mode in PEOPLE_CHOOSE and not failsafe_chose(status)
+
+
 def people_fly(status: AutopilotStatus | None) -> bool:
-    """PX4 is armed and in a mode that only people choose."""
-    return status is not None and status.armed and status.mode in PEOPLE_CHOOSE
+    """PX4 is armed and in a mode that people chose: a pilot flies."""
+    return status is not None and status.armed and people_chose(status)

@@ -105,10 +105,10 @@ class Monitors:
                 findings.found(RECORDER_DROPS, "the recorder loses samples")
             if i.guardian_ready is False:
                 findings.found(GUARDIAN_LOST, "the guardian is dead, or could not take over")
-            if situation.airborne:
-                self._flight.check(i.vehicle, situation, gap_s, findings)
             if not self._mocap.trusted:
                 i = dataclasses.replace(i, mocap=None)
+            if situation.airborne:
+                self._flight.check(i, situation, gap_s, findings)
             if not self._force.trusted:
                 i = dataclasses.replace(i, force=None)
         self.trusted = i

@@ -7,6 +7,7 @@ import math
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2
 from companion.frames import tilt_rad
+from companion.mission.rotor_stop import FLIPPED_TILT_RAD, seems_flipped
 from companion.safety.findings import Findings, Situation
 from companion.safety.governor import BODY_TOP_M
 from companion.safety.rules import (
@@ -29,9 +30,7 @@ from companion.safety.rules import (
     TRACKING_WARN,
 )
 from companion.safety.stop import StopModel
-from companion.types import ControlLog, TetherState, Vec3, VehicleState
-
-CRASH_TILT_RAD = math.radians(70.0)
+from companion.types import ControlLog, Inputs, TetherState, Vec3
 
 
 class FlightMonitor:
@@ -42,7 +41,7 @@ class FlightMonitor:
         self._s = s
         self._tilt_max_rad = math.radians(s.tilt_abort_deg)
         # Of a quaternion, x^2 + y^2 = sin^2(tilt / 2).
-        self._lean_max = math.sin(0.5 * min(self._tilt_max_rad, CRASH_TILT_RAD)) ** 2
+        self._lean_max = math.sin(0.5 * min(self._tilt_max_rad, FLIPPED_TILT_RAD)) ** 2
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         inset_m = vehicle.airframe.radius_m - s.geofence_tolerance_m
         self._x_m = (room.x_m[0] + inset_m, room.x_m[1] - inset_m)
@@ -53,12 +52,13 @@ class FlightMonitor:
         self._clearance_min_m = tether.clearance_min_m
         self._saturated_s = 0.0
 
-    def check(self, vehicle: VehicleState | None, situation: Situation, dt_s: float, findings: Findings) -> None:
-        """One tick in the air."""
+    def check(self, i: Inputs, situation: Situation, dt_s: float, findings: Findings) -> None:
+        """One tick in the air; `i` without what is not to be believed."""
+        vehicle = i.vehicle
         if vehicle is not None:
             _, x, y, _ = vehicle.attitude_wxyz
             if x * x + y * y > self._lean_max:
-                self._lean(tilt_rad(vehicle.attitude_wxyz), findings)
+                self._lean(i, tilt_rad(vehicle.attitude_wxyz), findings)
             self._motion(vehicle.position_world_m, vehicle.velocity_world_m_s, findings)
         error_m = situation.tracking_error_m
         if error_m is not None and error_m > self._s.tracking_error_warn_m:
@@ -67,11 +67,11 @@ class FlightMonitor:
         if situation.tether is not None:
             self._tether(situation.tether, findings)
 
-    def _lean(self, lean_rad: float, findings: Findings) -> None:
+    def _lean(self, i: Inputs, lean_rad: float, findings: Findings) -> None:
         if lean_rad > self._tilt_max_rad:
             findings.found(TILT, "tilt {:.0f} deg", math.degrees(lean_rad))
-        if lean_rad > CRASH_TILT_RAD:
-            findings.found(CRASHED, "upside down")
+        if seems_flipped(i):
+            findings.found(CRASHED, "flipped: tilt {:.0f} deg, confirmed by a second source", math.degrees(lean_rad))
 
     def _off(self, error_m: float, findings: Findings) -> None:
         s = self._s

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
-from companion.mission.sequencer import PEOPLE_CHOOSE
+from companion.mission.sequencer import failsafe_chose, people_chose
 from companion.safety.findings import Age, Findings, Situation
 from companion.safety.rules import (
     BATTERY_LOW,
@@ -67,8 +67,9 @@ class Px4Monitor:
             return
         if situation.offboard_expected:
             if status.mode is not FlightMode.OFFBOARD:
-                rule = PILOT_TOOK_OVER if status.mode in PEOPLE_CHOOSE else OFFBOARD_LEFT
-                findings.found(rule, "PX4 left OFFBOARD for {}", status.mode.value.upper())
+                rule = PILOT_TOOK_OVER if people_chose(status) else OFFBOARD_LEFT
+                why = "; its failsafe acts" if failsafe_chose(status) else ""
+                findings.found(rule, "PX4 left OFFBOARD for {}{}", status.mode.value.upper(), why)
             if not status.armed and situation.airborne and v is not None and v.position_world_m[2] > self._high_m:
                 findings.found(PX4_DISARMED, "PX4 says disarmed at a height of {:.2f} m", v.position_world_m[2])
         self._battery(status, findings)

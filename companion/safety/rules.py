@@ -205,7 +205,7 @@ PX4_DISARMED = _rule(
 PILOT_TOOK_OVER = _rule(
     "pilot_took_over",
     Part.PX4,
-    "PX4 left OFFBOARD for a mode that people choose: manual, hold, return or take-off",
+    "PX4 left OFFBOARD for a mode that people choose (manual, hold, return or take-off), and not by its own failsafe",
     (),
     0.0,
     _PX4_LANDS,
@@ -294,7 +294,16 @@ GUARDIAN_LOST = _rule(
 )
 
 TILT = _rule("tilt", Part.FLIGHT, "leans too far", ("tilt_abort_deg",), 0.1, None, _PX4_LANDS)
-CRASHED = _rule("crashed", Part.FLIGHT, "leans more than 70 deg", (), 0.3, None, _TERMINATE, False)
+CRASHED = _rule(
+    "crashed",
+    Part.FLIGHT,
+    "tilted by more than 70 deg, by PX4 and by motion capture (or the accelerometer, if the body is not seen)",
+    (),
+    0.3,
+    None,
+    _TERMINATE,
+    False,
+)
 TRACKING_WARN = _rule("tracking_warn", Part.FLIGHT, "off the reference", ("tracking_error_warn_m",), 0.2, None, _WARN)
 TRACKING_HOLD = _rule(
     "tracking_hold", Part.FLIGHT, "further off the reference", ("tracking_error_hold_m",), 0.2, None, _HOLD

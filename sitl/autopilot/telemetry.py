@@ -35,7 +35,7 @@ def clock_us(stub: Px4Stub) -> int:
 
 def heartbeat(stub: Px4Stub) -> Message:
     """HEARTBEAT."""
-    state, commander = stub.nav_state, stub.commander
+    state = stub.nav_state
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if state not in (NavState.TERMINATION, NavState.MANUAL, NavState.ACRO):
         base |= mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -43,15 +43,18 @@ def heartbeat(stub: Px4Stub) -> Message:
         base |= mavlink.MAV_MODE_FLAG_AUTO_ENABLED
     if stub.armed:
         base |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-    if state is NavState.TERMINATION:
-        status = mavlink.MAV_STATE_FLIGHT_TERMINATION
-    elif stub.armed:
-        status = mavlink.MAV_STATE_CRITICAL if commander.failsafe else mavlink.MAV_STATE_ACTIVE
-    else:
-        status = mavlink.MAV_STATE_STANDBY
     return mavlink.MAVLink_heartbeat_message(
-        stub.params.integer("MAV_TYPE"), mavlink.MAV_AUTOPILOT_PX4, base, state.custom_mode, status, 3
+        stub.params.integer("MAV_TYPE"), mavlink.MAV_AUTOPILOT_PX4, base, state.custom_mode, system_status(stub), 3
     )
+
+
+def system_status(stub: Px4Stub) -> int:
+    """HEARTBEAT.system_status (MAV_STATE), as PX4 1.16's HEARTBEAT.hpp chooses it."""
+    if stub.nav_state is NavState.TERMINATION:
+        return int(mavlink.MAV_STATE_FLIGHT_TERMINATION)
+    if not stub.armed:
+        return int(mavlink.MAV_STATE_STANDBY)
+    return int(mavlink.MAV_STATE_CRITICAL if stub.commander.failsafe else mavlink.MAV_STATE_ACTIVE)
 
 
 def sys_status(stub: Px4Stub) -> Message:

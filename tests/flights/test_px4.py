@@ -20,9 +20,9 @@ from companion.config.loader import load_flight
 from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.safety.stop import StopModel
 from companion.sitl_process import PX4_FOLDER
-from companion.types import PhaseKind
+from companion.types import AutopilotRequest, PhaseKind
 from sitl.px4_process import MODEL, VARIABLE, Instance, find
-from tests.support import CATCH, DEADLINE_S, HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in
+from tests.support import CATCH, DEADLINE_S, HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in, set_options
 
 REAL = [
     pytest.mark.px4,
@@ -47,6 +47,8 @@ LINE_TO_THE_WALL = (
 NEAREST_STOP_S = 9.6
 """After arming, on that line: the predicted stop is nearest to the wall."""
 GUARDIAN_LANDS = ["guardian_land", "guardian_touchdown", "guardian_landed"]
+STOPPED_WITHIN_S = 2.5
+"""After a flip was certain, as the flight process hears it: a heartbeat comes once a second, a lost command again after 0.5 s."""
 LANDED_M = 0.4
 """Of the body's origin, which stands 0.3 m high."""
 
@@ -177,6 +179,42 @@ def test_a_dead_link_is_landed_by_px4_itself(sandbox: Sandbox, autopilot: str) -
     world = witness(sandbox)
     assert "LAND" in [mode for _, mode, _ in world["modes"]]
     assert not world["armed"]
+
+
+def test_a_rotor_lost_in_the_air_is_a_flip_and_the_others_are_stopped(sandbox: Sandbox, autopilot: str) -> None:
+    """LAND comes first and does not help: PX4 refuses a plain DISARM in the air, and its rotors went on in the wreck."""
+    fault = "world.faults=[{kind: motor_weak, size: 1.0, t_s: 7.0}]"
+    # High enough to turn over before it is down.
+    high = set_options(**{"mission.phases[0].height_m": 1.6, "mission.phases[0].duration_s": 5.0})
+    ended = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "out", "--set", fault, *high)
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    assert ended.code == EXIT_LOST, (ended.out, ended.err)
+    summary = read_summary(sandbox.cwd / "out")
+    ids = event_ids(summary)
+    assert ids.index("tilt") < ids.index("crashed")
+    assert "guardian_took_over" not in ids
+    assert not witness(sandbox)["armed"]
+    log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    [flipped] = [event for event in summary["events"] if event["id"] == "crashed"]
+    stopped_s = next(
+        i.t_s for i in log.inputs if i.t_s > flipped["t_s"] and i.status is not None and not i.status.armed
+    )
+    assert stopped_s - flipped["t_s"] < STOPPED_WITHIN_S
+    assert AutopilotRequest.DISARM not in {o.request for o in log.outputs}
+
+
+def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed(sandbox: Sandbox, autopilot: str) -> None:
+    """PX4's land detector takes its time, and in the middle of that the pilot switches to Hold: FORCE_DISARM left all the same."""
+    slow = ("--set", "world.px4_params={LNDMC_TRIG_TIME: 7.5}")
+    fault = "world.faults=[{kind: pilot_takeover, t_s: 8.5, size: 5.0}]"
+    ended = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "out", *slow, "--set", fault)
+    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
+    ids = event_ids(read_summary(sandbox.cwd / "out"))
+    assert ids.index("touchdown") < ids.index("pilot_took_over")
+    log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert not {o.request for o in log.outputs} & {AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM}
+    assert not witness(sandbox)["crashed"]
 
 
 @pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])

@@ -37,6 +37,7 @@ POSITION_M: Vec3 = (0.5, -0.25, 1.25)
 ATTITUDE: Quat = (0.9689124217106447, 0.0, 0.0, 0.24740395925452294)
 """Yaw 0.5 rad."""
 OWN_IDS = (1, 195)
+STANDING_M = load_flight(HOVER).vehicle.airframe.ground_clearance_m
 # Holds PX4's port as the flight process does, and does nothing: the test speaks to the guardian in its name.
 _FLIGHT = "import socket, sys; s = socket.socket(type=2); s.bind(('127.0.0.1', int(sys.argv[1]))); print(flush=True); sys.stdin.read()"
 
@@ -46,6 +47,7 @@ class Cameras:
 
     def __init__(self, body_id: int) -> None:
         self.position_m: Vec3 = POSITION_M
+        self.attitude: Quat = ATTITUDE
         self.tracked = True
         self.port = 0
         self._body_id = body_id
@@ -70,7 +72,7 @@ class Cameras:
             self._started.set()
             while not self._stop.is_set():
                 now_s = time.monotonic()
-                server.publish(now_s, (BodyPose(self._body_id, self.position_m, ATTITUDE, self.tracked),), now_s)
+                server.publish(now_s, (BodyPose(self._body_id, self.position_m, self.attitude, self.tracked),), now_s)
                 await asyncio.sleep(0.01)
 
 
@@ -224,11 +226,21 @@ class Rig:
         self.listen()
         return next((message for message in self.messages if message["type"] == "guardian_result"), None)
 
+    def come_down(self) -> None:
+        """From where it is to standing height, by motion capture and by PX4, slowly enough to be believed."""
+        x, y, z = self.cameras.position_m
+        while z > STANDING_M:
+            z = max(STANDING_M, z - 0.05)
+            self.cameras.position_m = (x, y, z)
+            time.sleep(0.02)
+        self.peer.position_ned_m, self.peer.velocity_ned_m_s = (y, x, -STANDING_M), (0.0, 0.0, 0.0)
+
     def land_as_told(self) -> None:
         """PX4's part, once LAND was commanded: the mode, the floor, the disarm."""
         wait_until(lambda: bool(self.peer.commands(mavlink.MAV_CMD_NAV_LAND)), lambda: self.log.read_text())
         self.peer.custom_mode = LAND_MODE
         wait_until(lambda: "guardian_land" in self.events, lambda: self.log.read_text())
+        self.come_down()
         self.peer.landed = mavlink.MAV_LANDED_STATE_ON_GROUND
         wait_until(lambda: bool(self.peer.commands(mavlink.MAV_CMD_COMPONENT_ARM_DISARM)), lambda: self.log.read_text())
         self.peer.base_mode = DISARMED

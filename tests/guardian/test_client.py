@@ -148,10 +148,21 @@ def test_a_pilot_stays_one_and_a_pose_that_is_not_believed_is_not_passed_on(pair
     event = Event(5.0, "pilot_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "a pilot")
     guard.tick(inputs(tracking=False), dataclasses.replace(waiting, events=(event,)))
     guard.tick(inputs(), dataclasses.replace(waiting, mocap_trusted=False))
-    guard.goodbye()
+    guard.goodbye(inputs().status)
     beats = [words.unpack(guardian.recv(words.MAX_BYTES)) for _ in range(3)]
     assert [beat is not None and (beat.pilot, beat.goodbye, beat.pose_stamp_s) for beat in beats] == [
         (True, False, float("-inf")),
         (True, False, float("-inf")),
         (True, True, float("-inf")),
     ]
+
+
+def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiting: Outputs) -> None:
+    """Whatever the outcome: rotors that turn are for the guardian to stop once this process is gone."""
+    client, guardian = pair
+    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 0), 0.0)
+    guard.tick(inputs(armed=True), dataclasses.replace(waiting, phase_kind=PhaseKind.DONE))
+    guard.goodbye(inputs(armed=True).status)
+    guard.goodbye(inputs(armed=False).status)
+    beats = [words.unpack(guardian.recv(words.MAX_BYTES)) for _ in range(2)]
+    assert [beat is not None and (beat.goodbye, beat.lifting) for beat in beats] == [(False, True), (True, True)]

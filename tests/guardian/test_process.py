@@ -175,6 +175,47 @@ def test_a_pilot_who_takes_over_from_the_guardian_is_respected(tmp_path: Path) -
         assert len(rig.peer.commands(NAV_LAND)) == before
 
 
+def test_a_hold_by_px4s_own_failsafe_is_no_pilot_and_is_landed(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.peer.custom_mode, rig.peer.system_status = HOLD_MODE, mavlink.MAV_STATE_CRITICAL
+        rig.flight.kill()
+        rig.land_as_told()
+        assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
+        assert "guardian_pilot" not in rig.events
+
+
+def test_in_the_air_it_never_disarms_on_the_land_detectors_word_alone(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.flight.kill()
+        wait_until(lambda: bool(rig.peer.commands(NAV_LAND)), rig.log.read_text)
+        rig.peer.custom_mode, rig.peer.landed = LAND_MODE, mavlink.MAV_LANDED_STATE_ON_GROUND
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", len(rig.peer.of("VISION_POSITION_ESTIMATE")) + 250)
+        assert rig.peer.commands(ARM_DISARM) == []
+
+
+@pytest.mark.parametrize("contradicted", [False, True])
+def test_a_flipped_vehicle_is_disarmed_by_force_again_and_again(tmp_path: Path, contradicted: bool) -> None:
+    """Refused it is repeated; an attitude that motion capture contradicts stops no rotor."""
+    with Rig(tmp_path) as rig:
+        rig.peer.acks[ARM_DISARM] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+        rig.beat_until_ready()
+        rig.peer.attitude_ned_frd, rig.peer.custom_mode = (0.0, 1.0, 0.0, 0.0), LAND_MODE
+        if not contradicted:
+            rig.cameras.attitude = (0.0, 1.0, 0.0, 0.0)
+        rig.flight.kill()
+        if contradicted:
+            rig.peer.wait_for("VISION_POSITION_ESTIMATE", 150)
+            assert rig.peer.commands(ARM_DISARM) == []
+            return
+        wait_until(lambda: len(rig.peer.commands(ARM_DISARM)) > 3, rig.log.read_text)
+        assert {(m.param1, m.param2) for m in rig.peer.commands(ARM_DISARM)} == {(0.0, 21196.0)}
+        rig.peer.base_mode = DISARMED
+        assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
+        assert "guardian_landing" in rig.events
+
+
 def test_a_jump_of_motion_capture_is_held_back(tmp_path: Path) -> None:
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()

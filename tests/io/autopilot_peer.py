@@ -49,6 +49,9 @@ class Px4Peer:
         """ESTIMATOR_STATUS without its time, sent once it was asked for."""
         self.landed = mavlink.MAV_LANDED_STATE_ON_GROUND
         self.attitude_ned_frd = (1.0, 0.0, 0.0, 0.0)
+        self.position_ned_m, self.velocity_ned_m_s = POSITION_NED_M, VELOCITY_NED_M_S
+        self.accel_frd_m_s2 = ACCEL_FRD_M_S2
+        self.system_status = mavlink.MAV_STATE_ACTIVE
         self.acks: dict[int, int | None] = {}
         """MAV_CMD to MAV_RESULT, accepted where absent; None: no answer at all."""
         self.working_on: list[Any] = []
@@ -195,7 +198,7 @@ class Px4Peer:
             self._say_ack(command, mavlink.MAV_RESULT_IN_PROGRESS)
         self.say(
             mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_QUADROTOR, self.autopilot, self.base_mode, self.custom_mode, 4, 3
+                mavlink.MAV_TYPE_QUADROTOR, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
             )
         )
         self.say(mavlink.MAVLink_extended_sys_state_message(0, self.landed))
@@ -206,14 +209,16 @@ class Px4Peer:
 
     def _say_fast(self, time_boot_ms: int) -> None:
         if mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED in self.asked_interval_us:
-            self.say(mavlink.MAVLink_local_position_ned_message(time_boot_ms, *POSITION_NED_M, *VELOCITY_NED_M_S))
+            self.say(
+                mavlink.MAVLink_local_position_ned_message(time_boot_ms, *self.position_ned_m, *self.velocity_ned_m_s)
+            )
         if mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION in self.asked_interval_us:
             self.say(mavlink.MAVLink_attitude_quaternion_message(time_boot_ms, *self.attitude_ned_frd, *GYRO_FRD_RAD_S))
         if mavlink.MAVLINK_MSG_ID_HIGHRES_IMU in self.asked_interval_us:
             rest = (0.0,) * 7
             self.say(
                 mavlink.MAVLink_highres_imu_message(
-                    time_boot_ms * 1000, *ACCEL_FRD_M_S2, *GYRO_FRD_RAD_S, *rest, 0xFFFF
+                    time_boot_ms * 1000, *self.accel_frd_m_s2, *GYRO_FRD_RAD_S, *rest, 0xFFFF
                 )
             )
 

@@ -39,12 +39,13 @@ def test_a_mode_without_the_custom_flag_is_unknown() -> None:
     assert messages.flight_mode(0, 6 << 16) is FlightMode.UNKNOWN
 
 
-def test_armed_is_the_safety_flag() -> None:
-    assert messages.armed_and_mode(json.dumps({"base_mode": 129, "custom_mode": 6 << 16})) == (
-        True,
-        FlightMode.OFFBOARD,
-    )
-    assert messages.armed_and_mode(json.dumps({"base_mode": 1, "custom_mode": 6 << 16})) == (False, FlightMode.OFFBOARD)
+@pytest.mark.parametrize(("base_mode", "armed"), [(129, True), (1, False)])
+@pytest.mark.parametrize("system_status", [3, 4, 5])
+def test_a_heartbeat_says_armed_mode_and_whether_a_failsafe_acts(
+    base_mode: int, armed: bool, system_status: int
+) -> None:
+    fields = {"base_mode": base_mode, "custom_mode": 6 << 16, "system_status": system_status}
+    assert messages.heartbeat_state(json.dumps(fields)) == (armed, FlightMode.OFFBOARD, system_status)
 
 
 def test_an_unheard_of_landed_state_is_unknown() -> None:
