@@ -98,6 +98,13 @@ def test_a_lost_device_lands_it(kind: str, at_s: float) -> None:
         assert max(abs(a - b) for a, b in zip(folded, FOLDED_DEG, strict=True)) < 12
 
 
+def test_after_a_landing_for_lost_motion_capture_nothing_is_said_of_its_rate() -> None:
+    """It comes back 1.9 s later, at its full rate, while PX4 lands."""
+    result = FastFlight(configured("world.faults=[{kind: mocap_loss, t_s: 6.0, duration_s: 2.0}]")).run()
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert event_ids(result) == ["takeoff", "mocap_lost", "autopilot_landing"]
+
+
 def test_a_short_mocap_gap_is_flown_through() -> None:
     result = FastFlight(configured("world.faults=[{kind: mocap_loss, t_s: 6.0, duration_s: 0.08}]")).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED

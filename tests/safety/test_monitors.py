@@ -332,6 +332,25 @@ def test_bad_poses_of_every_kind_in_turn_are_no_motion_capture() -> None:
     assert first.t_s - START_S <= VEHICLE.safety.mocap_timeout_s + 5 * TICK_S
 
 
+@pytest.mark.parametrize("gone_s", [0.2, 0.8, 2.5])
+def test_motion_capture_that_comes_back_at_its_full_rate_is_not_reported_as_slow(gone_s: float) -> None:
+    def lost_for_a_while(i: Inputs) -> Inputs:
+        return stopped("mocap")(i) if 1.0 <= i.t_s - START_S < 1.0 + gone_s else i
+
+    events = watched(VEHICLE, after_a_moment(lost_for_a_while, ticks=1200), flying())
+    assert [event.id for event in events] == ["mocap_lost"]
+
+
+def test_motion_capture_that_comes_back_slowly_is_reported_with_its_own_rate() -> None:
+    def lost_then_slow(i: Inputs) -> Inputs:
+        since_s = i.t_s - START_S
+        return stopped("mocap")(i) if 1.0 <= since_s < 3.0 else every_35_ms(i) if since_s >= 3.0 else i
+
+    events = watched(VEHICLE, after_a_moment(lost_then_slow, ticks=1200), flying())
+    assert [event.id for event in events] == ["mocap_lost", "mocap_slow"]
+    assert events[1].text == "motion capture comes at 29 Hz"
+
+
 def test_fast_flight_and_a_gap_are_no_jump() -> None:
     """1.5 m/s, and 80 ms without a frame; it ends where it could still stop."""
 
