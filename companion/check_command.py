@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Self, cast
+from typing import Any, Self
 
 from rich.console import Console
 from rich.markup import escape
@@ -39,7 +39,7 @@ from companion.preflight.observations import Observations
 from companion.preflight.px4 import PARAM_ID
 from companion.preflight.rows import Level, Row, refusals
 from companion.sitl_process import SitlProcess
-from companion.terminal import SteadyStream, tell
+from companion.terminal import console_on, tell
 
 GROUPS = {
     "px4": "PX4",
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace, config: FlightConfig, problems: Plans) ->
     if arguments.plan_only:
         return _plan_only(arguments, config, found)
     task = Task(config, arguments.mission, arguments.sitl, arguments.hand, arguments.json)
-    people = Console(file=cast("IO[str]", SteadyStream(sys.stderr)))
+    people = console_on(sys.stderr)
     scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
     try:
         rows = _rows(task, tuple(found), scratch, people)

@@ -17,6 +17,7 @@ from companion.mission.rotor_stop import RotorStop
 from companion.mission.sequencer import Stage
 from companion.mission.settled import SettledEstimate
 from companion.mission.touchdown import Touchdown
+from companion.negative_zero import without_negative_zero
 from companion.safety.monitors import unfused
 from companion.safety.rules import PILOT_TOOK_OVER
 from companion.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, SafetyAction, Severity
@@ -77,7 +78,8 @@ class FlightStages:
         self, i: Inputs, event_id: str, severity: Severity, action: SafetyAction, text: str, t_s: float | None = None
     ) -> None:
         """Something happened; ids are listed in docs/safety.md."""
-        self.events.append(Event(i.t_s if t_s is None else t_s, event_id, severity, action, text))
+        told_s = i.t_s if t_s is None else t_s
+        self.events.append(Event(told_s, event_id, severity, action, without_negative_zero(text)))
 
     def enter(self, stage: Stage, i: Inputs, *, pilot_flies: bool = False, flipped: bool = False) -> None:
         """Go to a stage. Of a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is known already."""

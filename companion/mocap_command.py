@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import math
+import sys
 from collections.abc import AsyncIterator
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ from companion.io.natnet import ServerInfo
 from companion.preflight import hand_judge
 from companion.preflight.hand_test import HandResult
 from companion.preflight.rows import refusals
-from companion.terminal import tell, terminal_console
+from companion.terminal import console_on, tell
 
 if TYPE_CHECKING:
     from companion.devices import SomeEdges
@@ -167,7 +168,7 @@ def _streaming(info: ServerInfo, device: MocapDevice) -> dict[Location, Data]:
 
 def _align(arguments: argparse.Namespace) -> int:
     config = load_flight(arguments.mission, arguments.vehicle, overrides=arguments.overrides)
-    people = Console(stderr=True) if arguments.json else terminal_console()
+    people = console_on(sys.stderr if arguments.json else sys.stdout)
     outcome = run_until_interrupted(_carried(config, people, json=arguments.json))
     if outcome is None:
         tell("companion mocap align: given up; nothing was changed")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from types import TracebackType
-from typing import IO, Self, cast
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from companion.clock import Clock
-from companion.terminal import SteadyStream
+from companion.terminal import console_on
 
 SHOW_AFTER_S = 1.0
 """What is over by then needs no bar."""
@@ -28,7 +28,7 @@ class PlanningProgress:
     def __init__(self, console: Console | None = None, now_s: Clock = time.monotonic) -> None:
         self._now_s = now_s
         self._start_s = now_s()
-        console = console or Console(file=cast("IO[str]", SteadyStream(sys.stderr)))
+        console = console or console_on(sys.stderr)
         self._visible = console.is_terminal
         self._shown = False
         self._progress = Progress(

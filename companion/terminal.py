@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.mission.sequencer import Stage
+from companion.negative_zero import without_negative_zero
 from companion.preflight.rows import Level, Row
 from companion.status import Message
 
@@ -51,9 +52,22 @@ class SteadyStream:
             os.dup2(nowhere.fileno(), self._stream.fileno())
 
 
+class _PlainNumbers(SteadyStream):
+    """A steady stream for people: it prints no negative zero."""
+
+    def write(self, text: str) -> int:
+        """Write the text without negative zeros."""
+        return super().write(without_negative_zero(text))
+
+
+def console_on(stream: TextIO) -> Console:
+    """Return a console for people on a stream whose reader may go away."""
+    return Console(file=cast("IO[str]", _PlainNumbers(stream)))
+
+
 def terminal_console() -> Console:
     """The console on standard output."""
-    return Console(file=cast("IO[str]", SteadyStream(sys.stdout)))
+    return console_on(sys.stdout)
 
 
 def tell(text: object) -> None:

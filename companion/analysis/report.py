@@ -155,7 +155,7 @@ def _rows(rows: Iterable[tuple[str, object]]) -> str:
 
 
 def _number(value: float | None, digits: int, unit: str = "") -> str:
-    return "–" if value is None else f"{value:.{digits}f}{unit}"
+    return "–" if value is None else f"{value:z.{digits}f}{unit}"
 
 
 def _start(log: FlightLog) -> str:

@@ -142,19 +142,23 @@ def _figures(comparison: Comparison) -> str:
 
 def _figure(figure: Figure, n: int) -> str:
     value, difference, first = figure.values[n], figure.differences[n], figure.values[0]
-    text = "–" if value is None else f"{value:.{figure.digits}f}"
+    text = "–" if value is None else f"{value:z.{figure.digits}f}"
     if n == 0:
         return f"<td class='n'>{text}</td>"
     if difference is None or first is None:
         return f"<td class='n'>{text}<small>–</small></td>"
-    told = f"{difference:+.{figure.digits}f}"
+    told = f"{difference:+z.{figure.digits}f}"
     if float(told) == 0:
         told = "0" if difference == 0 else "≈ 0"
     elif first:
         ratio = (first + difference) / first
         # Thousands of percent, or those of a figure that changed its sign, say nothing.
         told += (
-            f" ({ratio:.0f}\u00a0times)" if ratio >= 10 else f" ({100 * (ratio - 1):+.0f}\u00a0%)" if ratio >= 0 else ""
+            f" ({ratio:.0f}\u00a0times)"
+            if ratio >= 10
+            else f" ({100 * (ratio - 1):+z.0f}\u00a0%)"
+            if ratio >= 0
+            else ""
         )
     verdict = figure.verdicts[n]
     marked = f" <span class='{verdict}'>{verdict}</span>" if verdict else ""
@@ -173,7 +177,7 @@ def _events(comparison: Comparison) -> str:
     if not events:
         return "<p class='sub'>None.</p>"
     rows = [
-        f"<tr class='{escape(event['severity'])}'><td class='n'>{t:+.2f}</td><td class='n'>{float(event['mission_t_s']):.2f}</td>"
+        f"<tr class='{escape(event['severity'])}'><td class='n'>{t:+z.2f}</td><td class='n'>{float(event['mission_t_s']):.2f}</td>"
         f"<td>{_line(n)}{comparison.flights[n].letter}</td><td>{escape(event['id'])}</td><td>{escape(event['severity'])}</td>"
         f"<td>{escape(event['action'])}</td><td>{escape(event['text'])}</td></tr>"
         for t, n, event in events

@@ -9,7 +9,7 @@ import sys
 import termios
 import tty
 from collections.abc import Iterator, Mapping, Sequence
-from typing import IO, Self, cast
+from typing import Self
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,15 +18,14 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.preflight.rows import Level, Row
-from companion.terminal import SteadyStream
+from companion.terminal import console_on
 
 _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 
 
 def people_console(json: bool) -> Console:
     """Where people are told: standard output, or standard error when that is for a script."""
-    stream = SteadyStream(sys.stderr if json else sys.stdout)
-    console = Console(file=cast("IO[str]", stream))
+    console = console_on(sys.stderr if json else sys.stdout)
     if not console.is_terminal:
         console.width = max(console.width, 132)
     return console

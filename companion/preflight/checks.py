@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from companion.negative_zero import without_negative_zero
 from companion.preflight.rows import Level, Row
 
 
@@ -26,15 +27,19 @@ class Check:
 
     def good(self, read: str, wanted: str = "") -> Row:
         """It is as it must be."""
-        return Row(self.id, self.title, True, read, wanted, self.why, "", self._level)
+        return self._row(True, read, wanted, "", self._level)
 
     def bad(self, read: str, wanted: str, fix: str) -> Row:
         """It is not: the machine does not lift (or, of a check that `warns`, people decide)."""
-        return Row(self.id, self.title, False, read, wanted, self.why, fix, self._level)
+        return self._row(False, read, wanted, fix, self._level)
 
     def doubtful(self, read: str, wanted: str, fix: str) -> Row:
         """It is not, but one can fly with it: people decide."""
-        return Row(self.id, self.title, False, read, wanted, self.why, fix, Level.WARN)
+        return self._row(False, read, wanted, fix, Level.WARN)
+
+    def _row(self, ok: bool, read: str, wanted: str, fix: str, level: Level) -> Row:
+        plain = without_negative_zero
+        return Row(self.id, self.title, ok, plain(read), plain(wanted), self.why, plain(fix), level)
 
     @property
     def _level(self) -> Level:

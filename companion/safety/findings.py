@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Safety
+from companion.negative_zero import without_negative_zero
 from companion.safety.rules import BY_PEOPLE, REATTACHED, RULES, Rule
 from companion.types import ControlLog, Event, SafetyAction, Severity, TetherState
 
@@ -107,7 +108,8 @@ class Findings:
                 self._told[id_] = (action, max(told[1], t_s), found)
             elif t_s - began_s >= self._hold_s[id_]:
                 self._told[id_] = (action, t_s if rule.clears else math.inf, found)
-                events.append(Event(t_s, id_, _severity(rule, action, airborne), action, text.format(*values)))
+                words = without_negative_zero(text.format(*values))
+                events.append(Event(t_s, id_, _severity(rule, action, airborne), action, words))
         self._drop_gone(t_s)
         return tuple(events)
 

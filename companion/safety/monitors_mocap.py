@@ -123,7 +123,8 @@ class MocapMonitor:
         self._frame, self._frame_awake_s = pose, awake_s
         self._window_frames += 1
         self._streams.update(pose.frame_number, awake_s)
-        if gone_s > self._s.mocap_timeout_s:  # the gap was reported as lost; a rate over it says nothing about this stream
+        # The gap was reported as lost; a rate over it says nothing about this stream.
+        if gone_s > self._s.mocap_timeout_s:
             self._window_awake_s = self._rate_hz = None
         self.repeats = (
             before is not None
