@@ -212,7 +212,8 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
     if summary.get("payload_kg") is not None:
         facts.add_row("payload", f"{summary['payload_kg']:g} kg (known to the simulated world only)")
     catch = summary.get("catch_t_s")
-    facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s")
+    doubt = "" if summary.get("catch_confirmed") is not False else ", not confirmed: the flight ended too soon after it"
+    facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
     loop = summary.get("loop") or {}
     if loop.get("ticks"):
         late = loop["lateness_ms"]

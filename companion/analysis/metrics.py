@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.analysis.log import Array, FlightLog
+from companion.control.sensing import CatchDetector
 from companion.frames import quat_rotate
 from companion.types import PhaseKind
 
@@ -40,7 +41,28 @@ def catch_index(log: FlightLog) -> int | None:
     """Tick (position in the log) of the catch: the one at the time of the first event "catch".
 
     A detector needs some time to be sure; it may date its event back to the contact, so that the kick counts as after the catch.
+    Without such an event it is the tick of an unconfirmed catch (`unconfirmed_catch_index`). None if nothing was felt.
     """
+    confirmed = _confirmed_catch_index(log)
+    return confirmed if confirmed is not None else unconfirmed_catch_index(log)
+
+
+def unconfirmed_catch_index(log: FlightLog) -> int | None:
+    """Tick of a blow with a pull after it that the flight was not given the time to confirm: it was killed, or left its course.
+
+    The forces in the log go through the flight's own detector once more. None if a catch was confirmed, or none was felt.
+    """
+    if _confirmed_catch_index(log) is not None:
+        return None
+    detector = CatchDetector()
+    for outputs in log.outputs:
+        if outputs.phase_kind is PhaseKind.FLIGHT and outputs.control is not None:
+            detector.update(outputs.t_s, outputs.control.force_ext_world_n)
+    felt_s = detector.unconfirmed_s
+    return None if felt_s is None else int(np.searchsorted(log.columns.t_s, felt_s))
+
+
+def _confirmed_catch_index(log: FlightLog) -> int | None:
     for k, outputs in enumerate(log.outputs):
         for event in outputs.events:
             if event.id == "catch":

@@ -110,6 +110,11 @@ def _results(summary: dict[str, Any], stride: int) -> str:
     flight = _rows(
         [
             ("catch at", _number(summary["catch_t_s"], 2, " s")),
+            *(
+                [("catch confirmed", "no, the flight ended too soon after it")]
+                if summary.get("catch_confirmed") is False
+                else []
+            ),
             ("final height error", _number(summary["final_e_z_m"], 3, " m")),
             ("impedance error, position", _number(summary["impedance_error"]["position_n"], 2, " N")),
             ("impedance error, arm", _number(summary["impedance_error"]["arm_nm"], 3, " N m")),

@@ -32,6 +32,7 @@ def empty_summary(
         "preset": preset,
         "payload_kg": payload_kg,
         "catch_t_s": None,
+        "catch_confirmed": None,
         "rms": {"pre": _rms(_NO_RMS), "post": _rms(_NO_RMS)},
         "impedance_error": {"position_n": None, "arm_nm": None},
         "final_e_z_m": None,
@@ -84,6 +85,7 @@ def summarise(
     position_n, arm_nm = metrics.impedance_error(log)
     summary.update(
         catch_t_s=None if caught is None else log.outputs[caught].mission_t_s,
+        catch_confirmed=None if caught is None else metrics.unconfirmed_catch_index(log) is None,
         rms={"pre": _rms(metrics.tracking_rms(log, pre)), "post": _rms(metrics.tracking_rms(log, post))},
         impedance_error={"position_n": position_n, "arm_nm": arm_nm},
         final_e_z_m=metrics.final_e_z_m(log),

@@ -111,6 +111,13 @@ class CatchDetector:
         self._blow_s = None
         return False
 
+    @property
+    def unconfirmed_s(self) -> float | None:
+        """Time of a blow that is followed by a downward pull so far, but not yet for `PULL_TIME_S`; None if there is none."""
+        if self.caught_s is not None or not self._samples or self._pull / self._samples >= -self.PULL_N:
+            return None
+        return self._blow_s
+
     def left(self, t_s: float, force_world_n: Vec3 | None, acceleration_z_m_s2: float) -> bool:
         """True in the one tick in which it becomes certain that the payload has left the net; the next catch may come.
 
