@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -48,6 +50,23 @@ def write_text(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise LaunchError(f"{path}: cannot be written: {error.strerror}; choose another --out") from None
+
+
+@contextlib.contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """Make a folder for temporary files, yield its absolute path, and remove it with all that children left in it.
+
+    Raises:
+        LaunchError: it cannot be made.
+    """
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise LaunchError(f"{path}: cannot be made: {error.strerror}; choose another --out") from None
+    try:
+        yield path.absolute()
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def how_it_ended(code: int) -> str:

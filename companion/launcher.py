@@ -21,7 +21,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from companion import status
-from companion.children import LaunchError, holds_traceback, how_it_ended, last_line, terminate, write_text
+from companion.children import (
+    LaunchError,
+    holds_traceback,
+    how_it_ended,
+    last_line,
+    scratch_folder,
+    terminate,
+    write_text,
+)
 from companion.config.loader import FlightConfig
 from companion.cores import keep_off
 from companion.exit_codes import EXIT_CODES
@@ -38,6 +46,8 @@ and it may be dead itself. Killed, the flight process leaves PX4 to its own offb
 GUARDIAN_LEAVE_TIMEOUT_S = 5.0
 """After the flight process is gone: a guardian that is not needed leaves at once."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
+TMP_FOLDER = "tmp"
+"""In the flight's folder: TMPDIR of the flight process. MAVSDK keeps folders in it, and leaves them there when it is killed."""
 
 OnMessage = Callable[[status.Message], None]
 Sitl = Literal["stub", "px4"]
@@ -130,7 +140,8 @@ class Launcher:
                 config = with_devices(config, sitl.devices(self._on_world_message, lambda: self._stop_asked))
             path = self._out / "config.json"
             write_text(path, config.model_dump_json(indent=1))
-            outcome = Outcome.ABORTED if self._stop_asked else self._fly(path, sitl)
+            with scratch_folder(self._out / TMP_FOLDER) as tmp:
+                outcome = Outcome.ABORTED if self._stop_asked else self._fly(path, sitl, tmp)
         except LaunchError:
             if not self._stop_asked:
                 raise
@@ -150,7 +161,7 @@ class Launcher:
     def _on_world_message(self, message: dict[str, Any]) -> None:
         self._on_message({**message, "source": "sitl"})
 
-    def _fly(self, config_path: Path, sitl: SitlProcess | None) -> Outcome:
+    def _fly(self, config_path: Path, sitl: SitlProcess | None, tmp: Path) -> Outcome:
         log_path = self._out / "flight.log"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         beats_out, beats_in = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -171,7 +182,7 @@ class Launcher:
                     stderr=log,
                     pass_fds=(theirs.fileno(), beats_out.fileno(), *shared),
                     start_new_session=True,
-                    env={**os.environ, **(sitl.flight_environment if sitl is not None else {})},
+                    env={**os.environ, "TMPDIR": str(tmp), **(sitl.flight_environment if sitl is not None else {})},
                 )
             self._channel = ours
             try:

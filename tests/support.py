@@ -148,14 +148,10 @@ class Sandbox:
         assert len(found) == 1, (module, self.survivors())
         return found[0]
 
-    def assert_nobody_left(self, within_s: float = 0.0, *, but_files: str = "") -> None:
-        """No process that was started here runs any more, after `within_s` at the latest, and TMPDIR is empty.
-
-        Args:
-            but_files: pattern of names that may be left in TMPDIR, by programs that were killed.
-        """
+    def assert_nobody_left(self, within_s: float = 0.0) -> None:
+        """No process that was started here runs any more, after `within_s` at the latest, and TMPDIR is empty."""
         wait_until(lambda: not self.survivors(), lambda: f"left behind: {self.survivors()}", within_s)
-        left = [path.name for path in self.tmp.iterdir() if not path.match(but_files or "-")]
+        left = [path.name for path in self.tmp.iterdir()]
         assert not left, f"files left in TMPDIR: {left}"
 
     def end_survivors(self) -> None:

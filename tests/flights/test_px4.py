@@ -32,7 +32,6 @@ REAL = [
     ),
 ]
 STUB = [pytest.mark.flight]
-OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
 E_P_MAX_M = 0.02
 """After the catch of 0.2 kg; measured: 7 mm on the stub, 9 to 13 mm on PX4 1.16.1."""
 E_Q_MAX_DEG = 2.0
@@ -102,7 +101,7 @@ def test_the_catch(sandbox: Sandbox, autopilot: str) -> None:
 def test_the_guardian_lands_after_the_catch(sandbox: Sandbox, autopilot: str, kind: str) -> None:
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
     ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
     ids = event_ids(read_summary(sandbox.cwd / "out"))
     assert ids[-4:] == ["guardian_took_over", "guardian_land", "guardian_touchdown", "guardian_landed"]
@@ -144,7 +143,7 @@ def test_through_mavsdks_offboard_plugin_the_guardian_lands_as_well(
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
     path = "vehicle.devices.autopilot.setpoint_path=offboard"
     ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault, path)
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
     assert event_ids(read_summary(sandbox.cwd / "out"))[-3:] == GUARDIAN_LANDS
     assert_landed_where_it_was(sandbox)
@@ -174,7 +173,7 @@ def test_a_dead_link_is_landed_by_px4_itself(sandbox: Sandbox, autopilot: str) -
     """Nothing gets through: the offboard-loss failsafe."""
     fault = f"world.faults=[{{kind: link_loss, t_s: {HOVERS_S}}}]"
     ended = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "out", "--set", fault)
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
     assert ended.code in (EXIT_ABORTED, EXIT_LOST), (ended.out, ended.err)  # PX4 lands without vision here
     world = witness(sandbox)
     assert "LAND" in [mode for _, mode, _ in world["modes"]]
@@ -187,7 +186,7 @@ def test_a_rotor_lost_in_the_air_is_a_flip_and_the_others_are_stopped(sandbox: S
     # High enough to turn over before it is down.
     high = set_options(**{"mission.phases[0].height_m": 1.6, "mission.phases[0].duration_s": 5.0})
     ended = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "out", "--set", fault, *high)
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
     assert ended.code == EXIT_LOST, (ended.out, ended.err)
     summary = read_summary(sandbox.cwd / "out")
     ids = event_ids(summary)
@@ -208,7 +207,7 @@ def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed(sandbox: Sandbo
     slow = ("--set", "world.px4_params={LNDMC_TRIG_TIME: 7.5}")
     fault = "world.faults=[{kind: pilot_takeover, t_s: 8.5, size: 5.0}]"
     ended = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "out", *slow, "--set", fault)
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
     ids = event_ids(read_summary(sandbox.cwd / "out"))
     assert ids.index("touchdown") < ids.index("pilot_took_over")
@@ -225,7 +224,7 @@ def test_a_px4_that_dies_in_the_air_is_one_clear_line(sandbox: Sandbox, autopilo
         assert len(px4) == 1
         os.kill(px4[0], signal.SIGKILL)
         ended = running.end()
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
     assert ended.code != EXIT_OK
     log = sandbox.cwd / "out" / PX4_FOLDER / "px4.log"
     assert re.search(rf"PX4: px4 -i \d was ended by SIGKILL; see {re.escape(str(log))}", ended.err), ended.err

@@ -17,7 +17,6 @@ from companion.exit_codes import EXIT_ABORTED, EXIT_REFUSED
 from companion.types import AutopilotRequest
 from tests.support import HOVER, Running, Sandbox, World, read_summary, sandbox_in, set_options, wait_until
 
-OF_KILLED_MAVSDK = "mavsdk-component-metadata-*"
 LONG = set_options(
     **{"mission.phases[1].duration_s": 40.0, "mission.phases[0].height_m": 1.6, "mission.phases[0].duration_s": 5.0}
 )
@@ -93,7 +92,7 @@ def test_started_again_in_the_air_it_lands_what_it_finds(sandbox: Sandbox, arm_o
         assert any(i.mocap is not None for i in log.inputs) and all(o.mocap_trusted for o in log.outputs)
         assert world.armings == 1 and not world.crashes
         wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
 
 
 @pytest.mark.flight
@@ -107,7 +106,7 @@ def test_left_alone_px4_lands_by_itself_and_the_next_companion_judges_it_as_any_
         ended = sandbox.run("fly", HOVER, "--out", "second", *elsewhere, *world.addresses())
         assert ended.code == EXIT_REFUSED, (ended.out, ended.err)
         assert world.armings == 1
-    sandbox.assert_nobody_left(but_files=OF_KILLED_MAVSDK)
+    sandbox.assert_nobody_left()
 
 
 def at_rest(world: World) -> bool:
