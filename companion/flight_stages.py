@@ -315,12 +315,12 @@ class FlightStages:
             reference_z = self.course.reference(i.t_s).position_world_m[2]
             share, landed = self._pilot.thrust_share, seq.on_ground(i.status)
             if self._touchdown.update(i.t_s, vehicle, i.mocap, reference_z, share, landed):
-                self.tell(i, "touchdown", Severity.INFO, SafetyAction.NOMINAL, "touch-down")
+                self.tell(i, "touchdown", Severity.INFO, SafetyAction.NOMINAL, "touchdown")
                 self.finish(Outcome.COMPLETED)
                 self.enter(Stage.TOUCHDOWN, i)
                 return
         if self.course.left_s(i.t_s) < -NO_TOUCHDOWN_S:
-            self.tell(i, "no_touchdown", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "no touch-down was felt")
+            self.tell(i, "no_touchdown", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "no touchdown was felt")
             self.finish(Outcome.ABORTED)
             self.enter(Stage.AUTOPILOT_LAND, i)
 
@@ -369,7 +369,7 @@ class FlightStages:
         step = self._landing.step(i)
         self.zero_thrust = step.zero_thrust
         if step.text is not None:
-            severity = Severity.INFO if step.text == "touch-down" else Severity.CRITICAL
+            severity = Severity.INFO if step.text == "touchdown" else Severity.CRITICAL
             self.tell(i, "autopilot_landing", severity, SafetyAction.AUTOPILOT_LAND, step.text)
         if step.ended:
             if not step.landed and self.outcome is not Outcome.CRASHED:

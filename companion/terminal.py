@@ -107,6 +107,8 @@ class FlightDisplay:
         self._console = console
         self._title = title
         self._phase = ""
+        self._event = ""
+        """Text of the newest event: a phase that begins with an event of the same name has its line."""
         self._progress = Progress(
             TextColumn("[bold]{task.description:<22}"),
             BarColumn(bar_width=28),
@@ -135,8 +137,9 @@ class FlightDisplay:
             )
             if message["phase"] != self._phase:
                 self._phase = message["phase"]
-                if not self._console.is_terminal:
+                if not self._console.is_terminal and self._phase != self._event:
                     self._console.print(f"  t {message['mission_t_s']:6.2f} s  {escape(self._phase)}")
+                self._event = ""
                 if self._phase == Stage.READY.value:
                     self.say("everything is ready; take off with: companion command start (Ctrl-C stands down)")
         elif kind == "event" and message.get("source") == "sitl":
@@ -145,6 +148,7 @@ class FlightDisplay:
                     "", f"the payload was {message['kind']}" if message["kind"] == "missed" else "crashed", "red"
                 )
         elif kind == "event":
+            self._event = message["text"]
             self._line(f"t {message['t_s']:6.2f} s", message["text"], _SEVERITY_STYLE[message["severity"]])
         elif kind == "preflight_progress":
             if not self._console.is_terminal and self._phase != "preflight":

@@ -39,7 +39,7 @@ REPEAT_S = 0.25
 """A command is given again until the status shows it done."""
 ZERO_THRUST_PERIOD_S = 0.02
 LINK_FRESH_S = 2.5
-TOUCH_DOWN = "touch-down"
+TOUCH_DOWN = "touchdown"
 """What the landing says when it feels the floor."""
 DISARMED_AFTER_S = 1.5
 """PX4 says once a second whether it is armed; an older word does not count."""

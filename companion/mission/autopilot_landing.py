@@ -105,7 +105,7 @@ class AutopilotLanding:
             return LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False, text)
         if self._touched_s is None and heard and self._touches(i):
             self._touched_s = i.t_s
-            return LandingStep(AutopilotRequest.LAND, True, False, False, "touch-down")
+            return LandingStep(AutopilotRequest.LAND, True, False, False, "touchdown")
         if self._touched_s is None:
             done = on_ground(i.status) and elapsed > 1.0 and self._stop.may_disarm
             return LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND, False, False, False)
