@@ -32,6 +32,7 @@ from companion.children import (
 )
 from companion.config.loader import FlightConfig
 from companion.cores import keep_off
+from companion.crowding import Crowding
 from companion.exit_codes import EXIT_CODES
 from companion.guardian.beat import HANGS
 from companion.guardian_process import GuardianProcess
@@ -113,6 +114,7 @@ class Launcher:
         self._failures: list[str] = []
         self._recorder_pid: int | None = None
         self._guardian: GuardianProcess | None = None
+        self._crowding = Crowding({})
         self._flying = False
         """Ticking, and not over yet: messages come ten times a second."""
 
@@ -189,6 +191,11 @@ class Launcher:
                 write_text(self._out / "flight.pid", str(process.pid))
                 if sitl is not None:
                     sitl.tell_flight(process.pid)
+                pids = {
+                    "flight process": process.pid,
+                    **({"simulated world": sitl.process.pid} if sitl is not None else {}),
+                }
+                self._crowding = Crowding(pids)
                 self._guardian = guardian = GuardianProcess(config_path, self._out, process.pid, beats_in, shared)
                 if self._stop_asked:
                     self.ask_to_land()
@@ -256,7 +263,8 @@ class Launcher:
                 for tick, text in self._grave
                 if tick == self._grave[0][0]
             ]
-        return (*reasons, *self._failures)
+        busy = () if self._crowding.line is None else (self._crowding.line,)
+        return (*reasons, *busy, *self._failures)
 
     def _watch(
         self,
@@ -280,7 +288,9 @@ class Launcher:
                     return
             for message in guardian.listen():
                 self._on_message(message)
+                self._look_for_crowding(message)
             now_s = time.monotonic()
+            self._crowding.sample(now_s)
             if channel in readable:
                 heard_s = now_s
                 flight_open = self._hear(channel)
@@ -327,6 +337,17 @@ class Launcher:
         elif kind == "px4":
             self._px4.append(message["text"])
         self._on_message(message)
+        self._look_for_crowding(message)
+
+    def _look_for_crowding(self, message: status.Message) -> None:
+        """What happened may be the doing of other programs: then the operator is told so beside it."""
+        text = self._crowding.take(message, time.monotonic())
+        if text is None:
+            return
+        self._on_message({"type": "busy", "text": text})
+        stamps = {"t_s": message.get("flight_t_s", 0.0), "mission_t_s": message.get("t_s", 0.0)}
+        about = {"id": "computer_busy", "severity": Severity.WARNING.value, "action": SafetyAction.WARN.value}
+        self._events.append({**stamps, **about, "text": text})
 
     def _await_recorder(self) -> None:
         """The recorder closes the log after a flight process that was killed; it is no child of ours, so look at its pid."""

@@ -165,6 +165,8 @@ class FlightDisplay:
             style = "cyan" if message["accepted"] else "yellow"
             words = f"{message['operator']} commanded {message['command']}: {message['text']}"
             self._line(f"t {message['t_s']:6.2f} s", words, style)
+        elif kind == "busy":
+            self._line("computer", message["text"], "yellow")
         elif kind == "ground":
             self._line("ground", message["text"], "cyan")
 
