@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.preflight.rows import Level
+from companion.types import SafetyAction, Severity
 
 WAIT_MAX = 0.15
 """Share of the time: a process that waits longer than this for a core answers too late."""
@@ -20,12 +21,12 @@ WAIT_LATE_MAX, LATE_S = 0.05, 0.005
 """The same where ticks come a whole period late."""
 WINDOW_S, SAMPLE_S = 3.0, 0.5
 CAUSED_BY_LATENESS = frozenset({
-    "mocap_lost", "mocap_too_late", "vehicle_state_lost", "link_late", "heartbeat_lost", "offboard_left", "arm_lost",
-    "arm_read_failures", "force_lost", "loop_late", "loop_stalled", "tracking_error", "guardian_took_over",
+    "mocap_lost", "mocap_too_late", "vehicle_state_lost", "heartbeat_lost", "offboard_left", "arm_lost",
+    "force_lost", "loop_stalled", "tracking_error", "guardian_took_over",
     "mocap.rate", "mocap.latency", "mocap.lost", "px4.heartbeat", "px4.rates", "px4.lag", "px4.vision", "px4.steady",
     "arm.reads", "force.rate",
 })  # fmt: skip
-"""Events and rows of the preflight that a busy computer brings about, by id."""
+"""Landings and refusals that a busy computer may bring about: ids of events and of rows of the preflight."""
 ADVICE = "close other programs, or permit real-time priority: docs/raspberry-pi.md, Real time"
 
 Waited = Mapping[int, float]
@@ -124,7 +125,8 @@ class Crowding:
 
 def _late(message: Mapping[str, Any]) -> bool:
     if message.get("type") == "event":
-        return message["id"] in CAUSED_BY_LATENESS
+        lands = SafetyAction(message["action"]).rank >= SafetyAction.LAND.rank
+        return message["id"] in CAUSED_BY_LATENESS and (lands or message["severity"] == Severity.CRITICAL.value)
     if message.get("type") == "preflight":
         refused = (row for row in message["rows"] if not row["ok"] and row["level"] == Level.REFUSE.value)
         return any(row["id"] in CAUSED_BY_LATENESS for row in refused)

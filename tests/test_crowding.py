@@ -53,8 +53,7 @@ def test_every_id_that_lateness_may_cause_exists() -> None:
     assert known >= CAUSED_BY_LATENESS
 
 
-LOST = {"type": "event", "id": "arm_lost", "t_s": 0.0, "flight_t_s": 1.0}
-LAND = {"type": "event", "id": "operator_land", "t_s": 0.0, "flight_t_s": 1.0}
+LOST = {"type": "event", "id": "arm_lost", "action": "land", "severity": "critical"}
 ROW: dict[str, Any] = {"id": "arm.reads", "ok": False, "level": "refuse"}
 
 
@@ -62,7 +61,9 @@ ROW: dict[str, Any] = {"id": "arm.reads", "ok": False, "level": "refuse"}
     ("message", "judged"),
     [
         (LOST, True),
-        (LAND, False),
+        ({**LOST, "id": "guardian_took_over", "action": "autopilot_land"}, True),
+        ({**LOST, "action": "warn", "severity": "warning"}, False),
+        ({**LOST, "id": "operator_land"}, False),
         ({"type": "preflight", "rows": [ROW]}, True),
         ({"type": "preflight", "rows": [{**ROW, "level": "warn"}, {**ROW, "ok": True}]}, False),
         ({"type": "preflight", "rows": [{**ROW, "id": "px4.battery"}]}, False),
