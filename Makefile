@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 MINUTES ?= 10
+# Without bytecode each of some hundred processes would compile the project anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install lock fly test lint explore debian bench docs clean
 

@@ -14,6 +14,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 from hypothesis.internal.constants_ast import Constants
 
+from tests.marked import MARKS, files_of
+
 _LOADED_COMPUTER = [HealthCheck.too_slow]
 """Neither this check nor a deadline may fail a test: both measure the computer."""
 settings.register_profile(
@@ -46,6 +48,14 @@ def pytest_configure() -> None:
     if settings.get_current_profile_name() == "test":
         nothing = Constants()
         providers._get_local_constants = lambda: nothing
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse a mark that its test's file does not name: the mark's stage would not collect the test (`tests.marked`)."""
+    for item in items:
+        for mark in MARKS:
+            if item.get_closest_marker(mark) is not None and item.path not in files_of(mark):
+                raise pytest.UsageError(f"{item.nodeid}: write pytest.mark.{mark} into its own file")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -19,12 +19,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.at_a_time import AT_A_TIME
+from tests.marked import TESTS, files_of
 
 _BIN = Path(sys.executable).parent
 _PYTEST = (sys.executable, "-m", "pytest")
 _TOGETHER = {"waiting": "waits", "flights": "flights"}
 """Stages whose number of simultaneous tests depends on the computer, with their names in `tests.at_a_time`."""
 _INTERRUPTED = 130
+_LINE_MAX = 120
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +54,18 @@ class Result:
     """Number of tests by reason."""
 
 
+def _files_of(mark: str) -> Iterable[str]:
+    return (str(path.relative_to(TESTS.parent)) for path in files_of(mark))
+
+
 STAGES = (
     Stage("format", (str(_BIN / "ruff"), "format", "--check", "."), tests=False),
     Stage("lint", (str(_BIN / "ruff"), "check", "."), tests=False),
     Stage("types", (str(_BIN / "mypy"),), tests=False),
     Stage("computing", (*_PYTEST, "-n", "3", "--dist", "worksteal", "-m", "not flight and not waits"), tests=True),
-    Stage("waiting", (*_PYTEST, "--dist", "loadgroup", "-m", "waits"), tests=True),
-    Stage("flights", (*_PYTEST, "--dist", "loadgroup", "-m", "flight and not alone"), tests=True),
-    Stage("alone", (*_PYTEST, "-m", "alone"), tests=True),
+    Stage("waiting", (*_PYTEST, "--dist", "loadgroup", "-m", "waits", *_files_of("waits")), tests=True),
+    Stage("flights", (*_PYTEST, "--dist", "loadgroup", "-m", "flight and not alone", *_files_of("flight")), tests=True),
+    Stage("alone", (*_PYTEST, "-m", "alone", *_files_of("alone")), tests=True),
 )
 """In turn: what checks the text, what computes, what waits for real processes, what flies."""
 
@@ -72,7 +78,8 @@ def _shown(words: Iterable[str]) -> str:
 
 def run(stage: Stage) -> Result:
     """Run one stage; its output goes where ours goes."""
-    print(f"\n=== {stage.name}: {_shown(stage.command)}", flush=True)
+    words = _shown(stage.command)
+    print(f"\n=== {stage.name}: {words if len(words) < _LINE_MAX else f'{words[:_LINE_MAX]} ...'}", flush=True)
     begun_s = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         tally = Path(folder) / "tally.json"
