@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import struct
 from typing import Any
 
@@ -27,6 +28,7 @@ from companion.record import (
     unpack,
     unpack_plain,
 )
+from tests.support import ROOT
 
 RECORDS: list[type] = [
     value for value in vars(types).values() if isinstance(value, type) and dataclasses.is_dataclass(value)
@@ -35,6 +37,17 @@ RECORDS: list[type] = [
 st.register_type_strategy(float, st.floats(allow_nan=False, allow_infinity=False))
 st.register_type_strategy(int, st.integers(-(2**62), 2**62))
 st.register_type_strategy(str, st.text(st.characters(codec="utf-8"), max_size=8))
+
+
+def test_marshal_is_decoded_only_where_the_flight_process_itself_has_written_it() -> None:
+    """Its decoder is not made for data that may be forged, so no packet of a process that faces a network gets there."""
+    package = ROOT / "companion"
+    users = {
+        str(path.relative_to(package))
+        for path in package.rglob("*.py")
+        if re.search(r"\bunpack_plain\(|\bmarshal\.load", path.read_text(encoding="utf-8"))
+    }
+    assert users == {"record.py", "recorder_process.py", "recording/ground_desk.py"}
 
 
 def test_all_records_of_the_types_module_are_covered() -> None:

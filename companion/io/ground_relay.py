@@ -4,9 +4,9 @@ It holds three sockets: one to MAVSDK's second connection (loopback), one to the
 throws away what comes from anywhere else, and the channel to the flight process. A flood from the ground costs this process its
 time, not the flight. It ends when the channel does.
 
-On the channel, `pack_plain` of: to the flight process `{"port": N}` once, or `{"error": text}`; later `{"text": text}`. From it
-`{"vehicle_port": N}` once; later `{"arming": true}` when it asks PX4 to arm, `{"texts": [[severity, text], ...]}`,
-`{"situation": text}`, `{"t_ms": N, "values": {...}}`, `{"bye": true}`.
+On the channel, JSON (`companion.io.ground_channel`): to the flight process `{"port": N}` once, or `{"error": text}`; later
+`{"text": text}`. From it `{"vehicle_port": N}` once; later `{"arming": true}` when it asks PX4 to arm,
+`{"texts": [[severity, text], ...]}`, `{"situation": text}`, `{"t_ms": N, "values": {...}}`, `{"bye": true}`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.io.ground_channel import pack, unpack
 from companion.io.ground_door import Door
 from companion.io.ground_frames import Thinner
 from companion.io.ground_words import COMPONENT, Texts, heartbeat_message, value_messages
-from companion.record import pack_plain, unpack_plain
 
 NICENESS = 10
 CHANNEL_MAX_BYTES = 65_536
@@ -119,7 +119,7 @@ class Relay:
                 return False
             if not data:
                 return False
-            self._take(unpack_plain(data))
+            self._take(unpack(data))
         return True
 
     def _take(self, said: dict[str, Any]) -> None:
@@ -170,7 +170,7 @@ class Relay:
 
     def _tell(self, text: str) -> None:
         with contextlib.suppress(OSError):
-            self._channel.send(pack_plain({"text": text}))
+            self._channel.send(pack({"text": text}))
 
 
 def _received(source: socket.socket) -> list[bytes]:
@@ -211,9 +211,9 @@ def main(argv: list[str] | None = None) -> int:
         try:
             ground.connect((a.host, a.port))
         except OSError as error:
-            channel.send(pack_plain({"error": error.strerror or str(error)}))
+            channel.send(pack({"error": error.strerror or str(error)}))
             return 1
-        channel.send(pack_plain({"port": vehicle.getsockname()[1]}))
+        channel.send(pack({"port": vehicle.getsockname()[1]}))
         door = Door(a.system, while_armed=a.while_armed, console=a.console)
         Relay(channel, vehicle, ground, door, a.system, (a.own[0], a.own[1]), a.name).run()
     return 0

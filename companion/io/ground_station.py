@@ -20,7 +20,7 @@ from typing import Any, Protocol, Self
 from companion.io import ground_words as words
 from companion.io.autopilot import LinkIdentity
 from companion.io.edges import DeviceError
-from companion.record import pack_plain, unpack_plain
+from companion.io.ground_channel import pack, unpack
 from companion.types import AutopilotRequest, Inputs, Outputs
 
 VALUES_EVERY = 50
@@ -31,6 +31,8 @@ _RESOLVE_DEADLINE_S = 5.0
 _START_DEADLINE_S = 10.0
 _END_DEADLINE_S = 2.0
 _MESSAGES_PER_CALL = 8
+_TEXT_MAX = 400
+"""Characters of a line from the relay; what is beyond is cut off."""
 
 
 class Forwarder(Protocol):
@@ -156,7 +158,8 @@ class GroundStation:
             except OSError:
                 data = b""
             if data:
-                self._messages.append(str(unpack_plain(data)["text"]))
+                text = str(unpack(data).get("text"))[:_TEXT_MAX]
+                self._messages.append("".join(c if c.isprintable() else "?" for c in text))
             else:
                 self._gone()
         messages, self._messages = self._messages, []
@@ -187,11 +190,12 @@ class GroundStation:
         except TimeoutError:
             expected = f"the relay to be ready within {_START_DEADLINE_S:g} s"
             raise ground_error(self.address, expected, "silence", "the machine is overloaded; try again") from None
-        answer = unpack_plain(data) if data else {"error": "its end"}
-        if "port" not in answer:
+        answer: dict[str, Any] = unpack(data) if data else {"error": "its end"}
+        relay_port = answer.get("port")
+        if type(relay_port) is not int or not 0 < relay_port <= 65535:
             fix = "give the address of one computer that can be reached from here"
             raise ground_error(self.address, "a relay to it", str(answer.get("error")).lower(), fix)
-        return int(answer["port"])
+        return relay_port
 
     def _spawn(self, ip: str, port: int) -> socket.socket:
         """The channel to the relay, which is starting."""
@@ -225,7 +229,7 @@ class GroundStation:
         if self._channel is None:
             return
         try:
-            self._channel.send(pack_plain(said))
+            self._channel.send(pack(said))
         except BlockingIOError:
             pass  # the relay is held up: these words are lost, the flight is not
         except OSError:

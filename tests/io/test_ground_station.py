@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import marshal
 import os
 import signal
 import socket
@@ -20,12 +22,12 @@ from companion.clock import flight_clock
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight
 from companion.config.vehicle import AutopilotDevice
-from companion.io.autopilot import MavsdkAutopilot
+from companion.io.autopilot import LinkIdentity, MavsdkAutopilot
 from companion.io.edges import DeviceError
+from companion.io.ground_channel import pack, unpack
 from companion.io.ground_frames import UP_BURST, UP_RATE_HZ
 from companion.io.ground_relay import GONE
 from companion.io.ground_station import GroundStation, check_address
-from companion.record import pack_plain, unpack_plain
 from companion.types import (
     AttitudeSetpoint,
     AutopilotRequest,
@@ -363,6 +365,46 @@ def test_a_stopped_relay_holds_nobody_up() -> None:
     asyncio.run(fly())
 
 
+class NoForwarder:
+    """For a station that is not opened."""
+
+    def identity(self) -> LinkIdentity:
+        raise AssertionError
+
+    async def forward_to(self, port: int) -> int:
+        raise AssertionError
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        marshal.dumps({"text": "hello"}, 2),
+        marshal.dumps({"text": "hello"}, 2)[:-3],
+        b"\xff\x00",
+        b"[" * 4000,
+        b"{}",
+        b"[1]",
+        b'{"port": 1}',
+        b'{"text": {"a": NaN}}',
+        b'{"text": "' + b"x" * 4000,
+        json.dumps({"text": "\x1b[2J" + "x" * 3000}).encode(),
+    ],
+    ids=[f"packet {number}" for number in range(10)],
+)
+def test_whatever_the_relay_sends_costs_the_flight_a_line_at_most(packet: bytes) -> None:
+    """The relay faces the network: who takes it over must reach nothing in the flight process."""
+    station = GroundStation("udpout://127.0.0.1:14550", NoForwarder())
+    ours, relay = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, relay:
+        ours.setblocking(False)
+        station._channel = ours
+        relay.send(packet)
+        relay.send(pack({"text": "messages refused: 3 HEARTBEAT"}))
+        *lines, last = station.take_messages()
+        assert len(lines) == 1 and len(lines[0]) <= 400 and lines[0] != "hello" and lines[0].isprintable()
+        assert last == "messages refused: 3 HEARTBEAT"
+
+
 @pytest.mark.parametrize(("bye", "texts"), [(False, 1), (True, 0)])
 def test_when_the_flight_process_dies_the_ground_is_told_and_the_relay_ends(bye: bool, texts: int) -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -374,10 +416,10 @@ def test_when_the_flight_process_dies_the_ground_is_told_and_the_relay_ends(bye:
             relay = subprocess.Popen(command, pass_fds=(theirs.fileno(),))
         try:
             ours.settimeout(DEADLINE_S)
-            assert "port" in unpack_plain(ours.recv(4096))
+            assert "port" in unpack(ours.recv(4096))
             ground.wait_for("HEARTBEAT", 191)
             if bye:
-                ours.send(pack_plain({"bye": True}))
+                ours.send(pack({"bye": True}))
             ours.close()
             assert relay.wait(DEADLINE_S) == 0
         finally:
