@@ -19,9 +19,12 @@ from pathlib import Path
 from companion.installing.plan import PERFORMANCE, SERVICE, Command, Plan
 from companion.installing.record import PATH, Entry, Record, inside, load, save
 from companion.installing.state import InstallError, State, put, read
+from companion.installing.texts import STATE
 
 GROUP = "dialout"
 COMMAND_TIMEOUT_S = 60.0
+HOME = f"/var/lib/{STATE}"
+"""Of the service's user: flight logs, and in .config the operators' keys that the vehicle has made."""
 _TOOLS = "/usr/sbin:/sbin:/usr/bin:/bin"
 
 Tell = Callable[[str], None]
@@ -184,6 +187,7 @@ def undo(root: Path, tell: Tell) -> bool:
         for path in reversed(back):
             put(inside(root, path), record.entries[path].before)
             tell(f"{'took away' if record.entries[path].before.absent else 'put back'} {path}")
+        _disown(root, record, tell)
         if live:
             _remove_users(record, tell)
             for words in (("udevadm", "control", "--reload"), ("systemctl", "daemon-reload")):
@@ -194,6 +198,42 @@ def undo(root: Path, tell: Tell) -> bool:
     for folder in _remove_folders(root, record.folders):
         tell(f"kept {folder}: something else is in it")
     return True
+
+
+def _disown(root: Path, record: Record, tell: Tell) -> None:
+    """Leave nothing to the id of a user who is deleted: the system may give that id to somebody else.
+
+    The service's keys are deleted, its logs belong to whoever undoes the installation (root) from now on. A home that belongs to a
+    user who stays is not touched.
+
+    Raises:
+        OSError: a file cannot be deleted or given to another owner.
+    """
+    home = inside(root, HOME)
+    if not record.users or home.is_symlink() or not home.is_dir():
+        return
+    if _name_of(home.stat().st_uid) not in (None, *record.users):
+        return
+    config = home / ".config"
+    if config.is_symlink():
+        config.unlink()
+    elif config.exists():
+        shutil.rmtree(config)
+        tell(f"took away {HOME}/.config: the service's keys")
+    owner, group = os.geteuid(), os.getegid()
+    for _, folders, files, folder_fd in os.fwalk(
+        home
+    ):  # follows no symbolic link: what is in there was written by the service
+        os.fchown(folder_fd, owner, group)
+        for name in (*folders, *files):
+            os.chown(name, owner, group, dir_fd=folder_fd, follow_symlinks=False)
+
+
+def _name_of(user_id: int) -> str | None:
+    try:
+        return pwd.getpwuid(user_id).pw_name
+    except KeyError:
+        return None
 
 
 def _remove_users(record: Record, tell: Tell) -> None:

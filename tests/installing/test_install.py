@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import pwd
 import shutil
 import stat
 from pathlib import Path
@@ -220,6 +221,29 @@ def test_a_record_that_others_could_write_is_not_trusted(root: Path, capsys: pyt
     (root / PATH.lstrip("/")).write_text("{}")
     assert undo(root) == EXIT_REFUSED
     assert "no record" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("goes", [True, False], ids=["the user is deleted", "the user stays"])
+def test_keys_go_with_the_user_who_is_deleted_and_stay_with_one_who_stays(
+    root: Path, tmp_path: Path, goes: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A user id that is free is given to the next user: no key of an operator may wait for that one."""
+    assert install(root) == EXIT_OK
+    path = root / PATH.lstrip("/")
+    record = json.loads(path.read_text())
+    record["users"] = [pwd.getpwuid(os.geteuid()).pw_name] if goes else []
+    path.write_text(json.dumps(record))
+    home, others = root / apply.HOME.lstrip("/"), tmp_path / "others"
+    keys, log = home / ".config/companion/operators.yaml", home / "flights/1/flight.mcap"
+    for file in (keys, log, others / "secret"):
+        file.parent.mkdir(parents=True)
+        file.write_text("key")
+    (home / ".config/elsewhere").symlink_to(others)
+    (home / "flights/elsewhere").symlink_to(others)
+    assert undo(root) == EXIT_OK
+    assert keys.exists() is not goes
+    assert log.exists() and (others / "secret").exists()
+    assert ("the service's keys" in capsys.readouterr().out) is goes
 
 
 def test_undo_without_an_installation_says_so(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
