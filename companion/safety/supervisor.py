@@ -55,10 +55,13 @@ def update(
         times: how long rungs may last.
         standing: what the vehicle must hold for now, in words; None: nothing, and people may let it go on.
     """
+    held = (
+        state.action is SafetyAction.HOLD
+    )  # nobody ends a hold that begins in this very tick: it was not there when they spoke
     for event in events:
         if event.action.rank > state.action.rank:
             state = SupervisorState(event.action, event.id, event.t_s)
-        elif event.id == RESUME and state.action is SafetyAction.HOLD and standing is None:
+        elif event.id == RESUME and held and state.action is SafetyAction.HOLD and standing is None:
             state = SupervisorState(SafetyAction.NOMINAL, event.id, event.t_s)
     if state.action is SafetyAction.HOLD and t_s - state.since_s > times.hold_max_s:
         return SupervisorState(SafetyAction.LAND, HOLD_EXPIRED, t_s)

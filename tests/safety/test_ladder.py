@@ -72,6 +72,11 @@ def test_going_on_in_the_tick_of_something_graver_changes_nothing() -> None:
         assert update(state, events, 2.0, TIMES).action is SafetyAction.LAND
 
 
+def test_a_resume_does_not_end_a_hold_that_begins_in_the_same_tick() -> None:
+    for events in itertools.permutations([event(RESUME, SafetyAction.NOMINAL), event("too_fast", SafetyAction.HOLD)]):
+        assert update(SupervisorState(), events, 2.0, TIMES).action is SafetyAction.HOLD
+
+
 @pytest.mark.parametrize("now", SafetyAction)
 def test_nobody_lets_it_go_on_while_something_stands(now: SafetyAction) -> None:
     state = SupervisorState(now, "before", 1.0)
