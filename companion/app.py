@@ -99,10 +99,10 @@ class Flight:
             if arm is not None:
                 arm.begin_read(ticker.due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
             now = await ticker.next()
-            command, asked = self._operator.next()
-            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, command)
-            if asked is not None:
-                self._answer(asked, before, outputs)
+            turn = self._operator.next()
+            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command)
+            if turn.asked is not None:
+                self._answer(turn.asked, turn.refused, before, outputs)
             before = outputs
             self._missed += now.lateness_s > self._period_s
             self._report(tick, outputs, sent)
@@ -156,16 +156,18 @@ class Flight:
             core_s=core_s,
             setpoint_sent_s=setpoint_s,
             current_sent_s=current_s,
+            hold=self._operator.judged(command, outputs),
         )
         self._recorder.client.record(inputs, outputs, sent)
         if commands := self._recorder.client.take_commands():
-            for asked in self._operator.ask(commands):
-                self._tell_asker(asked, False, "too many commands at once", outputs)
+            for asked, why in self._operator.ask(commands):
+                self._tell_asker(asked, False, why, outputs)
         return inputs, outputs, sent
 
-    def _answer(self, asked: GroundCommand, before: Outputs | None, after: Outputs) -> None:
+    def _answer(self, asked: GroundCommand, refused: str | None, before: Outputs | None, after: Outputs) -> None:
         """Tell the one who commanded, the log and the launcher what came of it."""
-        self._tell_asker(asked, *effect_of(asked.command, before, after), after)
+        effect = (False, refused) if refused is not None else effect_of(asked.command, before, after)
+        self._tell_asker(asked, *effect, after)
 
     def _tell_asker(self, asked: GroundCommand, accepted: bool, text: str, after: Outputs) -> None:
         about = (asked.nonce, asked.operator, asked.command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import time
 from typing import Any
 
@@ -15,7 +16,7 @@ from companion.ground.messages import CommandName, Topic
 from companion.ground.orders import INSTEAD, Failed, Sent, signer_of, told
 from companion.ground.station import Station
 from companion.ground.tasks import until_first
-from companion.ground.watch import Vehicle
+from companion.ground.watch import LIVE_S, Vehicle
 from companion.monitor_command import add_broker_options, vehicle_option
 from companion.terminal import tell
 
@@ -40,6 +41,12 @@ def add_parser(commands: Any) -> None:
         + ".",
     )
     command.add_argument("name", choices=[name.value for name in CommandName], metavar="NAME", help="see above")
+    command.add_argument(
+        "--hold",
+        type=int,
+        metavar="N",
+        help="resume: number of the hold that is to end, as the telemetry has it; default: the one that stands now",
+    )
     add_broker_options(command)
     command.set_defaults(run=run)
 
@@ -51,7 +58,10 @@ def run(arguments: argparse.Namespace) -> int:
     signer = signer_of(access, arguments.operators, arguments.operator)
     if isinstance(signer, str):
         raise ConfigError([f"companion command: {signer}"])
-    teller = _Commander(CommandName(arguments.name), only)
+    name = CommandName(arguments.name)
+    if arguments.hold is not None and (name is not CommandName.RESUME or arguments.hold < 1):
+        raise ConfigError([f"--hold {arguments.hold}: expected the number of a hold, 1 or more, and only with resume"])
+    teller = _Commander(name, only, arguments.hold)
     station = Station(
         access,
         signer,
@@ -70,8 +80,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Commander:
-    def __init__(self, command: CommandName, only: str | None) -> None:
+    def __init__(self, command: CommandName, only: str | None, hold: int | None) -> None:
         self._command = command
+        self._hold = hold
         self._only = only
         self.changed = asyncio.Event()
         self.code = EXIT_LOST
@@ -87,7 +98,7 @@ class _Commander:
             return
         if vehicle is None:
             return
-        ack = await station.orders.give(vehicle, self._command, self._hear)
+        ack = await station.orders.give(vehicle, self._command, self._hear, self._hold)
         if ack is None:
             self.code = EXIT_LOST if self._sent else EXIT_REFUSED
         elif ack.accepted:
@@ -101,19 +112,28 @@ class _Commander:
 
         What is retained comes before the link says that it is connected (`Station`, in_order): until then nobody is missing.
         """
+        connected_s: float | None = None
         while True:
             self.changed.clear()
             known = station.watch.vehicles
             if station.link.connected:
+                connected_s = connected_s or time.monotonic()
                 names = [self._only] if self._only is not None else station.watch.there(time.monotonic())
                 if len(names) > 1:
                     self._end(
                         EXIT_BAD_INPUT, f"there are several vehicles ({', '.join(names)}); say which: --vehicle NAME"
                     )
                     return None
-                if names and names[0] in known and (known[names[0]].stream is not None or known[names[0]].ended):
-                    return names[0]
-            await self.changed.wait()
+                if names and names[0] in known:
+                    waited = (
+                        time.monotonic() - connected_s > LIVE_S
+                    )  # what flies has proven so by then, whatever its state says
+                    vehicle = known[names[0]]
+                    if vehicle.proven is not None or (waited and (vehicle.stream is not None or vehicle.ended)):
+                        return names[0]
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LIVE_S):
+                    await self.changed.wait()
 
     def _why_nobody(self, station: Station) -> str:
         if not station.link.connected:

@@ -19,7 +19,8 @@ from companion.config.ground import VEHICLE_NAME, Mqtt
 from companion.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.ground.access import BrokerAccess, broker_access
 from companion.ground.link import BrokerRefused
-from companion.ground.orders import Signer, signer_of
+from companion.ground.orders import signer_of
+from companion.ground.proof import Signer
 from companion.ground.replayed import Replayed
 from companion.ground.tasks import until_first
 from companion.terminal import tell

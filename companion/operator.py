@@ -7,13 +7,13 @@ import contextlib
 import signal
 import socket
 from collections.abc import Coroutine, Iterable, Iterator
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from companion import status
-from companion.types import GroundCommand, OperatorCommand
+from companion.types import GroundCommand, OperatorCommand, Outputs, SafetyAction
 
 WAITING_MAX = 32
-"""Commands that wait for their tick; of more than that at once the mildest are sent back."""
+"""Commands that wait for their tick; of more than that at once the mildest are refused."""
 _GRAVEST_FIRST = {
     command: rank
     for rank, command in enumerate(
@@ -26,8 +26,28 @@ _GRAVEST_FIRST = {
         )
     )
 }
+_STOPS = frozenset({OperatorCommand.ABORT, OperatorCommand.LAND, OperatorCommand.HOLD})
 
 _T = TypeVar("_T")
+
+
+class Dropped(NamedTuple):
+    """A command that never has its tick."""
+
+    asked: GroundCommand
+    why: str
+    """For the operator who gave it."""
+
+
+class Turn(NamedTuple):
+    """What one tick is asked for."""
+
+    command: OperatorCommand
+    """For the core."""
+    asked: GroundCommand | None
+    """The command from the ground that is to be answered after the tick."""
+    refused: str | None = None
+    """Then the answer, and the core is not asked; None: the answer is what came of it."""
 
 
 class GivenUp(Exception):
@@ -46,30 +66,64 @@ class Operator:
         self._land = asyncio.Event()
         self._waiting: list[GroundCommand] = []
         self._given = OperatorCommand.NONE
+        self._holds = 0
+        self.hold: int | None = None
+        """Number of the hold that stands, as `Sent.hold`; None: it does not hold."""
 
-    def ask(self, commands: Iterable[GroundCommand]) -> list[GroundCommand]:
-        """Commands from the ground: each has its tick, the gravest first. Those that there is no room for are given back."""
-        self._waiting += commands
+    def ask(self, commands: Iterable[GroundCommand]) -> list[Dropped]:
+        """Commands from the ground in the order in which they came: each has its tick, the gravest first.
+
+        A hold, landing or abort drops every RESUME and START that waits: those were given before it. Returns what is dropped.
+        """
+        dropped = []
+        for asked in commands:
+            if asked.command in _STOPS:
+                why = f"a {asked.command.value} was commanded after it"
+                dropped += [Dropped(one, why) for one in self._waiting if one.command not in _STOPS]
+                self._waiting = [one for one in self._waiting if one.command in _STOPS]
+            self._waiting.append(asked)
         self._waiting.sort(key=lambda asked: _GRAVEST_FIRST[asked.command])
-        too_many = self._waiting[WAITING_MAX:]
+        dropped += [Dropped(one, "too many commands at once") for one in self._waiting[WAITING_MAX:]]
         del self._waiting[WAITING_MAX:]
-        return too_many
+        return dropped
 
-    def next(self) -> tuple[OperatorCommand, GroundCommand | None]:
-        """What is asked for in this tick, and the command from the ground that is to be answered after it.
+    def next(self) -> Turn:
+        """What is asked for in this tick.
 
         A landing that the launcher or a signal asked for stays asked for. A command from the ground lasts one tick, and the same one
-        again comes a tick later: the core counts what begins.
+        again comes a tick later: the core counts what begins. A RESUME that names another hold than the one that stands is refused.
         """
         waiting = self._waiting
         if self._land.is_set():
-            return OperatorCommand.LAND, waiting.pop(0) if waiting else None
+            return Turn(OperatorCommand.LAND, waiting.pop(0) if waiting else None)
         if not waiting or waiting[0].command is self._given:
             self._given = OperatorCommand.NONE
-            return OperatorCommand.NONE, None
+            return Turn(OperatorCommand.NONE, None)
         asked = waiting.pop(0)
+        if asked.command is OperatorCommand.RESUME and self.hold is not None and asked.hold != self.hold:
+            self._given = OperatorCommand.NONE
+            meant = f"hold {asked.hold}" if asked.hold else "no hold"
+            text = f"resume refused: it names {meant}, now hold {self.hold} stands; look again, then command it anew"
+            return Turn(OperatorCommand.NONE, asked, text)
         self._given = asked.command
-        return asked.command, asked
+        return Turn(asked.command, asked)
+
+    def judged(self, command: OperatorCommand, outputs: Outputs) -> int | None:
+        """Number the holds: a new one begins with `SafetyAction.HOLD`, and with every command to hold while it stands.
+
+        Args:
+            command: of the tick.
+            outputs: what the core made of the tick.
+
+        Returns:
+            `hold`.
+        """
+        if outputs.action is not SafetyAction.HOLD:
+            self.hold = None
+        elif self.hold is None or command is OperatorCommand.HOLD:
+            self._holds += 1
+            self.hold = self._holds
+        return self.hold
 
     @contextlib.contextmanager
     def attention(self) -> Iterator[None]:

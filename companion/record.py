@@ -337,7 +337,8 @@ def _converter(
         unbox = _sequence_of(element)
 
         def tuple_of(value: Any) -> Any:
-            value = unbox(value)
+            if isinstance(value, (bytes, list, tuple)):
+                value = unbox(value)
             if not isinstance(value, (list, tuple)) or (size is not None and len(value) != size):
                 raise RecordError(
                     f"{where}: expected {size if size is not None else 'any number of'} values, found {value!r:.60}"

@@ -128,6 +128,8 @@ class GroundCommand:
     """Name of the one whose key signed it."""
     nonce: str
     """The answer names it."""
+    hold: int = 0
+    """Number of the hold that a RESUME is to end, `Sent.hold`; 0: none, and in every other command."""
 
 
 @quick
@@ -375,3 +377,6 @@ class Sent:
     setpoint_sent_s: float
     current_sent_s: float
     """Stamps on the flight clock of: joint state at hand, core step done, setpoint sent, currents handed to the bus thread."""
+    hold: int | None = None
+    """Number of the hold that stands after this tick, counted from 1 in each flight. A command to hold begins a new one, also where
+    the vehicle holds already. None: it does not hold."""

@@ -4,15 +4,16 @@ A command is signed with its operator's key, end to end: what stands between gro
 open, and nobody without a key commands the vehicle. The signature is HMAC-SHA256 (RFC 2104) over `canonical`.
 
 What a key cannot prove is checked beside it: the command is of this flight (session), made now (the vehicle's own flight clock, which
-the ground hears in every `Stream`), for the first time (nonce), and not one of very many (rate). None of it is touched by a message
-that is not well signed, so nobody without a key can have a genuine command refused.
+the ground takes from `Stream` messages that the vehicle has proven), for the first time (nonce), and not one of very many (rate). None
+of it is touched by a message that is not well signed, so nobody without a key can have a genuine command refused.
+
+A command that was refused once is never accepted later, whatever the reason was.
 """
 
 from __future__ import annotations
 
 import hashlib
 import hmac
-import json
 import re
 import secrets
 from collections import deque
@@ -21,21 +22,23 @@ from enum import StrEnum
 from typing import NamedTuple, TypeAlias
 
 from companion.config.ground import VEHICLE_NAME
-from companion.ground.keys import OPERATOR_NAME, Operators
+from companion.ground.keys import OPERATOR_NAME, SAFER, Operators
 from companion.ground.messages import COMMAND_MAX_BYTES, VERSION, Command, CommandName
+from companion.ground.wire import WireError, parse
 from companion.record import RecordError, from_jsonable
 
-DOMAIN = "companion command 1"
+DOMAIN = "companion command 2"
 """First line of every signed text: a signature made for anything else is none of a command."""
 AHEAD_MAX_S = 0.5
 """A command may be so much ahead of the vehicle's clock."""
-NONCES_MAX = 512
-"""Kept per operator, at most."""
+REFUSED_MAX = 512
+"""Nonces of refused commands that are kept for each operator and command. Beyond that a time is kept: see `_Heard.closed_until_t_s`."""
 ANSWERS_PER_S = 20
 """Refused commands that are answered: replaying old ones makes no flood of answers."""
 _T_MS_MAX = 2**53
 _TEXT_MAX = 160
 _SESSION = re.compile(r"[\x21-\x7e]{1,64}")
+_HOLD_MAX = 2**31
 _NONCE = re.compile(r"[0-9a-f]{32}")
 _MAC = re.compile(r"[0-9a-f]{64}")
 
@@ -68,9 +71,11 @@ class Reason(StrEnum):
     UNKNOWN_OPERATOR = "unknown_operator"
     BAD_SIGNATURE = "bad_signature"
     WRONG_SESSION = "wrong_session"
+    EARLY = "early"
     STALE = "stale"
     FROM_THE_FUTURE = "from_the_future"
     REPLAYED = "replayed"
+    OVERTAKEN = "overtaken"
     RETAINED = "retained"
     TOO_MANY = "too_many"
     NOT_ALLOWED = "not_allowed"
@@ -109,7 +114,7 @@ def canonical(command: Command) -> bytes:
         raise ValueError(problem)
     return (
         f"{DOMAIN}\n{command.v}\n{command.vehicle}\n{command.session}\n{command.operator}\n{command.command.value}\n"
-        f"{command.t_ms}\n{command.nonce}\n"
+        f"{command.t_ms}\n{command.hold}\n{command.nonce}\n"
     ).encode("ascii")
 
 
@@ -122,7 +127,9 @@ def sign(command: Command, key: bytes) -> Command:
     return replace(command, mac=_mac(command, key))
 
 
-def make_command(name: CommandName, vehicle: str, session: str, operator: str, key: bytes, t_ms: int) -> Command:
+def make_command(
+    name: CommandName, vehicle: str, session: str, operator: str, key: bytes, t_ms: int, hold: int = 0
+) -> Command:
     """A signed command with a nonce of its own; `companion.ground.messages.encode` makes the payload.
 
     Args:
@@ -132,11 +139,12 @@ def make_command(name: CommandName, vehicle: str, session: str, operator: str, k
         operator: who asks.
         key: the operator's, `Operators.key`.
         t_ms: the vehicle's flight clock now, `FlightClock.now_ms`.
+        hold: number of the hold that a RESUME is to end, `Stream.hold`; 0: none.
 
     Raises:
         ValueError: a field that no command may have; says which.
     """
-    unsigned = Command(VERSION, vehicle, session, operator, name, t_ms, secrets.token_hex(16), "")
+    unsigned = Command(VERSION, vehicle, session, operator, name, t_ms, hold, secrets.token_hex(16), "")
     return sign(unsigned, key)
 
 
@@ -154,13 +162,55 @@ def _unspeakable(command: Command) -> str | None:
         return f"operator: {command.operator!r:.60} is no operator's name"
     if not -_T_MS_MAX < command.t_ms < _T_MS_MAX:
         return "t_ms: out of range"
+    if not 0 <= command.hold < _HOLD_MAX:
+        return "hold: out of range"
     if _NONCE.fullmatch(command.nonce) is None:
         return f"nonce: {command.nonce!r:.60}, expected 32 hexadecimal digits in lower case"
     return None
 
 
+class _Heard:
+    """What is remembered of one operator's commands of one name. Bounded, however many come."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self.accepted_t_s: deque[float] = deque(maxlen=limits.per_s)
+        """Flight clock at which the newest were accepted."""
+        self._followed: dict[str, float] = {}
+        """Nonce, and the flight clock at which the command is stale in any case. The rate bounds how many there are."""
+        self._refused: dict[str, float] = {}
+        """The same of those that were refused, at most `REFUSED_MAX`."""
+        self._closed_until_t_s = float("-inf")
+        """Newest date of a refused command whose nonce found no room: nothing up to this date is accepted any more."""
+
+    @property
+    def size(self) -> int:
+        """Nonces that are kept."""
+        return len(self._followed) + len(self._refused)
+
+    def knows(self, command: Command) -> bool:
+        """Whether it was accepted or refused before, or may have been."""
+        nonce = command.nonce
+        return nonce in self._followed or nonce in self._refused or command.t_ms / 1000.0 <= self._closed_until_t_s
+
+    def follow(self, command: Command, now_t_s: float) -> None:
+        self.accepted_t_s.append(now_t_s)
+        self._followed[command.nonce] = command.t_ms / 1000.0 + self.limits.age_max_s
+
+    def refuse(self, command: Command) -> None:
+        if len(self._refused) < REFUSED_MAX:
+            self._refused[command.nonce] = command.t_ms / 1000.0 + self.limits.age_max_s
+        else:
+            self._closed_until_t_s = max(self._closed_until_t_s, command.t_ms / 1000.0)
+
+    def sweep(self, now_t_s: float) -> None:
+        """Forget what is stale: the clock never goes back, so it stays stale."""
+        self._followed = {nonce: until for nonce, until in self._followed.items() if until >= now_t_s}
+        self._refused = {nonce: until for nonce, until in self._refused.items() if until >= now_t_s}
+
+
 class Verifier:
-    """The vehicle's judge of what comes in on its ``command`` topic. No I/O and no clock; it remembers what was accepted.
+    """The vehicle's judge of what comes in on its ``command`` topic. No I/O and no clock; it remembers what it has judged.
 
     Args:
         operators: who may command.
@@ -169,33 +219,29 @@ class Verifier:
     """
 
     def __init__(self, operators: Operators, vehicle: str, session: str) -> None:
-        self._operators = operators
+        self.operators = operators
         self._vehicle = vehicle
         self._session = session
         self._now_t_s = float("-inf")
         self._swept_t_s = float("-inf")
-        self._nonces: dict[str, dict[str, float]] = {name: {} for name in operators.names}
-        """Per operator: nonce, and the flight clock at which its command is stale in any case."""
-        self._accepted: dict[tuple[str, CommandName], deque[float]] = {
-            (name, command): deque(maxlen=limits.per_s)
-            for name in operators.names
-            for command, limits in LIMITS.items()
+        self._stopped_t_s = float("-inf")
+        """Newest date of an accepted HOLD, LAND or ABORT, whoever gave it."""
+        self._heard = {
+            (name, command): _Heard(limits) for name in operators.names for command, limits in LIMITS.items()
         }
-        """Flight clock of the newest accepted ones."""
+        """Each command of each operator has its own room: no flood of one takes that of another."""
         self._answered: deque[float] = deque(maxlen=ANSWERS_PER_S)
 
-    def check(self, payload: bytes, retained: bool, now_t_s: float) -> Verdict:
+    def check(self, payload: bytes, retained: bool, now_t_s: float | None) -> Verdict:
         """Judge one message; never raises, whatever the payload.
 
         Args:
             payload: as it came.
             retained: the broker had kept it: it may be of any age, and whoever comes next would hear it again.
-            now_t_s: flight clock, s. It never goes back here: of two calls the later time counts.
+            now_t_s: flight clock, s; None: it has not begun. It never goes back here: of two calls the later time counts.
         """
         if len(payload) > COMMAND_MAX_BYTES:
             return Refused(Reason.OVERSIZED, f"{len(payload)} bytes, at most {COMMAND_MAX_BYTES} expected")
-        if retained:
-            return Refused(Reason.RETAINED, "a command that the broker kept; commands are sent, never retained")
         try:
             command = _parsed(payload)
         except RecursionError:  # nested nearly as deep as the parser goes: too deep to be shown
@@ -204,53 +250,59 @@ class Verifier:
             return command
         if command.vehicle != self._vehicle:
             return Refused(Reason.WRONG_VEHICLE, f"for {command.vehicle}, this is {self._vehicle}")
-        key = self._operators.find(command.operator)
+        key = self.operators.find(command.operator)
         if key is None:
             return Refused(Reason.UNKNOWN_OPERATOR, f"{command.operator} is none of this vehicle's operators")
         if not hmac.compare_digest(_mac(command, key), command.mac):
             return Refused(Reason.BAD_SIGNATURE, f"not signed with the key of {command.operator}")
-        self._now_t_s = max(self._now_t_s, now_t_s)
-        return self._judge(command)
+        if now_t_s is not None:
+            self._now_t_s = max(self._now_t_s, now_t_s)
+        if self._now_t_s - self._swept_t_s >= 1.0:
+            self._swept_t_s = self._now_t_s
+            for heard in self._heard.values():
+                heard.sweep(self._now_t_s)
+        return self._judge(command, retained)
 
-    def _judge(self, command: Command) -> Verdict:
-        """Of a command that its operator has made, whenever that was."""
+    def _judge(self, command: Command, retained: bool) -> Verdict:
+        """Of a command that its operator has made, whenever that was. One that could come again is remembered, accepted or not."""
+        heard = self._heard[command.operator, command.command]
         now_t_s, t_s = self._now_t_s, command.t_ms / 1000.0
-        limits = LIMITS[command.command]
         who = f"{command.command.value} of {command.operator}"
         if command.session != self._session:
             return self._answer(Reason.WRONG_SESSION, f"{who} is for another flight", command)
-        if now_t_s - t_s > limits.age_max_s:
-            text = f"{who} is {now_t_s - t_s:.1f} s old, at most {limits.age_max_s:.1f} s expected"
+        if now_t_s - t_s > heard.limits.age_max_s:
+            text = f"{who} is {now_t_s - t_s:.1f} s old, at most {heard.limits.age_max_s:.1f} s expected"
             return self._answer(Reason.STALE, text, command)
-        if t_s - now_t_s > AHEAD_MAX_S:
-            text = f"{who} is {t_s - now_t_s:.1f} s ahead of the flight's clock, at most {AHEAD_MAX_S:.1f} s expected"
-            return self._answer(Reason.FROM_THE_FUTURE, text, command)
-        nonces = self._known(command.operator)
-        if command.nonce in nonces:
+        if heard.knows(command):
             return Refused(Reason.REPLAYED, f"{who} was heard before")
-        accepted = self._accepted[command.operator, command.command]
-        often = len(accepted) == limits.per_s and now_t_s - accepted[0] < 1.0
-        if len(nonces) >= NONCES_MAX:
-            return self._answer(
-                Reason.TOO_MANY, f"more than {NONCES_MAX} commands of {command.operator} at once", command
-            )
-        # Refused or not: whoever recorded it cannot have it followed later.
-        nonces[command.nonce] = t_s + limits.age_max_s
-        if not self._operators.may(command.operator, command.command):
-            text = f"{command.operator} may make things safer only, not {command.command.value}"
-            return self._answer(Reason.NOT_ALLOWED, text, command)
-        if often:
-            return self._answer(Reason.TOO_MANY, f"{who}: more than {limits.per_s} a second", command)
-        accepted.append(now_t_s)
+        if retained:
+            heard.refuse(command)
+            return Refused(Reason.RETAINED, "a command that the broker kept; commands are sent, never retained")
+        problem = self._problem(command, heard, who)
+        if problem is not None:
+            heard.refuse(command)
+            return self._answer(*problem, command)
+        heard.follow(command, now_t_s)
+        if command.command in SAFER:
+            self._stopped_t_s = max(self._stopped_t_s, t_s)
         return Accepted(command)
 
-    def _known(self, operator: str) -> dict[str, float]:
-        """Nonces of an operator that could come again."""
-        if self._now_t_s - self._swept_t_s >= 1.0:
-            self._swept_t_s = self._now_t_s
-            for name, nonces in self._nonces.items():
-                self._nonces[name] = {nonce: until for nonce, until in nonces.items() if until >= self._now_t_s}
-        return self._nonces[operator]
+    def _problem(self, command: Command, heard: _Heard, who: str) -> tuple[Reason, str] | None:
+        """Why a command that was never heard before is refused; None: it is not."""
+        now_t_s, t_s = self._now_t_s, command.t_ms / 1000.0
+        if now_t_s == float("-inf"):
+            return Reason.EARLY, "the flight has not begun"
+        if t_s - now_t_s > AHEAD_MAX_S:
+            text = f"{who} is {t_s - now_t_s:.1f} s ahead of the flight's clock, at most {AHEAD_MAX_S:.1f} s expected"
+            return Reason.FROM_THE_FUTURE, text
+        if not self.operators.may(command.operator, command.command):
+            return Reason.NOT_ALLOWED, f"{command.operator} may make things safer only, not {command.command.value}"
+        if command.command not in SAFER and t_s < self._stopped_t_s:
+            return Reason.OVERTAKEN, f"{who} was given before a hold, land or abort that was accepted"
+        accepted_t_s = heard.accepted_t_s
+        if len(accepted_t_s) == heard.limits.per_s and now_t_s - accepted_t_s[0] < 1.0:
+            return Reason.TOO_MANY, f"{who}: more than {heard.limits.per_s} a second"
+        return None
 
     def _answer(self, reason: Reason, text: str, command: Command) -> Refused:
         if len(self._answered) == ANSWERS_PER_S and self._now_t_s - self._answered[0] < 1.0:
@@ -262,16 +314,14 @@ class Verifier:
 def _parsed(payload: bytes) -> Command | Refused:
     """The command as it claims to be, every field in range; or why it is none."""
     try:
-        data = json.loads(payload)
-    except ValueError:
-        return Refused(Reason.MALFORMED, "no JSON")
+        data = parse(payload)
+    except WireError as error:
+        return Refused(Reason.MALFORMED, str(error))
     if not isinstance(data, dict):
         return Refused(Reason.MALFORMED, "no JSON object")
     version = data.get("v")
     if type(version) is int and version != VERSION:
-        # By its size first: Python refuses to write out numbers that are long enough.
-        shown = version if abs(version) < 1_000_000 else "very high"
-        return Refused(Reason.WRONG_VERSION, f"version {shown}, expected {VERSION}")
+        return Refused(Reason.WRONG_VERSION, f"version {version}, expected {VERSION}")
     try:
         command = from_jsonable(Command, data)
     except RecordError as error:

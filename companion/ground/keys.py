@@ -140,6 +140,11 @@ class Operators:
         """In the order of the file."""
         return tuple(self._by_name)
 
+    @property
+    def keys(self) -> tuple[bytes, ...]:
+        """In the order of the file."""
+        return tuple(operator.key for operator in self._by_name.values())
+
     def key(self, name: str) -> bytes:
         """The 32 bytes of an operator.
 

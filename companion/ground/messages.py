@@ -1,4 +1,4 @@
-"""Messages between a vehicle and its ground stations over MQTT, version 1: one frozen record per topic, JSON on the wire.
+"""Messages between a vehicle and its ground stations over MQTT, version 2: one frozen record per topic, JSON on the wire.
 
 All topics of a vehicle lie below ``companion/VEHICLE/``:
 
@@ -20,16 +20,16 @@ World ENU, body FLU, SI units, quaternions (w, x, y, z), as in `companion.types`
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from companion.frozen import quick
+from companion.ground.wire import WireError, check_finite, parse
 from companion.record import RecordError, from_jsonable, json_text, to_jsonable
 from companion.types import Quat, Vec2, Vec3, Vec4
 
-VERSION = 1
+VERSION = 2
 ROOT = "companion"
 STREAM_PERIOD_S = 0.05
 MESSAGE_MAX_BYTES = 200_000
@@ -261,6 +261,8 @@ class Stream:
     progress: float
     action: str
     """`companion.types.SafetyAction`."""
+    hold: int | None
+    """Number of the hold that stands, `companion.types.Sent.hold`: `resume` names it. None: it does not hold."""
     armed: bool | None
     mode: str | None
     landed: str | None
@@ -287,6 +289,8 @@ class Stream:
     bent_by: tuple[str, ...]
     waits_for_start: bool
     """All is well and it waits on the ground for `start`."""
+    proofs: tuple[str, ...] = ()
+    """One for each operator whose key the vehicle holds (`companion.ground.proof`); empty if it hears no commands."""
 
 
 class CommandName(Enum):
@@ -310,8 +314,10 @@ class Command:
     operator: str
     command: CommandName
     t_ms: int
-    """The vehicle's flight clock as the sender knows it: `Stream.t_s` of the last message and the time since, in ms. No two
+    """The vehicle's flight clock as the sender knows it: `Stream.t_s` of the last proven message and the time since, in ms. No two
     wall clocks need to agree."""
+    hold: int
+    """`Stream.hold` that a `resume` is to end; 0: none, and in every other command."""
     nonce: str
     """32 hexadecimal digits, never used twice."""
     mac: str
@@ -335,6 +341,8 @@ class Ack:
     t_s: float
     phase: str
     action: str
+    proof: str = ""
+    """For the operator who commanded (`companion.ground.proof`)."""
 
 
 RECORDS: dict[Topic, type] = {
@@ -358,27 +366,23 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
     """A record from the wire.
 
     Raises:
-        MessageError: too large, no JSON, another version, or not the record.
+        MessageError: too large, not JSON as `companion.ground.wire` reads it, another version, not the record, or a number in it that
+            is not finite.
     """
     if len(payload) > max_bytes:
         raise MessageError(f"{len(payload)} bytes, at most {max_bytes} expected")
-    data = _parsed(payload)
-    if not isinstance(data, dict) or data.get("v") != VERSION:
-        version = data.get("v") if isinstance(data, dict) else None
-        raise MessageError(f"version {version!r:.20}, expected {VERSION}")
     try:
-        return from_jsonable(cls, data)
-    except RecordError as error:
+        data = parse(payload)
+        if not isinstance(data, dict) or data.get("v") != VERSION:
+            version = data.get("v") if isinstance(data, dict) else None
+            raise MessageError(f"version {version!r:.20}, expected {VERSION}")
+        record = from_jsonable(cls, data)
+        check_finite(record)
+    except (RecordError, WireError) as error:
         raise MessageError(str(error)) from None
     except RecursionError:  # nested so deeply that the refusal cannot even quote it
         raise MessageError("nested too deeply") from None
-
-
-def _parsed(payload: bytes) -> Any:
-    try:
-        return json.loads(payload)
-    except (ValueError, RecursionError):
-        raise MessageError("no JSON") from None
+    return record
 
 
 def vehicle_of(topic: str) -> tuple[str, Topic] | None:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from companion.ground.access import BrokerAccess
 from companion.ground.commands import make_command
 from companion.ground.keys import load_operators, own_file
 from companion.ground.link import Link, LinkError
 from companion.ground.messages import Ack, CommandName, Topic, encode
-from companion.ground.watch import Watch
+from companion.ground.proof import Signer
+from companion.ground.watch import Vehicle, Watch
 
 ANSWER_S = 1.5
 """For the vehicle's `Ack`."""
@@ -22,14 +23,6 @@ again himself."""
 REPEATED = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
 INSTEAD = "use Ctrl-C or the pilot's switch"
 NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {INSTEAD}"
-
-
-@dataclass(frozen=True, slots=True)
-class Signer:
-    """The operator who sits here."""
-
-    operator: str
-    key: bytes = field(repr=False)
 
 
 def signer_of(
@@ -116,12 +109,12 @@ class Orders:
         return self._signer if isinstance(self._signer, str) else None
 
     def heard(self, ack: Ack) -> None:
-        """Take every `Ack` that comes in."""
+        """Take every `Ack` that comes in; those to this operator are proven (`Watch`)."""
         answer = self._waiting.get(ack.nonce)
         if answer is not None and not answer.done():
             answer.set_result(ack)
 
-    async def give(self, vehicle: str, command: CommandName, tell: Tell) -> Ack | None:
+    async def give(self, vehicle: str, command: CommandName, tell: Tell, hold: int | None = None) -> Ack | None:
         """Give a command; over when the vehicle has answered, or all tries are used up.
 
         A newer command for the same vehicle, or a new flight, ends the tries of an older one.
@@ -130,6 +123,7 @@ class Orders:
             vehicle: its name.
             command: what is asked for.
             tell: hears of every try as it goes out, and of every one that failed.
+            hold: number of the hold that a RESUME is to end, as the operator saw it; None: the one that stands by the newest message.
 
         Returns:
             The vehicle's answer; None: there was none, `tell` knows why.
@@ -138,23 +132,18 @@ class Orders:
         if problem is not None or not isinstance(self._signer, Signer):
             tell(Failed(vehicle, command, problem or str(self._signer)))
             return None
-        session = self._watch.vehicles[vehicle].session
+        session = _session(self._watch.vehicles.get(vehicle))
         order = self._newest[vehicle] = object()
         answer: asyncio.Future[Ack] = asyncio.get_running_loop().create_future()
         nonces: list[str] = []
         tries = TRIES if command in REPEATED else 1
         try:
             for number in range(1, tries + 1):
-                problem = await self._try(self._signer, vehicle, command, answer, nonces, tell)
+                problem = await self._try(self._signer, vehicle, command, hold, session, answer, nonces, tell)
                 if problem is None:
                     return answer.result()
-                current = self._watch.vehicles.get(vehicle)
-                on = (
-                    number < tries
-                    and self._newest[vehicle] is order
-                    and current is not None
-                    and current.session == session
-                )
+                current = _session(self._watch.vehicles.get(vehicle))
+                on = number < tries and self._newest[vehicle] is order and current == session
                 tell(Failed(vehicle, command, problem + (f" (sent again, {number + 1} of {tries})" if on else "")))
                 if not on:
                     return None
@@ -170,19 +159,22 @@ class Orders:
         signer: Signer,
         vehicle: str,
         command: CommandName,
+        hold: int | None,
+        session: str | None,
         answer: asyncio.Future[Ack],
         nonces: list[str],
         tell: Tell,
     ) -> str | None:
         """One try, `ANSWER_S` long at most; None: the answer is there, otherwise what went wrong."""
         known = self._watch.vehicles.get(vehicle)
-        t_ms = None if known is None else known.clock.now_ms(time.monotonic())
-        if (
-            known is None or known.session is None or t_ms is None
-        ):  # was there a moment ago; a new flight may have begun
+        proven = None if known is None else known.proven
+        if proven is None or proven.session != session:  # was there a moment ago
             return f"a new flight of {vehicle} has begun"
+        t_ms, ends = proven.now_ms(time.monotonic()), 0
+        if command is CommandName.RESUME:
+            ends = proven.hold if hold is None else hold
         try:
-            signed = make_command(command, vehicle, known.session, signer.operator, signer.key, t_ms)
+            signed = make_command(command, vehicle, session, signer.operator, signer.key, t_ms, ends)
         except ValueError as error:
             return f"no command can be made for what calls itself {vehicle}: {error}"
         nonces.append(signed.nonce)
@@ -201,13 +193,26 @@ class Orders:
         return None
 
     def _impossible(self, vehicle: str) -> str | None:
+        """Why no command can be made, or would be heard; None: it is sent.
+
+        What nobody has proven never speaks against a command as long as proven messages come in.
+        """
         known = self._watch.vehicles.get(vehicle)
-        if known is None or known.session is None:
+        if known is None or (known.session is None and known.proven is None):
             return f"nothing is known of a vehicle {vehicle!r:.60}"
+        if known.proven is not None and known.proven.live(time.monotonic()):
+            return None
         if known.ended:
             return f"the flight of {vehicle} has ended"
         if known.state is not None and known.state.session == known.session and not known.state.commands:
             return f"{vehicle} hears no commands: {known.state.text or 'switched off'}; {INSTEAD}"
-        if known.clock.now_ms(time.monotonic()) is None:
+        if known.proven is not None:
+            return None
+        if known.stream is None:
             return f"nothing was heard from {vehicle} yet, so no command can be dated; {INSTEAD}"
-        return None
+        text = "it does not have this key, or another program speaks for it"
+        return f"no message of {vehicle} is proven for {self.operator}: {text}; {INSTEAD}"
+
+
+def _session(known: Vehicle | None) -> str | None:
+    return None if known is None or known.proven is None else known.proven.session

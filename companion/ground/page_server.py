@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from companion.ground.access import BrokerAccess
 from companion.ground.hub import Hub
-from companion.ground.orders import Signer
+from companion.ground.proof import Signer
 from companion.ground.replayed import Replayed
 from companion.ground.station import Station
 from companion.ground.tasks import until_first

@@ -25,6 +25,7 @@ from companion.ground.messages import (
     Timing,
 )
 from companion.ground.timings import Worst, worst_of
+from companion.ground.wire import NUMBER_MAX
 from companion.mission.sequencer import Stage
 from companion.types import (
     ControlLog,
@@ -146,7 +147,7 @@ class StreamMaker:
         """
         if self._newest is None:
             raise LookupError("no tick yet")
-        i, o, _ = self._newest
+        i, o, sent = self._newest
         lost = max(dropped, i.recorder_dropped)
         ages = self._ages_of_the_last_second(i.t_s)
         look = Look(i, o, ages, self._mocap_rate_hz(i.t_s), self._missed, lost, recorder_error)
@@ -167,6 +168,7 @@ class StreamMaker:
             kind=o.phase_kind.value,
             progress=_number(o.progress, 5) or 0.0,
             action=o.action.value,
+            hold=sent.hold,
             armed=status.armed if status is not None else None,
             mode=status.mode.value if status is not None else None,
             landed=status.landed.value if status is not None else None,
@@ -330,17 +332,22 @@ def shortened(text: str) -> str:
 
 
 def _finite_line(line: EventLine) -> EventLine:
-    if math.isfinite(line.t_s) and math.isfinite(line.mission_t_s):
+    if _fits(line.t_s) and _fits(line.mission_t_s):
         return line
     return dataclasses.replace(line, t_s=_number(line.t_s, 4) or 0.0, mission_t_s=_number(line.mission_t_s, 4) or 0.0)
 
 
+def _fits(value: float) -> bool:
+    """Whether a message may hold it: False for NaN, too."""
+    return abs(value) <= NUMBER_MAX
+
+
 def _number(value: float | None, digits: int) -> float | None:
     """What is no number is not known."""
-    return round(value, digits) if value is not None and math.isfinite(value) else None
+    return round(value, digits) if value is not None and _fits(value) else None
 
 
 def _rounded(values: T | None, digits: int) -> T | None:
-    if values is None or not all(map(math.isfinite, values)):
+    if values is None or not all(map(_fits, values)):
         return None
     return type(values)(round(value, digits) for value in values)

@@ -9,7 +9,8 @@ from typing import NoReturn
 from companion.ground.access import BrokerAccess
 from companion.ground.link import Link
 from companion.ground.messages import Topic
-from companion.ground.orders import Orders, Signer
+from companion.ground.orders import Orders
+from companion.ground.proof import Signer
 from companion.ground.watch import HEARD_TOPICS, Heard, Watch
 
 OnHeard = Callable[[Heard], None]
@@ -41,7 +42,7 @@ class Station:
         topics: Sequence[Topic] = HEARD_TOPICS,
         in_order: bool = False,
     ) -> None:
-        self.watch = Watch(only)
+        self.watch = Watch(only, signer if isinstance(signer, Signer) else None)
         self._on_heard = on_heard
         subscriptions = [(topic.of(only or "+"), 0 if in_order or topic is Topic.STREAM else 1) for topic in topics]
         self.link = Link(access, subscriptions, self._take, on_change)
@@ -52,9 +53,13 @@ class Station:
         await self.link.run()
 
     def _take(self, topic: str, payload: bytes, retained: bool) -> None:
-        heard = self.watch.take(topic, payload, retained, time.monotonic())
-        if heard is None:
-            return
-        if heard.topic is Topic.ACK:
-            self.orders.heard(heard.record)
-        self._on_heard(heard)
+        """Take one message. None ends the connection, whatever it holds: commands have to leave by it."""
+        try:
+            heard = self.watch.take(topic, payload, retained, time.monotonic())
+            if heard is None:
+                return
+            if heard.topic is Topic.ACK:
+                self.orders.heard(heard.record)
+            self._on_heard(heard)
+        except Exception as error:
+            self.watch.reject(topic, error)

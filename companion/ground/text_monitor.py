@@ -17,7 +17,8 @@ from rich.live import Live
 
 from companion.ground.access import BrokerAccess
 from companion.ground.messages import Ack, CommandName, Topic
-from companion.ground.orders import Failed, Sent, Signer, told
+from companion.ground.orders import Failed, Sent, told
+from companion.ground.proof import Signer
 from companion.ground.station import Station
 from companion.ground.tasks import until_first
 from companion.ground.text_view import Around, Note, frame, line
@@ -72,7 +73,8 @@ class _Screen:
         self._console = console
         self._notes: deque[Note] = deque(maxlen=10)
         self._chosen: str | None = None
-        self._asked: tuple[CommandName, float] | None = None
+        self._asked: tuple[CommandName, float, int] | None = None
+        """What waits for its key to be pressed again, since when, and the hold that was shown then."""
         self._keys: deque[str] = deque(maxlen=KEYS_MAX)
         self._pressed = asyncio.Event()
 
@@ -96,7 +98,8 @@ class _Screen:
                         command = self._command(key, station)
                         vehicle = self._vehicle(station)
                         if command is not None and vehicle is not None:
-                            errands.create_task(station.orders.give(vehicle.name, command, self._on_note))
+                            hold = _hold(vehicle) if command is CommandName.RESUME else None
+                            errands.create_task(station.orders.give(vehicle.name, command, self._on_note, hold))
                     live.update(frame(self._vehicle(station), time.monotonic(), self._around(station)), refresh=True)
                     await self._key_or_period()
 
@@ -120,10 +123,10 @@ class _Screen:
         asked, self._asked = self._asked, None
         if command is None:
             return None
-        now_s = time.monotonic()
-        if asked is not None and asked[0] is command and now_s - asked[1] < CONFIRM_S:
+        now_s, hold = time.monotonic(), _hold(self._vehicle(station))
+        if asked is not None and asked[0] is command and now_s - asked[1] < CONFIRM_S and asked[2] == hold:
             return command
-        self._asked = (command, now_s)
+        self._asked = (command, now_s, hold)
         self._notes.append(Note(f"{command.value}? press {key} again within {CONFIRM_S:g} s", "bold yellow"))
         return None
 
@@ -177,3 +180,8 @@ class _Screen:
         finally:
             loop.remove_reader(file)
             termios.tcsetattr(file, termios.TCSADRAIN, before)
+
+
+def _hold(vehicle: Vehicle | None) -> int:
+    """Number of the hold that is shown; 0: none."""
+    return 0 if vehicle is None or vehicle.stream is None else vehicle.stream.hold or 0

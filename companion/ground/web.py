@@ -9,7 +9,8 @@ WebSocket at ``/ws``, JSON text. Server to page:
     {"kind": "sent", "vehicle", "command", "nonce"}                                  to who commanded; its `ack` has the nonce
     {"kind": "refused", "vehicle", "command", "text"}                                to the viewer who commanded
 
-Page to server: ``{"kind": "token", "token"}`` first (empty without one: view only), then ``{"kind": "command", "vehicle", "command"}``.
+Page to server: ``{"kind": "token", "token"}`` first (empty without one: view only), then ``{"kind": "command", "vehicle", "command",
+"hold"?}``: with "resume" the number of the hold that the stream showed when the operator pressed; without it, the one that stands.
 """
 
 from __future__ import annotations
@@ -229,10 +230,10 @@ class Monitor:
         if self._hub is not None:
             self._hub.leave(outbox)
 
-    def order(self, vehicle: str, command: CommandName, outbox: Outbox) -> None:
+    def order(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
         """Give a command; it is followed to its end even if the viewer goes away."""
         assert self._orders is not None and self._errands is not None
-        self._errands.create_task(self._orders.give(vehicle, command, lambda note: outbox.put(_note(note))))
+        self._errands.create_task(self._orders.give(vehicle, command, lambda note: outbox.put(_note(note)), hold))
 
 
 class _Session:
@@ -287,15 +288,16 @@ class _Session:
                 case {"kind": "token", "token": token}:
                     self._token = token
                     outbox.put(self._monitor.hello(token))
-                case {"kind": "command", "vehicle": str(vehicle), "command": str(name)} if name in COMMANDS:
-                    self._command(vehicle, COMMANDS[name], outbox)
+                case {"kind": "command", "vehicle": str(vehicle), "command": str(name), **more} if name in COMMANDS:
+                    hold = more.get("hold")
+                    self._command(vehicle, COMMANDS[name], hold if type(hold) is int else None, outbox)
                 case _:
                     outbox.part(Parting(1008, "expected a token or a command"))
                     return
 
-    def _command(self, vehicle: str, command: CommandName, outbox: Outbox) -> None:
+    def _command(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
         if self._monitor.may_command(self._token):
-            self._monitor.order(vehicle, command, outbox)
+            self._monitor.order(vehicle, command, hold, outbox)
         else:
             outbox.put(_note(Failed(vehicle, command, self._monitor.why_not or NO_TOKEN)))
 

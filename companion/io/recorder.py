@@ -158,8 +158,10 @@ class RecorderClient:
         match message:
             case {"error": str(error)}:
                 self.error = error
-            case {"command": str(name), "operator": str(operator), "nonce": str(nonce)} if name in _COMMANDS:
-                self._commands.append(GroundCommand(_COMMANDS[name], operator, nonce))
+            case {"command": str(name), "operator": str(operator), "nonce": str(nonce), "hold": int(hold)} if (
+                name in _COMMANDS
+            ):
+                self._commands.append(GroundCommand(_COMMANDS[name], operator, nonce, hold))
             case {"ground": str(text)}:
                 self.ground = text
 

@@ -296,7 +296,12 @@ class Uplink:
             time.sleep(FLOOD_PAUSE_S)  # the whole loop, on purpose: reading must stop
 
     def _hand_over(self, command: Command, now_s: float) -> None:
-        message = {"command": command.command.value, "operator": command.operator, "nonce": command.nonce}
+        message = {
+            "command": command.command.value,
+            "operator": command.operator,
+            "nonce": command.nonce,
+            "hold": command.hold,
+        }
         if self._flight.say(message):
             self._counts.commands += 1
             return

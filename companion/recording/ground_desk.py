@@ -25,6 +25,7 @@ from companion.ground.messages import (
     Topic,
     encode,
 )
+from companion.ground.proof import with_proof, with_proofs
 from companion.ground.scene import scene_of
 from companion.ground.snapshot import StreamMaker, shortened
 from companion.io.packets import ACK, CLOSE, METADATA, TEXT, TICK
@@ -179,13 +180,9 @@ class GroundDesk:
 
     def hear(self, payload: bytes, retained: bool, now_s: float) -> Command | None:
         """Judge what came on the command topic; the command if it is to be followed."""
-        now_t_s = self.flight_s(now_s)
         if self._verifier is None or self._over:
             return None
-        if now_t_s is None:
-            self._refused("early", "the flight has not begun")
-            return None
-        verdict = self._verifier.check(payload, retained, now_t_s)
+        verdict = self._verifier.check(payload, retained, self.flight_s(now_s))
         if isinstance(verdict, Accepted):
             return verdict.command
         self._refused(verdict.reason.value, verdict.text)
@@ -254,8 +251,10 @@ class GroundDesk:
             out.retained[Topic.EVENTS] = encode(self._maker.events_record())
         if self._new_ticks:
             self._new_ticks = False
-            out.stream = encode(self._maker.make(wall_s, dropped=dropped, recorder_error=recorder_error))
-        out.acks = [encode(ack) for ack in self._acks]
+            stream = self._maker.make(wall_s, dropped=dropped, recorder_error=recorder_error)
+            keys = self._verifier.operators.keys if self._verifier is not None else ()
+            out.stream = encode(with_proofs(stream, self.vehicle, keys))
+        out.acks = [encode(self._proven(ack)) for ack in self._acks]
         self._acks.clear()
         out.log = list(self._log)
         self._log.clear()
@@ -278,6 +277,11 @@ class GroundDesk:
         self._acks.append(
             Ack(VERSION, self.session, nonce, operator, CommandName(command), accepted, text, t_s, phase, action)
         )
+
+    def _proven(self, ack: Ack) -> Ack:
+        """With the proof for the operator who commanded."""
+        key = self._verifier.operators.find(ack.operator) if self._verifier is not None else None
+        return ack if key is None else with_proof(ack, self.vehicle, key)
 
     def _metadata(self, name: str, values: dict[str, str]) -> None:
         if name == "plan":

@@ -32,6 +32,7 @@ from companion.ground.messages import (
     encode,
     vehicle_of,
 )
+from companion.ground.proof import ack_proven, stream_proven
 from companion.types import OperatorCommand, Outcome, SafetyAction
 from tests.broker import loopback_broker
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options
@@ -69,8 +70,9 @@ class Station:
     async def command(self, name: CommandName) -> Ack:
         """Command, and wait for the answer."""
         t_ms = self._clock.now_ms(time.monotonic())
-        assert t_ms is not None and self._session is not None
-        command = make_command(name, self._vehicle, self._session, self._operator, self._key, t_ms)
+        assert t_ms is not None and self._session is not None and self.stream is not None
+        hold = (self.stream.hold or 0) if name is CommandName.RESUME else 0
+        command = make_command(name, self._vehicle, self._session, self._operator, self._key, t_ms, hold)
         await self._client.publish(Topic.COMMAND.of(self._vehicle), encode(command), qos=1)
         await self.until(lambda: command.nonce in self.acks, f"an answer to {name.value}")
         return self.acks[command.nonce]
@@ -83,10 +85,12 @@ class Station:
                 self.state = decode(State, message.payload)
             case Topic.STREAM:
                 self.stream = decode(Stream, message.payload)
+                assert stream_proven(self.stream, self._vehicle, self._key)
                 self._session = self.stream.session
                 self._clock.heard(self.stream.t_s, time.monotonic())
             case Topic.ACK:
                 ack = decode(Ack, message.payload)
+                assert ack_proven(ack, self._vehicle, self._key)
                 self.acks[ack.nonce] = ack
 
 

@@ -390,12 +390,13 @@ ATTACKS = {
     "stale": Attack(Reason.STALE, lambda key, genuine: encode(signed(key, t_s=NOW_T_S - 5.1))),
     "of another flight": Attack(Reason.WRONG_SESSION, lambda key, genuine: encode(signed(key, session="f3a8"))),
     "from the future": Attack(Reason.FROM_THE_FUTURE, lambda key, genuine: encode(signed(key, t_s=NOW_T_S + 0.6))),
-    "malformed": Attack(Reason.MALFORMED, lambda key, genuine: b'{"v":1,"command":"land"}'),
+    "malformed": Attack(Reason.MALFORMED, lambda key, genuine: b'{"v":2,"command":"land"}'),
     "oversized": Attack(Reason.OVERSIZED, lambda key, genuine: genuine + b" " * COMMAND_MAX_BYTES),
     "wrong vehicle": Attack(Reason.WRONG_VEHICLE, lambda key, genuine: encode(signed(key, vehicle="second"))),
     "unsigned": Attack(Reason.MALFORMED, lambda key, genuine: re.sub(rb'"mac":"\w+"', b'"mac":""', genuine)),
     "changed": Attack(
-        Reason.BAD_SIGNATURE, lambda key, genuine: genuine.replace(b'"hold"', b'"abort"').replace(b'"land"', b'"abort"')
+        Reason.BAD_SIGNATURE,
+        lambda key, genuine: genuine.replace(b':"hold"', b':"abort"').replace(b'"land"', b'"abort"'),
     ),
     "a viewer's key": Attack(Reason.BAD_SIGNATURE, lambda key, genuine: encode(signed(new_key()))),
     "a viewer's name": Attack(Reason.UNKNOWN_OPERATOR, lambda key, genuine: encode(signed(new_key(), operator="wall"))),

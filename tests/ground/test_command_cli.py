@@ -62,6 +62,7 @@ def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, capsys: py
             ended = await command(capsys, "start", broker, keys)
             assert ended.code == EXIT_REFUSED
             assert ended.err_lines == ["companion command: rig: start refused: PX4 is not ready"]
+            vehicle.streams = False
             await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
             ended = await command(capsys, "land", broker, keys, "--vehicle", "rig")
             assert (ended.code, ended.err_lines) == (
@@ -72,18 +73,19 @@ def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, capsys: py
     play(scene())
 
 
-def test_a_stranger_is_refused_by_the_vehicle(
+def test_a_stranger_is_told_that_the_vehicle_does_not_have_the_key(
     broker: Broker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Another key of the same name: the vehicle does not even answer."""
+    """Another key of the same name: nothing of the vehicle is proven to it, so no command can be dated."""
     keys = tmp_path / "stranger.yaml"
     write_private(keys, operators_text([Operator("anna", b"x" * 32)]).encode())
 
     async def scene() -> None:
         async with played_vehicle(broker.port, OPERATORS) as vehicle:
             ended = await command(capsys, "start", broker, str(keys))
-            assert ended.code == EXIT_LOST
-            assert [refused.reason.value for refused in vehicle.refused] == ["bad_signature"]
+            assert ended.code == EXIT_REFUSED
+            assert "start: no message of rig is proven for anna: it does not have this key" in ended.err
+            assert not vehicle.commands_heard
 
     play(scene())
 
@@ -149,7 +151,7 @@ def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_quiet(
             async with aiomqtt.Client("127.0.0.1", broker.port) as client:
                 for number in range(50):
                     name = f"quiet-{number:02}"
-                    state = b'{"v":1,"vehicle":"%s","session":"s","presence":"%s","simulated":true,"mission":"m","law":"l",' \
+                    state = b'{"v":2,"vehicle":"%s","session":"s","presence":"%s","simulated":true,"mission":"m","law":"l",' \
                         b'"preset":"p","wall_s":0.0,"commands":true}'  # fmt: skip
                     presence = b"flying" if number == 49 else b"ended"
                     await client.publish(Topic.STATE.of(name), state % (name.encode(), presence), qos=1, retain=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +13,9 @@ from companion.config.document import ConfigError
 from companion.ground.access import broker_access
 from companion.ground.keys import Operator, operators_text, write_private
 from companion.ground.messages import CommandName, Presence
-from companion.ground.orders import NO_ANSWER, TRIES, Signer, signer_of
+from companion.ground.orders import NO_ANSWER, TRIES, signer_of
+from companion.ground.proof import Signer
+from companion.ground.watch import LIVE_S
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, play, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle
@@ -153,6 +156,9 @@ def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broke
             assert "no command can be dated" in await why_not("rig")
             await vehicle.say_stream()
             await viewer.until("stream")
+            await asyncio.sleep(
+                LIVE_S
+            )  # as long as proven messages come in, a state that nobody has proven is not believed
             await vehicle.say_state(commands=False, text="the broker is another computer")
             await viewer.until("state", lambda message: not message["data"]["commands"])
             assert "hears no commands: the broker is another computer" in await why_not("rig")

@@ -30,6 +30,7 @@ from companion.ground.messages import (
     Topic,
     encode,
 )
+from companion.ground.proof import with_proof, with_proofs
 from companion.ground.scene import scene_of
 from companion.ground.snapshot import replay
 from tests.analysis.synthetic_flight import synthetic_flight
@@ -58,6 +59,7 @@ class PlayedVehicle:
         self._client = client
         self._started_s = time.monotonic()
         self._verifier = Verifier(operators, name, session)
+        self._operators = operators
         self._seq = 0
         self.name = name
         self.session = session
@@ -105,6 +107,7 @@ class PlayedVehicle:
     async def say_stream(self, **values: Any) -> Stream:
         _, streams, _ = flight()
         stream = replace(streams[self._seq % len(streams)], session=self.session, seq=self._seq, t_s=self.t_s, **values)
+        stream = with_proofs(stream, self.name, self._operators.keys)
         self._seq += 1
         self.last_stream = stream
         await self.say(Topic.STREAM, stream, qos=0)
@@ -141,7 +144,7 @@ class PlayedVehicle:
                     VERSION, self.session, command.nonce, command.operator, command.command, accepted, text, self.t_s,
                     "catch", "nominal",
                 )  # fmt: skip
-                await self.say(Topic.ACK, ack)
+                await self.say(Topic.ACK, with_proof(ack, self.name, self._operators.key(command.operator)))
 
 
 @contextlib.asynccontextmanager

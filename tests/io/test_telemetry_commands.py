@@ -178,13 +178,13 @@ def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path
 
 def test_a_command_that_the_broker_kept_is_refused(tmp_path: Path, broker: Broker) -> None:
     with Listener(broker.port) as listener:
-        listener.publish(Topic.COMMAND.of(VEHICLE), b'{"v":1}', retain=True)
+        kept = make_command(CommandName.LAND, VEHICLE, "before", "anna", bytes(32), 0)
+        listener.publish(Topic.COMMAND.of(VEHICLE), encode(kept), retain=True)
         with flight_with(tmp_path, broker.url) as flight:
             flight.fly(100)
             listener.wait(Topic.STATE, State, lambda state: state.commands)
             listener.wait(
-                Topic.EVENTS, Events, lambda e: any("refused a command: retained" in line.text or "refused a command: early"
-                                                    in line.text for line in e.lines)
+                Topic.EVENTS, Events, lambda e: any("refused a command: bad_signature" in line.text for line in e.lines)
             )  # fmt: skip
 
 

@@ -46,7 +46,7 @@ export class Commands {
     const hint = make("small", { className: "hint" });
     button.replaceChildren(make("span", { className: "label", text: button.textContent }), hint);
     this._buttons.set(name, { button, hint, output: byId("answers").querySelector(`[data-for="${name}"]`) });
-    if (button.dataset.press === "long") new LongPress(button, this._now, () => this.press(name));
+    if (button.dataset.press === "long") new LongPress(button, this._now, () => this._about.vehicle?.stream?.hold, (hold) => this.press(name, hold));
     else button.addEventListener("click", () => this.press(name));
   }
 
@@ -58,13 +58,20 @@ export class Commands {
     this.press(name);
   }
 
-  /** A person wants this. */
-  press(name) {
+  /**
+   * A person wants this.
+   *
+   * @param name of the command
+   * @param hold for resume: number of the hold that was shown when the button went down
+   */
+  press(name, hold) {
     const now = this._now();
     if (refusal(name, this._about) !== null || now - (this._pressedMs.get(name) ?? -Infinity) < DOUBLE_MS) return;
     this._pressedMs.set(name, now);
     const vehicle = this._about.vehicle.name;
-    const left = this._send({ kind: "command", vehicle, command: name });
+    const message = { kind: "command", vehicle, command: name };
+    if (name === "resume") message.hold = hold ?? 0;
+    const left = this._send(message);
     const told = left ? { state: "wait", text: "sending …" } : { state: "no", text: `NOT SENT, no connection to the monitor: ${HELP}` };
     this._told.set(`${vehicle} ${name}`, { ...told, open: left, atMs: now, nonces: new Set(), sent: 0 });
     this.draw(this._about);
@@ -123,9 +130,11 @@ export class Commands {
 
 /** A button that must be pressed for 0.8 s, by pointer or key. */
 class LongPress {
-  constructor(button, now, act) {
+  /** @param look what is shown, when it goes down; @param act what is done with that, after 0.8 s */
+  constructor(button, now, look, act) {
     this._button = button;
     this._now = now;
+    this._look = look;
     this._act = act;
     this._startMs = null;
     button.addEventListener("pointerdown", (event) => event.button === 0 && this._start());
@@ -142,6 +151,7 @@ class LongPress {
   _start() {
     if (this._button.disabled) return;
     this._startMs = this._now();
+    this._seen = this._look();
     this._grow();
   }
 
@@ -151,7 +161,7 @@ class LongPress {
     if (this._button.disabled) this._stop();
     else if (part >= 1) {
       this._stop();
-      this._act();
+      this._act(this._seen);
     } else {
       this._button.style.setProperty("--pressed", String(part));
       requestAnimationFrame(() => this._grow());

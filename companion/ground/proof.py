@@ -1,0 +1,60 @@
+"""Proofs that a vehicle puts on what it publishes, for each operator whose key it holds: HMAC-SHA256 (RFC 2104), cut to 128 bits.
+
+The stream carries one proof per operator, an answer that of the operator who commanded. A ground station with a key dates its commands
+by proven messages only: whoever else writes to the broker cannot make it sign a command for a time that has not come.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+from companion.ground.messages import Ack, Stream
+from companion.record import json_text, to_jsonable
+
+_STREAM_DOMAIN = "companion stream 2"
+_ACK_DOMAIN = "companion ack 2"
+"""First line of every proven text: no proof is good for anything else, and none is a command's signature."""
+_PROOF_BYTES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Signer:
+    """The operator who commands from this ground station."""
+
+    operator: str
+    key: bytes = field(repr=False)
+
+
+def with_proofs(stream: Stream, vehicle: str, keys: Iterable[bytes]) -> Stream:
+    """The stream message with one proof for each key, in their order."""
+    text = _text(_STREAM_DOMAIN, vehicle, replace(stream, proofs=()))
+    return replace(stream, proofs=tuple(_proof(text, key) for key in keys))
+
+
+def stream_proven(stream: Stream, vehicle: str, key: bytes) -> bool:
+    """Whether one of the proofs was made with this key, for this vehicle and this very message."""
+    if not stream.proofs:
+        return False
+    wanted = _proof(_text(_STREAM_DOMAIN, vehicle, replace(stream, proofs=())), key)
+    return wanted.encode() in [proof.encode(errors="replace") for proof in stream.proofs]
+
+
+def with_proof(ack: Ack, vehicle: str, key: bytes) -> Ack:
+    """The answer with the proof for the operator whose key this is."""
+    return replace(ack, proof=_proof(_text(_ACK_DOMAIN, vehicle, replace(ack, proof="")), key))
+
+
+def ack_proven(ack: Ack, vehicle: str, key: bytes) -> bool:
+    """Whether the answer was made by a vehicle that holds this key."""
+    return with_proof(ack, vehicle, key).proof == ack.proof
+
+
+def _text(domain: str, vehicle: str, record: Stream | Ack) -> bytes:
+    return f"{domain}\n{vehicle}\n{json_text(to_jsonable(record))}\n".encode()
+
+
+def _proof(text: bytes, key: bytes) -> str:
+    return hmac.digest(key, text, hashlib.sha256)[:_PROOF_BYTES].hex()

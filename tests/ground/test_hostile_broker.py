@@ -1,0 +1,320 @@
+"""A broker that sends whatever it likes: no message ends the ground station, sets its clock, or keeps it from commanding."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from companion.ground.access import broker_access
+from companion.ground.commands import Accepted, Verifier, make_command
+from companion.ground.hub import Hub, Outbox
+from companion.ground.messages import (
+    VERSION,
+    Ack,
+    CommandName,
+    Preflight,
+    PreflightRow,
+    Presence,
+    Stream,
+    Topic,
+    encode,
+)
+from companion.ground.proof import with_proof, with_proofs
+from companion.ground.scene import scene_of
+from companion.ground.station import Station
+from companion.ground.tasks import until_first
+from companion.ground.text_view import Around, frame, line
+from companion.ground.watch import LIVE_S, VEHICLES_MAX, Watch
+from companion.record import to_jsonable
+from tests.broker import Broker, loopback_broker
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play, until
+from tests.ground.vehicle import flight, played_vehicle, state_of
+
+pytestmark = pytest.mark.waits
+
+STREAM = "companion/rig/stream"
+AROUND = Around("connected", True, "anna", None)
+
+
+def stream_of(t_s: float = 1.0, session: str = "s1", **values: Any) -> Stream:
+    return replace(flight()[1][30], session=session, t_s=t_s, **values)
+
+
+def proven(stream: Stream, vehicle: str = "rig") -> bytes:
+    return encode(with_proofs(stream, vehicle, [b"b" * 32, ANNA.key]))
+
+
+def flying(t_s: float = 100.0) -> Watch:
+    """A ground station of anna that has heard one proven message, at 50 s of its own clock."""
+    watch = Watch(signer=SIGNER)
+    assert watch.take(STREAM, proven(stream_of(t_s)), False, 50.0) is not None
+    return watch
+
+
+# -- the clock that commands are dated by ------------------------------------------------------------------------------
+
+
+def forged(watch: Watch) -> dict[str, bytes]:
+    genuine = with_proofs(stream_of(100.05), "rig", [ANNA.key])
+    return {
+        "no proof": encode(stream_of(160.0)),
+        "the proof of another message": encode(replace(genuine, t_s=160.0)),
+        "proven with another key": encode(with_proofs(stream_of(160.0), "rig", [b"x" * 32])),
+        "proven for another vehicle": proven(stream_of(160.0), "other"),
+        "of another flight": encode(stream_of(160.0, "s2")),
+        "many proofs": encode(stream_of(160.0, proofs=("0" * 32,) * 500)),
+        "proofs that are no text of ours": encode(stream_of(160.0, proofs=("\ud800", "", "\0"))),
+        "another hold": encode(replace(genuine, hold=7)),
+    }
+
+
+@pytest.mark.parametrize("name", forged(Watch()))
+def test_a_forged_stream_makes_nobody_sign_for_a_time_that_has_not_come(name: str) -> None:
+    """Signed 60 s ahead it would be refused now and good for whoever kept a copy of it 60 s later."""
+    watch = flying()
+    assert watch.take(STREAM, forged(watch)[name], False, 50.1) is None
+    known = watch.vehicles["rig"].proven
+    assert known is not None
+    assert (known.session, known.now_ms(50.1), known.hold) == ("s1", 100_100, 0)
+    command = make_command(CommandName.START, "rig", known.session, "anna", ANNA.key, known.now_ms(50.1))
+    assert isinstance(Verifier(OPERATORS, "rig", "s1").check(encode(command), False, 100.11), Accepted)
+
+
+def test_a_copy_of_an_earlier_message_is_not_shown_as_new() -> None:
+    watch, copy = Watch(signer=SIGNER), proven(stream_of(99.0))
+    assert watch.take(STREAM, copy, False, 49.0) is not None
+    assert watch.take(STREAM, proven(stream_of(100.0)), False, 50.0) is not None
+    assert watch.take(STREAM, copy, False, 50.1) is None
+
+
+def test_a_recording_of_an_earlier_flight_takes_the_place_of_none_that_is_under_way() -> None:
+    now, before = stream_of(100.0, "now", wall_s=2000.0), stream_of(500.0, "before", wall_s=1000.0)
+    watch = Watch(signer=SIGNER)
+    for k in range(40):  # the recording plays already when the flight begins, and goes on
+        watch.take(STREAM, proven(replace(before, t_s=500.0 + k / 20)), False, 50.0 + k / 20)
+    known = watch.vehicles["rig"]
+    assert known.proven is not None and known.proven.session == "before"
+    for k in range(40):
+        assert watch.take(STREAM, proven(replace(now, t_s=100.0 + k / 20)), False, 52.0 + k / 20) is not None
+        assert watch.take(STREAM, proven(replace(before, t_s=502.0 + k / 20)), False, 52.01 + k / 20) is None
+    assert (known.session, known.proven.session) == ("now", "now")
+
+
+def test_the_next_flight_is_taken_though_the_clock_on_the_wall_was_set_back() -> None:
+    watch = flying()
+    later = proven(stream_of(1.0, "s2", wall_s=5.0))
+    assert watch.take(STREAM, later, False, 50.5) is None
+    assert watch.take(STREAM, later, False, 50.0 + LIVE_S) is not None
+    known = watch.vehicles["rig"].proven
+    assert known is not None and (known.session, known.now_ms(51.0)) == ("s2", 1000)
+
+
+def test_without_a_key_everything_is_shown() -> None:
+    watch = Watch()
+    for t_s in (100.0, 160.0):
+        assert watch.take(STREAM, encode(stream_of(t_s)), False, 50.0) is not None
+    assert watch.vehicles["rig"].proven is None
+
+
+def test_an_answer_that_the_vehicle_did_not_prove_is_none() -> None:
+    """Else whoever reads the nonce on the way says "landing" and ends the tries."""
+    ack = Ack(VERSION, "s1", "0" * 32, "anna", CommandName.LAND, True, "landing", 1.0, "catch", "land")
+    watch, topic = Watch(signer=SIGNER), "companion/rig/ack"
+    assert watch.take(topic, encode(ack), False, 50.0) is None
+    assert watch.take(topic, encode(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
+    assert watch.take(topic, encode(with_proof(ack, "other", ANNA.key)), False, 50.0) is None
+    assert watch.take(topic, encode(with_proof(ack, "rig", ANNA.key)), False, 50.0) is not None
+    assert watch.take(topic, encode(replace(ack, operator="bert")), False, 50.0) is not None
+
+
+def test_a_flood_of_vehicles_does_not_push_out_the_one_that_is_proven() -> None:
+    watch = flying()
+    for number in range(3 * VEHICLES_MAX):
+        name = f"forged-{number}"
+        watch.take(f"companion/{name}/state", encode(state_of(name, "s")), False, 50.01)
+    assert len(watch.vehicles) == VEHICLES_MAX
+    assert "rig" in watch.vehicles
+
+
+# -- numbers and everything else ---------------------------------------------------------------------------------------
+
+HOSTILE = (
+    "NaN", "Infinity", "-Infinity", '"nan"', '"inf"', "1e999", "-1e999", "9" * 400, "-" + "9" * 400, "9" * 5000, "1e300", "-1e300",
+    "1e12", "-1e12", "1e-320", "-0.0", "0", "-1", str(2**53), str(2**63), "true", "null", '"x"', "[]", "{}", "[" * 5000 + "]" * 5000,
+    '"' + "y" * 150_000 + '"', '"\\ud800"', '"\\u0000\\u001b[2J\\u202e"', '[NaN]', "[1,2,3]", '{"v":2,"v":2}',
+)  # fmt: skip
+
+
+@cache
+def genuine() -> dict[Topic, dict[str, Any]]:
+    """One good message of each topic, as data."""
+    config, _, events = flight()
+    scene = scene_of(config, "s1", [(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], mission_s=21.0)
+    ack = Ack(VERSION, "s1", "0" * 32, "bert", CommandName.HOLD, True, "holding", 1.0, "catch", "hold")
+    records = {
+        Topic.STATE: state_of("rig", "s1"),
+        Topic.SCENE: scene,
+        Topic.PREFLIGHT: Preflight(VERSION, "s1", (PreflightRow("px4_link", "ok", "3 ms"),)),
+        Topic.EVENTS: replace(events, session="s1", lines=events.lines[:2]),
+        Topic.STREAM: stream_of(hold=1, proofs=("0" * 32,)),
+        Topic.ACK: ack,
+    }
+    return {topic: json.loads(encode(record)) for topic, record in records.items()}
+
+
+def places(data: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Where in the data a value stands, containers included; of a list's elements the first two."""
+    yield path
+    items = data.items() if isinstance(data, dict) else enumerate(data[:2]) if isinstance(data, list) else ()
+    for key, value in items:
+        yield from places(value, (*path, key))
+
+
+def spoiled(data: Any, path: tuple[str | int, ...], raw: str) -> bytes:
+    """The message with this JSON text at that place."""
+    if not path:
+        return raw.encode()
+    copy = json.loads(json.dumps(data))
+    inner = copy
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = "@here@"
+    return json.dumps(copy).replace('"@here@"', raw).encode()
+
+
+def everything_hostile() -> Iterator[tuple[Topic, bytes]]:
+    for topic, data in genuine().items():
+        for path in places(data):
+            for raw in HOSTILE:
+                yield topic, spoiled(data, path, raw)
+        payload = json.dumps(data).encode()
+        for other in (
+            payload[:-1],
+            payload.decode().encode("utf-16"),
+            b"\xef\xbb\xbf" + payload,
+            b"\xff" + payload,
+            payload * 2,
+            b"",
+        ):
+            yield topic, other
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_no_message_raises_anywhere_in_a_ground_station(signed: bool) -> None:
+    """Every value at every place of every message, through the watch, the page's hub and what the terminal shows."""
+    watch = Watch(signer=SIGNER if signed else None)
+    hub, outbox = Hub(watch, ""), Outbox()
+    hub.join(outbox, 0.0)
+    console = Console(file=io.TextIOWrapper(io.BytesIO(), encoding="utf-8"), width=100)
+    now_s, taken = 50.0, 0
+    for topic, payload in everything_hostile():
+        now_s += 0.001
+        heard = watch.take(topic.of("rig"), payload, False, now_s)
+        if heard is None:
+            continue
+        taken += 1
+        hub.relay(heard)
+        known = watch.vehicles["rig"]
+        console.print(frame(known, now_s, AROUND))
+        line(known, now_s).encode()
+        watch.there(now_s)
+        Hub(watch, "").join(Outbox(), now_s)
+    assert taken > 100, "what is merely odd is shown"
+    assert watch.rubbish > 4000
+
+
+@given(
+    st.binary(max_size=300),
+    st.sampled_from([topic.of("rig") for topic in Topic] + ["companion/rig", "x", "", "a/\0/b"]),
+)
+def test_random_bytes_are_counted(payload: bytes, topic: str) -> None:
+    watch = Watch(signer=SIGNER)
+    assert watch.take(topic, payload, False, 50.0) is None
+    assert watch.rubbish == 1
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with loopback_broker(tmp_path) as broker:
+        yield broker
+
+
+def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker: Broker) -> None:
+    changes: list[str] = []
+
+    async def scene() -> None:
+        station = Station(
+            broker_access(broker.url, None, None), SIGNER, None, lambda heard: None, lambda connected, text: changes.append(text)
+        )  # fmt: skip
+
+        async def fight() -> None:
+            async with (
+                played_vehicle(broker.port, OPERATORS, session="s1") as vehicle,
+                aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as hostile,
+            ):
+                watch = station.watch
+                await until(lambda: "rig" in watch.vehicles and watch.vehicles["rig"].proven is not None)
+                for number, (topic, payload) in enumerate(everything_hostile()):
+                    await hostile.publish(topic.of("rig"), payload, qos=number % 200 == 0)
+                for lie in (
+                    state_of("rig", "s1", presence=Presence.ENDED, outcome="completed"),
+                    state_of("rig", "s1", commands=False, text="hears nothing"),
+                    state_of("rig", "another flight"),
+                ):
+                    await hostile.publish(Topic.STATE.of("rig"), encode(lie), qos=1, retain=True)
+                    await until(lambda lie=lie: watch.vehicles["rig"].state == lie)  # type: ignore[misc]
+                    ack = await station.orders.give("rig", CommandName.LAND, lambda note: None)
+                    assert ack is not None and ack.accepted
+                assert [command.command for command in vehicle.accepted] == [CommandName.LAND] * 3
+                assert watch.rubbish > 4000
+            assert [text for text in changes if not text.startswith("connected")] == []
+
+        await until_first(station.run(), fight())
+
+    play(scene())
+
+
+def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> None:
+    """An error of our own while a message is handled costs that message, neither the connection nor the command."""
+
+    def fails(heard: object) -> None:
+        raise ZeroDivisionError("of our own")
+
+    async def scene() -> None:
+        changes: list[str] = []
+        station = Station(
+            broker_access(broker.url, None, None), SIGNER, None, fails, lambda connected, text: changes.append(text)
+        )
+
+        async def fight() -> None:
+            async with played_vehicle(broker.port, OPERATORS):
+                await until(lambda: station.watch.rubbish > 10)
+                ack = await station.orders.give("rig", CommandName.LAND, lambda note: None)
+                assert ack is not None and ack.accepted
+            assert "ZeroDivisionError: 'of our own'" in (station.watch.rubbish_text or "")
+            assert len(changes) == 1
+
+        await until_first(station.run(), fight())
+
+    play(scene())
+
+
+def test_proofs_are_of_the_whole_message() -> None:
+    stream = with_proofs(stream_of(), "rig", [ANNA.key])
+    data = to_jsonable(stream)
+    watch = Watch(signer=SIGNER)
+    for name in data.keys() - {"v", "session", "proofs"}:
+        less = {key: value for key, value in data.items() if key != name}
+        watch.take(STREAM, json.dumps(less).encode(), False, 50.0)
+    assert not watch.vehicles or watch.vehicles["rig"].proven is None
