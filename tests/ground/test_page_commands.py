@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from companion.ground.messages import Presence
 from tests.ground.page_browser import Page, chromium, playing, watching
 from tests.ground.page_stand import NAME, Message, Stand, ack, flown, retained, state, told
 
@@ -105,6 +107,19 @@ def test_a_double_click_sends_one_command(stand: Stand, page: Page) -> None:
     page.run(0.02)
     page.press("hold")
     assert asked(stand, 3) == ["hold", "land", "hold"]
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [state(Presence.ENDED, outcome="completed"), state(Presence.FLYING, commands=False, text="hears nothing")],
+    ids=["ended", "hears no commands"],
+)
+def test_a_state_that_the_stream_contradicts_keeps_nobody_from_landing_it(stand: Stand, page: Page, lie: Any) -> None:
+    """The stream is proven, the state is not."""
+    page.tell(told(replace(flown().at(8.55), proofs=("0" * 32,))), told(lie))
+    assert page.enabled() == {"hold", "land", "abort"}
+    page.press("land")
+    assert asked(stand, 1) == ["land"]
 
 
 def test_safety_does_not_wait_for_fresh_data(stand: Stand, page: Page) -> None:

@@ -6,6 +6,7 @@ const DOUBLE_MS = 300;
 const PRESS_MS = 800;
 const NO_ANSWER_MS = 2500; // the monitor itself gives up after 1.5 s and says so
 const FRESH_MS = 8000; // so long a button shows what came of it
+const LIVE_S = 1; // as the monitor has it
 const SAFE = new Set(["hold", "land", "abort"]);
 const KEYS = { H: "hold", L: "land", A: "abort" };
 const HELP = "use Ctrl-C in the flight's terminal, or the pilot's switch";
@@ -19,6 +20,8 @@ const HELP = "use Ctrl-C in the flight's terminal, or the pilot's switch";
 export function refusal(name, { canCommand, whyNot, vehicle, verdict }) {
   if (!canCommand) return whyNot || "view only";
   if (vehicle === null) return "no vehicle";
+  // The vehicle proves its stream and not its state: while the stream comes in, no state keeps anybody from making it safer.
+  if (SAFE.has(name) && verdict.ageS !== null && verdict.ageS <= LIVE_S && vehicle.stream?.proofs?.length > 0) return null;
   if (verdict.ended) return "the flight is over";
   if (vehicle.state && !vehicle.state.commands && vehicle.state.presence !== "lost") return vehicle.state.text || "this vehicle hears no commands";
   if (SAFE.has(name)) return null;
