@@ -6,6 +6,7 @@ Expectations and known keys are read from the model's own JSON schema, so that t
 from __future__ import annotations
 
 import difflib
+import functools
 import json
 import re
 from collections.abc import Iterator
@@ -34,6 +35,12 @@ MANY_OPTIONS = 12
 """More of them are not listed in a line."""
 
 
+@functools.cache
+def _schema_of(model: type[Model]) -> _Node:
+    """Return the model's JSON Schema; making it takes longer than all other validation."""
+    return model.model_json_schema()
+
+
 def validate(model: type[M], document: Document) -> M | None:
     """Build a model from a document; problems are appended to `document.problems` and the answer is None.
 
@@ -41,7 +48,7 @@ def validate(model: type[M], document: Document) -> M | None:
         model: what the document describes.
         document: read and overridden.
     """
-    schema = model.model_json_schema()
+    schema = _schema_of(model)
     found = [
         _problem(RANK_VALUE, document.origin(at), at, f"expected {describe(node, schema)}, got {_show(value)}")
         for at, node, value in _booleans(schema, document.data, ())

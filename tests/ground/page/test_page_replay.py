@@ -18,15 +18,11 @@ from companion.record import to_jsonable
 from sitl.fast import FastFlight
 from tests.analysis.recorded import record
 from tests.broker import free_port
-from tests.ground.page_browser import Page, chromium, watching
+from tests.ground.page_browser import Page, watching
 from tests.ground.page_stand import Message, Stand, flown, hello, preflight, sent_at, state
 from tests.support import CATCH, sandbox_in
 
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
+pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
 
 def log_of(streams: tuple[Stream, ...] | None = None) -> Message:

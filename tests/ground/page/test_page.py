@@ -9,17 +9,13 @@ from typing import Any
 import pytest
 
 from companion.ground.messages import Presence, Stream
-from tests.ground.page_browser import Page, chromium, events_of, playing, watching
+from tests.ground.page_browser import Page, events_of, playing, watching
 from tests.ground.page_stand import BROKER, NAME, Stand, ack, event, flown, hello, retained, state, told
+
+pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
 SAFE = {"hold", "land", "abort"}
 HOSTILE = "<img src=x onerror='window.pwned = 1'><script>window.pwned = 1</script>"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture

@@ -9,17 +9,13 @@ from typing import Any
 import pytest
 
 from companion.ground.messages import Presence
-from tests.ground.page_browser import Page, chromium, playing, watching
+from tests.ground.page_browser import Page, playing, watching
 from tests.ground.page_stand import NAME, Message, Stand, ack, flown, retained, state, told
+
+pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
 NONCE = "0123456789abcdef" * 2
 NO_ANSWER = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture

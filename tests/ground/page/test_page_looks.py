@@ -14,19 +14,15 @@ from companion.config.loader import load_flight
 from companion.control.manipulator import Manipulator
 from companion.frames import quat_from_euler_zyx, quat_rotate
 from companion.record import to_jsonable
-from tests.ground.page_browser import SIZES, Page, chromium, events_of, watching
+from tests.ground.page_browser import SIZES, Page, events_of, watching
 from tests.ground.page_stand import BROKER, Stand, event, flown, hello, retained, told
 from tests.support import CATCH
+
+pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
 TOUCH_PX = 56.0
 LARGE_PX, LARGE_BOLD_PX = 24.0, 18.66
 """WCAG 2.2, 1.4.3: text of this size needs 3 : 1, all other 4.5 : 1."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture
