@@ -88,6 +88,32 @@ class AutopilotEnd(Protocol):
         """kind (stub, px4) and version."""
 
 
+def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
+    """Return the stub with the parameters of this world, gains included; its hover thrust is set by `set_hover_thrust`.
+
+    Args:
+        config: `setpoint_delay_s` and `px4_params`.
+        link_delay_s: added to the setpoint delay, for a loop without a wire that takes this time.
+    """
+    params = Params()
+    for name, value in config.spoiled_px4_params().items():
+        params.set(name, value)
+    cascade = Cascade(gains_from_params(params))
+    return Px4Stub(params, Estimator(), cascade, setpoint_delay_s=config.setpoint_delay_s + link_delay_s)
+
+
+def set_hover_thrust(px4: Px4Stub, config: WorldConfig, world: World) -> float:
+    """Set MPC_THR_HOVER to this machine's hover thrust times 1 + `hover_thrust_error`, unless `px4_params` overrides it.
+
+    Returns:
+        The hover thrust before the override.
+    """
+    hover_thrust = world.hover_command * (1.0 + config.hover_thrust_error)
+    if "MPC_THR_HOVER" not in config.px4_params:
+        px4.params.set("MPC_THR_HOVER", hover_thrust)
+    return hover_thrust
+
+
 class StubEnd:
     """The stub, in this process."""
 
@@ -96,10 +122,7 @@ class StubEnd:
     def __init__(self, config: WorldConfig, ports: Ports) -> None:
         self._config = config
         self._ports = ports
-        params = Params()
-        self.px4 = Px4Stub(
-            params, Estimator(), Cascade(gains_from_params(params)), setpoint_delay_s=config.setpoint_delay_s
-        )
+        self.px4 = stub_of(config)
 
     @property
     def armed(self) -> bool:
@@ -118,10 +141,7 @@ class StubEnd:
 
     def attach(self, world: World) -> None:
         """Its hover thrust is that of this world's machine."""
-        hover_thrust = world.hover_command * (1.0 + self._config.hover_thrust_error)
-        self.px4.params.set("MPC_THR_HOVER", hover_thrust)
-        for name, value in self._config.spoiled_px4_params().items():
-            self.px4.params.set(name, value)
+        set_hover_thrust(self.px4, self._config, world)
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:
@@ -146,7 +166,8 @@ class StubEnd:
     def pump(self, t_s: float, battery: Battery) -> None:
         """What it measures and what it streams."""
         self.px4.battery = battery
-        self._mavlink.pump(t_s)
+        if not self.down:  # its clock would be negative
+            self._mavlink.pump(t_s)
 
     def set_link(self, down: bool, delay_s: float) -> None:
         """Both of its links."""

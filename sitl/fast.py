@@ -21,7 +21,7 @@ from companion.frames import (
     flu_from_frd,
     ned_from_enu,
 )
-from companion.io import dynamixel as dxl
+from companion.io.dynamixel import WATCHDOG_ERROR
 from companion.types import (
     ArmState,
     AutopilotRequest,
@@ -38,23 +38,25 @@ from companion.types import (
     Vec3,
     VehicleState,
 )
-from sitl.autopilot.autopilot import Command7, Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.autopilot import Command7
 from sitl.autopilot.commander import FORCE_MAGIC, Command
-from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.modes import NavState
-from sitl.autopilot.params import Params
 from sitl.autopilot.telemetry import system_status
 from sitl.autopilot.types import AttitudeTarget
+from sitl.ends import set_hover_thrust, stub_of
+from sitl.fast_bus import scales_of
 from sitl.fast_guardian import TAKE_OVER_S, Landing, StandIn
 from sitl.fast_link import FastLink
 from sitl.faults import COOL_C, Faults, in_time
 from sitl.plant import MocapFrame, Plant, battery_voltage_v
 from sitl.server import start_of
-from sitl.servo_drive import MODE_CURRENT, ServoDrive
+from sitl.servo_drive import MODE_CURRENT
+from sitl.servo_knobs import plugged_in, servos_of
 from sitl.world import Layout, Snapshot, Truth
 
 TICK_S = 0.005
+LINK_DELAY_S = 0.002
+"""Time that a setpoint takes on the wire."""
 POSITION_PERIOD_S = 1.0 / 124.0
 """As PX4 streams at most; attitude and IMU come with every tick."""
 _NO_COMMAND, _LAND = OperatorCommand.NONE, OperatorCommand.LAND
@@ -125,11 +127,9 @@ class FastFlight:
         config = in_time(config)
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
-        params = Params()
-        self.px4 = Px4Stub(
-            params, Estimator(), Cascade(gains_from_params(params)), setpoint_delay_s=world.setpoint_delay_s + 0.002
-        )
-        self._drives = [ServoDrive() for _ in vehicle.arm.joints]
+        self.px4 = stub_of(world, LINK_DELAY_S)
+        servos = servos_of(vehicle, world)
+        self._drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
         self.plant = Plant(vehicle, world, self.px4, self._drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
         self.faults = Faults(world, self.plant.world, self.px4, self._drives, vehicle.tether.anchor_world_m)
@@ -138,10 +138,7 @@ class FastFlight:
         self._guardian = StandIn(vehicle, self.px4) if world.faults else None
         self._link = FastLink(self.faults, self.plant.world, self.px4, TICK_S)
         self._goal_s = 0.0
-        hover = self.plant.world.hover_command * (1.0 + world.hover_thrust_error)
-        params.set("MPC_THR_HOVER", hover)
-        for name, value in world.spoiled_px4_params().items():
-            params.set(name, value)
+        hover = set_hover_thrust(self.px4, world, self.plant.world)
         if vehicle.airframe.hover_thrust is None:
             airframe = vehicle.airframe.model_copy(update={"hover_thrust": hover})
             vehicle = vehicle.model_copy(update={"airframe": airframe})
@@ -151,11 +148,10 @@ class FastFlight:
         self._watchdog_s = vehicle.devices.arm.watchdog_ms * 1e-3
         for drive in self._drives:
             drive.mode, drive.torque_on = MODE_CURRENT, True
+            drive.set_goal_current(0, at_once=True)
             drive.start_watchdog(self._watchdog_s)
-        self._scales = [
-            dxl.joint_scale(joint, vehicle.arm.torque_per_amp_nm_a, drive.current_limit_counts)
-            for joint, drive in zip(vehicle.arm.joints, self._drives, strict=True)
-        ]
+        self._scales = scales_of(vehicle, plugged_in(servos, world))
+        """None if the set-up of the servo bus failed: the arm never answers."""
         self._mocap: MocapPose | None = None
         self._force: ForceSample | None = None
         self._arm: ArmState | None = None
@@ -347,7 +343,9 @@ class FastFlight:
             system_status(self.px4),
         )
 
-    def _read_arm(self, t_s: float) -> ArmState:
+    def _read_arm(self, t_s: float) -> ArmState | None:
+        if self._scales is None:
+            return None
         (drive1, drive2), (scale1, scale2) = self._drives, self._scales
         current1, speed1, position1 = drive1.present()
         current2, speed2, position2 = drive2.present()
@@ -357,7 +355,7 @@ class FastFlight:
             errors, temperatures_c = (e1, e2), (c1, c2)
         if drive1.watchdog_tripped or drive2.watchdog_tripped:
             # As the edge does: told in one state, and started again with no current.
-            tripped = (drive1.watchdog_tripped * dxl.WATCHDOG_ERROR, drive2.watchdog_tripped * dxl.WATCHDOG_ERROR)
+            tripped = (drive1.watchdog_tripped * WATCHDOG_ERROR, drive2.watchdog_tripped * WATCHDOG_ERROR)
             errors = (errors[0] | tripped[0], errors[1] | tripped[1])
             drive1.start_watchdog(self._watchdog_s)
             drive2.start_watchdog(self._watchdog_s)
@@ -382,7 +380,7 @@ class FastFlight:
                 self._link.send(lambda: self.px4.on_setpoint(self.plant.world.t_s, target))
             else:
                 self.px4.on_setpoint(self.plant.world.t_s, target)
-        if torque_nm is not None:
+        if torque_nm is not None and self._scales is not None:
             self._goal_s = self.plant.world.t_s
             (drive1, drive2), (scale1, scale2) = self._drives, self._scales
             counts = (scale1.current_counts(torque_nm[0]), scale2.current_counts(torque_nm[1]))

@@ -32,7 +32,6 @@ class ForceTorqueServer:
         product_name: what it answers to PRODUCT_NAME.
         serial_number: to SERIAL_NUMBER.
         firmware: to FIRMWARE_VERSION.
-        scale: its readings over the truth, of a sensor that is badly calibrated or another model.
 
     Attributes:
         silent: the sensor neither answers nor streams (cable cut).
@@ -45,9 +44,7 @@ class ForceTorqueServer:
         product_name: str = "RFT60-HA01",
         serial_number: str = "RFT60HA-0001",
         firmware: str = "V1.2.0",
-        scale: float = 1.0,
     ) -> None:
-        self._scale = scale
         self.silent = False
         self.stuck = False
         self.dropped = 0
@@ -107,8 +104,8 @@ class ForceTorqueServer:
 
     def set_wrench(self, force_n: Vec3, torque_nm: Vec3) -> None:
         """What the sensor feels from now on, in its own frame, N and N m; any rate."""
-        self._force_n = _scaled(force_n, self._scale)
-        self._torque_nm = _scaled(torque_nm, self._scale)
+        self._force_n = force_n
+        self._torque_nm = torque_nm
 
     def tick(self, t_s: float) -> None:
         """Send every packet that is due by the world's time `t_s`; call it every millisecond or two of world time."""
@@ -188,10 +185,6 @@ class ForceTorqueServer:
         else:
             text = self._texts[command].encode("ascii")[:15]
             self._write(rft.pack(bytes((command,)) + text, rft.RESPONSE_BYTES))
-
-
-def _scaled(v: Vec3, k: float) -> Vec3:
-    return v if k == 1.0 else (k * v[0], k * v[1], k * v[2])
 
 
 def _subtract(a: Vec3, b: Vec3) -> Vec3:

@@ -174,11 +174,9 @@ class HungWeight:
     def __init__(self, config: WorldConfig) -> None:
         self._weight_n, self._after_s = GRAVITY_M_S2 * config.net_weight_kg, config.net_weight_t_s
         self._read_since_s: float | None = None
-        self.pull_n = 0.0
-        """Downwards, on the net's centre, now."""
 
-    def changed(self, t_s: float, read: bool) -> bool:
-        """Whether `pull_n` is another than before.
+    def pull_n(self, t_s: float, read: bool) -> float:
+        """Force on the net's centre now, N, downwards.
 
         Args:
             t_s: world time.
@@ -189,9 +187,7 @@ class HungWeight:
         elif self._read_since_s is None:
             self._read_since_s = t_s
         since_s = self._read_since_s
-        pull_n = self._weight_n if since_s is not None and t_s - since_s >= self._after_s else 0.0
-        before, self.pull_n = self.pull_n, pull_n
-        return pull_n != before
+        return self._weight_n if since_s is not None and t_s - since_s >= self._after_s else 0.0
 
 
 def _holding(held_s: float) -> tuple[_Leg, ...]:

@@ -21,7 +21,7 @@ from companion.types import Quat, Vec2, Vec3, Vec4
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
 from sitl.faults import Faults
-from sitl.hand import Hand
+from sitl.hand import Hand, HungWeight
 from sitl.mocap_axes import SpoiledFrame
 from sitl.world import Truth, World
 
@@ -125,6 +125,9 @@ class Plant:
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
         self._spoiled = SpoiledFrame.of(config)
         self._hand = Hand(config, self.world.weight_n) if config.hand else None
+        self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
+        self.force_is_read = True
+        """Whether the force sensor streams; the fast closed loop reads it from the start."""
         self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self._tick = 0
         self._imu_sample: ImuSample | None = None
@@ -160,10 +163,15 @@ class Plant:
         """The fault of that kind that is active now."""
         return None if self.faults is None else self.faults.active.get(kind)
 
-    def _push(self, push: Push) -> Vec3:
-        now = self.mission_t_s()
-        active = now is not None and push.t_s <= now < push.t_s + push.duration_s
-        return push.force_world_n if active else (0.0, 0.0, 0.0)
+    def _load_on_net(self, push: Push | None, weight: HungWeight | None) -> Vec3:
+        """Force on the net's centre of the push and of the hung weight, N, world frame."""
+        now, force = self.mission_t_s(), (0.0, 0.0, 0.0)
+        if push is not None and now is not None and push.t_s <= now < push.t_s + push.duration_s:
+            force = push.force_world_n
+        if weight is None:
+            return force
+        x, y, z = force
+        return (x, y, z - weight.pull_n(self.world.t_s, self.force_is_read))
 
     def step(self, armed: bool) -> None:
         """Advance by one physics step."""
@@ -185,8 +193,8 @@ class Plant:
             self._rotors = self._px4.step(self._imu_sample or self._imu())
             self._imu_sample = None
         self._tick += 1
-        if config.push is not None:
-            world.push(self._push(config.push))
+        if config.push is not None or self._weight is not None:
+            world.push(self._load_on_net(config.push, self._weight))
         if self._hand is not None:
             world.hold(None if armed else self._hand.wrench(t_s, q, v))
         world.step(self._rotors, (torque1, torque2), armed)
@@ -273,7 +281,7 @@ class Plant:
         return remaining if remaining > 0.0 else 0.0
 
     def force_torque(self) -> tuple[Vec3, Vec3]:
-        """What the force-torque sensor reads: noise and bias on, sensor frame."""
+        """Reading of the force-torque sensor in N and N m, sensor frame: noise, bias, faults and scale error included."""
         s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
         bx, by, bz = self._config.force_bias_n
         noise_n = self._config.force_noise_n
@@ -284,4 +292,11 @@ class Plant:
             (-s[f] + bx + noise_n * nx, -s[f + 1] + by + noise_n * ny, -s[f + 2] + bz + noise_n * nz),
             (-s[tq] + noise_nm * mx, -s[tq + 1] + noise_nm * my, -s[tq + 2] + noise_nm * mz),
         )
-        return wrench if self.faults is None else self.faults.wrench(*wrench)
+        if self.faults is not None:
+            wrench = self.faults.wrench(*wrench)
+        scale = self._config.force_scale
+        return wrench if scale == 1.0 else (_scaled(wrench[0], scale), _scaled(wrench[1], scale))
+
+
+def _scaled(v: Vec3, k: float) -> Vec3:
+    return (k * v[0], k * v[1], k * v[2])

@@ -25,12 +25,11 @@ from sitl.ends import AutopilotEnd, StubEnd
 from sitl.faults import Faults, Sample, sample
 from sitl.flight_faults import SIGNALS, FlightFaults, environment, strike
 from sitl.force_torque import ForceTorqueServer
-from sitl.hand import HungWeight
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
 from sitl.plant import MocapFrame, Plant
 from sitl.px4_link import Px4Error
 from sitl.servo_bus import ServoBus
-from sitl.servo_knobs import servo_of
+from sitl.servo_knobs import plugged_in, servos_of
 from sitl.servo_model import ServoModel
 from sitl.world import PHYSICS_DT_S
 
@@ -89,12 +88,8 @@ class Sitl:
         self._vehicle = vehicle
         self._config = config
         self._on_message = on_message
-        arm = vehicle.arm
-        knobs = [config.servo(index) for index in range(len(arm.joints))]
-        self.servos = [
-            servo_of(joint, vehicle.devices.arm, knob) for joint, knob in zip(arm.joints, knobs, strict=True)
-        ]
-        self._on_bus = [servo for servo, knob in zip(self.servos, knobs, strict=True) if knob.connected]
+        self.servos = servos_of(vehicle, config)
+        self._on_bus = plugged_in(self.servos, config)
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
         self.autopilot: AutopilotEnd = autopilot or StubEnd(config, stub_ports)
         pose = (start.position_m, start.yaw_rad, start.arm_rad)
@@ -110,7 +105,6 @@ class Sitl:
         )
         if config.faults:
             self.plant.faults = self.faults
-        self._weight = HungWeight(config)
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
         self._arm_hand = ArmHand(vehicle.arm, pose[2]) if config.arm_hand else None
@@ -141,7 +135,7 @@ class Sitl:
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
             self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
-            self.force = await stack.enter_async_context(ForceTorqueServer(scale=self._config.force_scale))
+            self.force = await stack.enter_async_context(ForceTorqueServer())
             self.mocap = await stack.enter_async_context(
                 NatNetServer(
                     version=self._config.natnet_version,
@@ -239,8 +233,7 @@ class Sitl:
             else:
                 loop = asyncio.get_running_loop()
                 self._next_frame = loop.call_at(self._origin_s + leaves_s, self._publish, frame, leaves_s)
-        if self._weight.changed(plant.t_s, self.force.streaming):
-            plant.world.push((0.0, 0.0, -self._weight.pull_n))
+        plant.force_is_read = self.force.streaming
         self.force.set_wrench(*plant.force_torque())
         self.force.tick(plant.t_s)
         autopilot.pump(plant.t_s, plant.battery())

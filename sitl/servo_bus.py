@@ -337,10 +337,7 @@ class ServoBus:
         speed = termios.tcgetattr(self._slave_fd)[5]
         # 0: a rate without a name in termios, which is none of the servos'.
         baud_bps = _BAUD_OF_SPEED.get(speed, 0)
-        if self.damaged():
-            middle = len(data) // 2
-            data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]
-        answer, delay_s = self.line.exchange(data, baud_bps)
+        answer, delay_s = self.answer_to(data, baud_bps)
         if not answer:
             return
         if not self._wire_time:
@@ -350,6 +347,13 @@ class ServoBus:
         self._line_free_s = max(now_s, self._line_free_s) + on_wire_s + delay_s
         self._timers = {timer for timer in self._timers if not timer.cancelled() and timer.when() > now_s}
         self._timers.add(self._loop.call_at(self._line_free_s, self._send, answer))
+
+    def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
+        """Return what the servos answer to bytes sent at a baud rate, and their return delay in s; noise may damage the bytes."""
+        if self.damaged():
+            middle = len(data) // 2
+            data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]
+        return self.line.exchange(data, baud_bps)
 
     def _send(self, answer: bytes) -> None:
         if self._loop is None:

@@ -1,11 +1,24 @@
-"""A servo as the world's settings want it: out of its box, or as somebody left it."""
+"""The servos as the world's settings want them, over wires as in the fast closed loop."""
 
 from __future__ import annotations
 
-from companion.config.vehicle import ArmDevice, Joint
-from companion.config.world import Servo
+from collections.abc import Sequence
+
+from companion.config.vehicle import ArmDevice, Joint, Vehicle
+from companion.config.world import Servo, World
 from sitl import servo_registers as reg
 from sitl.servo_model import ServoModel
+
+
+def servos_of(vehicle: Vehicle, config: World) -> list[ServoModel]:
+    """Return the servo of each joint, whether or not it is plugged in."""
+    joints, device = vehicle.arm.joints, vehicle.devices.arm
+    return [servo_of(joint, device, config.servo(index)) for index, joint in enumerate(joints)]
+
+
+def plugged_in(servos: Sequence[ServoModel], config: World) -> list[ServoModel]:
+    """Return the servos whose plug is in the bus."""
+    return [servo for index, servo in enumerate(servos) if config.servo(index).connected]
 
 
 def servo_of(joint: Joint, device: ArmDevice, knobs: Servo) -> ServoModel:

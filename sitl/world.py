@@ -20,6 +20,8 @@ DRAG_N_PER_M_S = 0.25
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
 """Of a tether that is caught."""
 _THROW_LEAD_S = 0.45
+_THROW_BESIDE_M = 0.5
+"""The vehicle passes `catch_at_m` at most this far to the left or right of it, else nothing is thrown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +267,8 @@ class World:
         if self._flies_since_s is None:
             vx = self.v[0]
             ahead = self.q[0] + vx * _THROW_LEAD_S
-            if airborne and vx > 0.05 and self._last_x < self._config.catch_at_m[0] <= ahead:
+            at_x, at_y = self._config.catch_at_m
+            if airborne and vx > 0.05 and self._last_x < at_x <= ahead and abs(self.q[1] - at_y) <= _THROW_BESIDE_M:
                 self._throw()
             self._last_x = ahead
             return

@@ -81,7 +81,8 @@ class World(Model):
     """0: nothing is thrown."""
     seed: Annotated[int, Field(ge=0)] = 1
     catch_at_m: Vector2 = (0.0, 0.0)
-    """Where the vehicle is when the payload arrives in the net; thrown on its first pass in the direction of +x."""
+    """Where the vehicle is when the payload arrives in the net; thrown on its first pass in the direction of +x, at most 0.5 m
+    to the left or right."""
     throw_velocity_m_s: Vector3 = (-2.0, 0.15, -1.5)
     """Velocity of the payload on arrival, world frame."""
     throws: Annotated[int, Field(ge=1, le=1000)] = 1

@@ -1,0 +1,192 @@
+"""Every knob of `world.*`, found in the pydantic models: a pair of worlds that differ in this knob alone.
+
+A new knob is walked without a word here if its type says what else it may be. A knob whose other values cannot be guessed, or that
+acts only together with another, has an entry in `VALUES` or `TOGETHER`; without one the walk fails and names the knob.
+"""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Iterator
+from typing import Any, Literal, NamedTuple
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from companion.config.base import Model
+from companion.config.faults import KINDS, Fault
+from companion.config.world import Push, Servo, World
+
+Settings = dict[str, Any]
+
+
+class Pair(NamedTuple):
+    """Two worlds that differ in one knob."""
+
+    knob: str
+    usual: Settings
+    changed: Settings
+
+
+EXAMPLES: dict[type[Model], Settings] = {
+    Push: {"t_s": 1.5, "duration_s": 0.5, "force_world_n": (0.0, 0.0, -2.0)},
+    Servo: {},
+    Fault: {"kind": "gust", "t_s": 0.5},
+}
+"""What the parts of the world look like whose fields are walked."""
+
+VALUES: dict[str, Any] = {
+    "mocap_axes": ("-x", "-y", "z"),
+    "mocap_other_id": 9,
+    "px4_params": {"MC_ROLLRATE_P": 0.1},
+    "net_weight_kg": 0.5,
+    "payload_kg": 0.3,
+    "hand_taps": 2,
+    "servos.id": 9,
+    "servos.baud": 57600,
+    "servos.current_limit_counts": 600,
+    "catch_at_m[1]": 1.0,
+    "faults.phase": "takeoff",
+    "faults.duration_s": 0.3,
+    "faults.size": 3.0,
+    "faults.after": "start",
+}
+"""Other values of knobs whose type or default does not say enough."""
+
+_HANDLED: Settings = {"hand": True, "hand_t_s": 0.0}
+_HANDLED_FOR_LONG: Settings = {**_HANDLED, "px4_params": {"EKF2_EV_CTRL": 0}}
+"""Without an estimate nothing arms."""
+TOGETHER: dict[str, Settings] = {
+    "hand": {"hand_t_s": 0.0},
+    "hand_t_s": _HANDLED,
+    "hand_taps": _HANDLED_FOR_LONG,
+    "hand_tap_n": {**_HANDLED_FOR_LONG, "hand_taps": 3},
+    "net_weight_kg": {"net_weight_t_s": 1.0},
+    "net_weight_t_s": {"net_weight_kg": 0.5, "net_weight_t_s": 1.0},
+    "keep_s": {"throws": 2, "keep_s": 0.2},
+    "throws": {"keep_s": 0.2},
+}
+"""What else is set, in both worlds, so that the knob acts early in a flight."""
+
+TOGETHER_IN_PART: dict[str, Settings] = {
+    "faults.phase": {"t_s": None, "phase": "line"},
+    "faults.servo": {"kind": "servo_overload"},
+}
+"""The same for a field of a part: the part's other fields."""
+
+_NEVER = {"kind": "gust", "t_s": 1000.0}
+BESIDE: dict[str, Settings] = {"tether_cut": {"kind": "tether_taut", "t_s": 0.4, "size": 0.02}}
+"""Kinds of faults that act only while another one does."""
+SIZES: dict[str, float] = {"payload_missed": 0.0, "autopilot_reboot": 0.1}
+"""Sizes of faults that half of the default size does not tell apart from it."""
+
+
+def pairs() -> Iterator[Pair]:
+    """Return a pair for each knob, for each component of a vector, and for each field of each part."""
+    for name, field in World.model_fields.items():
+        parts = [part for part in _models(field.annotation) if part in EXAMPLES]
+        unknown = [part for part in _models(field.annotation) if part not in EXAMPLES]
+        assert not unknown, f"world.{name}: say in EXAMPLES what {unknown} looks like"
+        for part in parts:
+            yield from _of_part(name, field, part)
+        if not parts:
+            together = TOGETHER.get(name, {})
+            for number, changed in _changes(name, field, together, World):
+                yield Pair(name + number, together, {**together, **changed})
+
+
+def fault_pairs() -> Iterator[Pair]:
+    """Return a pair for each kind of fault that may begin, and one for each kind that has a size."""
+    for kind, about in KINDS.items():
+        after = "catch" if kind.startswith("payload_") else "start" if about.phases == ("ground",) else "arming"
+        fault = {"kind": kind, "t_s": 0.1 if after != "arming" else 0.5, "after": after}
+        if kind not in ("payload_missed", "payload_heavy"):  # those act from the start, whatever t_s says
+            with_it = BESIDE.get(kind, _NEVER)
+            yield Pair(f"faults.kind {kind}", {"faults": [with_it]}, {"faults": [with_it, fault]})
+        if about.default is not None and kind != "pilot_takeover":
+            other = {**fault, "size": SIZES.get(kind, 0.5 * about.default)}
+            yield Pair(f"faults.size {kind}", {"faults": [fault]}, {"faults": [other]})
+
+
+def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
+    wide = 2 if part is Servo else 1
+    for key, inner in part.model_fields.items():
+        if (name, key) == ("faults", "kind"):
+            continue  # `fault_pairs`
+        path = f"{name}.{key}"
+        usual = {**EXAMPLES[part], **TOGETHER_IN_PART.get(path, {})}
+        for number, changed in _changes(path, inner, usual, part):
+            for place in range(wide):
+                suffix = f" of {place + 1}" if wide > 1 else ""
+                yield Pair(
+                    path + number + suffix,
+                    {name: _placed(field, part, usual, place)},
+                    {name: _placed(field, part, {**usual, **changed}, place)},
+                )
+
+
+def _placed(field: FieldInfo, part: type[Model], settings: Settings, place: int) -> Any:
+    if part is Servo:
+        return [settings if index == place else {} for index in range(2)]
+    return [settings] if isinstance(field.default, tuple) else settings
+
+
+def _changes(path: str, field: FieldInfo, usual: Settings, model: type[Model]) -> Iterator[tuple[str, Settings]]:
+    """The number of the component ("" if it has none) and what is set instead."""
+    name = path.rpartition(".")[2]
+    if path in VALUES:
+        yield "", {name: VALUES[path]}
+        return
+    default = usual[name] if name in usual else field.get_default(call_default_factory=True)
+    if isinstance(default, tuple) and default and all(isinstance(value, (int, float)) for value in default):
+        for index, value in enumerate(default):
+            within = (default, index)
+            yield f"[{index}]", {name: _accepted(f"{path}[{index}]", field, usual, model, value, within)}
+        return
+    yield "", {name: _accepted(path, field, usual, model, default, None)}
+
+
+def _accepted(
+    path: str, field: FieldInfo, usual: Settings, model: type[Model], value: Any, within: tuple[Any, int] | None
+) -> Any:
+    name = path.rpartition(".")[2].partition("[")[0]
+    for other in [VALUES[path]] if path in VALUES else _others(value, field.annotation):
+        whole = other
+        if within is not None:
+            vector, index = within
+            whole = (*vector[:index], other, *vector[index + 1 :])
+        try:
+            model.model_validate({**usual, name: whole})
+        except ValidationError:
+            continue
+        return whole
+    raise AssertionError(f"world.{path}: say in tests/sitl/knobs.py, VALUES, what else it may be than {value!r}")
+
+
+def _others(value: Any, annotation: Any) -> list[Any]:
+    if isinstance(value, bool):
+        return [not value]
+    literals = [choice for choice in _literals(annotation) if choice != value]
+    if literals:
+        return literals
+    if isinstance(value, int):
+        return [value + 1, value + 2, value - 1, value // 2]
+    if isinstance(value, float):
+        return [1.5 * value + 0.2, 1.5 * value + 2.0, value + 0.2, 0.5 * value]
+    return []
+
+
+def _literals(annotation: Any) -> list[Any]:
+    if typing.get_origin(annotation) is Literal:
+        return list(typing.get_args(annotation))
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType, typing.Annotated):
+        return [choice for inner in typing.get_args(annotation) for choice in _literals(inner)]
+    return []
+
+
+def _models(annotation: Any) -> list[type[Model]]:
+    if isinstance(annotation, type) and issubclass(annotation, Model):
+        return [annotation]
+    found = [model for inner in typing.get_args(annotation) for model in _models(inner)]
+    return list(dict.fromkeys(found))

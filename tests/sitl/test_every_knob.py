@@ -1,0 +1,122 @@
+"""No knob of `world.*` is dead: each changes something in the fast closed loop, and something on the wires."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.config.world import World
+from sitl.fast import FastFlight, FastResult
+from tests.sitl.device_ends import Emitted, emitted
+from tests.sitl.knobs import Pair, Settings, fault_pairs, pairs
+from tests.support import CATCH
+
+BASE = load_flight(CATCH)
+PAIRS = [*pairs(), *fault_pairs()]
+
+_SET_UP = "the companion's set-up of the bus writes this register, or a row of its preflight judges it; the fast loop has neither"
+ON_WIRES_ONLY = {
+    "natnet_version": "the fast loop has no NatNet bytes",
+    "mocap_other_id": "an address: the fast loop has no stream of several rigid bodies",
+    "arm_hand": "it holds a limp arm; in the fast loop the arm gives torque from the start",
+    "servos.firmware": _SET_UP,
+    "servos.return_delay_us": _SET_UP,
+    "servos.operating_mode": _SET_UP,
+    "servos.position_limit_counts": "mode 0 has no position limits",
+    "servos.shadow_id": "a second address on the bus",
+}
+"""Knobs without a meaning in the fast closed loop, and why."""
+
+LIMIT_S, EARLY_S = 14.0, 1.0
+"""Flight times in the fast loop: in the first everything shows, the catch included; after the second the others give torque."""
+
+
+class Unlike(Exception):
+    """The flight has done something else."""
+
+
+class Watched(list[Any]):
+    """A record that ends the flight as soon as it is unlike an earlier one."""
+
+    def __init__(self, usual: list[Any]) -> None:
+        super().__init__()
+        self._usual = usual
+
+    def append(self, item: Any) -> None:
+        """Add an item.
+
+        Raises:
+            Unlike: the earlier record has another one, or none.
+        """
+        if len(self) >= len(self._usual) or item != self._usual[len(self)]:
+            raise Unlike
+        super().append(item)
+
+
+def world(settings: Settings) -> FlightConfig:
+    return BASE.model_copy(update={"world": World.model_validate(settings)})
+
+
+@cache
+def usual_flight(world_json: str) -> FastResult:
+    config = BASE.model_copy(update={"world": World.model_validate_json(world_json)})
+    return FastFlight(config).run(LIMIT_S)
+
+
+@cache
+def usual_ends(world_json: str) -> Emitted:
+    return emitted(BASE.model_copy(update={"world": World.model_validate_json(world_json)}))
+
+
+def flights_differ(pair: Pair, limit_s: float) -> bool:
+    """Whether core, world or guardian ever do something else in the fast loop."""
+    usual = usual_flight(world(pair.usual).world.model_dump_json())
+    result = FastResult(
+        inputs=Watched(usual.inputs),
+        outputs=Watched(usual.outputs),
+        snapshots=Watched(usual.snapshots),
+        after=Watched(usual.after),
+    )
+    try:
+        FastFlight(world(pair.changed))._run(result, limit_s)
+    except Unlike:
+        return True
+    return limit_s == LIMIT_S and len(result.inputs) < len(usual.inputs)
+
+
+def field(pair: Pair) -> str:
+    """The knob without its component or place."""
+    return pair.knob.partition("[")[0].partition(" ")[0]
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair.knob)
+def test_it_changes_a_flight_in_the_fast_loop(pair: Pair) -> None:
+    if field(pair) in ON_WIRES_ONLY:
+        assert not flights_differ(pair, EARLY_S), "it does act in the fast loop: take it off the list"
+    else:
+        assert flights_differ(pair, LIMIT_S), f"world.{pair.knob} does nothing in the fast loop"
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair.knob)
+def test_it_changes_what_the_device_ends_emit(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The server notes what it struck; no process of ours is struck.
+    monkeypatch.setattr("sitl.server.strike", lambda kind, pid: True)
+    usual = usual_ends(world(pair.usual).world.model_dump_json())
+    unlike = emitted(world(pair.changed), usual) != usual
+    assert unlike, f"world.{pair.knob} does nothing on the wires"
+
+
+def test_the_list_of_exceptions_names_knobs_that_there_are() -> None:
+    assert set(ON_WIRES_ONLY) <= {field(pair) for pair in PAIRS}
+    assert len({field(pair) for pair in PAIRS} - set(ON_WIRES_ONLY)) > 40
+
+
+def test_the_device_ends_emit_the_same_when_nothing_is_changed() -> None:
+    usual = usual_ends(world({}).world.model_dump_json())
+    assert emitted(world({}), usual) == usual
+    caught = usual.steps[-1][-1][-1]
+    assert "thrown" in caught[-2]
+    assert "caught" in caught[-1]
