@@ -43,7 +43,8 @@ async def _serve(config: FlightConfig, for_launcher: bool, witness: Path, px4_fo
     on_message = _say if for_launcher else _tell
     px4 = None
     if px4_folder is not None:
-        px4 = RealPx4(config.world, px4_folder, lambda text: on_message({"type": "progress", "text": text}))
+        airframe = config.vehicle.airframe
+        px4 = RealPx4(airframe, config.world, px4_folder, lambda text: on_message({"type": "progress", "text": text}))
     pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
     sitl = Sitl(config.vehicle, config.world, pose, ports, on_message, px4)
     loop = asyncio.get_running_loop()

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import Airframe, Vehicle
 from companion.config.world import World
 
-ROTOR_ARM_M = 0.325
-"""Tarot 650: centre to rotor."""
-YAW_TORQUE_PER_THRUST_M = 0.025
-BASE_INERTIA_KG_M2 = (0.045, 0.045, 0.075)
-JOINT_ARMATURE_KG_M2 = 0.008
 PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"
 """What a fault throws after the payload."""
 # PX4's quad-x order with each rotor's place (body FLU, in units of arm/sqrt 2) and its yaw reaction about body z (up).
 ROTORS = ((1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1))
+
+
+def rotor_offset_m(airframe: Airframe) -> float:
+    """Distance of each rotor from the body's x-z plane and from its y-z plane."""
+    return airframe.rotor_arm_m / math.sqrt(2.0)
 
 
 def base_mass_kg(vehicle: Vehicle, world: World) -> float:
@@ -34,16 +34,16 @@ def link_masses_kg(vehicle: Vehicle, world: World) -> tuple[float, float]:
 
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     """The model as MJCF."""
-    arm, tool = vehicle.arm, vehicle.tool
+    airframe, arm, tool = vehicle.airframe, vehicle.arm, vehicle.tool
     l1, l2 = arm.link_lengths_m
     m1, m2 = link_masses_kg(vehicle, world)
-    offset = ROTOR_ARM_M / math.sqrt(2.0)
-    clearance = vehicle.airframe.ground_clearance_m
+    offset = rotor_offset_m(airframe)
+    clearance = airframe.ground_clearance_m
     rotors = "\n".join(
         f'<site name="rotor{i}" pos="{x * offset} {y * offset} 0.03"/>' for i, (x, y, _) in enumerate(ROTORS)
     )
     motors = "\n".join(
-        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {s * YAW_TORQUE_PER_THRUST_M}"/>'
+        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {s * airframe.yaw_torque_per_thrust_m}"/>'
         for i, (_, _, s) in enumerate(ROTORS)
     )
     feet = "\n".join(
@@ -85,18 +85,18 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     <site name="anchor" pos="{xyz(vehicle.tether.anchor_world_m)}"/>
     <body name="base" pos="0 0 {clearance}">
       <freejoint name="base"/>
-      <inertial pos="0 0 0" mass="{base_mass_kg(vehicle, world)}" diaginertia="{xyz(BASE_INERTIA_KG_M2)}"/>
+      <inertial pos="0 0 0" mass="{base_mass_kg(vehicle, world)}" diaginertia="{xyz(airframe.inertia_kg_m2)}"/>
       <site name="imu"/>
       <site name="tether" pos="{xyz(vehicle.tether.attachment_body_m)}"/>
       {rotors}
       {feet}
       <body name="link1" pos="{xyz(arm.shoulder_body_m)}">
         <joint name="alpha1" axis="0 1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
-               armature="{JOINT_ARMATURE_KG_M2}"/>
+               armature="{arm.joint_armature_kg_m2}"/>
         {rod(m1, arm.link_com_m[0], l1)}
         <body name="link2" pos="{l1} 0 0">
           <joint name="alpha2" axis="0 -1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
-                 armature="{JOINT_ARMATURE_KG_M2}"/>
+                 armature="{arm.joint_armature_kg_m2}"/>
           {rod(m2, arm.link_com_m[1], l2)}
           <body name="sensor" pos="{l2} 0 0">
             <inertial pos="0 0 0" mass="{max(tool.sensor_mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>

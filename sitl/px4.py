@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config.faults import FaultKind
+from companion.config.vehicle import Airframe
 from companion.config.world import World as WorldConfig
 from companion.types import Vec4
 from sitl.autopilot.autopilot import Battery
@@ -66,6 +67,7 @@ class RealPx4:
     """One PX4 for one flight.
 
     Args:
+        airframe: of the vehicle file.
         config: of the world.
         folder: of PX4: parameters, logs, what it says.
         tell: takes one line for the user.
@@ -76,8 +78,9 @@ class RealPx4:
 
     lockstep = True
 
-    def __init__(self, config: WorldConfig, folder: Path, tell: Tell) -> None:
+    def __init__(self, airframe: Airframe, config: WorldConfig, folder: Path, tell: Tell) -> None:
         refuse_what_needs_the_stub(config)
+        self._airframe = airframe
         self._config = config
         self._folder = folder
         self._tell = tell
@@ -149,7 +152,7 @@ class RealPx4:
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._witness.version()
         self._tell(f"PX4 {self._version}, instance {self.number}: setting its parameters")
-        wanted = parameters(self._config, self._world.hover_command)
+        wanted = parameters(self._airframe, self._config, self._world.hover_command)
         changed = await self._settle(wanted)
         if changed:
             await self._restart(changed)

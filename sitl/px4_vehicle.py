@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from companion.config.vehicle import Airframe
 from companion.config.world import World as WorldConfig
 from companion.px4.wanted import WANTED, simulated_values
 from sitl.autopilot.params import PX4_DEFAULTS, VEHICLE_DEFAULTS, Value
-from sitl.model import ROTOR_ARM_M, ROTORS, YAW_TORQUE_PER_THRUST_M
+from sitl.model import ROTORS, rotor_offset_m
 
 BEFORE_BOOT: Mapping[str, Value] = {
     "SDLOG_MODE": 1,
@@ -37,21 +38,22 @@ _MIXED_GAINS = (
 )  # fmt: skip
 
 
-def rotor_geometry() -> dict[str, Value]:
+def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
     """CA_ROTOR*: places in FRD (m) from the centre of mass, and the yaw reaction, positive for a rotor that turns counter-clockwise."""
     found: dict[str, Value] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4}
-    offset = ROTOR_ARM_M / math.sqrt(2.0)
+    offset = rotor_offset_m(airframe)
     for i, (x, y, yaw) in enumerate(ROTORS):
         found[f"CA_ROTOR{i}_PX"] = x * offset
         found[f"CA_ROTOR{i}_PY"] = -y * offset
-        found[f"CA_ROTOR{i}_KM"] = -yaw * YAW_TORQUE_PER_THRUST_M
+        found[f"CA_ROTOR{i}_KM"] = -yaw * airframe.yaw_torque_per_thrust_m
     return found
 
 
-def parameters(config: WorldConfig, hover_command: float) -> dict[str, Value]:
+def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) -> dict[str, Value]:
     """Everything that is set on a real PX4 before it flies, by name.
 
     Args:
+        airframe: the rotors' geometry, of the vehicle file.
         config: of the world.
         hover_command: normalised thrust that truly holds the machine.
     """
@@ -64,7 +66,7 @@ def parameters(config: WorldConfig, hover_command: float) -> dict[str, Value]:
         **BEFORE_BOOT,
         **gains,
         **mixed,
-        **rotor_geometry(),
+        **rotor_geometry(airframe),
         "THR_MDL_FAC": 0.0,  # the world's rotors are linear in the command
         "MPC_THR_HOVER": hover_command * (1.0 + config.hover_thrust_error),
         "SIM_BAT_DRAIN": config.battery_life_s,

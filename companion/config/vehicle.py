@@ -29,7 +29,14 @@ class Airframe(Model):
     mass_kg: Positive
     """Whole machine, arm and net included, ready to fly, without payload."""
     inertia_kg_m2: Positive3 = (0.045, 0.045, 0.075)
-    """Of the base without arm and tool, about the body's x, y, z at its origin; for the laws that are built on a model."""
+    """Of the base without arm and tool, about the body's x, y, z at its origin: for the laws that are built on a model, and for the
+    simulated airframe. The default is the Tarot 650's."""
+    rotor_arm_m: Positive = 0.325
+    """Distance of each of the four rotors from the body's z axis, in the X layout (45 deg from the body's x axis): for the simulated
+    airframe and PX4's CA_ROTOR parameters there. The default is the Tarot 650's."""
+    yaw_torque_per_thrust_m: Positive = 0.025
+    """Yaw torque of one rotor over its thrust, N m/N: for the simulated airframe and PX4's CA_ROTOR parameters there. The default is
+    the Tarot 650's."""
     thrust_max_n: Positive
     """All rotors at full command, at the voltage of a charged battery."""
     hover_thrust: Fraction | None = None
@@ -72,7 +79,7 @@ class Arm(Model):
     """From the link's own joint outwards."""
     torque_per_amp_nm_a: Positive = 1.3
     joint_armature_kg_m2: NonNegative = 0.008
-    """Inertia of rotor and gears of one servo, felt at the joint; for the laws that are built on a model."""
+    """Inertia of rotor and gears of one servo, felt at the joint: for the laws that are built on a model, and for the simulated arm."""
     joint_friction_nm: NonNegative = 0.04
     """Dry friction of one joint; for laws that feed it forward."""
     joints: tuple[Joint, Joint]
@@ -333,6 +340,13 @@ class Vehicle(Model):
             if not low_deg <= angle_deg <= high_deg:
                 text = f"{angle_deg:g} deg is outside the joint's walls, {low_deg:g} to {high_deg:g} deg"
                 problems.append((("safety", "fold_arm_deg", index), text))
+        for axis, own in enumerate(self.airframe.inertia_kg_m2):
+            others = sum(self.airframe.inertia_kg_m2) - own
+            if own > others * (1.0 + 1e-9):
+                text = (
+                    f"expected at most {others:g} kg m^2, the sum of the other two, as of every rigid body, got {own:g}"
+                )
+                problems.append((("airframe", "inertia_kg_m2", axis), text))
         carried_kg = sum(self.arm.link_masses_kg) + self.tool.sensor_mass_kg + self.tool.net_mass_kg
         if carried_kg >= self.airframe.mass_kg:
             text = f"{self.airframe.mass_kg:g} kg is the whole machine, but arm and tool alone weigh {carried_kg:g} kg"

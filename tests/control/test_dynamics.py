@@ -14,7 +14,6 @@ from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_bo
 from companion.control.manipulator import Manipulator
 from companion.frames import quat_from_euler_zyx
 from companion.types import Vec2, Vec3, Vec8
-from sitl.model import BASE_INERTIA_KG_M2, JOINT_ARMATURE_KG_M2
 from tests.pinocchio_or_skip import pin
 from tests.sitl.test_world_dynamics import oracle
 
@@ -71,11 +70,6 @@ def to_twist_rate(rpy: Vec3, rate: Vec8) -> Array:
 
     h = 1e-3
     return (8.0 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12.0 * h)
-
-
-def test_nominal_inertias_are_the_worlds(vehicle: Vehicle) -> None:
-    assert vehicle.airframe.inertia_kg_m2 == BASE_INERTIA_KG_M2
-    assert vehicle.arm.joint_armature_kg_m2 == JOINT_ARMATURE_KG_M2
 
 
 def test_mass_coriolis_and_gravity_agree_with_pinocchio(vehicle: Vehicle) -> None:

@@ -11,10 +11,10 @@ from collections.abc import AsyncIterator
 import pytest
 
 from companion.config.faults import Fault
+from companion.config.loader import load_vehicle
 from companion.config.world import World
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
-from sitl.model import ROTOR_ARM_M
 from sitl.px4 import OF_THE_STUB, refuse_what_needs_the_stub
 from sitl.px4_link import Px4Error
 from sitl.px4_process import Instance
@@ -22,6 +22,8 @@ from sitl.px4_relay import Relay
 from sitl.px4_vehicle import parameters, rotor_geometry
 from sitl.px4_witness import Witness, same
 from tests.sitl.px4_rig import Rig
+
+VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
 
 DEADLINE_S = 20.0
 
@@ -98,15 +100,16 @@ def test_a_mode_is_chosen_and_seen() -> None:
 
 def test_the_geometry_is_that_of_the_world() -> None:
     """Front right first, turning counter-clockwise; FRD, so right is positive."""
-    geometry = rotor_geometry()
-    offset = ROTOR_ARM_M / math.sqrt(2.0)
+    airframe = VEHICLE.airframe.model_copy(update={"rotor_arm_m": 0.2, "yaw_torque_per_thrust_m": 0.03})
+    geometry = rotor_geometry(airframe)
+    offset = 0.2 / math.sqrt(2.0)
     places = [(geometry[f"CA_ROTOR{i}_PX"], geometry[f"CA_ROTOR{i}_PY"]) for i in range(4)]
     assert places == [(offset, offset), (-offset, -offset), (offset, -offset), (-offset, offset)]
-    assert [geometry[f"CA_ROTOR{i}_KM"] > 0 for i in range(4)] == [True, True, False, False]
+    assert [geometry[f"CA_ROTOR{i}_KM"] for i in range(4)] == [0.03, 0.03, -0.03, -0.03]
 
 
 def test_the_hover_thrust_is_wrong_by_what_the_world_says() -> None:
-    assert parameters(World(hover_thrust_error=0.1), 0.5)["MPC_THR_HOVER"] == pytest.approx(0.55)
+    assert parameters(VEHICLE.airframe, World(hover_thrust_error=0.1), 0.5)["MPC_THR_HOVER"] == pytest.approx(0.55)
 
 
 @pytest.mark.parametrize("kind", list(OF_THE_STUB))

@@ -13,7 +13,7 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
 from companion.control.manipulator import Manipulator
-from sitl.model import BASE_INERTIA_KG_M2, JOINT_ARMATURE_KG_M2, base_mass_kg
+from sitl.model import base_mass_kg
 from sitl.world import PHYSICS_DT_S, World
 from tests.pinocchio_or_skip import pin
 
@@ -33,7 +33,9 @@ def oracle(vehicle: Vehicle) -> pin.Model:
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
     base_mass = base_mass_kg(vehicle, NO_PAYLOAD)
-    model.appendBodyToJoint(base, pin.Inertia(base_mass, np.zeros(3), np.diag(BASE_INERTIA_KG_M2)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        base, pin.Inertia(base_mass, np.zeros(3), np.diag(vehicle.airframe.inertia_kg_m2)), pin.SE3.Identity()
+    )
 
     def rod(mass: float, com: float, length: float) -> pin.Inertia:
         across = mass * length**2 / 12
@@ -50,7 +52,7 @@ def oracle(vehicle: Vehicle) -> pin.Model:
     for mass in (tool.sensor_mass_kg, tool.net_mass_kg):
         model.appendBodyToJoint(link2, pin.Inertia(mass, np.zeros(3), np.eye(3) * 1e-4), end)
     model.addFrame(pin.Frame("net", link2, end, pin.FrameType.OP_FRAME))
-    model.armature = np.array([0.0] * 6 + [JOINT_ARMATURE_KG_M2] * 2)
+    model.armature = np.array([0.0] * 6 + [arm.joint_armature_kg_m2] * 2)
     return model
 
 

@@ -1,0 +1,84 @@
+"""The simulated airframe is the one of the vehicle file."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.config.vehicle import Vehicle
+from companion.config.world import World as WorldConfig
+from companion.types import Outcome, Vec3, Vec4
+from sitl.fast import FastFlight
+from sitl.world import World
+from tests.support import CATCH
+
+HOVER = CATCH.parent / "hover.yaml"
+VEHICLE = load_flight(HOVER).vehicle
+SMALL = {"rotor_arm_m": 0.22, "inertia_kg_m2": (0.022, 0.022, 0.04), "yaw_torque_per_thrust_m": 0.016}
+FULL_N = VEHICLE.airframe.thrust_max_n / 4.0
+
+
+def with_airframe(**changes: Any) -> Vehicle:
+    return VEHICLE.model_copy(update={"airframe": VEHICLE.airframe.model_copy(update=changes)})
+
+
+def torque_nm(vehicle: Vehicle, thrusts_n: Vec4) -> Vec3:
+    """Torque of the rotors on the base, body FLU."""
+    world = World(vehicle, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, (1.5, 1.5))
+    model, data = world.model, world.data
+    data.ctrl[:4] = thrusts_n
+    mujoco.mj_forward(model, data)
+    x, y, z = data.qfrc_actuator[3:6].tolist()
+    return (x, y, z)
+
+
+@pytest.mark.parametrize(("arm_m", "yaw_m"), [(0.325, 0.025), (0.22, 0.016), (0.5, 0.04)])
+def test_the_rotors_turn_it_by_their_arm_and_by_their_yaw_torque(arm_m: float, yaw_m: float) -> None:
+    vehicle = with_airframe(rotor_arm_m=arm_m, yaw_torque_per_thrust_m=yaw_m)
+    offset_m = arm_m / math.sqrt(2.0)
+    front_right, rear_left, front_left, rear_right = 8.0, 7.0, 6.0, 5.0
+    roll_nm = offset_m * (rear_left + front_left - front_right - rear_right)
+    pitch_nm = offset_m * (rear_left + rear_right - front_left - front_right)
+    yaw_nm = yaw_m * (front_left + rear_right - front_right - rear_left)
+    expected = pytest.approx((roll_nm, pitch_nm, yaw_nm), abs=1e-9)
+    assert torque_nm(vehicle, (front_right, rear_left, front_left, rear_right)) == expected
+
+
+def test_the_base_has_the_inertia_of_the_vehicle_file() -> None:
+    for inertia in ((0.045, 0.045, 0.075), (0.02, 0.025, 0.03)):
+        world = World(with_airframe(inertia_kg_m2=inertia), WorldConfig(), (0.0, 0.0), 0.0, (1.5, 1.5))
+        assert world.model.body("base").inertia.tolist() == list(inertia)
+
+
+def test_the_joints_have_the_armature_of_the_vehicle_file() -> None:
+    arm = VEHICLE.arm.model_copy(update={"joint_armature_kg_m2": 0.003})
+    world = World(VEHICLE.model_copy(update={"arm": arm}), WorldConfig(), (0.0, 0.0), 0.0, (1.5, 1.5))
+    assert world.model.dof_armature[list(world.layout.joint_v)].tolist() == [0.003, 0.003]
+
+
+def hovering(vehicle: Vehicle) -> FlightConfig:
+    config = load_flight(HOVER)
+    return config.model_copy(update={"vehicle": vehicle})
+
+
+def test_another_quadrotor_hovers_and_moves_otherwise_than_a_tarot() -> None:
+    tarot, small = (FastFlight(hovering(vehicle)).run() for vehicle in (VEHICLE, with_airframe(**SMALL)))
+    for flight in (tarot, small):
+        assert flight.outputs[-1].outcome is Outcome.COMPLETED
+        errors_m = [
+            math.dist(truth.position_world_m, output.reference.position_world_m)
+            for truth, output in zip(flight.truth, flight.outputs, strict=True)
+            if output.reference is not None and truth.position_world_m[2] > 0.95
+        ]
+        assert len(errors_m) > 800
+        assert max(errors_m) < 0.03
+    rates = [np.array([truth.angular_rate_body_rad_s for truth in flight.truth]) for flight in (tarot, small)]
+    shared = min(map(len, rates))
+    difference = np.abs(rates[0][:shared] - rates[1][:shared]).max(axis=0)
+    assert difference[0] > 0.01
+    assert difference[2] > 0.01
