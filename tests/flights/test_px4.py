@@ -63,6 +63,12 @@ def autopilot(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+def faults(*kinds: str, on_stub: str) -> pytest.MarkDecorator:
+    """Every fault on the real PX4; on the stub one of them, since its guardian is the same in every test."""
+    cases = [pytest.param("stub", on_stub, marks=STUB), *(pytest.param("px4", kind, marks=REAL) for kind in kinds)]
+    return pytest.mark.parametrize(("autopilot", "kind"), cases)
+
+
 def event_ids(summary: dict[str, Any]) -> list[str]:
     return [event["id"] for event in summary["events"]]
 
@@ -97,7 +103,7 @@ def test_the_catch(sandbox: Sandbox, autopilot: str) -> None:
     assert summary["rms"]["post"]["e_q_deg"] < E_Q_MAX_DEG
 
 
-@pytest.mark.parametrize("kind", ["kill_flight", "stop_flight"])
+@faults("kill_flight", "stop_flight", on_stub="kill_flight")
 def test_the_guardian_lands_after_the_catch(sandbox: Sandbox, autopilot: str, kind: str) -> None:
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
     ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)
@@ -110,7 +116,7 @@ def test_the_guardian_lands_after_the_catch(sandbox: Sandbox, autopilot: str, ki
     assert_stopped_as_modelled(sandbox, kind)
 
 
-@pytest.mark.parametrize("kind", ["kill_flight", "stop_flight"])
+@faults("kill_flight", "stop_flight", on_stub="stop_flight")
 def test_the_guardian_stops_before_the_wall(sandbox: Sandbox, autopilot: str, kind: str) -> None:
     """The fastest line to the wall that the mission check accepts, and the fault where the predicted stop is nearest to it."""
     fault = f"world.faults=[{{kind: {kind}, t_s: {NEAREST_STOP_S}}}]"
@@ -135,7 +141,7 @@ def assert_stopped_as_modelled(sandbox: Sandbox, kind: str) -> None:
     assert fault["worst_tilt_deg"] < 30.0
 
 
-@pytest.mark.parametrize("kind", ["kill_flight", "hold_gil"])
+@faults("kill_flight", "hold_gil", on_stub="hold_gil")
 def test_through_mavsdks_offboard_plugin_the_guardian_lands_as_well(
     sandbox: Sandbox, autopilot: str, kind: str
 ) -> None:
