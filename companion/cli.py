@@ -6,6 +6,7 @@ import argparse
 import datetime
 import importlib
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -62,6 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"companion {arguments.command}: unknown arguments: {' '.join(unknown)}; see companion {arguments.command} --help"
         )
         return EXIT_BAD_INPUT
+    arguments.command_line = shlex.join(["companion", *words])
     missing = lacking(arguments)
     if missing is not None:
         tell(missing)

@@ -229,6 +229,7 @@ def _write(
 def _settings(grid: _Grid, arguments: argparse.Namespace) -> dict[str, Any]:
     config = grid.configs[0]
     return {
+        "command": arguments.command_line,
         "mission": config.sources.mission,
         "vehicle": config.sources.vehicle,
         "overrides": list(arguments.overrides),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 
 def written(text: str, tables: Mapping[str, str]) -> str:
@@ -31,3 +33,37 @@ def write_page(page: Path, tables: Mapping[str, str]) -> int:
         print(f"{page}: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def flown_by(results: Mapping[str, Any]) -> str:
+    """Return the line below a table that names the command and the commit that its figures come from.
+
+    Args:
+        results: the JSON file of `companion compare`, `robustness` or `faults`.
+
+    Raises:
+        KeyError: the file was written by a version that did not note its command.
+    """
+    commit = results["versions"].get("git", "unknown")
+    dirty = " with changes" if commit.endswith("-dirty") else ""
+    return f"\nFlown by `{results['settings']['command']}` at commit {commit.removesuffix('-dirty')[:10]}{dirty}."
+
+
+def write_results(page: Path, file: Path, tables_of: Callable[[dict[str, Any]], Mapping[str, str]]) -> int:
+    """Write the tables of a results file into the page.
+
+    Args:
+        page: with the place of each table marked.
+        file: JSON of a campaign.
+        tables_of: makes the tables, by name; may raise KeyError or ValueError.
+
+    Returns:
+        An exit code; the reason goes to standard error.
+    """
+    try:
+        tables = tables_of(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError) as error:
+        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
+        print(f"{file}: {reason}", file=sys.stderr)
+        return 2
+    return write_page(page, tables)

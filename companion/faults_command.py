@@ -184,6 +184,7 @@ def _show(config: FlightConfig, flown: Flown[Row], arguments: argparse.Namespace
     rows = flown.rows
     table: dict[str, Any] = {"rows": rows, "summary": summary(rows)}
     settings = {
+        "command": arguments.command_line,
         "mission": config.sources.mission,
         "vehicle": config.sources.vehicle,
         "controller": config.sources.controller,

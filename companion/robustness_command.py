@@ -151,6 +151,7 @@ def _show(job: _Job, flown: Flown[Row], arguments: argparse.Namespace, out: Path
     table = {"rows": rows, "summary": _summary(rows)}
     law, preset = job.law
     settings = {
+        "command": arguments.command_line,
         "mission": job.mission,
         "vehicle": job.config.sources.vehicle,
         "controller": law,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.doc_tables import write_page
+from companion.doc_tables import flown_by, write_results
 
 ABLATION_KG = 0.2
 """The payload of the table of what each option is worth."""
@@ -73,13 +72,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, help="compare.json of companion compare --ablation")
     arguments = parser.parse_args(argv)
-    try:
-        aggregate = json.loads(arguments.results.read_text(encoding="utf-8"))["aggregate"]
-        tables = {"laws": laws_markdown(aggregate), "ablation": ablation_markdown(aggregate)}
-    except (OSError, ValueError, KeyError) as error:
-        print(f"{arguments.results}: {error}", file=sys.stderr)
-        return 2
-    return write_page(arguments.page, tables)
+    return write_results(arguments.page, arguments.results, tables)
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Return both tables, each with the command and the commit of its figures."""
+    aggregate, below = results["aggregate"], flown_by(results)
+    return {"laws": laws_markdown(aggregate) + "\n" + below, "ablation": ablation_markdown(aggregate) + "\n" + below}
 
 
 if __name__ == "__main__":

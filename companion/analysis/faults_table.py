@@ -21,7 +21,7 @@ from rich.table import Table
 from companion.analysis.faults import GOOD, Row, good, outcomes
 from companion.analysis.page import CLOSING, folded, opening
 from companion.config.faults import KINDS, PHASES
-from companion.doc_tables import write_page
+from companion.doc_tables import flown_by, write_page, write_results
 
 _STYLE = """
 :root { --width: 84rem; }
@@ -206,15 +206,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("results", type=Path, nargs="?", help="faults.json of a campaign")
     parser.add_argument("--name", default="campaign", help="of the table that the results go to (default: campaign)")
     arguments = parser.parse_args(argv)
-    tables = {"kinds": kinds_markdown()}
-    if arguments.results is not None:
-        try:
-            rows = json.loads(arguments.results.read_text(encoding="utf-8"))["rows"]
-            tables[arguments.name] = outcomes_markdown(rows)
-        except (OSError, ValueError, KeyError) as error:
-            print(f"{arguments.results}: {error}", file=sys.stderr)
-            return 2
-    return write_page(arguments.page, tables)
+    kinds, name = kinds_markdown(), arguments.name
+    if arguments.results is None:
+        return write_page(arguments.page, {"kinds": kinds})
+    return write_results(
+        arguments.page,
+        arguments.results,
+        lambda results: {"kinds": kinds, name: outcomes_markdown(results["rows"]) + "\n" + flown_by(results)},
+    )
 
 
 if __name__ == "__main__":

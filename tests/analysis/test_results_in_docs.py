@@ -1,0 +1,59 @@
+"""The figures of the docs carry the command and the commit that they come from."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.analysis import compare_doc, faults_table, robustness_doc
+from companion.cli import main
+from companion.doc_tables import flown_by
+from tests.support import CATCH
+
+RUNS = {
+    "compare": ("compare.json", shlex.split("--presets recommended --payloads 0.2 --seeds 1 --ablation")),
+    "robustness": ("robustness.json", [str(CATCH), "--draws", "2"]),
+    "faults": ("faults.json", [str(CATCH), "--kinds", "force_loss", "--phases", "line"]),
+}
+PAGES = {
+    "compare": (("laws", "ablation"), compare_doc.main),
+    "robustness": (("result",), robustness_doc.main),
+    "faults": (("kinds", "campaign"), faults_table.main),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_campaign_notes_its_command_and_the_page_prints_it(name: str, tmp_path: Path) -> None:
+    file, options = RUNS[name]
+    words = [name, *options, "--jobs", "1", "--out", str(tmp_path)]
+    assert main(words) == 0
+    results = json.loads((tmp_path / file).read_text(encoding="utf-8"))
+    command = shlex.join(["companion", *words])
+    assert results["settings"]["command"] == command
+    tables, write = PAGES[name]
+    page = tmp_path / "page.md"
+    page.write_text(
+        "".join(f"<!-- table: {table} -->\nthe old one\n<!-- end: {table} -->\n" for table in tables), encoding="utf-8"
+    )
+    assert write([str(page), str(tmp_path / file)]) == 0
+    text = page.read_text(encoding="utf-8")
+    assert "the old one" not in text
+    assert text.count(f"Flown by `{command}` at commit {results['versions']['git'][:10]}") == (
+        2 if name == "compare" else 1
+    )
+
+
+def test_a_file_that_names_no_command_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "compare.json"
+    file.write_text(json.dumps({"aggregate": [], "settings": {}, "versions": {}}), encoding="utf-8")
+    assert compare_doc.main(["page.md", str(file)]) == 2
+    assert capsys.readouterr().err == f"{file}: key 'command' is missing\n"
+
+
+def test_changes_beyond_the_commit_are_named() -> None:
+    results: dict[str, Any] = {"settings": {"command": "companion compare"}, "versions": {"git": 40 * "a" + "-dirty"}}
+    assert flown_by(results).strip() == "Flown by `companion compare` at commit aaaaaaaaaa with changes."
