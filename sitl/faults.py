@@ -168,6 +168,7 @@ class Faults:
         self._frozen: tuple[Vec3, Quat] | None = None
         self._other: tuple[Vec3, Quat] | None = None
         self._stuck: tuple[Vec3, Vec3] | None = None
+        self._now_s = self._drag_began_s = 0.0
         self._second: Ball | None = None
         self._pilot_lands_s = math.inf
         self._stepped_s = math.inf
@@ -176,6 +177,7 @@ class Faults:
 
     def step(self, t_s: float, armed_t_s: float | None) -> None:
         """Before every step of the physics; `armed_t_s`: world time at which the rotors were armed."""
+        self._now_s = t_s
         origins = {"start": 0.0, "arming": armed_t_s, "catch": self._world.caught_t_s}
         for index, fault in enumerate(self._faults):
             origin_s = origins[fault.after]
@@ -250,6 +252,8 @@ class Faults:
                 x, y, _ = world.q[0:3]
                 there = (x, y + size, _OTHER_BODY_Z_M)
                 self._other = (there, quat_from_euler_zyx(0.0, 0.0, _OTHER_BODY_YAW_RAD)) if on else None
+            case "mocap_drag":
+                self._drag_began_s = t_s
             case "clock_step":
                 self._stepped_s = t_s if on else math.inf
             case "mocap_freeze":
@@ -300,10 +304,10 @@ class Faults:
             pose = self._frozen
         if self._other is not None:
             pose = self._other
-        jump = active.get("mocap_jump")
-        if jump is not None:
+        shift_m = self.size("mocap_jump") + self.size("mocap_drag") * (self._now_s - self._drag_began_s)
+        if shift_m:
             (x, y, z), attitude = pose
-            pose = ((x + _BESIDE[0] * jump.magnitude, y + _BESIDE[1] * jump.magnitude, z), attitude)
+            pose = ((x + _BESIDE[0] * shift_m, y + _BESIDE[1] * shift_m, z), attitude)
         return (*pose, "mocap_occluded" not in active)
 
     def mocap_period_s(self, usual_s: float) -> float:

@@ -16,6 +16,7 @@ FaultKind = Literal[
     "mocap_loss",
     "mocap_occluded",
     "mocap_jump",
+    "mocap_drag",
     "mocap_swap",
     "mocap_freeze",
     "mocap_latency",
@@ -79,8 +80,8 @@ class Kind:
 
 _MOCAP_GONE = ("mocap_lost", "mocap_invalid", "mocap_too_late")
 _MOCAP_WRONG = (
-    "mocap_jump", "mocap_swapped", "mocap_frozen", "estimate_disagrees", "yaw_disagrees", "tracking_warn", "tracking_hold",
-    "tracking_error",
+    "mocap_jump", "mocap_swapped", "mocap_frozen", "mocap_dragged", "estimate_disagrees", "yaw_disagrees", "tracking_warn",
+    "tracking_hold", "tracking_error",
 )  # fmt: skip
 _PX4_GONE = ("vehicle_state_lost", "heartbeat_lost", "px4_rebooted", "px4_disarmed", "estimate_frozen", "offboard_left")
 _ARM_GONE = ("arm_lost", "arm_read_failures", "arm_let_go")
@@ -95,6 +96,7 @@ KINDS: dict[FaultKind, Kind] = {
     "mocap_loss": Kind("no frame leaves the motion-capture machine", named_by=_MOCAP_GONE),
     "mocap_occluded": Kind("frames come, but the body is not seen in them", named_by=_MOCAP_GONE),
     "mocap_jump": Kind("poses are shifted sideways", "shift", "m", 0.3, _MOCAP_WRONG),
+    "mocap_drag": Kind("poses are dragged sideways, further with every frame", "speed", "m/s", 0.3, _MOCAP_WRONG),
     "mocap_swap": Kind(
         "poses are those of another body that lies on the floor", "distance to it", "m", 1.0, _MOCAP_WRONG
     ),

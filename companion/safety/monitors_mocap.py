@@ -9,10 +9,13 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
+from companion.control.sensing import acceleration_world_m_s2
 from companion.frames import euler_zyx_from_quat, wrap_rad
 from companion.safety.findings import Findings, Situation
+from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck
 from companion.safety.rules import (
     ESTIMATE_DISAGREES,
+    MOCAP_DRAGGED,
     MOCAP_FROZEN,
     MOCAP_INVALID,
     MOCAP_JUMP,
@@ -74,6 +77,14 @@ class MocapMonitor:
         self._same_since_s: float | None = None
         self._moved = False
         self._streams = StreamWatch()
+        self._inertial = InertialCheck(s.mocap_inertial_m, s.mocap_inertial_s, s.mocap_timeout_s)
+        self._imu_s: float | None = None
+        self._against_imu = False
+        """The newest believed pose does not move as the IMU says."""
+        self._dragged = False
+        """That was found in the air while the companion commands. Latched: the observer soon follows the drag, and the poses must not
+        be believed again. Not judged once PX4 lands for another reason: behind a late link the check can be wrong, and PX4 needs
+        the poses."""
         self._window_awake_s: float | None = None
         self._window_frames = 0
         self._rate_hz: float | None = None
@@ -86,6 +97,9 @@ class MocapMonitor:
         """One tick; `moving`: the IMU or PX4's velocity say that the vehicle moves."""
         pose, vehicle, s = i.mocap, i.vehicle, self._s
         self._moved = self._moved or moving
+        if vehicle is not None and vehicle.imu_stamp_s != self._imu_s:
+            self._imu_s = vehicle.imu_stamp_s
+            self._inertial.imu(self._imu_s, acceleration_world_m_s2(vehicle))
         if pose is not None and (self._frame is None or pose.stamp_s != self._frame.stamp_s):
             self._judge(pose, vehicle, awake_s)
         if awake_s - self._believed_awake_s > s.mocap_timeout_s:
@@ -99,10 +113,14 @@ class MocapMonitor:
             and awake_s - self._same_since_s > s.mocap_frozen_s
         )
         two_streams = self._streams.two(awake_s)
-        self.trusted = self._plausible and not frozen and not two_streams
+        self._dragged = self._dragged or (self._against_imu and situation.airborne and situation.offboard_expected)
+        self.trusted = self._plausible and not frozen and not two_streams and not self._dragged
         if two_streams:
             text = "motion capture comes in two sequences of frame numbers: two servers at one address; neither is believed"
             findings.found(MOCAP_TWO_STREAMS, text)
+        if self._dragged:
+            text = "motion capture does not move as the IMU measures: {:.0f} mm off (limit {:.0f} mm); PX4 lands without it"
+            findings.found(MOCAP_DRAGGED, text, self._inertial.innovation_m * 1e3, s.mocap_inertial_m * 1e3)
         if frozen:
             findings.found(MOCAP_FROZEN, "motion capture repeats the same pose, the vehicle moves")
         self._tell_rate(awake_s, findings)
@@ -142,6 +160,17 @@ class MocapMonitor:
         )
         if self._plausible:
             self._believed, self._believed_awake_s = pose, awake_s
+            # A repeated pose is judged by mocap_frozen: it is not passed on, and says nothing of how the vehicle moves.
+            if not self.repeats:
+                self._against_imu = self._inertial.pose(pose.stamp_s, pose.position_world_m, self._age_s(pose))
+        else:
+            self._against_imu = False
+
+    def _age_s(self, pose: MocapPose) -> float:
+        """Time from the exposure of a pose to the newest IMU sample, limited; negative if the pose is newer."""
+        if self._imu_s is None:
+            return 0.0
+        return min(max(-IMU_GAP_MAX_S, self._imu_s - pose.stamp_s + (pose.latency_s or 0.0)), self._s.mocap_timeout_s)
 
     def _follows(self, before: MocapPose, pose: MocapPose, vehicle: VehicleState) -> bool:
         """The pose is where the body can be by now."""

@@ -143,6 +143,16 @@ MOCAP_TWO_STREAMS = _rule(
     _PX4_LANDS,
     _PX4_LANDS,
 )
+MOCAP_DRAGGED = _rule(
+    "mocap_dragged",
+    Part.MOCAP,
+    "poses do not move as the IMU measures: somebody drags them, or they are shifted",
+    ("mocap_inertial_m", "mocap_inertial_s"),
+    0.0,
+    None,
+    _PX4_LANDS,
+    False,
+)
 ESTIMATE_DISAGREES = _rule(
     "estimate_disagrees",
     Part.MOCAP,

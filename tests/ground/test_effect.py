@@ -159,6 +159,7 @@ def test_a_resume_while_a_cause_stands_that_came_during_the_hold_is_refused() ->
 # A jump of pose and estimate together is no finding of the ones that watch for jumps; 0.8 m off would be a landing.
 FORGIVING = (
     "vehicle.safety.mocap_jump_m=2.0",
+    "vehicle.safety.mocap_inertial_m=2.0",
     "vehicle.safety.tracking_error_abort_m=5",
     "vehicle.safety.hold_max_s=6",
 )

@@ -131,6 +131,12 @@ def two_streams(i: Inputs) -> Inputs:
     return put("mocap", frame_number=i.mocap.frame_number + 1_000_000)(i) if i.tick % 2 else i
 
 
+def dragged(i: Inputs) -> Inputs:
+    """From 2.8 s on the poses are dragged by 0.4 m/s, and PX4's position follows them; its IMU measures no motion."""
+    by_m = 0.4 * max(0.0, i.t_s - START_S - 2.8)
+    return both(moved("mocap", (by_m, 0.0, 0.0)), moved("vehicle", (by_m, 0.0, 0.0)))(i)
+
+
 FAULTS: dict[str, Fault] = {
     "mocap_not_finite": Fault(put("mocap", position_world_m=(NAN, 0.0, 1.0)), also=frozenset({"mocap_lost"})),
     "vehicle_not_finite": Fault(
@@ -148,6 +154,7 @@ FAULTS: dict[str, Fault] = {
     "mocap_swapped": Fault(moved("mocap", (0.0, 0.3, 0.0)), also=frozenset({"mocap_jump"})),
     "mocap_frozen": Fault(frozen_values("mocap", "position_world_m", "attitude_wxyz")),
     "mocap_two_streams": Fault(two_streams),
+    "mocap_dragged": Fault(dragged),
     "estimate_disagrees": Fault(drifting),
     "yaw_disagrees": Fault(turning),
     "vehicle_state_lost": Fault(stopped("vehicle")),

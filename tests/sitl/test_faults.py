@@ -16,11 +16,13 @@ from companion.exit_codes import EXIT_BAD_INPUT
 from companion.mission.plan import Plan
 from companion.mission.sequencer import SPOOL_S
 from companion.safety.stop import StopModel
+from companion.types import SafetyAction
 from sitl.campaign import CampaignError
 from sitl.fast import FastFlight, FastResult
 from sitl.fault_campaign import fly, grid
 from sitl.faults import FaultError, in_time
 from sitl.flight_faults import environment
+from sitl.robustness import draw, throws
 from tests.support import CATCH, HOVER, sandbox_in
 
 CONFIG = load_flight(CATCH, preset="recommended")
@@ -213,6 +215,34 @@ def test_mocap_lost_in_the_middle_of_the_line(duration_s: float | None) -> None:
     assert row["outcome"] == "landed"
     assert row["reacted_s"] <= 0.15
     assert row["drift_m"] <= StopModel(CONFIG.vehicle.tether).distance_m(LINE_M_S)
+
+
+def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0_6_m() -> None:
+    """PX4 fuses the dragged poses, so its position agrees with them; the IMU does not."""
+    flight = FastFlight(with_faults({"kind": "mocap_drag", "phase": "line", "size": 0.3}))
+    result = flight.run()
+    begun_s = flight.faults.begun_s
+    assert begun_s is not None
+    events = [event for outputs in result.outputs for event in outputs.events if event.t_s >= begun_s]
+    assert (events[0].id, events[0].action) == ("mocap_dragged", SafetyAction.AUTOPILOT_LAND)
+    assert events[0].t_s - begun_s < 0.2
+    assert not any(outputs.mocap_trusted for outputs in result.outputs if outputs.t_s >= events[0].t_s)
+    assert not result.crashed and not result.armed
+    x, y, _ = next(truth for truth in result.truth if truth.t_s >= begun_s).position_world_m
+    landed_x, landed_y, _ = result.truth[-1].position_world_m
+    assert math.dist((x, y), (landed_x, landed_y)) < 0.6
+
+
+@pytest.mark.parametrize("number", [3, 7])
+def test_a_catch_in_a_drawn_world_is_no_drag(number: int) -> None:
+    """Wind, delays, mass errors and the blow of a thrown payload: the flights from which the threshold was chosen, two of them."""
+    knobs = draw(11, number, throws(CONFIG.mission, CONFIG.vehicle))
+    flight = FastFlight(
+        load_flight(CATCH, overrides=[f"world.{key}={json.dumps(value)}" for key, value in knobs.items()])
+    )
+    result = flight.run()
+    assert result.caught
+    assert "mocap_dragged" not in {event.id for outputs in result.outputs for event in outputs.events}
 
 
 def test_a_gap_shorter_than_the_timeout_is_flown_through() -> None:

@@ -1,0 +1,104 @@
+"""Does motion capture move as the IMU says that the vehicle moves? Pure.
+
+PX4 fuses the poses of motion capture, so its position agrees with them even when an attacker drags them away. The accelerometer does
+not: an observer of position, velocity and accelerometer bias integrates it, and each pose corrects the observer. The innovation, pose
+minus predicted position, stays near zero while both measure the same motion. A drag that begins at v m/s raises it to 0.08 s x v after
+0.2 s; then the observer follows the drag, as it follows a constant acceleration error. A drag that begins slowly is not found.
+
+The attitude that turns the specific force into the world is PX4's. PX4 corrects its tilt by the same poses, but slowly (0.4 rad/s).
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.types import Vec3
+
+POLE_RAD_S = 3.0
+"""All three poles of the observer."""
+SETTLE_S = 9.0 / POLE_RAD_S
+"""The innovation is not judged for this time after a start: velocity and bias are unknown then."""
+IMU_GAP_MAX_S = 0.05
+"""The observer starts again after a longer gap between IMU samples: motion in the gap was not measured."""
+
+
+class InertialCheck:
+    """Observer of the vehicle's position, velocity and acceleration error in the world frame.
+
+    Args:
+        limit_m: threshold of the innovation's length.
+        hold_s: hold time: the innovation must exceed the threshold in every pose for this long.
+        gap_max_s: the observer starts again after a longer gap between poses.
+    """
+
+    def __init__(self, limit_m: float, hold_s: float, gap_max_s: float) -> None:
+        self._limit_m, self._hold_s, self._gap_max_s = limit_m, hold_s, gap_max_s
+        self._position = self._velocity = self._bias = (0.0, 0.0, 0.0)
+        self._imu_s: float | None = None
+        self._pose_s: float | None = None
+        self._started_s = 0.0
+        self._above_since_s: float | None = None
+        self.innovation_m = 0.0
+        """Length of the newest innovation; 0 while the observer settles."""
+
+    def imu(self, stamp_s: float, acceleration_world_m_s2: Vec3) -> None:
+        """Predict up to an IMU sample; a sample that was used before changes nothing.
+
+        Args:
+            stamp_s: time of the sample.
+            acceleration_world_m_s2: specific force turned into the world, gravity removed.
+        """
+        before_s, self._imu_s = self._imu_s, stamp_s
+        if before_s is None or stamp_s == before_s:
+            return
+        dt_s = stamp_s - before_s
+        if not 0.0 < dt_s <= IMU_GAP_MAX_S:
+            self._pose_s = None
+            return
+        half = 0.5 * dt_s * dt_s
+        ax, ay, az = acceleration_world_m_s2
+        bx, by, bz = self._bias
+        vx, vy, vz = self._velocity
+        px, py, pz = self._position
+        ax, ay, az = ax + bx, ay + by, az + bz
+        self._position = (px + vx * dt_s + ax * half, py + vy * dt_s + ay * half, pz + vz * dt_s + az * half)
+        self._velocity = (vx + ax * dt_s, vy + ay * dt_s, vz + az * dt_s)
+
+    def pose(self, stamp_s: float, position_world_m: Vec3, age_s: float) -> bool:
+        """Compare a new pose with the prediction and correct the observer.
+
+        Args:
+            stamp_s: time of arrival.
+            position_world_m: measured position.
+            age_s: time from the exposure to the newest IMU sample; the prediction is taken back by as much,
+                or forward if it is negative.
+
+        Returns:
+            True if the innovation has exceeded the threshold for the hold time.
+        """
+        before_s, self._pose_s = self._pose_s, stamp_s
+        dt_s = stamp_s - before_s if before_s is not None else math.inf
+        stale = self._imu_s is None or stamp_s - self._imu_s > IMU_GAP_MAX_S
+        if stale or not 0.0 < dt_s <= self._gap_max_s:
+            self._position, self._velocity, self._bias = position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+            self._started_s, self._above_since_s, self.innovation_m = stamp_s, None, 0.0
+            return False
+        (px, py, pz), (vx, vy, vz), (bx, by, bz) = self._position, self._velocity, self._bias
+        x, y, z = position_world_m
+        x, y, z = x - px + vx * age_s, y - py + vy * age_s, z - pz + vz * age_s
+        # Gains that put three discrete poles at exp(-POLE_RAD_S dt) (fading-memory filter of second order), so any rate is stable.
+        pole = math.exp(-POLE_RAD_S * dt_s)
+        less = 1.0 - pole
+        kp, kv, kb = 1.0 - pole**3, 1.5 * less * less * (1.0 + pole) / dt_s, less**3 / (dt_s * dt_s)
+        self._position = (px + kp * x, py + kp * y, pz + kp * z)
+        self._velocity = (vx + kv * x, vy + kv * y, vz + kv * z)
+        self._bias = (bx + kb * x, by + kb * y, bz + kb * z)
+        if stamp_s - self._started_s < SETTLE_S:
+            return False
+        self.innovation_m = math.sqrt(x * x + y * y + z * z)
+        if self.innovation_m <= self._limit_m:
+            self._above_since_s = None
+            return False
+        if self._above_since_s is None:
+            self._above_since_s = stamp_s
+        return stamp_s - self._above_since_s >= self._hold_s
