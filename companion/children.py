@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,8 +20,11 @@ def use_default_signals() -> None:
     """Undo which signals the parent left ignored or blocked, so that Ctrl-C and `kill -INT` work however we were started.
 
     A shell without job control starts `companion ... &` with SIGINT ignored, and children inherit that. With SIGCHLD ignored, the
-    exit code of a child is lost. SIGHUP stays as it is: `nohup` means it.
+    exit code of a child is lost. SIGHUP stays as it is: `nohup` means it. Does nothing in a thread other than the main one, which
+    cannot set handlers: there the program around it decides.
     """
+    if threading.current_thread() is not threading.main_thread():
+        return
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGTERM, signal.SIGCHLD):

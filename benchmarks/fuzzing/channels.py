@@ -34,7 +34,7 @@ class ChannelsTarget(Target):
         self._tidings = [
             b'{"error": "recorder: log.mcap: No space left on device"}',
             b'{"samples": 1}',
-            b'{"command": "hold", "operator": "anna", "nonce": "0123456789abcdef"}',
+            b'{"command": "hold", "operator": "anna", "nonce": "0123456789abcdef", "hold": 1}',
             b'{"ground": "connected to mqtt://127.0.0.1:1883"}',
             b"[1]",
             b"null",
@@ -68,7 +68,7 @@ class ChannelsTarget(Target):
             self._client.error = None
             self._hear(b'{"error": "disk full"}')
             one_line(self._client.error or "", "the recorder's word")
-            self._hear(b'{"command": "land", "operator": "anna", "nonce": "00"}')
+            self._hear(b'{"command": "land", "operator": "anna", "nonce": "00", "hold": 0}')
             if [asked.command for asked in self._client.take_commands()] != [OperatorCommand.LAND]:
                 raise Wrong("a valid command behind it is not heard")
 

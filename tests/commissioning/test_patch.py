@@ -58,7 +58,8 @@ def test_what_the_file_leaves_to_its_default_is_added_to_its_block(mine: Path) -
     assert vehicle.arm.joint_friction_nm == 0.08
     assert vehicle.ground.mqtt is not None and vehicle.ground.mqtt.commands is False
     lines = mine.read_text(encoding="utf-8").splitlines()
-    assert lines[lines.index("  torque_per_amp_nm_a: 1.3") + 1] == "  joint_friction_nm: 0.08"
+    [before] = [number for number, line in enumerate(lines) if line.startswith("  joint_armature_kg_m2: ")]
+    assert lines[before + 1] == "  joint_friction_nm: 0.08"
 
 
 def test_a_list_keeps_its_comment(mine: Path) -> None:
