@@ -7,9 +7,12 @@ import os
 import shutil
 import signal
 import subprocess
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+
+TMP_PREFIX = "tmp-"
 
 
 class LaunchError(Exception):
@@ -57,16 +60,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 @contextlib.contextmanager
-def scratch_folder(path: Path) -> Iterator[Path]:
-    """Make a folder for temporary files, yield its absolute path, and remove it with all that children left in it.
+def scratch_folder(out: Path) -> Iterator[Path]:
+    """Make a new folder for temporary files in `out`, yield its absolute path, and remove it with all that children left in it.
+
+    A folder that was there before is never taken, whatever its name: it would be removed.
 
     Raises:
         LaunchError: it cannot be made.
     """
     try:
-        path.mkdir(exist_ok=True)
+        path = Path(tempfile.mkdtemp(prefix=TMP_PREFIX, dir=out))
     except OSError as error:
-        raise LaunchError(f"{path}: cannot be made: {error.strerror}; choose another --out") from None
+        raise LaunchError(f"{out}: a folder in it cannot be made: {error.strerror}; choose another --out") from None
     try:
         yield path.absolute()
     finally:

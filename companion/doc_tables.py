@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -46,7 +47,8 @@ def flown_by(results: Mapping[str, Any]) -> str:
     """
     commit = results["versions"].get("git", "unknown")
     dirty = " with changes" if commit.endswith("-dirty") else ""
-    return f"\nFlown by `{results['settings']['command']}` at commit {commit.removesuffix('-dirty')[:10]}{dirty}."
+    command = re.sub(r" --out \S+", "", results["settings"]["command"])
+    return f"\nFlown by `{command}` at commit {commit.removesuffix('-dirty')[:10]}{dirty}."
 
 
 def write_results(page: Path, file: Path, tables_of: Callable[[dict[str, Any]], Mapping[str, str]]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from typing import Protocol
 
@@ -11,7 +12,7 @@ from companion.clock import Clock
 from companion.config.loader import FlightConfig
 from companion.flight_guard import FlightGuard
 from companion.mission.sequencer import people_fly
-from companion.types import AutopilotRequest, AutopilotStatus, Outcome
+from companion.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, Outcome
 
 HAND_OVER_S = 30.0
 HAND_OVER_MIN_S = 1.5
@@ -25,6 +26,9 @@ class Lander(Protocol):
 
     def status(self) -> AutopilotStatus | None:
         """Latest slow state."""
+
+    def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
+        """None: from now on no setpoint leaves."""
 
     def request(self, request: AutopilotRequest) -> None:
         """Start carrying a request out."""
@@ -42,6 +46,9 @@ async def hand_over(autopilot: Lander, channel: socket.socket, clock: Clock, gua
     Returns:
         ABORTED once PX4 has disarmed, LOST if it has not within `HAND_OVER_S`.
     """
+    # MAVSDK's Offboard plugin would go on repeating the last setpoint, and PX4's own failsafe would never act.
+    with contextlib.suppress(Exception):  # whatever it is, LAND must be requested
+        autopilot.send_attitude(None)
     start_s = clock()
     while clock() - start_s < HAND_OVER_S:
         now = autopilot.status()

@@ -179,7 +179,7 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
     mission, vehicle = files["--mission"], files["--vehicle"]
     assert mission is not None and files["--program"] is not None
     seen = None if vehicle is None else inside(root, vehicle)
-    config = load_flight(inside(root, mission), seen, overrides=["mission.start.takeoff=by_operator"])
+    config = load_flight(inside(root, mission), seen, overrides=["mission.start.takeoff=by_operator"], hardware=True)
     mqtt = config.vehicle.ground.mqtt
     if mqtt is None or not mqtt.commands:
         key = "vehicle.ground.mqtt is null" if mqtt is None else "vehicle.ground.mqtt.commands is false"

@@ -47,8 +47,6 @@ and it may be dead itself. Killed, the flight process leaves PX4 to its own offb
 GUARDIAN_LEAVE_TIMEOUT_S = 5.0
 """After the flight process is gone: a guardian that is not needed leaves at once."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
-TMP_FOLDER = "tmp"
-"""In the flight's folder: TMPDIR of the flight process. MAVSDK keeps folders in it, and leaves them there when it is killed."""
 
 OnMessage = Callable[[status.Message], None]
 Sitl = Literal["stub", "px4"]
@@ -142,7 +140,8 @@ class Launcher:
                 config = with_devices(config, sitl.devices(self._on_world_message, lambda: self._stop_asked))
             path = self._out / "config.json"
             write_text(path, config.model_dump_json(indent=1))
-            with scratch_folder(self._out / TMP_FOLDER) as tmp:
+            # TMPDIR of the flight process: MAVSDK keeps folders there, and leaves them when it is killed.
+            with scratch_folder(self._out) as tmp:
                 outcome = Outcome.ABORTED if self._stop_asked else self._fly(path, sitl, tmp)
         except LaunchError:
             if not self._stop_asked:

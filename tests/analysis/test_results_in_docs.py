@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,8 @@ def test_a_campaign_notes_its_command_and_the_page_prints_it(name: str, tmp_path
     assert write([str(page), str(tmp_path / file)]) == 0
     text = page.read_text(encoding="utf-8")
     assert "the old one" not in text
-    assert text.count(f"Flown by `{command}` at commit {results['versions']['git'][:10]}") == (
+    shown = re.sub(r" --out \S+", "", command)
+    assert text.count(f"Flown by `{shown}` at commit {results['versions']['git'][:10]}") == (
         2 if name == "compare" else 1
     )
 

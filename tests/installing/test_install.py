@@ -32,6 +32,10 @@ def root(tmp_path: Path) -> Path:
     root = tmp_path / "root"
     for folder in ("missions", "vehicles", "controllers"):
         shutil.copytree(ROOT / "configs" / folder, root / "etc/companion" / folder)
+    vehicle = root / "etc/companion/vehicles/tarot650_2r.yaml"
+    text = vehicle.read_text(encoding="utf-8")
+    assert "interface: 0.0.0.0 " in text, "of every network: the service would refuse to fly"
+    vehicle.write_text(text.replace("interface: 0.0.0.0 ", "interface: 192.0.2.7 "), encoding="utf-8")
     (root / RULES).parent.mkdir(parents=True)
     (root / RULES).write_bytes(b"# by hand, in Latin-1: \xe4\n")
     (root / RULES).chmod(0o640)
@@ -61,6 +65,16 @@ def install(root: Path, *more: str) -> int:
 
 def undo(root: Path, *more: str) -> int:
     return main(["install", "--undo", "--root", str(root), "--yes", *more])
+
+
+def test_a_vehicle_file_that_the_service_would_refuse_is_refused_now(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(ROOT / "configs/vehicles", root / "etc/companion/vehicles", dirs_exist_ok=True)
+    before = tree(root)
+    assert install(root) == EXIT_BAD_INPUT
+    assert "interface" in capsys.readouterr().err
+    assert tree(root) == before
 
 
 def test_installed_and_undone_leaves_every_byte_as_it_was(root: Path) -> None:
