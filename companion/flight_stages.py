@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import math
+
 from companion.config.loader import FlightConfig
 from companion.control.pilot import Pilot
 from companion.frames import euler_zyx_from_quat
@@ -22,6 +24,8 @@ from companion.safety.monitors import unfused
 from companion.safety.rules import PILOT_TOOK_OVER
 from companion.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, SafetyAction, Severity
 
+ARMED_SHOWN_S = 1.5
+"""PX4's HEARTBEAT shows once a second whether it is armed: after a request to arm, an older "not armed" proves nothing."""
 NO_TOUCHDOWN_S = 5.0
 """After the plan's end."""
 
@@ -41,6 +45,8 @@ class FlightStages:
         self._touchdown = Touchdown(self._clearance_m)
         self._stop = RotorStop(self._clearance_m)
         self._settled = SettledEstimate()
+        self._arm_requested_s = -math.inf
+        """When ARM was last requested."""
         self._tare_start_s: float | None = None
         self.waits_for_start = config.mission.start.takeoff == "by_operator"
         self._was_ready = False
@@ -184,6 +190,7 @@ class FlightStages:
                 elif elapsed > seq.ARM_TIMEOUT_S:
                     self._refuse(i, "arming_refused", "PX4 did not arm")
                 else:
+                    self._arm_requested_s = i.t_s
                     return AutopilotRequest.ARM
             case Stage.SPOOL:
                 if elapsed >= seq.SPOOL_S:
@@ -325,7 +332,7 @@ class FlightStages:
             self.enter(Stage.AUTOPILOT_LAND, i)
 
     def _stand_down(self, i: Inputs, elapsed_s: float) -> AutopilotRequest:
-        if not seq.is_armed(i.status):
+        if not seq.is_armed(i.status) and i.t_s - self._arm_requested_s > ARMED_SHOWN_S:
             self.enter(Stage.DONE, i)
         elif not self._left_to_pilot(i) and elapsed_s > seq.DISARM_TIMEOUT_S:
             text = "PX4 did not disarm: its rotors may turn; disarm it by its switch or from a ground station"

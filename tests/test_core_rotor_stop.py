@@ -10,7 +10,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from companion.core import FlightCore
-from companion.types import AutopilotRequest, FlightMode, LandedState, Outcome, Outputs
+from companion.types import AutopilotRequest, FlightMode, LandedState, OperatorCommand, Outcome, Outputs
 from tests.core_walk import (
     ON_ITS_BACK,
     STEP_S,
@@ -138,6 +138,19 @@ def test_a_pilot_who_takes_over_between_arming_and_take_off_is_not_disarmed(mode
     outputs = walked(core, machine, 600)
     assert not requests(outputs) & set(STOPS)
     assert outputs[-1].outcome is None, "it waits for the pilot's own disarm"
+
+
+def test_landed_just_after_arming_it_ends_only_once_px4_shows_that_it_is_not_armed() -> None:
+    """PX4's HEARTBEAT comes once a second: LAND 20 ms after ARM meets a status from before the arming."""
+    core, machine, _ = machine_from("arm", 1, landed=LandedState.ON_GROUND, armed=False)
+    begun = [core.step(dataclasses.replace(machine.tick(), command=OperatorCommand.LAND)), *walked(core, machine, 40)]
+    assert all(o.outcome is None for o in begun), "over while the rotors spool up"
+    machine.armed = True
+    outputs = walked(core, machine, 100)
+    assert AutopilotRequest.DISARM in requests(outputs)
+    assert outputs[-1].outcome is None
+    machine.armed = False
+    assert walked(core, machine, 100)[-1].outcome is Outcome.ABORTED
 
 
 # -- it is flipped ---------------------------------------------------------------------------------------------------
