@@ -123,7 +123,8 @@ class MavsdkAutopilot:
                 *(self._mavsdk, address, self._forwarding),
             )
             self._local_port = claim.pin()
-            system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
+            async with claim.calling(self._own_ids):
+                system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
             self._direct = MavlinkDirect(system)
             self._setpoints = setpoint_path(self._device.setpoint_path, system, self._direct)

@@ -8,6 +8,9 @@ import errno
 import fcntl
 import os
 import socket
+from collections.abc import AsyncIterator
+
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.autopilot_link import (
     bind_alone,
@@ -25,6 +28,7 @@ Peer = tuple[str, int]
 _DATAGRAM_MAX_BYTES = 65535
 _DRAIN_DATAGRAMS = 1000
 _RIVALS_REPORTED_MAX = 4
+_CALL_PERIOD_S = 1.0
 
 
 class LinkClaim:
@@ -48,7 +52,9 @@ class LinkClaim:
         self._lock: int | None = None
         self._port: socket.socket | None = None
         self._rivals: set[Peer] = set()
+        self._reported = 0
         self._system = 0
+        self._armed = False
         self._before: frozenset[int] = frozenset()
         self.peer: Peer | None = None
         """PX4's UDP address; None before it is proved, and on TCP and serial links, which have one far end."""
@@ -63,7 +69,7 @@ class LinkClaim:
         """Wait on a `udpin` link for a valid HEARTBEAT of an autopilot, and keep its sender as PX4's address; resolve that of `udpout`.
 
         Raises:
-            DeviceError: no HEARTBEAT within `timeout_s`, or HEARTBEATs from two addresses.
+            DeviceError: no HEARTBEAT within `timeout_s`, or HEARTBEATs from two addresses while PX4 is not armed.
         """
         if self._parts.kind == "udpout":
             with contextlib.suppress(OSError):  # MAVSDK names a host that does not resolve
@@ -80,6 +86,22 @@ class LinkClaim:
             raise no_heartbeat(self._address, timeout_s)
         self.refuse_rivals()
 
+    @contextlib.asynccontextmanager
+    async def calling(self, own: tuple[int, int]) -> AsyncIterator[None]:
+        """Send PX4 a HEARTBEAT from the port of a `udpin` link, at once and each second, until MAVSDK has heard PX4.
+
+        PX4 on Ethernet may broadcast until it has heard a partner (MAV_x_BROADCAST), and MAVSDK's connected socket gets no broadcasts.
+        More than one, as PX4 takes no partner in the first 3 s after it has opened its port.
+
+        Args:
+            own: system and component id of MAVSDK.
+        """
+        calls = asyncio.create_task(self._call(own))
+        try:
+            yield
+        finally:
+            calls.cancel()
+
     def pin(self) -> int:
         """Connect the UDP socket that MAVSDK opened since `find_px4` to PX4's address; its local port, 0 if the link is not UDP.
 
@@ -95,25 +117,25 @@ class LinkClaim:
             raise device_error(self._address, "MAVSDK's socket in /proc", found, "mount /proc") from None
 
     def refuse_rivals(self) -> None:
-        """Read what other senders sent so far.
+        """Read what other senders sent so far. PX4 that was found armed may be in the air: rivals are then left to `take_rival`.
 
         Raises:
-            DeviceError: one of them claims to be PX4.
+            DeviceError: one of them claims to be PX4, which was found not armed.
         """
         for _ in range(_DRAIN_DATAGRAMS):
             if not self._read_one():
                 break
-        if self._rivals:
+        if self._rivals and not self._armed:
             found = f"{_text(self.peer)} and {', '.join(sorted(map(_text, self._rivals)))}"
             fix = "stop the other sender, or use a link of PX4's own (serial, or a port that only PX4 sends to)"
             raise device_error(self._address, f"PX4 (system {self._system}) at one address", found, fix)
 
     def take_rival(self) -> str | None:
-        """Read one datagram of another sender; a line for the log if it is the first that claims to be PX4. Never waits."""
-        before = len(self._rivals)
+        """Read one datagram of another sender; a line for the log if there is a new one that claims to be PX4. Never waits."""
         self._read_one()
-        if len(self._rivals) == before:
+        if len(self._rivals) == self._reported:
             return None
+        self._reported = len(self._rivals)
         newest = ", ".join(sorted(map(_text, self._rivals)))
         return f"{newest} claims to be PX4 (system {self._system}), which is at {_text(self.peer)}; ignored"
 
@@ -140,13 +162,23 @@ class LinkClaim:
     def _hear(self, datagram: bytes, sender: Peer) -> None:
         if sender == self.peer or sender in self._rivals or len(self._rivals) >= _RIVALS_REPORTED_MAX:
             return
-        system = autopilot_heartbeat(datagram)
-        if system is None:
+        heard = autopilot_heartbeat(datagram)
+        if heard is None:
             return
         if self.peer is None:
-            self.peer, self._system = sender, system
-        elif system == self._system:
+            self.peer, self._system, self._armed = sender, heard.system, heard.armed
+        elif heard.system == self._system:
             self._rivals.add(sender)
+
+    async def _call(self, own: tuple[int, int]) -> None:
+        message = mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_UNINIT, 3
+        )
+        data = message.pack(mavlink.MAVLink(None, srcSystem=own[0], srcComponent=own[1]))
+        while self._port is not None and self.peer is not None:
+            with contextlib.suppress(OSError):  # no route at this moment; the next one may pass
+                self._port.sendto(data, self.peer)
+            await asyncio.sleep(_CALL_PERIOD_S)
 
 
 def _lock(address: str, path: str) -> int:

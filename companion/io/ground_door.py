@@ -73,12 +73,9 @@ class ArmedState:
 
     def hear(self, datagram: bytes, now_s: float) -> None:
         """Take in what MAVSDK forwards from PX4."""
-        if autopilot_heartbeat(datagram) != self._vehicle_system:
-            return
-        for frame in frames(datagram):
-            if frame is not None and frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-                armed = bool(frame.payload[6:7] and frame.payload[6] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-                self._disarmed_s = None if armed else now_s
+        heard = autopilot_heartbeat(datagram)
+        if heard is not None and heard.system == self._vehicle_system:
+            self._disarmed_s = None if heard.armed else now_s
 
     def expect_arming(self, now_s: float) -> None:
         """The companion asks PX4 to arm; the HEARTBEAT that shows it comes up to a second later."""

@@ -10,6 +10,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
@@ -49,6 +50,12 @@ _COMMAND_OFFSET = 28
 """Of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
 _AUTOPILOT_OFFSET = 5
 """Of the uint8 `autopilot` in the payload of HEARTBEAT."""
+_BASE_MODE_OFFSET = 6
+"""Of the uint8 `base_mode` in the payload of HEARTBEAT."""
+_PROOF_MAX_BYTES = 1500
+"""One Ethernet frame: the longest datagram that is searched for a HEARTBEAT; bridges put several messages into one."""
+_PROOF_FRAMES_MAX = 32
+_PROOF_CHECKSUMS_MAX = 2
 
 FAST_STREAMS = frozenset(
     getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
@@ -152,19 +159,36 @@ def frames(datagram: bytes) -> Iterator[Frame | None]:
         at += len(frame.data)
 
 
-def autopilot_heartbeat(datagram: bytes) -> int | None:
-    """System id of the autopilot (component 1) whose HEARTBEAT with a right checksum is in the datagram; None if there is none."""
-    for frame in frames(datagram):
-        if frame is None or frame.message_id != mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-            continue
-        autopilot = int.from_bytes(frame.payload[_AUTOPILOT_OFFSET : _AUTOPILOT_OFFSET + 1], "little")
-        if (
-            frame.component == mavlink.MAV_COMP_ID_AUTOPILOT1
-            and autopilot != mavlink.MAV_AUTOPILOT_INVALID
-            and frame.intact()
-        ):
-            return frame.system
+@dataclass(frozen=True, slots=True)
+class AutopilotHeartbeat:
+    """What an autopilot (component 1) says of itself in HEARTBEAT."""
+
+    system: int
+    armed: bool
+
+
+def autopilot_heartbeat(datagram: bytes) -> AutopilotHeartbeat | None:
+    """The HEARTBEAT of an autopilot with a right checksum in the datagram; None if there is none.
+
+    Strangers choose what is read here, and the control loop waits for it: a datagram longer than one Ethernet frame is not looked at,
+    of the others only the first 32 frames and the first two checksums.
+    """
+    if len(datagram) > _PROOF_MAX_BYTES:
+        return None
+    beats = (frame for frame in islice(frames(datagram), _PROOF_FRAMES_MAX) if _of_autopilot(frame))
+    for frame in islice(beats, _PROOF_CHECKSUMS_MAX):
+        if frame is not None and frame.intact():
+            base_mode = int.from_bytes(frame.payload[_BASE_MODE_OFFSET : _BASE_MODE_OFFSET + 1], "little")
+            return AutopilotHeartbeat(frame.system, bool(base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED))
     return None
+
+
+def _of_autopilot(frame: Frame | None) -> bool:
+    """It says that it is an autopilot's HEARTBEAT; its checksum is not looked at."""
+    if frame is None or frame.message_id != mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+        return False
+    autopilot = int.from_bytes(frame.payload[_AUTOPILOT_OFFSET : _AUTOPILOT_OFFSET + 1], "little")
+    return bool(frame.component == mavlink.MAV_COMP_ID_AUTOPILOT1 and autopilot != mavlink.MAV_AUTOPILOT_INVALID)
 
 
 def _frame_at(datagram: bytes, at: int) -> Frame | None:

@@ -6,9 +6,11 @@ import asyncio
 import os
 import socket
 import tty
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import serial
@@ -16,8 +18,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.clock import flight_clock
 from companion.config.vehicle import AutopilotDevice
+from companion.io import ground_frames
 from companion.io.autopilot import MavsdkAutopilot
+from companion.io.autopilot_claim import LinkClaim
 from companion.io.edges import DeviceError
+from companion.io.ground_frames import AutopilotHeartbeat
 from companion.types import MocapPose
 from tests.io.autopilot_peer import Px4Peer, free_udp_port
 from tests.io.test_autopilot import edge, eventually, refused
@@ -32,6 +37,9 @@ def forged_heartbeat() -> bytes:
     message = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, 12, ARMED, 4 << 16 | 6 << 24, 4, 3)
     packed: bytes = message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
     return packed
+
+
+WRONG_HEARTBEAT = forged_heartbeat()[:-2] + b"\0\0"
 
 
 @contextmanager
@@ -88,6 +96,97 @@ def test_two_senders_that_claim_to_be_px4_are_refused_by_address() -> None:
         text = str(caught.value)
         assert "expected PX4 (system 1) at one address, found " in text
         assert all(f"{host}:{at}" in text for host, at in (one.address, other.address))
+
+
+def test_beside_an_armed_px4_the_other_sender_is_reported_and_the_flight_goes_on() -> None:
+    async def main() -> None:
+        port = free_udp_port()
+        one, other = Px4Peer(port), Px4Peer(port)
+        one.base_mode = other.base_mode = ARMED
+        with one, other:
+            async with edge(port) as autopilot:
+                peer = autopilot.identity().peer
+                rival = next(each.address for each in (one, other) if each.address != peer)
+                texts: list[str] = []
+
+                def reported() -> bool:
+                    texts.extend(autopilot.take_messages())
+                    return any(f"{rival[0]}:{rival[1]} claims to be PX4 (system 1)" in text for text in texts)
+
+                await eventually(reported, "the rival is reported")
+                texts.extend(text for _ in range(10) for text in autopilot.take_messages())
+                assert sum("claims to be PX4" in text for text in texts) == 1
+
+    asyncio.run(main())
+
+
+class _Broadcasting(Px4Peer):
+    """PX4 with MAV_x_BROADCAST 1: it broadcasts until it has a partner, and takes none in its first time, here the first HEARTBEAT."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(port)
+        self._partner = self.remote
+        self.remote = ("127.255.255.255", port)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+
+    def _take(self, message: Any) -> None:
+        super()._take(message)
+        if len(self.of("HEARTBEAT")) > 1:
+            self.remote = self._partner
+
+
+def test_px4_that_broadcasts_until_it_has_a_partner_is_found() -> None:
+    async def main() -> None:
+        port = free_udp_port()
+        device = AutopilotDevice(address=f"udpin://0.0.0.0:{port}", discovery_timeout_s=20.0)
+        with _Broadcasting(port) as px4:
+            async with MavsdkAutopilot(device, flight_clock()) as autopilot:
+                assert autopilot.identity().peer == px4.address
+                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("data", "frames_max", "checksums_max"),
+    [
+        pytest.param(WRONG_HEARTBEAT * 3000, 0, 0, id="60 kB of heartbeats with wrong checksums"),
+        pytest.param(WRONG_HEARTBEAT * 70, 3, 2, id="an Ethernet frame of them"),
+        pytest.param(b"\xfe\0\0\1\1\0\0\0" * 187, 32, 2, id="an Ethernet frame of empty ones"),
+        pytest.param(b"\xfe\0\0\1\1\1\0\0" * 187, 32, 0, id="an Ethernet frame of other messages"),
+    ],
+)
+def test_little_of_a_strangers_datagram_is_read(
+    data: bytes, frames_max: int, checksums_max: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted in the control loop's own call: frames cut out, and checksums computed."""
+    counted: Counter[str] = Counter()
+    for name in ("_frame_at", "_checksum"):
+        monkeypatch.setattr(ground_frames, name, _counting(counted, name, getattr(ground_frames, name)))
+    port = free_udp_port()
+    with (
+        closing(LinkClaim(f"udpin://127.0.0.1:{port}")) as claim,
+        closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger,
+    ):
+        stranger.sendto(data, ("127.0.0.1", port))
+        assert claim.take_rival() is None
+        assert (counted["_frame_at"] <= frames_max, counted["_checksum"] <= checksums_max) == (True, True), counted
+        stranger.sendto(forged_heartbeat(), ("127.0.0.1", port))
+        claim.take_rival()
+        assert claim.peer is not None and claim.peer[1] == stranger.getsockname()[1], "a valid HEARTBEAT is still read"
+
+
+def test_a_heartbeat_among_the_messages_that_a_bridge_puts_into_one_datagram_is_read() -> None:
+    other = mavlink.MAVLink_attitude_message(0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6).pack(mavlink.MAVLink(None, 1, 1))
+    assert ground_frames.autopilot_heartbeat(other * 20 + forged_heartbeat()) == AutopilotHeartbeat(1, True)
+
+
+def _counting(counted: Counter[str], name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+    def count(*values: Any) -> Any:
+        counted[name] += 1
+        return real(*values)
+
+    return count
 
 
 async def _enter(port: int) -> None:
