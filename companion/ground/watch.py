@@ -167,6 +167,12 @@ class Watch:
             or (known.state is not None and known.state.presence in (Presence.FLYING, Presence.SILENT))
         )
 
+    def proven(self, now_s: float) -> list[str]:
+        """Names of the vehicles whose proven messages come in."""
+        return sorted(
+            name for name, known in self.vehicles.items() if known.proven is not None and known.proven.live(now_s)
+        )
+
     def _believed(self, ack: Ack, name: str) -> bool:
         """Answers to this operator are proven; those to others cannot be judged here."""
         signer = self._signer
@@ -189,8 +195,8 @@ class Watch:
         if proven is None:
             proven = Proven(stream.session, stream.wall_s, stream.t_s, stream.hold or 0, now_s)
             self._vehicle(name, now_s).proven = proven
-        if stream.t_s < proven.t_s:
-            return False  # a copy of what was heard before
+        elif stream.t_s <= proven.t_s:
+            return False  # a copy of what was heard before: the vehicle sends none without a new tick
         proven.wall_s, proven.t_s, proven.hold, proven.heard_s = stream.wall_s, stream.t_s, stream.hold or 0, now_s
         proven.clock.heard(stream.t_s, now_s)
         return True

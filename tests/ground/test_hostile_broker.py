@@ -98,6 +98,19 @@ def test_a_copy_of_an_earlier_message_is_not_shown_as_new() -> None:
     assert watch.take(STREAM, copy, False, 50.1) is None
 
 
+def test_a_copy_of_the_newest_message_keeps_no_dead_link_alive() -> None:
+    """Sent again and again it would set the clock back, and every command would be refused as stale."""
+    watch, copy = flying(), proven(stream_of(100.0))
+    for k in range(1, 401):
+        now_s = 50.0 + k / 20
+        assert watch.take(STREAM, copy, False, now_s) is None
+    known = watch.vehicles["rig"].proven
+    assert known is not None and not known.live(70.0)
+    assert known.now_ms(70.0) == 120_000
+    command = make_command(CommandName.HOLD, "rig", known.session, "anna", ANNA.key, known.now_ms(70.0))
+    assert isinstance(Verifier(OPERATORS, "rig", "s1").check(encode(command), False, 120.01), Accepted)
+
+
 def test_a_recording_of_an_earlier_flight_takes_the_place_of_none_that_is_under_way() -> None:
     now, before = stream_of(100.0, "now", wall_s=2000.0), stream_of(500.0, "before", wall_s=1000.0)
     watch = Watch(signer=SIGNER)
