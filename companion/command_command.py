@@ -11,6 +11,7 @@ from typing import Any
 from companion.config.document import ConfigError
 from companion.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.ground.access import broker_access
+from companion.ground.keys import SAFER
 from companion.ground.link import BrokerRefused
 from companion.ground.messages import CommandName, Topic
 from companion.ground.orders import INSTEAD, Failed, Sent, signer_of, told
@@ -118,16 +119,25 @@ class _Commander:
             known = station.watch.vehicles
             if station.link.connected:
                 connected_s = connected_s or time.monotonic()
+                # What flies has proven so by then, whatever its state says.
+                waited = time.monotonic() - connected_s > LIVE_S
                 names = [self._only] if self._only is not None else station.watch.there(time.monotonic())
+                if len(names) > 1 and self._command in SAFER:
+                    if not waited:
+                        names = []  # a state proves nothing, and anybody may have left it behind
+                    elif len(proven := station.watch.proven(time.monotonic())) == 1:
+                        others = ", ".join(name for name in names if name not in proven)
+                        tell(
+                            f"companion command: {proven[0]} is meant, nothing is proven by: {others}; "
+                            "to command another: --vehicle NAME"
+                        )
+                        return proven[0]
                 if len(names) > 1:
                     self._end(
                         EXIT_BAD_INPUT, f"there are several vehicles ({', '.join(names)}); say which: --vehicle NAME"
                     )
                     return None
                 if names and names[0] in known:
-                    waited = (
-                        time.monotonic() - connected_s > LIVE_S
-                    )  # what flies has proven so by then, whatever its state says
                     vehicle = known[names[0]]
                     if vehicle.proven is not None or (waited and (vehicle.stream is not None or vehicle.ended)):
                         return names[0]

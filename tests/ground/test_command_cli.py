@@ -141,25 +141,50 @@ def test_several_vehicles_have_to_be_told_apart(broker: Broker, keys: str, capsy
     play(scene())
 
 
+@pytest.mark.parametrize("name", ["resume", "start"])
 def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_quiet(
-    broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
+    name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What is retained is known before anything is sent, however many there are."""
 
     async def scene() -> None:
         async with played_vehicle(broker.port, OPERATORS, "one") as one:
-            async with aiomqtt.Client("127.0.0.1", broker.port) as client:
-                for number in range(50):
-                    name = f"quiet-{number:02}"
-                    state = b'{"v":2,"vehicle":"%s","session":"s","presence":"%s","simulated":true,"mission":"m","law":"l",' \
-                        b'"preset":"p","wall_s":0.0,"commands":true}'  # fmt: skip
-                    presence = b"flying" if number == 49 else b"ended"
-                    await client.publish(Topic.STATE.of(name), state % (name.encode(), presence), qos=1, retain=True)
-            ended = await command(capsys, "land", broker, keys)
+            await leave_states(broker)
+            ended = await command(capsys, name, broker, keys)
             assert ended.code == EXIT_BAD_INPUT and "(one, quiet-49)" in ended.err
             assert not one.accepted
 
     play(scene())
+
+
+@pytest.mark.parametrize("name", ["hold", "land", "abort"])
+def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
+    name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Anybody may have retained it; one vehicle alone proves its stream, and the other is named."""
+
+    async def scene() -> None:
+        async with played_vehicle(broker.port, OPERATORS, "rig") as vehicle:
+            await leave_states(broker)
+            ended = await command(capsys, name, broker, keys)
+            assert (ended.code, ended.out) == (EXIT_OK, f"rig: {name}: {name}: done\n")
+            assert ended.err_lines == [
+                "companion command: rig is meant, nothing is proven by: quiet-49; to command another: --vehicle NAME"
+            ]
+            assert [heard.command.value for heard in vehicle.accepted] == [name]
+
+    play(scene())
+
+
+async def leave_states(broker: Broker) -> None:
+    """Fifty retained states of vehicles that send nothing else; ``quiet-49`` flies by its state."""
+    async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+        for number in range(50):
+            name = f"quiet-{number:02}"
+            state = b'{"v":2,"vehicle":"%s","session":"s","presence":"%s","simulated":true,"mission":"m","law":"l",' \
+                b'"preset":"p","wall_s":0.0,"commands":true}'  # fmt: skip
+            presence = b"flying" if number == 49 else b"ended"
+            await client.publish(Topic.STATE.of(name), state % (name.encode(), presence), qos=1, retain=True)
 
 
 @pytest.mark.parametrize(
