@@ -73,8 +73,8 @@ class _Screen:
         self._console = console
         self._notes: deque[Note] = deque(maxlen=10)
         self._chosen: str | None = None
-        self._asked: tuple[CommandName, float, int] | None = None
-        """What waits for its key to be pressed again, since when, and the hold that was shown then."""
+        self._asked: tuple[CommandName, float, tuple[object, ...]] | None = None
+        """What waits for its key to be pressed again, since when, and whom it was for then (`_meant`)."""
         self._keys: deque[str] = deque(maxlen=KEYS_MAX)
         self._pressed = asyncio.Event()
 
@@ -123,10 +123,10 @@ class _Screen:
         asked, self._asked = self._asked, None
         if command is None:
             return None
-        now_s, hold = time.monotonic(), _hold(self._vehicle(station))
-        if asked is not None and asked[0] is command and now_s - asked[1] < CONFIRM_S and asked[2] == hold:
+        now_s, meant = time.monotonic(), _meant(self._vehicle(station))
+        if asked is not None and asked[0] is command and now_s - asked[1] < CONFIRM_S and asked[2] == meant:
             return command
-        self._asked = (command, now_s, hold)
+        self._asked = (command, now_s, meant)
         self._notes.append(Note(f"{command.value}? press {key} again within {CONFIRM_S:g} s", "bold yellow"))
         return None
 
@@ -180,6 +180,14 @@ class _Screen:
         finally:
             loop.remove_reader(file)
             termios.tcsetattr(file, termios.TCSADRAIN, before)
+
+
+def _meant(vehicle: Vehicle | None) -> tuple[object, ...]:
+    """Vehicle, flight and hold that are shown."""
+    if vehicle is None:
+        return ()
+    session = vehicle.session if vehicle.proven is None else vehicle.proven.session
+    return vehicle.name, session, _hold(vehicle)
 
 
 def _hold(vehicle: Vehicle | None) -> int:

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import termios
+import time
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +20,16 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from companion.ground.access import broker_access
 from companion.ground.keys import operators_text, write_private
-from companion.ground.messages import Presence, encode
+from companion.ground.messages import CommandName, Presence, encode
+from companion.ground.proof import with_proofs
+from companion.ground.station import Station
+from companion.ground.text_monitor import _Screen
 from companion.ground.text_view import STALE_S, Around, Note, frame, line, stale, word
 from companion.ground.watch import Vehicle, Watch
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, play
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play
 from tests.ground.vehicle import flight, played_vehicle, state_of
 from tests.support import ROOT
 
@@ -182,6 +187,28 @@ async def terminal_at(broker: Broker, folder: Path, *more: str) -> AsyncIterator
         yield terminal
     finally:
         terminal.close()
+
+
+@pytest.mark.parametrize("after", [{"session": "s2"}, {"hold": 2}, {"vehicle": "second"}], ids=str)
+def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
+    """Vehicle, flight and hold together: if one of them is another one at the second press, it asks again."""
+    access = broker_access("mqtt://127.0.0.1", None, None)
+    station = Station(access, SIGNER, None, lambda heard: None, lambda connected, text: None)
+    screen = _Screen(Console())
+
+    def shown(vehicle: str = "rig", session: str = "s1", hold: int = 1) -> None:
+        stream = replace(
+            flight()[1][-1], session=session, hold=hold, action="hold", wall_s=2e9 if session == "s2" else 1e9
+        )
+        payload = encode(with_proofs(replace(stream, t_s=stream.t_s + hold), vehicle, [ANNA.key]))
+        assert station.watch.take(f"companion/{vehicle}/stream", payload, False, time.monotonic()) is not None
+        screen._chosen = vehicle
+
+    shown()
+    assert screen._command("r", station) is None
+    shown(**after)
+    assert screen._command("r", station) is None
+    assert screen._command("r", station) is CommandName.RESUME
 
 
 def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:

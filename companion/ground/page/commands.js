@@ -49,8 +49,14 @@ export class Commands {
     const hint = make("small", { className: "hint" });
     button.replaceChildren(make("span", { className: "label", text: button.textContent }), hint);
     this._buttons.set(name, { button, hint, output: byId("answers").querySelector(`[data-for="${name}"]`) });
-    if (button.dataset.press === "long") new LongPress(button, this._now, () => this._about.vehicle?.stream?.hold, (hold) => this.press(name, hold));
+    if (button.dataset.press === "long") new LongPress(button, this._now, () => this._meant(), () => this.press(name));
     else button.addEventListener("click", () => this.press(name));
+  }
+
+  /** Whom a long press is for: vehicle, flight and hold that are shown. */
+  _meant() {
+    const { vehicle } = this._about;
+    return JSON.stringify([vehicle?.name, vehicle?.stream?.session, vehicle?.stream?.hold]);
   }
 
   _key(event) {
@@ -61,19 +67,14 @@ export class Commands {
     this.press(name);
   }
 
-  /**
-   * A person wants this.
-   *
-   * @param name of the command
-   * @param hold for resume: number of the hold that was shown when the button went down
-   */
-  press(name, hold) {
+  /** A person wants this command. */
+  press(name) {
     const now = this._now();
     if (refusal(name, this._about) !== null || now - (this._pressedMs.get(name) ?? -Infinity) < DOUBLE_MS) return;
     this._pressedMs.set(name, now);
     const vehicle = this._about.vehicle.name;
     const message = { kind: "command", vehicle, command: name };
-    if (name === "resume") message.hold = hold ?? 0;
+    if (name === "resume") message.hold = this._about.vehicle.stream?.hold ?? 0;
     const left = this._send(message);
     const told = left ? { state: "wait", text: "sending …" } : { state: "no", text: `NOT SENT, no connection to the monitor: ${HELP}` };
     this._told.set(`${vehicle} ${name}`, { ...told, open: left, atMs: now, nonces: new Set(), sent: 0 });
@@ -133,7 +134,7 @@ export class Commands {
 
 /** A button that must be pressed for 0.8 s, by pointer or key. */
 class LongPress {
-  /** @param look what is shown, when it goes down; @param act what is done with that, after 0.8 s */
+  /** @param look a text of what is shown: the press ends when it changes; @param act what is done after 0.8 s */
   constructor(button, now, look, act) {
     this._button = button;
     this._now = now;
@@ -161,10 +162,10 @@ class LongPress {
   _grow() {
     if (this._startMs === null) return;
     const part = Math.min(1, (this._now() - this._startMs) / PRESS_MS);
-    if (this._button.disabled) this._stop();
+    if (this._button.disabled || this._look() !== this._seen) this._stop();
     else if (part >= 1) {
       this._stop();
-      this._act(this._seen);
+      this._act();
     } else {
       this._button.style.setProperty("--pressed", String(part));
       requestAnimationFrame(() => this._grow());

@@ -15,6 +15,12 @@ from tests.ground.page_stand import NAME, Message, Stand, ack, flown, retained, 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
 NONCE = "0123456789abcdef" * 2
+CHOOSE = """(name) => {
+  const select = document.getElementById("vehicle-select");
+  select.value = name;
+  select.dispatchEvent(new Event("change"));
+}"""
+"""Another vehicle is looked at, and the button that is pressed keeps the focus."""
 NO_ANSWER = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch"
 
 
@@ -159,6 +165,31 @@ def test_resume_needs_a_hold_and_works_by_keyboard(stand: Stand, page: Page) -> 
     assert asked(stand, 1) == ["resume"]
     page.run(1.0)
     assert "resume" not in page.enabled() and page.body("stale") == "true"
+
+
+@pytest.mark.parametrize("change", ["another session", "another hold", "another vehicle"])
+def test_a_press_is_for_what_was_shown_when_the_button_went_down(stand: Stand, page: Page, change: str) -> None:
+    """Vehicle, flight and hold together: if one of them is another one after 0.8 s, nothing is sent."""
+    changes: dict[str, Message] = {"another session": {"session": "s2"}, "another hold": {"hold": 2}}
+    after = changes.get(change, {})
+    held = replace(flown().at(8.5), action="hold", hold=1)
+    news = playing(held)
+    page.tell(news(), *retained("second"), {**news(), "vehicle": "second"})
+    page.tab.hover("[data-command='resume']")
+    page.tab.mouse.down()
+    for k in range(9):
+        page.run(0.1)
+        said = news()
+        if k >= 4:
+            said = {**said, "data": {**said["data"], **after}}
+        if k == 4 and change == "another vehicle":
+            page.tab.evaluate(CHOOSE, "second")
+            page.shown = "second"
+        page.tell(said, {**said, "vehicle": "second"})
+        assert "resume" in page.enabled()
+    page.tab.mouse.up()
+    page.press("land")
+    assert [message["command"] for message in stand.wait_heard("command", 1)] == ["land"]
 
 
 def test_a_long_press_ends_with_the_permission(stand: Stand, page: Page) -> None:
