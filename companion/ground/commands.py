@@ -32,9 +32,11 @@ DOMAIN = "companion command 2"
 AHEAD_MAX_S = 0.5
 """A command may be so much ahead of the vehicle's clock."""
 REFUSED_MAX = 512
-"""Nonces of refused commands that are kept for each operator and command. Beyond that a time is kept: see `_Heard.closed_until_t_s`."""
+"""Nonces of refused commands that are kept for each operator and command. Beyond that a time is kept: see `_Heard.refuse`."""
 ANSWERS_PER_S = 20
 """Refused commands that are answered: replaying old ones makes no flood of answers."""
+_NOTHING = (float("inf"), float("-inf"))
+"""A range of dates that holds none."""
 _T_MS_MAX = 2**53
 _TEXT_MAX = 160
 _SESSION = re.compile(r"[\x21-\x7e]{1,64}")
@@ -180,8 +182,9 @@ class _Heard:
         """Nonce, and the flight clock at which the command is stale in any case. The rate bounds how many there are."""
         self._refused: dict[str, float] = {}
         """The same of those that were refused, at most `REFUSED_MAX`."""
-        self._closed_until_t_s = float("-inf")
-        """Newest date of a refused command whose nonce found no room: nothing up to this date is accepted any more."""
+        self._closed_t_s = {False: _NOTHING, True: _NOTHING}
+        """Oldest and newest date of refused commands whose nonces found no room: nothing between is accepted any more. Those from
+        the future (True) are kept apart, lest they close what is dated between now and then."""
 
     @property
     def size(self) -> int:
@@ -190,21 +193,28 @@ class _Heard:
 
     def knows(self, command: Command) -> bool:
         """Whether it was accepted or refused before, or may have been."""
-        nonce = command.nonce
-        return nonce in self._followed or nonce in self._refused or command.t_ms / 1000.0 <= self._closed_until_t_s
+        nonce, t_s = command.nonce, command.t_ms / 1000.0
+        closed = any(from_t_s <= t_s <= until_t_s for from_t_s, until_t_s in self._closed_t_s.values())
+        return closed or nonce in self._followed or nonce in self._refused
 
     def follow(self, command: Command, now_t_s: float) -> None:
         self.accepted_t_s.append(now_t_s)
         self._followed[command.nonce] = command.t_ms / 1000.0 + self.limits.age_max_s
 
-    def refuse(self, command: Command) -> None:
+    def refuse(self, command: Command, now_t_s: float) -> None:
         if len(self._refused) < REFUSED_MAX:
             self._refused[command.nonce] = command.t_ms / 1000.0 + self.limits.age_max_s
         else:
-            self._closed_until_t_s = max(self._closed_until_t_s, command.t_ms / 1000.0)
+            t_s = command.t_ms / 1000.0
+            future = t_s - now_t_s > AHEAD_MAX_S
+            from_t_s, until_t_s = self._closed_t_s[future]
+            self._closed_t_s[future] = min(from_t_s, t_s), max(until_t_s, t_s)
 
     def sweep(self, now_t_s: float) -> None:
         """Forget what is stale: the clock never goes back, so it stays stale."""
+        stale_t_s = now_t_s - self.limits.age_max_s - 1.0  # well beyond what rounding can bring back
+        for future, (from_t_s, until_t_s) in self._closed_t_s.items():
+            self._closed_t_s[future] = _NOTHING if until_t_s < stale_t_s else (max(from_t_s, stale_t_s), until_t_s)
         self._followed = {nonce: until for nonce, until in self._followed.items() if until >= now_t_s}
         self._refused = {nonce: until for nonce, until in self._refused.items() if until >= now_t_s}
 
@@ -276,11 +286,11 @@ class Verifier:
         if heard.knows(command):
             return Refused(Reason.REPLAYED, f"{who} was heard before")
         if retained:
-            heard.refuse(command)
+            heard.refuse(command, now_t_s)
             return Refused(Reason.RETAINED, "a command that the broker kept; commands are sent, never retained")
         problem = self._problem(command, heard, who)
         if problem is not None:
-            heard.refuse(command)
+            heard.refuse(command, now_t_s)
             return self._answer(*problem, command)
         heard.follow(command, now_t_s)
         if command.command in SAFER:

@@ -223,7 +223,8 @@ def test_none_of_many_commands_is_accepted_after_its_first_refusal(
     """Many commands, offered again and again in any order, beside floods that leave no room for their nonces."""
     judge, now_t_s = verifier(), NOW_T_S
     payloads = [encode(made(name, NOW_T_S + ahead_s)) for name, ahead_s in made_at]
-    floods = {name: [encode(made(name, NOW_T_S + 100.0)) for _ in range(REFUSED_MAX)] for name, _ in made_at}
+    flood_s = data.draw(st.sampled_from([0.0, 40.0, 100.0]))
+    floods = {name: [encode(made(name, NOW_T_S + flood_s)) for _ in range(REFUSED_MAX + 40)] for name, _ in made_at}
     reasons: dict[bytes, list[Reason | None]] = {payload: [] for payload in payloads}
     for _ in range(data.draw(st.integers(1, 60))):
         now_t_s += data.draw(st.sampled_from([0.0, 0.01, 1.0, 10.0]))
@@ -304,6 +305,20 @@ def test_a_flood_of_one_command_leaves_room_for_every_other(flood: CommandName, 
             assert judged(encode(made(name, NOW_T_S + 0.1)), judge, now_t_s=NOW_T_S + 0.1) is None
     if not ahead_s:
         assert judged(encode(made(flood, NOW_T_S + 1.1)), judge, now_t_s=NOW_T_S + 1.1) is None, "and for its own"
+
+
+def test_a_flood_from_the_far_future_closes_its_own_dates_only() -> None:
+    """Those that found no room are refused when their date comes; what is dated now, or after them, is not."""
+    judge, flood = verifier(), [encode(made(t_s=NOW_T_S + 60.0)) for _ in range(REFUSED_MAX + 2)]
+    for payload in flood:
+        judged(payload, judge)
+    for _ in range(30):
+        judged(encode(made()), judge)  # and too many now, without room for their nonces either
+    for later_s in (1.1, 59.0, 61.0):
+        t_s = NOW_T_S + later_s
+        assert judged(encode(made(t_s=t_s)), judge, now_t_s=t_s) is None
+        for payload in (flood[0], flood[-1]):
+            assert judged(payload, judge, now_t_s=t_s) is Reason.REPLAYED
 
 
 def test_memory_is_bounded_and_forgets() -> None:
