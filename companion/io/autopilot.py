@@ -39,7 +39,7 @@ from companion.io.autopilot_link import (
 )
 from companion.io.autopilot_origin import ensure_origin
 from companion.io.autopilot_params import ParamTransfer
-from companion.io.autopilot_requests import RequestDesk
+from companion.io.autopilot_requests import SENT_ONCE, RequestDesk
 from companion.io.autopilot_setpoints import SetpointPath, setpoint_path
 from companion.io.edges import DeviceError
 from companion.preflight.observations import EstimatorReport, StateCounts
@@ -135,6 +135,7 @@ class MavsdkAutopilot:
             )
             self._info = Info(system)
             self._inbox.subscribe(telemetry, self._direct)
+            self._direct.subscribe_message("COMMAND_ACK", self._on_ack)
             await ask_for_streams(address, self._calls, telemetry, self._direct, self._system_id)
             self._open = True
             await self.ensure_origin()
@@ -246,7 +247,15 @@ class MavsdkAutopilot:
             self._desk.answer(request, reason, self._clock())
 
         command = MavlinkMessage("COMMAND_LONG", fields_json=messages.command_json(request, self._system_id))
-        self._direct.send_command_async(command, answered)
+        if request in SENT_ONCE:
+            self._direct.send_message(command)
+        else:
+            self._direct.send_command_async(command, answered)
+
+    def _on_ack(self, message: Any, _: Any) -> None:
+        """COMMAND_ACK, on a thread of MAVSDK's."""
+        if messages.answers_arming(message.fields_json):
+            self._desk.answer_sent_once(messages.refusal(message.fields_json), self._clock())
 
     def take_messages(self) -> list[str]:
         """Refusals and STATUSTEXTs since the last call, oldest first, and a second sender that claims to be PX4."""

@@ -253,6 +253,11 @@ def refusal(ack_json: str) -> str | None:
     return None if result == 0 else result_text(result)
 
 
+def answers_arming(ack_json: str) -> bool:
+    """Return whether a COMMAND_ACK answers MAV_CMD_COMPONENT_ARM_DISARM (400)."""
+    return int(json.loads(ack_json)["command"]) == _COMMANDS[AutopilotRequest.ARM][0]
+
+
 def result_text(result: int) -> str:
     """A MAV_RESULT in words."""
     return f"{_MAV_RESULTS.get(result, 'unknown result')} (MAV_RESULT {result})"

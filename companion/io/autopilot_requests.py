@@ -15,6 +15,9 @@ from typing import Any
 from companion.io.autopilot_texts import Texts
 from companion.types import AutopilotRequest
 
+SENT_ONCE = frozenset({AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM})
+"""Sent as one plain message: MAVSDK repeats a command for 2 s until it is answered, and what the core no longer requests must not
+stop rotors. The core requests again in every tick for as long as its rule holds."""
 RETRY_S = 0.5
 """Least time between two commands of one kind."""
 SETTLE_S = 1.5
@@ -47,7 +50,7 @@ class RequestDesk:
         with self._lock:
             kind = self._kinds.get(request)
             if kind is not None:
-                if kind.pending:
+                if kind.pending and request not in SENT_ONCE:
                     if now_s < kind.sent_s + ANSWER_DEADLINE_S:
                         return False
                     self._messages.append(f"{request.name}: no answer within {ANSWER_DEADLINE_S:g} s, asking again")
@@ -67,6 +70,15 @@ class RequestDesk:
                 kind.not_before_s = now_s + SETTLE_S
             else:
                 self._messages.extend(self._texts.once(f"{request.name} refused: {refusal}", now_s))
+
+    def answer_sent_once(self, refusal: str | None, now_s: float) -> None:
+        """A COMMAND_ACK to arming or disarming came: it answers the requests of `SENT_ONCE` that wait for one."""
+        for request in SENT_ONCE:
+            with self._lock:
+                kind = self._kinds.get(request)
+                waits = kind is not None and kind.pending
+            if waits:
+                self.answer(request, refusal, now_s)
 
     def hear(self, statustext: Mapping[str, Any], now_s: float) -> None:
         """Keep what the autopilot said by itself, once it is complete (`Texts.take`)."""

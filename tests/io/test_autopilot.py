@@ -299,6 +299,25 @@ def test_offboard_arm_land_disarm_reach_px4_as_commands() -> None:
     asyncio.run(fly())
 
 
+@pytest.mark.parametrize("request_", [AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM])
+def test_a_request_to_stop_the_rotors_is_never_repeated_by_the_link(request_: AutopilotRequest) -> None:
+    """Its datagram was lost, a pilot climbs, the core is silent: MAVSDK would send the command three times more, for 1.5 s."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            peer.acks[ARM_DISARM] = None
+            async with edge(port) as autopilot:
+                autopilot.request(request_)
+                await eventually(lambda: bool(peer.commands(ARM_DISARM)), "the request")
+                await asyncio.sleep(1.2)  # longer than MAVSDK waits before it repeats a command: 0.5 s
+                assert len(peer.commands(ARM_DISARM)) == 1
+                autopilot.request(request_)
+                await eventually(lambda: len(peer.commands(ARM_DISARM)) == 2, "the request, made anew by the core")
+
+    asyncio.run(fly())
+
+
 def test_a_repeated_request_is_one_command_and_its_refusals_are_told_once_in_words() -> None:
     async def fly() -> None:
         port = free_udp_port()
