@@ -96,7 +96,7 @@ KINDS: dict[FaultKind, Kind] = {
     "mocap_loss": Kind("no frame leaves the motion-capture machine", named_by=_MOCAP_GONE),
     "mocap_occluded": Kind("frames come, but the body is not seen in them", named_by=_MOCAP_GONE),
     "mocap_jump": Kind("poses are shifted sideways", "shift", "m", 0.3, _MOCAP_WRONG),
-    "mocap_drag": Kind("poses are dragged sideways, further with every frame", "speed", "m/s", 0.3, _MOCAP_WRONG),
+    "mocap_drag": Kind("poses are dragged sideways, further with every frame", "speed", "m/s", 1.0, _MOCAP_WRONG),
     "mocap_swap": Kind(
         "poses are those of another body that lies on the floor", "distance to it", "m", 1.0, _MOCAP_WRONG
     ),

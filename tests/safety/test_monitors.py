@@ -132,8 +132,8 @@ def two_streams(i: Inputs) -> Inputs:
 
 
 def dragged(i: Inputs) -> Inputs:
-    """From 2.8 s on the poses are dragged by 0.4 m/s, and PX4's position follows them; its IMU measures no motion."""
-    by_m = 0.4 * max(0.0, i.t_s - START_S - 2.8)
+    """From 2.8 s on the poses are dragged by 1.2 m/s, and PX4's position follows them; its IMU measures no motion."""
+    by_m = 1.2 * max(0.0, i.t_s - START_S - 2.8)
     return both(moved("mocap", (by_m, 0.0, 0.0)), moved("vehicle", (by_m, 0.0, 0.0)))(i)
 
 

@@ -218,8 +218,11 @@ def test_mocap_lost_in_the_middle_of_the_line(duration_s: float | None) -> None:
 
 
 def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0_6_m() -> None:
-    """PX4 fuses the dragged poses, so its position agrees with them; the IMU does not."""
-    flight = FastFlight(with_faults({"kind": "mocap_drag", "phase": "line", "size": 0.3}))
+    """PX4 fuses the dragged poses, so its position agrees with them; the IMU does not. With the limit of a quiet IMU."""
+    sharp = CONFIG.vehicle.safety.model_copy(update={"mocap_inertial_m": 0.015})
+    config = with_faults({"kind": "mocap_drag", "phase": "line", "size": 0.3})
+    vehicle = config.vehicle.model_copy(update={"safety": sharp})
+    flight = FastFlight(config.model_copy(update={"vehicle": vehicle}))
     result = flight.run()
     begun_s = flight.faults.begun_s
     assert begun_s is not None
