@@ -12,7 +12,7 @@ import socket
 from companion.guardian.settings import MocapSettings
 from companion.io import natnet
 from companion.io.mocap_pose import VERSIONS, mocap_pose
-from companion.io.natnet import Malformed, Message, NatNetVersion, RigidBody
+from companion.io.natnet import Malformed, Message, NatNetVersion
 from companion.io.natnet_source import join_source
 from companion.safety.stream_watch import StreamWatch
 from companion.types import MocapPose
@@ -59,7 +59,6 @@ class MocapClient:
         self._version: NatNetVersion | None = None
         self._clock_frequency_hz: int | None = None
         self._last_number: int | None = None
-        self._last_body: RigidBody | None = None
         self._streams = StreamWatch()
         self._heard_s = float("-inf")
         self._spoke_s = float("-inf")
@@ -150,14 +149,12 @@ class MocapClient:
         if isinstance(frame, Malformed):
             self.trouble = frame.reason
             return None
-        if frame.number == self._last_number and frame.body == self._last_body:
-            return None  # the network has doubled the datagram
-        if self._streams.update(frame.number, now_s):
+        if self._streams.update(frame.number, frame.body, now_s):
             self.trouble = "two servers at one address: frame numbers come in two sequences"
             return None
         if not natnet.is_newer(frame.number, self._last_number, now_s - self._heard_s):
             return None
-        self._last_number, self._last_body = frame.number, frame.body
+        self._last_number = frame.number
         self._heard_s = now_s
         pose = mocap_pose(frame, now_s - origin_s, self._settings.up_axis)
         if pose is not None and pose.tracking_valid:

@@ -18,7 +18,7 @@ from companion.io import natnet
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.io.edges import DeviceError
 from companion.io.mocap_pose import VERSIONS, mocap_pose
-from companion.io.natnet import Frame, Malformed, Message, NatNetVersion, RigidBody, ServerInfo
+from companion.io.natnet import Frame, Malformed, Message, NatNetVersion, ServerInfo
 from companion.io.natnet_source import join_source
 from companion.safety.stream_watch import StreamWatch
 from companion.types import MocapPose
@@ -90,7 +90,6 @@ class NatNetMocap:
         self._latest: MocapPose | None = None
         self._last_number: int | None = None
         self._last_frame_s = 0.0
-        self._last_body: RigidBody | None = None
         self._streams = StreamWatch()
         self._seen_ids: tuple[int, ...] | None = None
         self._names: dict[int, str] = {}
@@ -371,15 +370,11 @@ class NatNetMocap:
         if isinstance(frame, Malformed):
             self._count_malformed(frame)
             return None
-        if frame.number == self._last_number and frame.body == self._last_body:
-            self._out_of_order += 1  # the network has doubled the datagram
-            return None
         # While two streams are mixed every frame is delivered, in whatever order: the monitor must see it.
-        two = self._streams.update(frame.number, arrived_s)
+        two = self._streams.update(frame.number, frame.body, arrived_s)
         if not two and not natnet.is_newer(frame.number, self._last_number, arrived_s - self._last_frame_s):
             self._out_of_order += 1
             return None
-        self._last_body = frame.body
         self._last_number = frame.number
         self._last_frame_s = arrived_s
         self._seen_ids = frame.body_ids

@@ -140,7 +140,7 @@ class MocapMonitor:
         gone_s = awake_s - self._frame_awake_s
         self._frame, self._frame_awake_s = pose, awake_s
         self._window_frames += 1
-        self._streams.update(pose.frame_number, awake_s)
+        self._streams.update(pose.frame_number, (pose.position_world_m, pose.attitude_wxyz), awake_s)
         # The gap was reported as lost; a rate over it says nothing about this stream.
         if gone_s > self._s.mocap_timeout_s:
             self._window_awake_s = self._rate_hz = None

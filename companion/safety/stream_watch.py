@@ -7,20 +7,45 @@ from collections import deque
 STEPS_BACK_MAX = 2
 """A server that is restarted starts its numbers anew: one step back, and perhaps another with a second restart."""
 WINDOW_S = 1.0
+REORDERED_MAX = 8
+"""A network may deliver a frame this many numbers behind the newest one."""
+_MASK = 0xFFFFFFFF
 _HALF = 0x80000000
 
 
 class StreamWatch:
-    """Counts frames whose number does not follow the one before (uint32, so it wraps)."""
+    """Counts frames whose number (uint32, so it wraps) steps back.
+
+    A frame that the network reordered or duplicated is no step back: it is at most REORDERED_MAX behind the newest one, and its number
+    was skipped before, or came with the same content. A second stream with numbers close to those of the first repeats them with
+    another content.
+    """
 
     def __init__(self) -> None:
-        self._number: int | None = None
+        self._newest: int | None = None
+        self._recent: dict[int, object] = {}
+        """Content by number, of the frames up to REORDERED_MAX behind the newest one."""
         self._back_s: deque[float] = deque(maxlen=STEPS_BACK_MAX + 1)
 
-    def update(self, number: int, t_s: float) -> bool:
-        """Take a new frame; True: more than STEPS_BACK_MAX steps back within WINDOW_S, so there are two streams."""
-        before, self._number = self._number, number
-        if before is not None and not 0 < (number - before) & 0xFFFFFFFF < _HALF:
+    def update(self, number: int, content: object, t_s: float) -> bool:
+        """Take a frame.
+
+        Args:
+            number: frame number.
+            content: what the frame says of the body; compared with that of another frame with the same number.
+            t_s: arrival time.
+
+        Returns:
+            True if there were more than STEPS_BACK_MAX steps back within WINDOW_S, so there are two streams.
+        """
+        behind = _HALF if self._newest is None else (self._newest - number) & _MASK
+        if behind > REORDERED_MAX:
+            if behind < _HALF:
+                self._back_s.append(t_s)
+            self._newest = number
+            self._recent = {n: c for n, c in self._recent.items() if (number - n) & _MASK <= REORDERED_MAX}
+            self._recent[number] = content
+        elif self._recent.setdefault(number, content) != content:
             self._back_s.append(t_s)
         return self.two(t_s)
 

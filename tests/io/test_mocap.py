@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import random
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable
@@ -144,7 +145,7 @@ def test_a_second_stream_at_the_servers_address_does_not_displace_the_first_unse
             with closing(socket.socket(type=socket.SOCK_DGRAM)) as forger:
                 for _ in range(2000):
                     pose = await inbox.next()
-                    if watch.update(pose.frame_number, pose.stamp_s):
+                    if watch.update(pose.frame_number, pose.position_world_m, pose.stamp_s):
                         break
                     if pose.position_world_m == POSE.position_m:
                         number = pose.frame_number + ahead
@@ -287,6 +288,29 @@ def test_old_and_repeated_frames_are_dropped() -> None:
             assert [(await inbox.next()).frame_number for _ in range(2)] == [100_000, 100_002]
             assert inbox.queue.empty()
             assert edge.health().out_of_order == 2
+
+    asyncio.run(run())
+
+
+def test_reordered_and_duplicated_datagrams_displace_no_frame() -> None:
+    """A minute at 240 Hz with 5 % of the frames up to three places late and 1 % twice: each late one is dropped, nothing else."""
+
+    async def run() -> None:
+        async with quiet_after_opening(Inbox()) as (_, edge):
+            draw = random.Random(3)
+            placed = [(k + (draw.randint(1, 3) + 0.5 if draw.random() < 0.05 else 0.0), k) for k in range(60 * 240)]
+            placed += [(k + draw.randint(0, 3) + 0.6, k) for k in range(60 * 240) if draw.random() < 0.01]
+            newest, in_order = -1, []
+            taken = []
+            for arrival, (_, k) in enumerate(sorted(placed)):
+                body = BodyPose(1, (k * 1e-3, 0.0, 1.0), POSE.quat_wxyz)
+                datagram = encode_frame("4.1", 100_000 + k, k / 240, [body], None, {})
+                if edge._take_frame(datagram, arrival / 240) is not None:
+                    taken.append(k)
+                if k > newest:
+                    newest = k
+                    in_order.append(k)
+            assert taken == in_order
 
     asyncio.run(run())
 
