@@ -11,7 +11,7 @@ from companion.config.loader import FlightConfig
 from companion.control.pilot import Pilot
 from companion.frames import euler_zyx_from_quat
 from companion.mission import sequencer as seq
-from companion.mission.autopilot_landing import AutopilotLanding
+from companion.mission.autopilot_landing import FLIPPED, TIPPED, AutopilotLanding
 from companion.mission.check import check_start
 from companion.mission.course import Course
 from companion.mission.plan import Plan
@@ -21,7 +21,7 @@ from companion.mission.settled import SettledEstimate
 from companion.mission.touchdown import Touchdown
 from companion.negative_zero import without_negative_zero
 from companion.safety.monitors import unfused
-from companion.safety.rules import PILOT_TOOK_OVER
+from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
 from companion.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, SafetyAction, Severity
 
 ARMED_SHOWN_S = 1.5
@@ -42,8 +42,9 @@ class FlightStages:
         self._config = config
         self._pilot = pilot
         self._clearance_m = config.vehicle.airframe.ground_clearance_m
+        self._tilt_max_rad = math.radians(config.vehicle.safety.tilt_abort_deg)
         self._touchdown = Touchdown(self._clearance_m)
-        self._stop = RotorStop(self._clearance_m)
+        self._stop = RotorStop(self._clearance_m, self._tilt_max_rad)
         self._settled = SettledEstimate()
         self._arm_requested_s = -math.inf
         """When ARM was last requested."""
@@ -90,9 +91,9 @@ class FlightStages:
     def enter(self, stage: Stage, i: Inputs, *, pilot_flies: bool = False, flipped: bool = False) -> None:
         """Go to a stage. Of a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is known already."""
         if stage is Stage.AUTOPILOT_LAND:
-            self._landing = AutopilotLanding(i.t_s, self._clearance_m, pilot_flies, flipped=flipped)
+            self._landing = AutopilotLanding(i.t_s, self._clearance_m, self._tilt_max_rad, pilot_flies, flipped=flipped)
         elif stage in seq.DISARMING:
-            self._stop = RotorStop(self._clearance_m)
+            self._stop = RotorStop(self._clearance_m, self._tilt_max_rad)
         self.stage = stage
         self._stage_s = i.t_s
 
@@ -105,7 +106,10 @@ class FlightStages:
         """PX4 flies already: it lands, or is only watched if people fly it; the mission is never begun."""
         self.finish(Outcome.ABORTED)
         self.stage, self._stage_s = Stage.AUTOPILOT_LAND, i.t_s
-        self._landing = AutopilotLanding(i.t_s, self._clearance_m, seq.people_fly(i.status), estimate_known=False)
+        pilot_flies = seq.people_fly(i.status)
+        self._landing = AutopilotLanding(
+            i.t_s, self._clearance_m, self._tilt_max_rad, pilot_flies, estimate_known=False
+        )
 
     def stand_down(self, i: Inputs, outcome: Outcome) -> None:
         """Disarm and end, on the ground."""
@@ -349,13 +353,16 @@ class FlightStages:
             return AutopilotRequest.NONE
         if self._left_to_pilot(i):
             return AutopilotRequest.NONE
+        self._stop.update(i)
+        if self._stop.overturned:
+            self._crash(i, FLIPPED if self._stop.flipped else TIPPED)
+            return AutopilotRequest.FORCE_DISARM
         if elapsed_s > seq.DISARM_TIMEOUT_S or not seq.in_offboard(i.status):
             text = "PX4 did not disarm" if seq.in_offboard(i.status) else "PX4 left OFFBOARD before it was disarmed"
             self.tell(i, "disarm_refused", Severity.CRITICAL, SafetyAction.NOMINAL, text)
             self.finish(Outcome.ABORTED)
             self.enter(Stage.AUTOPILOT_LAND, i)
             return AutopilotRequest.NONE
-        self._stop.update(i)
         if seq.on_ground(i.status):
             return AutopilotRequest.DISARM if self._stop.may_disarm else AutopilotRequest.NONE
         return AutopilotRequest.FORCE_DISARM if self._stop.may_force else AutopilotRequest.NONE
@@ -371,11 +378,19 @@ class FlightStages:
         self.enter(Stage.AUTOPILOT_LAND, i, pilot_flies=True)
         return True
 
+    def _crash(self, i: Inputs, text: str) -> None:
+        """Reported once: the ladder may have done so, by the rule of the same id."""
+        if self.outcome is not Outcome.CRASHED:
+            self.tell(i, CRASHED.id, Severity.CRITICAL, SafetyAction.TERMINATE, text)
+            self.finish(Outcome.CRASHED)
+
     def _autopilot_land(self, i: Inputs) -> AutopilotRequest:
         assert self._landing is not None
         step = self._landing.step(i)
         self.zero_thrust = step.zero_thrust
-        if step.text is not None:
+        if self._landing.overturned and self.outcome is not Outcome.CRASHED:
+            self._crash(i, step.text or TIPPED)
+        elif step.text is not None:
             severity = Severity.INFO if step.text == "touchdown" else Severity.CRITICAL
             self.tell(i, "autopilot_landing", severity, SafetyAction.AUTOPILOT_LAND, step.text)
         if step.ended:

@@ -5,6 +5,7 @@ What its process does beside that (kill, take the port) is told here by how long
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
@@ -166,7 +167,7 @@ class StandIn:
     def take_over(self, t_s: float) -> Landing:
         """In charge from now on."""
         assert self._beat is not None
-        return Landing(self._beat, self._vehicle.airframe.ground_clearance_m, self._px4, t_s, self._tell)
+        return Landing(self._beat, self._vehicle, self._px4, t_s, self._tell)
 
     def _tell(self, told: Told) -> None:
         self.events.append(Event(told.t_s, told.id, told.severity, told.action, told.text))
@@ -175,10 +176,11 @@ class StandIn:
 class Landing:
     """The guardian in charge."""
 
-    def __init__(self, beat: Beat, clearance_m: float, px4: Px4Stub, t_s: float, tell: Tell) -> None:
+    def __init__(self, beat: Beat, vehicle: Vehicle, px4: Px4Stub, t_s: float, tell: Tell) -> None:
         self._wire = MemoryWire(px4)
         self._link = Link(self._wire, _OWN, beat.autopilot_system)
-        self._charge = Charge(beat, clearance_m, self._link, t_s, tell)
+        clearance_m, tilt_max_rad = vehicle.airframe.ground_clearance_m, math.radians(vehicle.safety.tilt_abort_deg)
+        self._charge = Charge(beat, clearance_m, tilt_max_rad, self._link, t_s, tell)
         self._round_s = float("-inf")
 
     @property

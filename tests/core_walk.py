@@ -30,9 +30,11 @@ from tests.support import HOVER
 
 STEP_S = 0.02
 LOW_M, STILL_M = 0.25, 0.05
-DISARM_S, FORCE_S, FLIPPED_S = 0.35, 4.0, 0.3
+DISARM_S, FORCE_S, FLIPPED_S, TIPPED_S = 0.35, 4.0, 0.3, 0.5
 UPRIGHT: Quat = (1.0, 0.0, 0.0, 0.0)
 ON_ITS_BACK = quat_from_euler_zyx(math.radians(178.0), 0.0, 0.0)
+ON_ITS_ROTORS = quat_from_euler_zyx(math.radians(-55.0), 0.0, 0.0)
+"""Tipped over: it rests on two feet and a rotor."""
 STOPS = (AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM)
 LOW_HOVER = ("mission.phases[0].height_m=0.5", "mission.phases[0].duration_s=2.0", "mission.phases[1].duration_s=1.0")
 replace = dataclasses.replace
@@ -155,7 +157,7 @@ class Account:
         if request not in STOPS:
             return None
         force = request is AutopilotRequest.FORCE_DISARM
-        if force and self._flipped():
+        if force and (self._flipped() or self._tipped()):
             return None
         window_s = FORCE_S if force else DISARM_S
         now_s = self._seen[-1][0]
@@ -182,6 +184,22 @@ class Account:
         now_s = self._seen[-1][0]
         past = [i for t_s, i in self._seen if t_s >= now_s - FLIPPED_S + 1.5 * STEP_S]
         return all(_upside_down(i) for i in past) and self._seen[0][0] <= now_s - FLIPPED_S + 1.5 * STEP_S
+
+    def _tipped(self) -> bool:
+        now_s = self._seen[-1][0]
+        past = [i for t_s, i in self._seen if t_s >= now_s - TIPPED_S + 1.5 * STEP_S]
+        tipped = all(_lies_tilted(i, self._low_m) for i in past)
+        return tipped and self._seen[0][0] <= now_s - TIPPED_S + 1.5 * STEP_S
+
+
+def _lies_tilted(i: Inputs, low_m: float) -> bool:
+    """Rolled by more than 40 deg by both, and low: the numbers of `safety.tilt_abort_deg` and docs/safety.md."""
+    assert i.vehicle is not None and i.status is not None
+    ours = i.status.armed and i.status.mode in (FlightMode.OFFBOARD, FlightMode.LAND)
+    pose = i.mocap if i.mocap is not None and i.t_s - i.mocap.stamp_s < 0.3 else None
+    if pose is None or pose.position_world_m[2] >= low_m or not ours:
+        return False
+    return min(abs(pose.attitude_wxyz[1]), abs(i.vehicle.attitude_wxyz[1])) > math.sin(math.radians(20.0))
 
 
 def _upside_down(i: Inputs) -> bool:

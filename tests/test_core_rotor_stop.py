@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import pytest
@@ -10,9 +11,11 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from companion.core import FlightCore
+from companion.frames import quat_from_euler_zyx
 from companion.types import AutopilotRequest, FlightMode, LandedState, OperatorCommand, Outcome, Outputs
 from tests.core_walk import (
     ON_ITS_BACK,
+    ON_ITS_ROTORS,
     STEP_S,
     STOPS,
     UPRIGHT,
@@ -52,7 +55,7 @@ segments = st.lists(
             "armed": st.sampled_from((True, True, True, True, False)),
             "up_m_s": st.sampled_from((0.0, 0.0, 0.0, -1.0, -0.1, 0.05, 0.4, 1.0)),
             "aside_m_s": st.sampled_from((0.0, 0.0, 0.0, 0.02, 0.5)),
-            "attitude": st.sampled_from((UPRIGHT, UPRIGHT, UPRIGHT, UPRIGHT, ON_ITS_BACK)),
+            "attitude": st.sampled_from((UPRIGHT, UPRIGHT, UPRIGHT, UPRIGHT, ON_ITS_BACK, ON_ITS_ROTORS)),
             "mocap_attitude": st.sampled_from((None, None, None, UPRIGHT)),
             "seen": st.sampled_from((True, True, True, False)),
             "feels_m_s2": st.sampled_from((9.81, 9.81, -9.81)),
@@ -226,6 +229,85 @@ def test_flipped_under_a_pilot_nothing_is_sent() -> None:
     walked(core, machine, 10)
     machine.attitude, machine.feels_m_s2 = ON_ITS_BACK, -9.81
     assert requests(walked(core, machine, 60)) == {AutopilotRequest.NONE}
+
+
+# -- it is tipped over -----------------------------------------------------------------------------------------------
+
+
+ON_THE_FLOOR_M = 0.15
+"""Above standing height: the body's origin of a vehicle that lies on a rotor."""
+
+
+def tipped(phase: str, height_m: float = ON_THE_FLOOR_M, **changes: Any) -> tuple[FlightCore, Machine, Account]:
+    core, machine, account = machine_from(phase, attitude=ON_ITS_ROTORS, feels_m_s2=5.6)
+    machine.position = (*machine.position[:2], machine.floor_m + height_m)
+    for name, value in changes.items():
+        setattr(machine, name, value)
+    return core, machine, account
+
+
+@pytest.mark.parametrize("phase", ["spool up", "land", "touchdown", "disarm"])
+def test_tipped_over_on_the_floor_it_is_disarmed_by_force_for_as_long_as_it_takes(phase: str) -> None:
+    """It drove its rotors into the floor for 30 s, and then for as long again under the guardian."""
+    core, machine, account = tipped(phase)
+    outputs = walked(core, machine, 20, account)
+    if phase != "disarm":
+        machine.mode = FlightMode.LAND
+    outputs += walked(core, machine, 600, account)
+    assert 0.48 < first_s(outputs, AutopilotRequest.FORCE_DISARM) < 0.68
+    assert requests(outputs[40:]) == {AutopilotRequest.FORCE_DISARM}
+    assert ids(outputs).count("crashed") == 1
+    machine.armed = False
+    assert walked(core, machine, 40)[-1].outcome is Outcome.CRASHED
+
+
+def test_rocking_on_the_floor_it_is_disarmed_by_force_all_the_same() -> None:
+    core, machine, account = tipped("land", mode=FlightMode.LAND)
+    outputs = []
+    for tick in range(40):
+        tilt_deg = 57.0 + 15.0 * math.cos(2.0 * math.pi * tick / 25)
+        machine.attitude = quat_from_euler_zyx(math.radians(-tilt_deg), 0.0, 0.0)
+        outputs += walked(core, machine, 1, account)
+    assert 0.48 < first_s(outputs, AutopilotRequest.FORCE_DISARM) < 0.68
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"height_m": 0.26},
+        {"seen": False},
+        {"mocap_attitude": UPRIGHT},
+        {"mode": FlightMode.MANUAL},
+        {"mode": FlightMode.OTHER},
+        {"attitude": quat_from_euler_zyx(math.radians(39.0), 0.0, 0.0)},
+    ],
+    ids=["high", "not seen", "contradicted", "a pilot", "another mode", "within the limit"],
+)
+@pytest.mark.parametrize("phase", ["land", "disarm"])
+def test_what_only_seems_tipped_over_is_not_disarmed_for_it(phase: str, changes: dict[str, Any]) -> None:
+    core, machine, account = tipped(phase, **{"mode": FlightMode.LAND, **changes})
+    machine.up_m_s = 0.02 if "height_m" in changes else 0.0
+    assert not requests(walked(core, machine, 100, account)) & set(STOPS)
+
+
+def test_it_rights_itself_before_half_a_second_and_is_landed() -> None:
+    core, machine, account = tipped("land")
+    outputs = walked(core, machine, 10, account)
+    machine.mode = FlightMode.LAND
+    outputs += walked(core, machine, 13, account)
+    machine.attitude, machine.feels_m_s2 = UPRIGHT, 9.81
+    outputs += walked(core, machine, 60, account)
+    assert AutopilotRequest.FORCE_DISARM not in requests(outputs)
+    assert AutopilotRequest.LAND in requests(outputs)
+
+
+@pytest.mark.parametrize("phase", ["touchdown", "disarm"])
+def test_flipped_after_touch_down_it_is_disarmed_by_force(phase: str) -> None:
+    core, machine, account = machine_from(phase, attitude=ON_ITS_BACK, feels_m_s2=-9.81)
+    outputs = walked(core, machine, 30, account)
+    assert 0.28 < first_s(outputs, AutopilotRequest.FORCE_DISARM) < 0.36
+    machine.armed = False
+    assert walked(core, machine, 40)[-1].outcome is Outcome.CRASHED
 
 
 # -- whose mode it is ------------------------------------------------------------------------------------------------

@@ -73,13 +73,15 @@ class Charge:
     Args:
         beat: the flight process's last word.
         clearance_m: height of the body's origin when the vehicle stands.
+        tilt_max_rad: `safety.tilt_abort_deg`.
         link: open.
         t_s: now, on the flight clock.
         tell: takes what people must know.
     """
 
-    def __init__(self, beat: Beat, clearance_m: float, link: Link, t_s: float, tell: Tell) -> None:
+    def __init__(self, beat: Beat, clearance_m: float, tilt_max_rad: float, link: Link, t_s: float, tell: Tell) -> None:
         self._clearance_m = clearance_m
+        self._tilt_max_rad = tilt_max_rad
         self._link = link
         self._tell = tell
         self._px4 = Px4State()
@@ -148,7 +150,7 @@ class Charge:
         self._mind_the_pilot(t_s)
         if self._landing is None:
             self._rounds += 1
-            self._landing = AutopilotLanding(t_s, self._clearance_m, self._pilot)
+            self._landing = AutopilotLanding(t_s, self._clearance_m, self._tilt_max_rad, self._pilot)
         self._tick += 1
         self._carry_out(t_s, status, self._landing.step(self._inputs(t_s, status)))
 

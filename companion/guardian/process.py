@@ -260,6 +260,7 @@ class Guardian:
         charge = Charge(
             last,
             self._settings.clearance_m,
+            self._settings.tilt_max_rad,
             link,
             time.monotonic() - last.origin_s,
             lambda told: self._tell(last, told),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,8 @@ class Settings:
     mocap: MocapSettings
     clearance_m: float
     """`airframe.ground_clearance_m`."""
+    tilt_max_rad: float
+    """`safety.tilt_abort_deg`."""
     timeout_s: float
     """`safety.guardian_timeout_s`."""
 
@@ -43,5 +46,6 @@ def read_settings(path: Path) -> Settings:
         autopilot_address=devices["autopilot"]["address"],
         mocap=MocapSettings(**{name: mocap[name] for name in MocapSettings.__slots__}),
         clearance_m=vehicle["airframe"]["ground_clearance_m"],
+        tilt_max_rad=math.radians(vehicle["safety"]["tilt_abort_deg"]),
         timeout_s=vehicle["safety"]["guardian_timeout_s"],
     )

@@ -4,8 +4,8 @@ PX4 lands on its own estimate. Without vision its height becomes invalid 4.5 s a
 thrust and never finds that it stands (measured). So the companion watches for touch-down as long as the dead-reckoned height can be
 trusted, takes OFFBOARD back with zero thrust once the vehicle stands, and disarms. No single source decides: PX4's estimate and motion
 capture must both see a vehicle that stands while PX4 wants it down, and if PX4 alone never notices, it is disarmed all the same.
-`companion.mission.rotor_stop` decides when a stop of the rotors may be requested, also of a vehicle that is flipped. Pure; time is an
-argument.
+`companion.mission.rotor_stop` decides when a stop of the rotors may be requested, also of a vehicle that is flipped or tipped over.
+Pure; time is an argument.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ BEGUN_S = 1.0
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
 FLIPPED = "flipped: PX4 is told to disarm at once"
+TIPPED = "tipped over on the floor: PX4 is told to disarm at once"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,7 @@ class AutopilotLanding:
     Args:
         start_s: flight time at its start.
         clearance_m: height of the body's origin when the vehicle stands.
+        tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
         pilot: a pilot took over: watch only, ask for nothing. One who takes over later is seen by PX4's mode.
         estimate_known: PX4 had motion capture until now; False: until poses come its estimate counts for nothing.
         flipped: the vehicle is known to be flipped, and has been for long enough.
@@ -57,6 +59,7 @@ class AutopilotLanding:
         self,
         start_s: float,
         clearance_m: float,
+        tilt_max_rad: float,
         pilot: bool,
         *,
         estimate_known: bool = True,
@@ -72,9 +75,10 @@ class AutopilotLanding:
         self._touched_s: float | None = None
         self._landing_since_s: float | None = None
         self._zero_thrust_since_s: float | None = None
-        self._was_flipped = False
+        self.overturned = False
+        """The vehicle was flipped or tipped over, and its rotors were to be stopped for that."""
         self._pose_s = start_s if estimate_known else -math.inf
-        self._stop = RotorStop(clearance_m, self._pose_s, flipped=flipped)
+        self._stop = RotorStop(clearance_m, tilt_max_rad, self._pose_s, flipped=flipped)
 
     @property
     def pilot(self) -> bool:
@@ -90,7 +94,7 @@ class AutopilotLanding:
             self._pilot = True
             return LandingStep(AutopilotRequest.NONE, False, False, False, "a pilot took over")
         if heard and not is_armed(i.status) and elapsed > 0.5:
-            text = "the vehicle was flipped; it is disarmed" if self._was_flipped else None
+            text = "the vehicle was flipped or tipped over; it is disarmed" if self.overturned else None
             return LandingStep(AutopilotRequest.NONE, False, True, True, text)
         if elapsed > TIMEOUT_S and not (self._pilot and heard):  # a pilot may fly on for as long as they like
             return LandingStep(AutopilotRequest.NONE, False, True, False, "the landing could not be confirmed")
@@ -99,9 +103,9 @@ class AutopilotLanding:
             return LandingStep(AutopilotRequest.NONE, False, True, True, text)
         if self._pilot:
             return LandingStep(AutopilotRequest.NONE, False, False, False)
-        if self._stop.flipped:
-            text = None if self._was_flipped else FLIPPED
-            self._was_flipped = True
+        if self._stop.overturned:
+            text = None if self.overturned else FLIPPED if self._stop.flipped else TIPPED
+            self.overturned = True
             return LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False, text)
         if self._touched_s is None and heard and self._touches(i):
             self._touched_s = i.t_s

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding
 from companion.types import (
     AutopilotRequest,
@@ -17,6 +19,7 @@ from companion.types import (
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ZERO = (0.0, 0.0, 0.0)
 CLEARANCE_M = 0.3
+TILT_MAX_RAD = math.radians(40.0)
 
 
 def seen(
@@ -45,7 +48,7 @@ def seen(
 
 
 def test_it_asks_for_land_until_touchdown_then_takes_offboard_back_with_zero_thrust_and_disarms() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False)
     step = landing.step(seen(0.1, 1.0, sink_m_s=0.7, mocap=False))
     assert (step.request, step.zero_thrust) == (AutopilotRequest.LAND, False)
     requests = []
@@ -70,20 +73,20 @@ def test_it_asks_for_land_until_touchdown_then_takes_offboard_back_with_zero_thr
 
 def test_a_height_that_nobody_can_vouch_for_is_no_touchdown() -> None:
     """Without vision for longer than PX4's height holds, thrust is not cut on its word."""
-    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False)
     for k in range(400):
         step = landing.step(seen(5.0 + k * 0.005, 0.31, mocap=False))
         assert not step.zero_thrust
 
 
 def test_sinking_is_no_touchdown() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False)
     for k in range(300):
         assert not landing.step(seen(1.0 + k * 0.005, 0.35, sink_m_s=0.2)).zero_thrust
 
 
 def test_nothing_is_asked_against_a_pilot_for_as_long_as_they_fly() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=True)
+    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=True)
     for t_s in (0.1, 1.0, TIMEOUT_S + 1.0, 600.0):
         step = landing.step(seen(t_s, 1.0, mode=FlightMode.MANUAL))
         assert step.request is AutopilotRequest.NONE
@@ -93,12 +96,12 @@ def test_nothing_is_asked_against_a_pilot_for_as_long_as_they_fly() -> None:
 
 
 def test_a_silent_px4_that_stands_is_landed_and_one_in_the_air_is_not() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False)
     steps = [landing.step(seen(4.0 + k * 0.05, 0.31, heard_s=0.0)) for k in range(80)]
     assert steps[-1].ended
     assert steps[-1].landed
     assert "by hand" in (steps[-1].text or "")
-    hovering = AutopilotLanding(0.0, CLEARANCE_M, pilot=False)
+    hovering = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False)
     assert not any(hovering.step(seen(4.0 + k * 0.05, 1.0, heard_s=0.0)).ended for k in range(80))
     late = hovering.step(seen(TIMEOUT_S + 1.0, 1.0, heard_s=0.0))
     assert late.ended

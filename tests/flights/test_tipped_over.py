@@ -1,0 +1,66 @@
+"""A vehicle that tips over on the floor with its rotors turning, in the fast closed loop: by the flight process and by the guardian."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.config.loader import load_flight
+from companion.frames import euler_zyx_from_quat, tilt_rad
+from companion.types import Outcome
+from sitl.fast import FastFlight
+from sitl.hand import Wrench
+from tests.support import HOVER, LOW_HOVER
+
+LIES_AT_RAD = math.radians(50.0)
+"""Two feet 0.18 m beside the origin and 0.28 m below it, and the edge of a rotor disk 0.45 m beside it: atan(0.31 / 0.27) = 49 deg."""
+STIFFNESS_NM, DAMPING_NMS = 80.0, 8.0
+"""Of the floor under that rotor, which the world does not have; far stronger than the rotors."""
+STOPPED_WITHIN_S = 1.5
+
+
+class TippedOver(FastFlight):
+    """A low hover that is tipped over, and lies, from the first moment of its landing at which it is below `below_m`."""
+
+    def __init__(self, below_m: float, after_s: float, *faults: str) -> None:
+        low = [f"{key}={value}" for key, value in LOW_HOVER.items()]
+        super().__init__(load_flight(HOVER, overrides=[*low, f"world.faults=[{', '.join(faults)}]"]))
+        self.begun_s = self.stopped_s = math.inf
+        world, step = self.plant.world, self.plant.step
+
+        def tipping(armed: bool) -> None:
+            if armed and world.t_s > after_s and world.q[2] < below_m:
+                self.begun_s = min(self.begun_s, world.t_s)
+            if world.t_s >= self.begun_s:
+                w, x, y, z = world.q[3:7]
+                torque_nm = (
+                    STIFFNESS_NM * (LIES_AT_RAD - euler_zyx_from_quat((w, x, y, z))[0]) - DAMPING_NMS * world.v[3]
+                )
+                world.hold(Wrench((0.0, 0.0, 0.0), (torque_nm, 0.0, 0.0)))
+                if not armed:
+                    self.stopped_s = min(self.stopped_s, world.t_s)
+            step(armed)
+
+        self.plant.step = tipping  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    ("below_m", "after_s"), [(0.35, 6.5), (0.31, 8.0)], ids=["just before touch-down", "after touch-down"]
+)
+def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_flight(below_m: float, after_s: float) -> None:
+    flight = TippedOver(below_m, after_s)
+    result = flight.run()
+    assert not result.crashed, "the world's word for beyond 72 deg: that is another test"
+    assert tilt_rad(result.truth[-1].attitude_wxyz) == pytest.approx(LIES_AT_RAD, abs=math.radians(12.0))
+    assert flight.stopped_s - flight.begun_s < STOPPED_WITHIN_S
+    assert result.outputs[-1].outcome is Outcome.CRASHED
+    assert [event.id for outputs in result.outputs for event in outputs.events].count("crashed") == 1
+
+
+def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_guardian() -> None:
+    flight = TippedOver(0.35, 6.5, "{kind: kill_flight, t_s: 4.4}")
+    result = flight.run()
+    assert result.guardian_landed is True
+    assert "tipped over on the floor: PX4 is told to disarm at once" in [e.text for e in result.guardian_events]
+    assert flight.stopped_s - flight.begun_s < STOPPED_WITHIN_S
