@@ -1,7 +1,8 @@
 """One instant of a plan against every limit: room, tether, floor, joints, motion, thrust.
 
-Pure. A place is judged with what a flight may differ from its plan (`TRACKING_M`, more around a catch), a velocity with the way that
-stopping takes from a fault to rest. What is asked is the governor's own `SafeSet`, and more: a plan without a violation is never bent.
+Pure. A place is judged with what a flight may differ from its plan (`TRACKING_M`, more around a catch), and so is the place where the
+vehicle would come to rest after a fault. What is asked is the governor's own `SafeSet`, and more: a plan without a violation is never
+bent.
 """
 
 from __future__ import annotations
@@ -111,8 +112,9 @@ class Judge:
                 "raise the waypoint",
             )
         position = (x_m, y_m, max(z_m, clearance_m)) if kind is PhaseKind.TAKEOFF else reference.position_world_m
-        yield from self._space(position, reference, self._off_m(t_s, position, kind))
-        yield from self._stop(position, reference, kind)
+        off_m = self._off_m(t_s, position, kind)
+        yield from self._space(position, reference, off_m)
+        yield from self._stop(position, reference, kind, off_m)
         yield from self._line(t_s, position, reference)
         yield from self._arm(position, reference)
         yield from self._motion(reference, jerks)
@@ -131,7 +133,7 @@ class Judge:
         net_radius_m = vehicle.tool.net_radius_m
         radius_m = vehicle.airframe.radius_m
         room = vehicle.room
-        why = f"{off_m:g} m for {'the catch' if off_m == CATCH_M else 'tracking'}"
+        why = _allowance(off_m)
         for axis, name, span in ((0, "x", room.x_m), (1, "y", room.y_m), (2, "z", room.z_m)):
             if axis == 2 and position[2] < vehicle.airframe.ground_clearance_m:
                 continue  # told as flying into the floor
@@ -157,8 +159,11 @@ class Judge:
                 "shorten the line or move the anchor",
             )
 
-    def _stop(self, position: Vec3, reference: Reference, kind: PhaseKind) -> Iterator[Violation]:
-        """Where it would come to rest after a fault at this instant."""
+    def _stop(self, position: Vec3, reference: Reference, kind: PhaseKind, off_m: float) -> Iterator[Violation]:
+        """Where it would come to rest after a fault at this instant, as far off the plan as the place itself may be.
+
+        The monitors judge the measured velocity: a flight that is a little off its plan must not be stopped by them.
+        """
         safe = self._safe
         speed = math.hypot(*reference.velocity_world_m_s)
         stop_s = self._stop_model.time_s(speed)
@@ -167,18 +172,19 @@ class Judge:
         if kind is PhaseKind.LANDING:
             z_m = max(z_m, floor_m)  # the floor is where it is going
         stop = (x_m, y_m, z_m)
+        less = f" with {_allowance(off_m)}"
         found = (
-            ("tether", "tether sphere", safe.breach_tether_m(stop) - max(0.0, safe.breach_tether_m(position))),
-            ("room", "room", safe.breach_walls_m(stop) - max(0.0, safe.breach_walls_m(position))),
-            ("floor", "height above the floor", min(floor_m, position[2]) - z_m),
+            ("tether", "tether sphere", safe.breach_tether_m(stop) - max(-off_m, safe.breach_tether_m(position)), less),
+            ("room", "room", safe.breach_walls_m(stop) - max(-off_m, safe.breach_walls_m(position)), less),
+            ("floor", "height above the floor", min(floor_m, position[2]) - z_m, ""),
         )
-        for limit, what, beyond_m in found:
+        for limit, what, beyond_m, with_m in found:
             if beyond_m > TOLERANCE:
                 yield Violation(
                     f"{STOP}{limit}",
                     beyond_m,
                     f"could not stop within the {what}",
-                    f"{speed:.2f} m/s take {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far",
+                    f"{speed:.2f} m/s take {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
                     "fly slower towards its edge or turn round earlier",
                 )
 
@@ -274,6 +280,10 @@ class Judge:
         if tilt_deg > airframe.tilt_max_deg * (1.0 + TOLERANCE):
             detail = f"{tilt_deg:.1f} deg, airframe.tilt_max_deg is {airframe.tilt_max_deg:g}"
             yield Violation("tilt", tilt_deg, "leans too far", detail, "take longer or go less far")
+
+
+def _allowance(off_m: float) -> str:
+    return f"{off_m:g} m for {'the catch' if off_m == CATCH_M else 'tracking'}"
 
 
 def _leaning(reference: Reference) -> Quat:
