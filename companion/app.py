@@ -360,7 +360,7 @@ def main(argv: list[str] | None = None) -> int:
         guardian = socket.socket(fileno=arguments.guardian)
         outcome = run(fly(config, arguments.out, channel, guardian, sitl=arguments.sitl))
     except DeviceError as error:
-        status.send(channel, {"type": "refused", "lines": str(error).splitlines()})
+        status.send(channel, {"type": "refused", "lines": str(error).splitlines(), "device_failed": True})
         return EXIT_REFUSED
     except Refused as refused:
         status.send(channel, {"type": "refused", "lines": refused.lines})

@@ -116,7 +116,12 @@ class Crowding:
             return []
         then_s, before = self._samples[0]
         elapsed_s = max(SAMPLE_S, now_s - then_s)
-        return [core_wait(name, before[name], self._read(pid), elapsed_s) for name, pid in self._pids.items()]
+        newest = self._samples[-1][1]
+        # A process that refuses the flight ends at once: its last sample counts then.
+        return [
+            core_wait(name, before[name], self._read(pid) or newest[name], elapsed_s)
+            for name, pid in self._pids.items()
+        ]
 
     def _late_p99_s(self) -> float:
         late_s = sorted(late_s for _, late_s in self._late_s)
@@ -130,4 +135,4 @@ def _late(message: Mapping[str, Any]) -> bool:
     if message.get("type") == "preflight":
         refused = (row for row in message["rows"] if not row["ok"] and row["level"] == Level.REFUSE.value)
         return any(row["id"] in CAUSED_BY_LATENESS for row in refused)
-    return False
+    return message.get("type") == "refused" and bool(message.get("device_failed"))

@@ -67,6 +67,8 @@ ROW: dict[str, Any] = {"id": "arm.reads", "ok": False, "level": "refuse"}
         ({"type": "preflight", "rows": [ROW]}, True),
         ({"type": "preflight", "rows": [{**ROW, "level": "warn"}, {**ROW, "ok": True}]}, False),
         ({"type": "preflight", "rows": [{**ROW, "id": "px4.battery"}]}, False),
+        ({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, True),
+        ({"type": "refused", "lines": ["px4.battery: 3.2 V a cell"]}, False),
     ],
 )
 def test_it_is_judged_when_something_happens_that_lateness_may_cause(message: dict[str, Any], judged: bool) -> None:
@@ -79,6 +81,17 @@ def test_it_is_judged_when_something_happens_that_lateness_may_cause(message: di
     if line is not None:
         assert "flight process waited 40 % of the time" in line
         assert crowding.take(message, 13.1) is None, "once is enough"
+
+
+def test_a_process_that_has_ended_is_judged_by_its_last_sample() -> None:
+    """A device that does not open ends the flight process as it reports it."""
+    reads = iter([{7: 1.0}, {7: 2.2}, {}])
+    crowding = Crowding({"flight process": 7}, lambda pid: next(reads))
+    crowding.sample(10.0)
+    crowding.sample(13.0)
+    line = crowding.take({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, 13.0)
+    assert line is not None
+    assert "flight process waited 40 % of the time" in line
 
 
 def test_programs_that_share_a_core_are_seen_to_wait() -> None:
