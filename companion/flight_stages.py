@@ -46,6 +46,8 @@ class FlightStages:
         self._touchdown = Touchdown(self._clearance_m)
         self._stop = RotorStop(self._clearance_m, self._tilt_max_rad)
         self._settled = SettledEstimate()
+        self._pose_s = -math.inf
+        """Of the newest motion-capture pose that was believed, and so passed on to PX4."""
         self._arm_requested_s = -math.inf
         """When ARM was last requested."""
         self._tare_start_s: float | None = None
@@ -91,7 +93,9 @@ class FlightStages:
     def enter(self, stage: Stage, i: Inputs, *, pilot_flies: bool = False, flipped: bool = False) -> None:
         """Go to a stage. Of a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is known already."""
         if stage is Stage.AUTOPILOT_LAND:
-            self._landing = AutopilotLanding(i.t_s, self._clearance_m, self._tilt_max_rad, pilot_flies, flipped=flipped)
+            self._landing = AutopilotLanding(
+                i.t_s, self._clearance_m, self._tilt_max_rad, pilot_flies, pose_s=self._pose_s, flipped=flipped
+            )
         elif stage in seq.DISARMING:
             self._stop = RotorStop(self._clearance_m, self._tilt_max_rad)
         self.stage = stage
@@ -107,9 +111,7 @@ class FlightStages:
         self.finish(Outcome.ABORTED)
         self.stage, self._stage_s = Stage.AUTOPILOT_LAND, i.t_s
         pilot_flies = seq.people_fly(i.status)
-        self._landing = AutopilotLanding(
-            i.t_s, self._clearance_m, self._tilt_max_rad, pilot_flies, estimate_known=False
-        )
+        self._landing = AutopilotLanding(i.t_s, self._clearance_m, self._tilt_max_rad, pilot_flies, pose_s=-math.inf)
 
     def stand_down(self, i: Inputs, outcome: Outcome) -> None:
         """Disarm and end, on the ground."""
@@ -169,6 +171,8 @@ class FlightStages:
         """Move the sequence on; the request that the present stage makes."""
         assert self._stage_s is not None
         elapsed = i.t_s - self._stage_s
+        if i.mocap is not None and i.mocap.tracking_valid:
+            self._pose_s = i.mocap.stamp_s
         match self.stage:
             case Stage.PLAN:
                 self._fly(i)

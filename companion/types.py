@@ -380,3 +380,16 @@ class Sent:
     hold: int | None = None
     """Number of the hold that stands after this tick, counted from 1 in each flight. A command to hold begins a new one, also where
     the vehicle holds already. None: it does not hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkIdentity:
+    """What another process must know to go on speaking on the MAVLink link to PX4."""
+
+    autopilot_system: int
+    own_system: int
+    own_component: int
+    local_port: int
+    """UDP port that MAVSDK speaks from; 0: not UDP, or not known."""
+    peer: tuple[str, int] | None = None
+    """PX4's IPv4 address and UDP port, the only ones that MAVSDK hears; None: not UDP."""

@@ -12,12 +12,13 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.vehicle import Vehicle
+from companion.flight_guard import Heartbeats
 from companion.guardian.beat import Beat
 from companion.guardian.charge import Charge, Tell, Told
 from companion.guardian.link import Link
 from companion.guardian.process import PERIOD_S
 from companion.guardian.watch import StallWatch
-from companion.types import AutopilotRequest, Event, Inputs, MocapPose, Outputs, PhaseKind, SafetyAction, Severity
+from companion.types import Event, Inputs, LinkIdentity, MocapPose, Outputs, SafetyAction, Severity
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver
 from sitl.autopilot.streams import STREAMS, Schedule
@@ -25,7 +26,6 @@ from sitl.autopilot.streams import STREAMS, Schedule
 TAKE_OVER_S = 0.03
 """From the decision to the first message: the flight process is killed, its port opened."""
 _OWN = (1, 191)
-_IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
 
 
 class MemoryWire:
@@ -116,36 +116,15 @@ class StandIn:
         self._px4 = px4
         self._watch = StallWatch(vehicle.safety.guardian_timeout_s)
         self._beat: Beat | None = None
-        self._pilot = False
+        system = px4.params.integer("MAV_SYS_ID")
+        self._heartbeats = Heartbeats(LinkIdentity(system, *_OWN, local_port=0), origin_s=0.0)
         self._round_s = 0.0
         self.events: list[Event] = []
         self.alive = True
 
     def beat(self, inputs: Inputs, outputs: Outputs) -> None:
-        """A control tick of the flight process, as `companion.flight_guard` tells it."""
-        self._pilot = self._pilot or any(event.id == "pilot_took_over" for event in outputs.events)
-        armed = inputs.status is not None and inputs.status.armed
-        mocap, before = inputs.mocap, self._beat
-        stamp_s, position = (
-            (before.pose_stamp_s, before.position_world_m) if before else (float("-inf"), (0.0, 0.0, 0.0))
-        )
-        if mocap is not None and mocap.tracking_valid and outputs.mocap_trusted:
-            stamp_s, position = mocap.stamp_s, mocap.position_world_m
-        self._beat = Beat(
-            tick=inputs.tick,
-            t_s=inputs.t_s,
-            origin_s=0.0,
-            mission_t_s=outputs.mission_t_s,
-            lifting=armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR,
-            pilot=self._pilot,
-            goodbye=outputs.outcome is not None and not armed,
-            autopilot_system=self._px4.params.integer("MAV_SYS_ID"),
-            own_system=_OWN[0],
-            own_component=_OWN[1],
-            local_port=0,
-            pose_stamp_s=stamp_s,
-            position_world_m=position,
-        )
+        """A control tick of the flight process."""
+        self._beat = self._heartbeats.of(inputs, outputs)
 
     def must_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
         """One look at the flight process; to be asked in every tick."""

@@ -20,7 +20,7 @@ HANGS = "the flight process hangs"
 """How the text of `guardian_took_over` begins when it did not die by itself."""
 MAX_BYTES = 1024
 
-_LIFTING, _PILOT, _GOODBYE = 1, 2, 4
+_LIFTING, _PILOT, _GOODBYE, _MOCAP_REFUSED = 1, 2, 4, 8
 _BEAT = struct.Struct("<cBBBBH4sHIddddddd")
 _NO_PEER = (bytes(4), 0)
 
@@ -42,6 +42,8 @@ class Beat:
     """A pilot took over."""
     goodbye: bool
     """The last one: the flight ends as it should."""
+    mocap_refused: bool
+    """The flight process does not believe motion capture and lands for that: its poses are neither for PX4 nor to judge by."""
     autopilot_system: int
     """MAVLink system id of PX4."""
     own_system: int
@@ -50,7 +52,7 @@ class Beat:
     local_port: int
     """UDP port that the companion speaks from; 0: not known, or no UDP."""
     pose_stamp_s: float
-    """Of the last motion-capture pose with the body in view, on the flight clock; -inf: none yet."""
+    """Of the last motion-capture pose with the body in view that was believed, on the flight clock; -inf: none yet."""
     position_world_m: Vec3
     """Of that pose."""
     peer: tuple[str, int] | None = None
@@ -60,6 +62,7 @@ class Beat:
 def pack(beat: Beat) -> bytes:
     """A beat as a datagram."""
     flags = _LIFTING * beat.lifting | _PILOT * beat.pilot | _GOODBYE * beat.goodbye
+    flags |= _MOCAP_REFUSED * beat.mocap_refused
     host, port = _NO_PEER if beat.peer is None else (socket.inet_aton(beat.peer[0]), beat.peer[1])
     return _BEAT.pack(
         BEAT,
@@ -95,6 +98,7 @@ def unpack(datagram: bytes) -> Beat | None:
         lifting=bool(flags & _LIFTING),
         pilot=bool(flags & _PILOT),
         goodbye=bool(flags & _GOODBYE),
+        mocap_refused=bool(flags & _MOCAP_REFUSED),
         autopilot_system=autopilot,
         own_system=system,
         own_component=component,

@@ -89,6 +89,9 @@ class Charge:
         self._start_s = t_s
         self._spoken_s: float | None = None
         self._pilot = beat.pilot
+        self._mocap_refused = beat.mocap_refused
+        self._pose_s = beat.pose_stamp_s
+        """Of the newest pose that PX4 has had, by the flight process or by the guardian."""
         self._landing: AutopilotLanding | None = None
         self._rounds = 0
         self._tick = beat.tick
@@ -111,15 +114,20 @@ class Charge:
         return self._px4.status()
 
     def take_poses(self, poses: Iterable[MocapPose]) -> None:
-        """Motion capture: pass on at once what can be true."""
+        """Motion capture: pass on at once what can be true; nothing if the flight process landed because it did not believe it."""
         for pose in poses:
             if not pose.tracking_valid:
+                continue
+            if self._mocap_refused:
+                text = "motion capture was not believed by the flight process; held back from PX4, which lands on its own estimate"
+                self._say(pose.stamp_s, "guardian_mocap", Severity.WARNING, text)
                 continue
             if not self._plausible.check(pose.stamp_s, pose.position_world_m):
                 self._say(pose.stamp_s, "guardian_mocap", Severity.WARNING, "motion capture jumps; held back from PX4")
                 continue
             self._link.vision(pose)
             self._pose = pose
+            self._pose_s = max(self._pose_s, pose.stamp_s)
 
     def take_messages(self, t_s: float, messages: Iterable[Any]) -> None:
         """What PX4 says."""
@@ -150,7 +158,9 @@ class Charge:
         self._mind_the_pilot(t_s)
         if self._landing is None:
             self._rounds += 1
-            self._landing = AutopilotLanding(t_s, self._clearance_m, self._tilt_max_rad, self._pilot)
+            self._landing = AutopilotLanding(
+                t_s, self._clearance_m, self._tilt_max_rad, self._pilot, pose_s=self._pose_s
+            )
         self._tick += 1
         self._carry_out(t_s, status, self._landing.step(self._inputs(t_s, status)))
 

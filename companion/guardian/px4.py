@@ -12,6 +12,7 @@ from companion.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleStat
 
 # SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
 _NO_MANOEUVRES = (511, 512)
+_ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Px4State:
@@ -22,12 +23,12 @@ class Px4State:
         """Why the last command was not accepted; None after one that was."""
         self._heartbeat: tuple[float, bool, FlightMode, int] | None = None
         self._landed = 0
-        self._position: tuple[float, Vec3, Vec3] | None = None
+        self._position: tuple[float, Vec3, Vec3] = (-math.inf, _ZERO, _ZERO)
         self._attitude: tuple[float, Quat, Vec3] | None = None
-        self._imu: tuple[float, Vec3] | None = None
+        self._imu: tuple[float, Vec3] = (-math.inf, _ZERO)
 
     def take(self, t_s: float, message: Any) -> None:
-        """One decoded message that arrived at `t_s` on the flight clock."""
+        """One decoded message that arrived at `t_s` on the flight clock. A state with a value that is not finite has not arrived."""
         m = message
         match m.get_type():
             case "HEARTBEAT":
@@ -36,11 +37,11 @@ class Px4State:
                 self._heartbeat = (t_s, armed, mode, m.system_status)
             case "EXTENDED_SYS_STATE":
                 self._landed = m.landed_state
-            case "LOCAL_POSITION_NED":
+            case "LOCAL_POSITION_NED" if _finite(m.x, m.y, m.z, m.vx, m.vy, m.vz):
                 self._position = (t_s, (m.x, m.y, m.z), (m.vx, m.vy, m.vz))
-            case "ATTITUDE_QUATERNION":
+            case "ATTITUDE_QUATERNION" if _finite(m.q1, m.q2, m.q3, m.q4, m.rollspeed, m.pitchspeed, m.yawspeed):
                 self._attitude = (t_s, (m.q1, m.q2, m.q3, m.q4), (m.rollspeed, m.pitchspeed, m.yawspeed))
-            case "HIGHRES_IMU":
+            case "HIGHRES_IMU" if _finite(m.xacc, m.yacc, m.zacc):
                 self._imu = (t_s, (m.xacc, m.yacc, m.zacc))
             case "COMMAND_ACK" if m.command not in _NO_MANOEUVRES:
                 self.refusal = None if m.result == 0 else f"MAV_CMD {m.command} {messages.result_text(m.result)}"
@@ -53,8 +54,10 @@ class Px4State:
         return AutopilotStatus(stamp_s, armed, mode, messages.landed_state(self._landed), None, None, system)
 
     def vehicle(self) -> VehicleState | None:
-        """None before position, attitude and IMU have come, or when they are not finite."""
-        if self._position is None or self._attitude is None or self._imu is None:
+        """None before the first attitude. That alone tells that the vehicle is flipped, so nothing else is waited for: the stamp of a
+        position or an IMU sample that never came is -inf.
+        """
+        if self._attitude is None:
             return None
         return messages.vehicle_state(*self._position, *self._attitude, *self._imu)
 
@@ -65,6 +68,10 @@ class Px4State:
 
     def yaw_rad(self) -> float | None:
         """Heading in the world (ENU)."""
-        if self._attitude is None or not any(self._attitude[1]) or not all(map(math.isfinite, self._attitude[1])):
+        if self._attitude is None or not any(self._attitude[1]):
             return None
         return euler_zyx_from_quat(attitude_enu_flu_from_ned_frd(self._attitude[1]))[2]
+
+
+def _finite(*values: float) -> bool:
+    return all(map(math.isfinite, values))

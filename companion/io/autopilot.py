@@ -11,7 +11,6 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
@@ -26,7 +25,7 @@ from companion.clock import Clock
 from companion.config.vehicle import AutopilotDevice
 from companion.io import autopilot_messages as messages
 from companion.io.autopilot_calls import NATIVE_CALL_DEADLINE_S, NativeCalls
-from companion.io.autopilot_claim import LinkClaim, Peer
+from companion.io.autopilot_claim import LinkClaim
 from companion.io.autopilot_inbox import Inbox, ask_for_streams
 from companion.io.autopilot_link import (
     add_connection,
@@ -43,7 +42,7 @@ from companion.io.autopilot_requests import SENT_ONCE, RequestDesk
 from companion.io.autopilot_setpoints import SetpointPath, setpoint_path
 from companion.io.edges import DeviceError
 from companion.preflight.observations import EstimatorReport, StateCounts
-from companion.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, MocapPose, VehicleState
+from companion.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, LinkIdentity, MocapPose, VehicleState
 
 _CONNECT_DEADLINE_S = 5.0
 _HEARTBEAT_DEADLINE_S = 5.0
@@ -53,19 +52,6 @@ _CLOSE_DEADLINE_S = 4.0
 _COVARIANCE_FROM_PARAMS = Covariance([float("nan")])
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class LinkIdentity:
-    """What another process must know to go on speaking on this link."""
-
-    autopilot_system: int
-    own_system: int
-    own_component: int
-    local_port: int
-    """UDP port that MAVSDK speaks from; 0: not UDP, or not known."""
-    peer: Peer | None = None
-    """PX4's UDP address, the only one that MAVSDK hears; None: not UDP."""
 
 
 class MavsdkAutopilot:

@@ -18,10 +18,9 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from companion.io import ground_words as words
-from companion.io.autopilot import LinkIdentity
 from companion.io.edges import DeviceError
 from companion.io.ground_channel import pack, unpack
-from companion.types import AutopilotRequest, Inputs, Outputs
+from companion.types import AutopilotRequest, Inputs, LinkIdentity, Outputs
 
 VALUES_EVERY = 50
 """Ticks: 4 Hz of a control loop of 200 Hz."""

@@ -10,10 +10,16 @@ Pure; time is an argument.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-from companion.mission.rotor_stop import ESTIMATE_TRUSTED_S, FORCE_DISARM_S, RotorStop, fresh_pose, hears_px4
+from companion.mission.rotor_stop import (
+    ESTIMATE_TRUSTED_S,
+    FORCE_DISARM_S,
+    STATE_FRESH_S,
+    RotorStop,
+    fresh_pose,
+    hears_px4,
+)
 from companion.mission.sequencer import in_offboard, is_armed, on_ground, people_chose
 from companion.mission.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking
 from companion.types import AutopilotRequest, FlightMode, Inputs
@@ -51,7 +57,7 @@ class AutopilotLanding:
         clearance_m: height of the body's origin when the vehicle stands.
         tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
         pilot: a pilot took over: watch only, ask for nothing. One who takes over later is seen by PX4's mode.
-        estimate_known: PX4 had motion capture until now; False: until poses come its estimate counts for nothing.
+        pose_s: flight time of the newest pose that PX4 has had; -inf: its estimate counts for nothing until poses come.
         flipped: the vehicle is known to be flipped, and has been for long enough.
     """
 
@@ -62,7 +68,7 @@ class AutopilotLanding:
         tilt_max_rad: float,
         pilot: bool,
         *,
-        estimate_known: bool = True,
+        pose_s: float,
         flipped: bool = False,
     ) -> None:
         self._start_s = start_s
@@ -77,8 +83,8 @@ class AutopilotLanding:
         self._zero_thrust_since_s: float | None = None
         self.overturned = False
         """The vehicle was flipped or tipped over, and its rotors were to be stopped for that."""
-        self._pose_s = start_s if estimate_known else -math.inf
-        self._stop = RotorStop(clearance_m, tilt_max_rad, self._pose_s, flipped=flipped)
+        self._pose_s = pose_s
+        self._stop = RotorStop(clearance_m, tilt_max_rad, pose_s, flipped=flipped)
 
     @property
     def pilot(self) -> bool:
@@ -140,7 +146,9 @@ class AutopilotLanding:
         elif self._landing_since_s is None:
             self._landing_since_s = i.t_s
         begun = self._landing_since_s is not None and i.t_s - self._landing_since_s > BEGUN_S
-        if vehicle is None or not begun or i.t_s - self._pose_s > ESTIMATE_TRUSTED_S:
+        fresh = vehicle is not None and i.t_s - vehicle.position_stamp_s < STATE_FRESH_S
+        if vehicle is None or not fresh or not begun or i.t_s - self._pose_s > ESTIMATE_TRUSTED_S:
+            self._height = HeightEvidence(self._clearance_m)
             return False
         height, sink = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
         stands = self._height.update(i.t_s, height, sink, height - 1.0)

@@ -94,7 +94,7 @@ class RotorStop:
     Args:
         clearance_m: height of the body's origin when the vehicle stands.
         tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
-        pose_s: flight time until which PX4 had motion capture for sure; -inf if that is not known.
+        pose_s: flight time of the newest pose that PX4 has had; -inf if that is not known.
         flipped: it is known to be flipped, and has been for long enough.
     """
 

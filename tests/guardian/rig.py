@@ -38,8 +38,17 @@ ATTITUDE: Quat = (0.9689124217106447, 0.0, 0.0, 0.24740395925452294)
 """Yaw 0.5 rad."""
 OWN_IDS = (1, 195)
 STANDING_M = load_flight(HOVER).vehicle.airframe.ground_clearance_m
-# Holds PX4's port as the flight process does, and does nothing: the test speaks to the guardian in its name.
-_FLIGHT = "import socket, sys; s = socket.socket(type=2); s.bind(('127.0.0.1', int(sys.argv[1]))); print(flush=True); sys.stdin.read()"
+_FLIGHT = """
+import socket, sys
+port, px4 = map(int, sys.argv[1:])
+s = socket.socket(type=socket.SOCK_DGRAM)
+s.bind(("127.0.0.1", port))
+s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+s.connect(("127.0.0.1", px4))
+print(flush=True)
+sys.stdin.read()
+"""
+"""Holds PX4's port as the flight process does, and does nothing: the test speaks to the guardian in its name."""
 
 
 class Cameras:
@@ -114,7 +123,9 @@ class Rig:
         path.write_text(json.dumps(data), encoding="utf-8")
 
         self.flight = subprocess.Popen(
-            [sys.executable, "-c", _FLIGHT, str(self.port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            [sys.executable, "-c", _FLIGHT, str(self.port), str(self.peer.address[1])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
         )
         assert self.flight.stdout is not None
         self.flight.stdout.readline()  # it holds the port
@@ -160,7 +171,13 @@ class Rig:
             opened.close()
 
     def beat(
-        self, *, lifting: bool = True, pilot: bool = False, goodbye: bool = False, pose_age_s: float = 0.0
+        self,
+        *,
+        lifting: bool = True,
+        pilot: bool = False,
+        goodbye: bool = False,
+        mocap_refused: bool = False,
+        pose_age_s: float = 0.0,
     ) -> None:
         """One tick of the flight process."""
         self.tick += 1
@@ -173,6 +190,7 @@ class Rig:
             lifting=lifting,
             pilot=pilot,
             goodbye=goodbye,
+            mocap_refused=mocap_refused,
             autopilot_system=1,
             own_system=OWN_IDS[0],
             own_component=OWN_IDS[1],

@@ -23,6 +23,7 @@ beats = st.builds(
     lifting=st.booleans(),
     pilot=st.booleans(),
     goodbye=st.booleans(),
+    mocap_refused=st.booleans(),
     autopilot_system=byte,
     own_system=byte,
     own_component=byte,

@@ -11,11 +11,11 @@ import pytest
 
 from companion.config.loader import load_flight
 from companion.core import FlightCore
-from companion.flight_guard import FlightGuard
+from companion.flight_guard import FlightGuard, Heartbeats
 from companion.guardian import beat as words
 from companion.guardian.client import SILENT_S, GuardianClient
-from companion.io.autopilot import LinkIdentity
 from companion.io.edges import DeviceError
+from companion.mission.sequencer import PILOT_FLIES
 from companion.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -23,6 +23,7 @@ from companion.types import (
     FlightMode,
     Inputs,
     LandedState,
+    LinkIdentity,
     MocapPose,
     OperatorCommand,
     Outputs,
@@ -96,7 +97,7 @@ def test_a_guardian_that_does_not_read_never_blocks_the_flight(pair: Pair) -> No
 
 
 def _beat() -> words.Beat:
-    return words.Beat(1, 2.0, 3.0, 0.0, True, False, False, 1, 1, 195, 14540, 1.9, (0.0, 0.0, 1.0))
+    return words.Beat(1, 2.0, 3.0, 0.0, True, False, False, False, 1, 1, 195, 14540, 1.9, (0.0, 0.0, 1.0))
 
 
 def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
@@ -166,3 +167,32 @@ def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiti
     guard.goodbye(inputs(armed=False).status)
     beats = [words.unpack(guardian.recv(words.MAX_BYTES)) for _ in range(2)]
     assert [beat is not None and (beat.goodbye, beat.lifting) for beat in beats] == [(False, True), (True, True)]
+
+
+@pytest.mark.parametrize("found", ["taken over from PX4's landing", "flying on a reattach"])
+def test_a_pilot_without_an_event_is_in_the_heartbeat(waiting: Outputs, found: str) -> None:
+    """The landing reports no `pilot_took_over`: it is the phase that says so."""
+    outputs = dataclasses.replace(waiting, phase=PILOT_FLIES, phase_kind=PhaseKind.LANDING)
+    heartbeats = Heartbeats(LinkIdentity(1, 1, 195, 0), 0.0)
+    if found == "taken over from PX4's landing":
+        assert not heartbeats.of(inputs(armed=True), dataclasses.replace(outputs, phase="autopilot land")).pilot
+    assert heartbeats.of(inputs(armed=True), outputs).pilot
+    assert heartbeats.of(inputs(armed=True), dataclasses.replace(outputs, phase="done")).pilot, "a pilot stays one"
+
+
+@pytest.mark.parametrize("event_id", ["mocap_dragged", "mocap_two_streams", "mocap_swapped", "mocap_frozen"])
+def test_motion_capture_is_refused_from_the_landing_for_it_until_it_is_believed_again(
+    waiting: Outputs, event_id: str
+) -> None:
+    heartbeats = Heartbeats(LinkIdentity(1, 1, 195, 0), 0.0)
+    bad = dataclasses.replace(waiting, mocap_trusted=False)
+    landing = Event(5.0, event_id, Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "not believed")
+    walk = [bad, waiting, dataclasses.replace(bad, events=(landing,)), bad, waiting, bad]
+    assert [heartbeats.of(inputs(armed=True), outputs).mocap_refused for outputs in walk] == [
+        False,  # a single pose that jumps or repeats itself
+        False,
+        True,
+        True,
+        False,
+        True,
+    ]

@@ -22,7 +22,7 @@ from companion.clock import flight_clock
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight
 from companion.config.vehicle import AutopilotDevice
-from companion.io.autopilot import LinkIdentity, MavsdkAutopilot
+from companion.io.autopilot import MavsdkAutopilot
 from companion.io.edges import DeviceError
 from companion.io.ground_channel import pack, unpack
 from companion.io.ground_frames import UP_BURST, UP_RATE_HZ
@@ -34,6 +34,7 @@ from companion.types import (
     Event,
     FlightMode,
     Inputs,
+    LinkIdentity,
     OperatorCommand,
     Outputs,
     PhaseKind,
