@@ -60,17 +60,21 @@ class UdpWire:
     Args:
         local: address to bind; None: any.
         remote: PX4's address; None: the sender of the first valid HEARTBEAT of an autopilot.
+        beside: the killed flight process still holds the port. It does not read any more: of sockets that are connected to PX4 the
+            kernel gives the datagrams to the newest (measured, Linux 6.18).
     """
 
     lost = False
 
-    def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None) -> None:
+    def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None, *, beside: bool = False) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._remote: tuple[str, int] | None = None
         self.ready = False
         """PX4's address is known."""
         try:
             self._socket.setblocking(False)
+            if beside:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if local is not None:
                 self._socket.bind(local)
             if remote is not None:
@@ -194,13 +198,20 @@ def address_problem(address: str) -> str | None:
     return f"autopilot {address}: the guardian can take over udpin, udpout, tcpout and serial only; use one of them"
 
 
-def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None) -> Wire:
+def is_udp(address: str) -> bool:
+    """The link may be opened beside a flight process that has been killed and has not ended: it has one reader less, and no writer."""
+    net = _NET.fullmatch(address)
+    return net is not None and net[1] in ("udpin", "udpout")
+
+
+def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None, *, beside: bool = False) -> Wire:
     """Open the link that the flight process has let go of.
 
     Args:
         address: as in `devices.autopilot.address`.
         local_port: of the flight process's UDP socket, 0 if not known.
         peer: PX4's UDP address as the flight process proved it; None: not known.
+        beside: the killed flight process still holds it; only for a link of which `is_udp` is true.
 
     Raises:
         OSError: it is not free (the flight process may still hold it), or not there.
@@ -209,10 +220,10 @@ def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None
     if net is not None:
         kind, host, port = net[1], net[2], int(net[3])
         if kind == "udpin":
-            return UdpWire((host, port), peer)
+            return UdpWire((host, port), peer, beside=beside)
         if kind == "udpout":
             remote = peer or (socket.gethostbyname(host), port)
-            return UdpWire(("", local_port) if local_port else None, remote)
+            return UdpWire(("", local_port) if local_port else None, remote, beside=beside)
         return TcpWire((host, port))
     port_of = _SERIAL.fullmatch(address)
     if port_of is None:

@@ -22,7 +22,7 @@ from companion import status
 from companion.guardian import beat as words
 from companion.guardian.beat import Beat
 from companion.guardian.charge import Charge, Told
-from companion.guardian.link import Link, Wire, address_problem, open_wire
+from companion.guardian.link import Link, Wire, address_problem, is_udp, open_wire
 from companion.guardian.mocap import MocapClient, MocapProblem
 from companion.guardian.settings import Settings, read_settings
 from companion.guardian.watch import StallWatch
@@ -33,7 +33,8 @@ from companion.types import SafetyAction, Severity
 
 PERIOD_S = 0.01
 MOCAP_FRESH_S = 0.5
-KILL_TIMEOUT_S = 1.0
+KILL_TIMEOUT_S = 0.5
+"""A killed process ends within milliseconds, unless one of its threads sleeps uninterruptibly in the kernel (state D)."""
 LINK_TIMEOUT_S = 30.0
 """A link that cannot be opened for this long is given up, and the vehicle with it."""
 REOPEN_PERIOD_S = 0.5
@@ -192,7 +193,7 @@ class Guardian:
         self._flight.kill()
         gone = self._flight.wait(KILL_TIMEOUT_S)
         now_s = time.monotonic() - last.origin_s
-        text = f"{reason}; the guardian has taken over" + ("" if gone else ", though it could not be ended")
+        text = f"{reason}; the guardian has taken over" + ("" if gone else ", though that was killed and has not ended")
         self._tell(last, Told(now_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
         link = self._open_link(last)
         if link is None:
@@ -216,11 +217,17 @@ class Guardian:
             time.sleep(PERIOD_S)
 
     def _try_wire(self, last: Beat) -> Wire | None:
-        """Open the wire. The first failure is reported. Never beside a flight process that lives: two readers share out the bytes."""
+        """Open the wire. The first failure is reported.
+
+        A killed flight process that has not ended runs no more code of its own, so it neither sends nor reads, and a UDP link is opened
+        beside it. Not a serial port, of which two readers share out the bytes should it come back to life in the kernel, nor TCP.
+        """
+        address = self._settings.autopilot_address
         try:
-            if not self._flight.wait(0.0):
+            beside = not self._flight.wait(0.0)
+            if beside and not is_udp(address):
                 raise OSError(errno.EBUSY, "the killed flight process still holds it")
-            wire = open_wire(self._settings.autopilot_address, last.local_port, last.peer)
+            wire = open_wire(address, last.local_port, last.peer, beside=beside)
         except OSError as error:
             self._report_no_link(last, error.strerror or str(error))
             return None

@@ -161,6 +161,22 @@ def test_nothing_is_opened_beside_a_flight_process_that_still_lives(
         wait_until(lambda: NAV_LAND in cable.hears(master, ARMED, OFFBOARD_MODE), rig.log.read_text)
 
 
+def test_over_udp_it_lands_beside_a_killed_flight_process_that_does_not_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread of it sleeps uninterruptibly in the kernel: it was waited for up to 30 s."""
+    install_hook(tmp_path, monkeypatch, immortal=True)
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        wait_until(lambda: bool(rig.peer.commands(NAV_LAND)), rig.log.read_text)
+        rig.land_as_told()
+        assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
+        assert rig.flight.poll() is None, "it has not ended"
+        assert "though that was killed and has not ended" in rig.log.read_text()
+        assert "guardian_no_link" not in rig.events
+        assert rig.events[-1] == "guardian_landed", "it hears PX4"
+
+
 def test_of_two_streams_of_motion_capture_at_one_address_none_is_passed_on() -> None:
     with Cameras(1) as cameras, closing(socket.socket(type=socket.SOCK_DGRAM)) as forger:
         settings = MocapSettings("127.0.0.1", "127.0.0.1", "unicast", "239.255.42.99", cameras.port, 1511, 1, "z")
