@@ -7,6 +7,7 @@ left behind. A pty lives as long as the process that holds its master, so no pro
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -23,6 +24,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from companion.cli import main
 from companion.config.loader import load_flight
 from companion.types import Inputs, Outputs
 
@@ -239,6 +241,17 @@ class Running:
             if not data:
                 pipe.close()
         return True
+
+
+def run_here(*arguments: object) -> Ended:
+    """`companion ARGUMENTS` in this process, to its end: spares the half second of processor time that the start of a process takes."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main([str(word) for word in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Ended(code, out.getvalue(), err.getvalue())
 
 
 class World:

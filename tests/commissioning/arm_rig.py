@@ -1,68 +1,112 @@
-"""A simulated world with something wrong about its servos, a vehicle file of its own, and the arm's tools run against them."""
+"""Servos with something wrong about them, a vehicle file of its own, and the arm's tools run against them over a real pty.
+
+Where nothing has to move, the servos lie on a bench: their bus alone, in this process. Else a simulated world holds and moves the arm.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from companion.clock import flight_clock
+from companion.config.loader import load_flight
+from companion.devices import SomeEdges, VisionValve
 from companion.exit_codes import EXIT_OK
-from tests.support import CATCH, ROOT, Ended, Running, Sandbox, World, sandbox_in
+from companion.io import dynamixel as dxl
+from companion.io.arm import DynamixelArm
+from companion.io.edges import DeviceError
+from companion.preflight import arm as preflight
+from companion.preflight.observe import observe
+from companion.preflight.rows import Row
+from sitl.server import start_of
+from sitl.servo_bus import ServoBus
+from sitl.servo_knobs import plugged_in, servos_of
+from tests.support import CATCH, ROOT, Ended, Running, Sandbox, World, run_here, sandbox_in
 
+HAND = "world.arm_hand=true"
+FILES = "3000000"
+"""The shipped vehicle file's baud rate: to look at it alone takes a second."""
 SHIPPED = ROOT / "configs/vehicles/tarot650_2r.yaml"
 PATIENT = ("vehicle.devices.arm.watchdog_ms=300", "vehicle.safety.arm_timeout_s=0.4", "vehicle.ground.mqtt=null")
 """A shared machine is held up as a whole now and then, by more than the vehicle file allows."""
 
-
 OF_THE_COMPUTER = {"arm.reads"}
+_LOOK = "vehicle.safety.preflight_s=1.0"
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The world runs; tools are run on its bus, by the vehicle file `vehicle`."""
+    """Tools are run on the bus at `port`, by the vehicle file `vehicle`."""
 
     sandbox: Sandbox
-    world: World
+    port: str
     vehicle: Path
 
-    @property
-    def port(self) -> str:
-        return str(self.world.devices["arm"]["port"])
+    def overrides(self, *more: str) -> list[str]:
+        """Of every tool."""
+        return [f"vehicle.devices.arm.port={self.port}", *PATIENT, *more]
 
     def options(self, *overrides: str) -> list[str]:
-        """Of every tool."""
-        patient = [word for one in (*PATIENT, *overrides) for word in ("--set", one)]
-        return ["--vehicle", str(self.vehicle), *self.world.addresses(), *patient]
+        """The same on a command line, and the vehicle file."""
+        return [
+            "--vehicle",
+            str(self.vehicle),
+            *(word for one in self.overrides(*overrides) for word in ("--set", one)),
+        ]
 
     def start(self, *words: str, background: bool = False) -> Running:
+        """`companion arm WORDS` as a process."""
         return self.sandbox.start("arm", *words, *self.options(), background=background)
 
     def run(self, *words: str) -> Ended:
-        return self.sandbox.run("arm", *words, *self.options())
+        """`companion arm WORDS` in this process."""
+        return run_here("arm", *words, *self.options())
 
-    def json(self, *words: str) -> tuple[int, dict[str, Any]]:
-        """Exit code and the one document on standard output."""
-        ended = self.run(*words, "--json")
+    def json(self, *words: str, process: bool = False) -> tuple[int, dict[str, Any]]:
+        """Exit code and the one document on standard output of `companion arm WORDS --json`, in this process or one of its own."""
+        if process:
+            ended = self.sandbox.run("arm", *words, "--json", *self.options())
+        else:
+            ended = self.run(*words, "--json")
         assert ended.out.count("\n") == 1, ended
         document: dict[str, Any] = json.loads(ended.out)
         assert document["schema_version"] == 1 and document["ok"] == (ended.code == EXIT_OK)
         return ended.code, document
 
-    def check_rows(self, *overrides: str) -> dict[str, dict[str, Any]]:
-        """The arm's rows of `companion check`."""
-        ended = self.sandbox.run("check", CATCH, "--json", *self.options(*overrides))
-        rows = {row["id"]: row for row in json.loads(ended.out)["rows"]}
-        return {name: row for name, row in rows.items() if name.startswith("arm.")}
+    def check_rows(self) -> dict[str, Row]:
+        """What the preflight finds of the arm, by the vehicle file as it is now."""
+        return asyncio.run(self._look())
 
-    def assert_check_passes_the_arm(self, *overrides: str) -> None:
+    async def _look(self) -> dict[str, Row]:
+        config = load_flight(CATCH, self.vehicle, overrides=self.overrides(_LOOK))
+        vehicle, clock, edges = config.vehicle, flight_clock(), SomeEdges(VisionValve())
+        async with AsyncExitStack() as stack:
+            try:
+                edges.arm = await stack.enter_async_context(DynamixelArm(vehicle.devices.arm, vehicle.arm, clock))
+            except DeviceError as error:
+                edges.failures["arm"] = str(error)
+            seen = await observe(
+                edges,
+                config,
+                clock,
+                out=self.sandbox.cwd,
+                param_names=(),
+                unsettled=lambda _: None,
+                tell=lambda _, __: None,
+            )
+        return {row.id: row for row in preflight.rows(seen, vehicle)}
+
+    def assert_check_passes_the_arm(self) -> None:
         """Everything that the tools can put right. How many bus cycles a busy computer misses is not theirs (`OF_THE_COMPUTER`)."""
-        rows = self.check_rows(*overrides)
-        of_the_arm = [row for name, row in rows.items() if name not in OF_THE_COMPUTER]
-        refusing = [row for row in of_the_arm if not row["ok"] and row["level"] == "refuse"]
+        rows = self.check_rows()
+        refusing = [row for name, row in rows.items() if name not in OF_THE_COMPUTER and row.refuses]
         assert refusing == [], refusing
         assert {"arm.device", "arm.angles", "arm.mode", "arm.return_delay"} <= set(rows)
 
@@ -70,13 +114,48 @@ class Rig:
 @contextmanager
 def rig(folder: Path, *overrides: str) -> Iterator[Rig]:
     """A world with these overrides, and a copy of the shipped vehicle file."""
-    vehicle = Path(shutil.copy(SHIPPED, folder / "mine.yaml"))
     with (
         sandbox_in(folder / "tool") as sandbox,
         sandbox_in(folder / "world") as around,
         World(around, CATCH, overrides) as world,
     ):
-        yield Rig(sandbox, world, vehicle)
+        yield Rig(sandbox, str(world.devices["arm"]["port"]), _copy(folder))
+
+
+@contextmanager
+def bench(folder: Path, servos: str = "[{}, {}]") -> Iterator[Rig]:
+    """Servos with `world.servos` as given, in an arm that stands as the mission begins, and a copy of the shipped vehicle file."""
+    config = load_flight(CATCH, overrides=[f"world.servos={servos}"])
+    vehicle, start = config.vehicle, config.mission.start
+    models = servos_of(vehicle, config.world)
+    for model, joint, angle_rad in zip(
+        models, vehicle.arm.joints, start_of(start.position_m, start.yaw_deg, start.arm_deg).arm_rad, strict=True
+    ):
+        model.update(0.0, joint.zero_count * dxl.RAD_PER_COUNT + joint.sign * angle_rad, 0.0)
+    with sandbox_in(folder / "tool") as sandbox, _served(ServoBus(plugged_in(models, config.world))) as port:
+        yield Rig(sandbox, port, _copy(folder))
+
+
+@contextmanager
+def _served(bus: ServoBus) -> Iterator[str]:
+    """The bus's port; its event loop runs in a thread."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, name="bench")
+    thread.start()
+    try:
+        asyncio.run_coroutine_threadsafe(bus.__aenter__(), loop).result()
+        try:
+            yield bus.path
+        finally:
+            asyncio.run_coroutine_threadsafe(bus.__aexit__(None, None, None), loop).result()
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+def _copy(folder: Path) -> Path:
+    return Path(shutil.copy(SHIPPED, folder / "mine.yaml"))
 
 
 def row_of(document: dict[str, Any], row_id: str) -> dict[str, Any]:
@@ -96,4 +175,4 @@ def keys(document: dict[str, Any]) -> dict[str, object]:
     return {} if patch is None else {change["key"]: change["new"] for change in patch["changes"]}
 
 
-__all__: Sequence[str] = ("Rig", "bad_ids", "keys", "rig", "row_of")
+__all__: Sequence[str] = ("FILES", "HAND", "Rig", "bad_ids", "bench", "keys", "rig", "row_of")
