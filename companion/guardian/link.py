@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import re
 import socket
+import time
 from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -13,10 +15,12 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.io import autopilot_messages as messages
 from companion.io.ground_frames import autopilot_heartbeat
+from companion.io.udp_peer import REPIN_SILENCE_S, disconnect_udp
 from companion.types import AutopilotRequest, MocapPose
 
 Message = Any
 
+_LOG = logging.getLogger(__name__)
 _NET = re.compile(r"(udpin|udpout|tcpout)://([^:/?]+):(\d+)")
 _SERIAL = re.compile(r"(serial|serial_flowcontrol)://(/[^:]+):(\d+)")
 _MAX_BYTES = 65535
@@ -55,7 +59,8 @@ class UdpWire:
     """UDP. Bound to where PX4 sends (`udpin`), or sending to it (`udpout`), from the port that the flight process spoke from.
 
     PX4 keeps the first partner of a UDP link, so the old port matters. Once PX4's address is known the socket is connected to it: the
-    kernel then drops datagrams of every other sender.
+    kernel then drops datagrams of every other sender. After REPIN_SILENCE_S without a datagram it is disconnected, and connected to the
+    next sender of a HEARTBEAT of PX4's system at the same IPv4 address: a router that restarts sends from another port.
 
     Args:
         local: address to bind; None: any.
@@ -69,6 +74,11 @@ class UdpWire:
     def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None, *, beside: bool = False) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._remote: tuple[str, int] | None = None
+        self._bound = local is not None
+        self._connected = False
+        self._heard_s = 0.0
+        self.system: int | None = None
+        """MAVLink system of PX4; None: any, until it is known."""
         self.ready = False
         """PX4's address is known."""
         try:
@@ -89,11 +99,16 @@ class UdpWire:
 
     def send(self, data: bytes) -> None:
         """To PX4, once it is known where it is."""
-        with contextlib.suppress(OSError):
-            self._socket.send(data)
+        if self._remote is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, self._remote)
 
     def receive(self) -> list[bytes]:
         """Datagrams of PX4's address; before it is known, what proves it and nothing else."""
+        # Disconnecting would take an unbound socket's port away from it.
+        if self._connected and self._bound and time.monotonic() - self._heard_s > REPIN_SILENCE_S:
+            disconnect_udp(self._socket)
+            self._connected = False
         found: list[bytes] = []
         for _ in range(_ROUND_DATAGRAMS):
             try:
@@ -102,9 +117,10 @@ class UdpWire:
                 break
             except OSError:  # an ICMP error of an earlier send
                 continue
-            if not self.ready and autopilot_heartbeat(data) is not None:
+            if not self._connected and self._proves(data, sender):
                 self._pin(sender)
             if sender == self._remote:
+                self._heard_s = time.monotonic()
                 found.append(data)
         return found
 
@@ -112,10 +128,25 @@ class UdpWire:
         """Close it."""
         self._socket.close()
 
+    def _proves(self, data: bytes, sender: tuple[str, int]) -> bool:
+        """Whether the datagram shows that PX4 is at its sender."""
+        if self._remote is not None and sender[0] != self._remote[0]:
+            return False
+        heard = autopilot_heartbeat(data)
+        return heard is not None and (self.system is None or heard.system == self.system)
+
     def _pin(self, remote: tuple[str, int]) -> None:
+        before, self._remote = self._remote, remote
         self._socket.connect(remote)
-        self._remote = remote
-        self.ready = True
+        self._heard_s = time.monotonic()
+        self._connected = self.ready = True
+        if before is not None and remote != before:
+            _LOG.warning(
+                "PX4 was silent at %s:%d for %g s and is heard at port %d; it is heard there alone now",
+                *before,
+                REPIN_SILENCE_S,
+                remote[1],
+            )
 
 
 class TcpWire:
@@ -256,6 +287,8 @@ class Link:
     def receive(self) -> list[Message]:
         """Messages of PX4 itself that wait; nothing that comes in can raise."""
         found: list[Message] = []
+        if isinstance(self.wire, UdpWire):
+            self.wire.system = self._autopilot_system
         for data in self.wire.receive():
             try:
                 parsed = self._decoder.parse_buffer(data) or ()

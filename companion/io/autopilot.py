@@ -158,7 +158,9 @@ class MavsdkAutopilot:
         expected = "the connection for forwarding to open"
         self._second = await self._calls.run(expected, _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address, True)
         try:
-            return pin_new_udp(before, ("127.0.0.1", port))
+            twin, own_port = pin_new_udp(before, ("127.0.0.1", port))
+            twin.close()
+            return own_port
         except OSError as error:
             self._drop_second()
             fix = "mount /proc, or fly without ground.qgroundcontrol"
@@ -244,9 +246,9 @@ class MavsdkAutopilot:
             self._desk.answer_sent_once(messages.refusal(message.fields_json), self._clock())
 
     def take_messages(self) -> list[str]:
-        """Refusals and STATUSTEXTs since the last call, oldest first, and a second sender that claims to be PX4."""
+        """Refusals and STATUSTEXTs since the last call, oldest first, a second sender that claims to be PX4, a new port of PX4."""
         texts = self._desk.take_messages(self._clock())
-        rival = self._claim.take_rival() if self._claim is not None else None
+        rival = self._claim.take_rival(self._inbox.silent_s()) if self._claim is not None else None
         return texts if rival is None else [*texts, rival]
 
     async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:

@@ -21,6 +21,7 @@ from companion.io.autopilot_link import (
     udp_sockets,
 )
 from companion.io.ground_frames import autopilot_heartbeat
+from companion.io.udp_peer import REPIN_SILENCE_S
 
 Peer = tuple[str, int]
 """IPv4 address and UDP port."""
@@ -37,7 +38,8 @@ class LinkClaim:
     A serial port is locked with flock on the device itself, so every name of the device counts, and pyserial's `exclusive` meets the
     same lock. A `udpin` port is bound without SO_REUSEADDR, and only then shared with MAVSDK, which sets that option and would join any
     program on the port. MAVSDK's socket is connected to PX4's address once that is proved; from then on the kernel gives datagrams of
-    every other sender to the socket held here.
+    every other sender to the socket held here. When PX4 is silent there for REPIN_SILENCE_S and another port of the same IPv4 address
+    sends a HEARTBEAT of its system, MAVSDK's socket is connected to that one: a router that restarts sends from another port.
 
     Args:
         address: as in `devices.autopilot.address`, checked.
@@ -51,6 +53,8 @@ class LinkClaim:
         self._parts = parse_address(address)
         self._lock: int | None = None
         self._port: socket.socket | None = None
+        self._mavsdk: socket.socket | None = None
+        self._moved: str | None = None
         self._rivals: set[Peer] = set()
         self._reported = 0
         self._system = 0
@@ -111,7 +115,12 @@ class LinkClaim:
         if self.peer is None:
             return 0
         try:
-            return pin_new_udp(self._before, self.peer)
+            twin, port = pin_new_udp(self._before, self.peer)
+            if self._port is None:
+                twin.close()
+            else:
+                self._mavsdk = twin
+            return port
         except OSError as error:
             found = error.strerror or str(error)
             raise device_error(self._address, "MAVSDK's socket in /proc", found, "mount /proc") from None
@@ -122,17 +131,28 @@ class LinkClaim:
         Raises:
             DeviceError: one of them claims to be PX4, which was found not armed.
         """
-        for _ in range(_DRAIN_DATAGRAMS):
-            if not self._read_one():
-                break
+        self._drain(silent=False)
         if self._rivals and not self._armed:
             found = f"{_text(self.peer)} and {', '.join(sorted(map(_text, self._rivals)))}"
             fix = "stop the other sender, or use a link of PX4's own (serial, or a port that only PX4 sends to)"
             raise device_error(self._address, f"PX4 (system {self._system}) at one address", found, fix)
 
-    def take_rival(self) -> str | None:
-        """Read one datagram of another sender; a line for the log if there is a new one that claims to be PX4. Never waits."""
-        self._read_one()
+    def take_rival(self, silent_s: float) -> str | None:
+        """Read one datagram of another sender, or all while PX4 is silent. Never waits.
+
+        Args:
+            silent_s: since the newest message of PX4.
+
+        Returns:
+            A line for the log if there is a new sender that claims to be PX4, or PX4 is heard at another port from now on.
+        """
+        if silent_s > REPIN_SILENCE_S:
+            self._drain(silent=True)
+            if self._moved is not None:
+                moved, self._moved = self._moved, None
+                return moved
+        else:
+            self._read_one()
         if len(self._rivals) == self._reported:
             return None
         self._reported = len(self._rivals)
@@ -141,6 +161,9 @@ class LinkClaim:
 
     def close(self) -> None:
         """Release the port. MAVSDK's descriptor must be closed before."""
+        if self._mavsdk is not None:
+            self._mavsdk.close()
+            self._mavsdk = None
         if self._port is not None:
             self._port.close()
             self._port = None
@@ -148,15 +171,39 @@ class LinkClaim:
             os.close(self._lock)
             self._lock = None
 
-    def _read_one(self) -> bool:
+    def _drain(self, *, silent: bool) -> None:
+        for _ in range(_DRAIN_DATAGRAMS):
+            if self._moved is not None or not self._read_one(silent):
+                break
+
+    def _read_one(self, silent: bool = False) -> bool:
         if self._port is None:
             return False
         try:
-            self._hear(*self._port.recvfrom(_DATAGRAM_MAX_BYTES))
+            datagram, sender = self._port.recvfrom(_DATAGRAM_MAX_BYTES)
+            if not (silent and self._repin(datagram, sender)):
+                self._hear(datagram, sender)
         except BlockingIOError:
             return False
         except OSError:  # an ICMP error: nothing was read, there may be more
             return True
+        return True
+
+    def _repin(self, datagram: bytes, sender: Peer) -> bool:
+        """Whether the datagram shows PX4 at another port of its address; MAVSDK hears that port alone from now on."""
+        if self._mavsdk is None or self.peer is None or sender == self.peer or sender[0] != self.peer[0]:
+            return False
+        heard = autopilot_heartbeat(datagram)
+        if heard is None or heard.system != self._system:
+            return False
+        self._mavsdk.connect(sender)
+        self._moved = (
+            f"PX4 (system {self._system}) was silent at {_text(self.peer)} for {REPIN_SILENCE_S:g} s and is heard at {_text(sender)}; "
+            "it is heard there alone now"
+        )
+        self.peer = sender
+        self._rivals.discard(sender)
+        self._reported = len(self._rivals)
         return True
 
     def _hear(self, datagram: bytes, sender: Peer) -> None:

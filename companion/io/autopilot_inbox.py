@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -116,11 +117,16 @@ class Inbox:
             self._estimator_report = messages.estimator_report(newest[1], newest[0])
         return self._estimator_report
 
+    def silent_s(self) -> float:
+        """Time since the newest message of PX4; infinite before the first."""
+        newest = (self._attitude, self._imu, self._position, self._heartbeat)
+        return self._clock() - max((message[0] for message in newest if message is not None), default=-math.inf)
+
     def counts(self) -> StateCounts:
         """Messages of the fast state since the link was opened."""
         return StateCounts(self._positions, self._attitudes, self._imus)
 
-    # Callbacks: C++ threads. Nothing but an assignment, and one more in a count.
+    # Callbacks: C++ threads, one message type in one thread. Nothing but an assignment, and one more in a count or a sum.
 
     def _on_position(self, value: Any, _: Any) -> None:
         p, v = value.position, value.velocity

@@ -203,7 +203,7 @@ def udp_sockets() -> dict[int, UdpSocket]:
     }
 
 
-def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> int:
+def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> tuple[socket.socket, int]:
     """Let the one UDP socket that MAVSDK has opened since hear `peer` alone: the kernel drops datagrams of every other sender.
 
     MAVSDK itself takes messages from every sender that finds its port, on a `udpout` connection too.
@@ -213,7 +213,7 @@ def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> int:
         peer: IPv4 address and port.
 
     Returns:
-        Local port of the socket.
+        A second descriptor of the socket, to connect it to another peer by, and its local port. The port is free once both are closed.
 
     Raises:
         OSError: the socket is not found, or cannot be connected.
@@ -221,9 +221,13 @@ def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> int:
     new = [found for inode, found in udp_sockets().items() if inode not in before]
     if len(new) != 1:
         raise OSError(errno.ENOENT, f"{len(new)} new sockets")
-    with socket.socket(fileno=os.dup(new[0].descriptor)) as twin:
+    twin = socket.socket(fileno=os.dup(new[0].descriptor))
+    try:
         twin.connect(peer)
-    return new[0].port
+    except OSError:
+        twin.close()
+        raise
+    return twin, new[0].port
 
 
 def _link_of(descriptor: str) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import select
 import socket
@@ -101,6 +102,40 @@ def test_only_the_address_that_the_flight_proved_is_heard(kind: str) -> None:
             px4.sendto(heartbeat(1, 1) + b"of PX4", ("127.0.0.1", port))
             wait_readable(wire)
             assert wire.receive() == [heartbeat(1, 1) + b"of PX4"]
+
+
+def test_px4_that_a_router_moved_to_another_port_is_heard_there(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Only after silence at its own port, at its own IP address, and with its own system id."""
+    sockets = [socket.socket(type=socket.SOCK_DGRAM) for _ in range(4)]
+    with contextlib.ExitStack() as stack:
+        px4, moved, other_host, other_system = (stack.enter_context(closing(one)) for one in sockets)
+        for one, host in ((px4, 1), (moved, 1), (other_host, 9), (other_system, 1)):
+            one.bind((f"127.0.0.{host}", 0))
+        port = free_udp_port()
+        where = ("127.0.0.1", port)
+        wire = stack.enter_context(opened(f"udpin://0.0.0.0:{port}", port, px4.getsockname()))
+        link = Link(wire, (1, 195), 1)
+
+        def from_all_but_px4() -> list[int]:
+            other_host.sendto(heartbeat(), where)
+            other_system.sendto(heartbeat(2), where)
+            moved.sendto(heartbeat(), where)
+            return [message.get_srcSystem() for message in link.receive()]
+
+        px4.sendto(heartbeat(), where)
+        wait_readable(wire)
+        assert [message.get_srcSystem() for message in link.receive()] == [1]
+        assert from_all_but_px4() == []
+        monkeypatch.setattr("companion.guardian.link.REPIN_SILENCE_S", 0.05)
+        wait_until(lambda: from_all_but_px4() == [1], lambda: "PX4 is not heard at its new port")
+        moved.settimeout(DEADLINE_S)
+        link.heartbeat()
+        assert moved.recv(1000)
+        assert [f"is heard at port {moved.getsockname()[1]}" in record.getMessage() for record in caplog.records] == [
+            True
+        ]
 
 
 def test_udpin_is_not_to_be_had_while_the_flight_holds_it() -> None:

@@ -169,10 +169,10 @@ def test_little_of_a_strangers_datagram_is_read(
         closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger,
     ):
         stranger.sendto(data, ("127.0.0.1", port))
-        assert claim.take_rival() is None
+        assert claim.take_rival(0.0) is None
         assert (counted["_frame_at"] <= frames_max, counted["_checksum"] <= checksums_max) == (True, True), counted
         stranger.sendto(forged_heartbeat(), ("127.0.0.1", port))
-        claim.take_rival()
+        claim.take_rival(0.0)
         assert claim.peer is not None and claim.peer[1] == stranger.getsockname()[1], "a valid HEARTBEAT is still read"
 
 
@@ -215,6 +215,36 @@ def test_a_stranger_in_px4s_name_changes_nothing_and_is_reported_once() -> None:
                 _, at = stranger.getsockname()
                 assert [text for text in texts if f":{at} claims to be PX4 (system 1)" in text] == texts
                 assert (len(texts), any(armed)) == (1, False)
+
+    asyncio.run(main())
+
+
+def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
+    """Only after it was silent at its own port, and only at its own IP address: rivals elsewhere send all the time."""
+
+    async def main() -> None:
+        port = free_udp_port()
+        with closing(socket.socket(type=socket.SOCK_DGRAM)) as elsewhere, Px4Peer(port) as px4:
+            elsewhere.bind(("127.0.0.9", 0))
+            async with edge(port) as autopilot:
+                where = px4.address
+                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+                px4.__exit__(None, None, None)
+                with Px4Peer(port) as moved:
+                    assert moved.address[1] != where[1]
+                    moved.base_mode = ARMED
+                    texts: list[str] = []
+
+                    def armed() -> bool:
+                        elsewhere.sendto(forged_heartbeat(), ("127.0.0.1", port))
+                        texts.extend(autopilot.take_messages())
+                        status = autopilot.status()
+                        return status is not None and status.armed
+
+                    await eventually(armed, "PX4 is heard at its new port")
+                    assert autopilot.identity().peer == moved.address
+                    said = [text for text in texts if "is heard there alone now" in text]
+                    assert len(said) == 1 and f"{moved.address[0]}:{moved.address[1]}" in said[0]
 
     asyncio.run(main())
 
