@@ -34,12 +34,13 @@ from sitl.faults import in_time
 from sitl.plant import Plant
 from sitl.server import Ports, Sitl, start_of
 from sitl.servo_protocol import Instruction, packet
-from sitl.world import PHYSICS_DT_S
 from tests.support import DEADLINE_S
 
-START_M = (-0.45, 0.0)
+START_M = (-0.2, 0.0)
 OFFBOARD = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-STREAM_S, MODE_S, ARM_S, UP_S, END_S = 0.3, 1.0, 1.1, 1.4, 4.7
+STREAM_S, MODE_S, ARM_S, UP_S = 0.3, 1.0, 1.1, 1.4
+END_STEPS = 1800
+"""Steps of the physics in which all is over, the catch included."""
 PERIOD_STEPS = 5
 _LAST_BYTES_S = 0.05
 NM_PER_COUNT = 1.3 * 2.69e-3
@@ -71,13 +72,13 @@ class WorldLoop(asyncio.SelectorEventLoop):
         return self.t_s
 
 
-def emitted(config: FlightConfig, usual: Emitted | None = None) -> Emitted:
-    """Return what the ends emit; the flight ends at the first step in which that is not what they emit in `usual`."""
+def emitted(config: FlightConfig, end: int, usual: Emitted | None = None) -> Emitted:
+    """Return what the ends emit in so many steps of the physics; the flight ends at the first step in which that is not what they emit in `usual`."""
     with asyncio.Runner(loop_factory=WorldLoop) as runner:
-        return runner.run(_emitted(in_time(config), usual))
+        return runner.run(_emitted(in_time(config), end, usual))
 
 
-async def _emitted(config: FlightConfig, usual: Emitted | None) -> Emitted:
+async def _emitted(config: FlightConfig, end: int, usual: Emitted | None) -> Emitted:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, WorldLoop)
     events: list[Any] = []
@@ -91,7 +92,7 @@ async def _emitted(config: FlightConfig, usual: Emitted | None) -> Emitted:
             with contextlib.closing(Partner(sitl, devices)) as partner:
                 pilot = Pilot(config, autopilot, sitl.plant, partner)
                 await partner.all_hear()
-                for step in range(round(END_S / PHYSICS_DT_S)):
+                for step in range(end):
                     loop.t_s = sitl.plant.t_s
                     pilot.step(step)
                     sitl._step()
@@ -230,7 +231,7 @@ class Pilot:
             return
         up = t_s >= UP_S
         thrust = self._hover * (1.0 + 0.5 * (0.9 - z) - 0.35 * vz) if up else 0.0
-        pitch = max(-0.15, min(0.15, 0.3 * (0.4 - vx))) if z > 0.5 else 0.0
+        pitch = max(-0.15, min(0.15, 0.3 * (0.4 - vx))) if z > 0.4 else 0.0
         roll = max(-0.15, min(0.15, 0.2 * y + 0.2 * vy))
         attitude_ned = attitude_ned_frd_from_enu_flu(quat_from_euler_zyx(roll, pitch, 0.0))
         px4.on_setpoint(t_s, AttitudeTarget(attitude_ned, max(0.0, min(0.9, thrust))))

@@ -30,9 +30,9 @@ class Pair(NamedTuple):
 
 
 EXAMPLES: dict[type[Model], Settings] = {
-    Push: {"t_s": 1.5, "duration_s": 0.5, "force_world_n": (0.0, 0.0, -2.0)},
+    Push: {"t_s": 0.1, "duration_s": 0.1, "force_world_n": (0.0, 0.0, -2.0)},
     Servo: {},
-    Fault: {"kind": "gust", "t_s": 0.5},
+    Fault: {"kind": "gust", "t_s": 0.1},
 }
 """What the parts of the world look like whose fields are walked."""
 
@@ -48,7 +48,7 @@ VALUES: dict[str, Any] = {
     "servos.current_limit_counts": 600,
     "catch_at_m[1]": 1.0,
     "faults.phase": "takeoff",
-    "faults.duration_s": 0.3,
+    "faults.duration_s": 0.1,
     "faults.size": 3.0,
     "faults.after": "start",
 }
@@ -76,8 +76,10 @@ TOGETHER_IN_PART: dict[str, Settings] = {
 """The same for a field of a part: the part's other fields."""
 
 _NEVER = {"kind": "gust", "t_s": 1000.0}
-BESIDE: dict[str, Settings] = {"tether_cut": {"kind": "tether_taut", "t_s": 0.4, "size": 0.02}}
+BESIDE: dict[str, Settings] = {"tether_cut": {"kind": "tether_taut", "t_s": 0.0, "size": 0.02}}
 """Kinds of faults that act only while another one does."""
+IN_THE_AIR = frozenset({"motor_weak", "offboard_refused", "pilot_takeover", "tether_taut", "tether_snag", "tether_cut"})
+"""Kinds of faults that show only once the rotors turn."""
 SIZES: dict[str, float] = {"payload_missed": 0.0, "autopilot_reboot": 0.1}
 """Sizes of faults that half of the default size does not tell apart from it."""
 
@@ -99,8 +101,8 @@ def pairs() -> Iterator[Pair]:
 def fault_pairs() -> Iterator[Pair]:
     """Return a pair for each kind of fault that may begin, and one for each kind that has a size."""
     for kind, about in KINDS.items():
-        after = "catch" if kind.startswith("payload_") else "start" if about.phases == ("ground",) else "arming"
-        fault = {"kind": kind, "t_s": 0.1 if after != "arming" else 0.5, "after": after}
+        after = "catch" if kind.startswith("payload_") else "arming" if kind in IN_THE_AIR else "start"
+        fault = {"kind": kind, "t_s": 0.1, "after": after}
         if kind not in ("payload_missed", "payload_heavy"):  # those act from the start, whatever t_s says
             with_it = BESIDE.get(kind, _NEVER)
             yield Pair(f"faults.kind {kind}", {"faults": [with_it]}, {"faults": [with_it, fault]})
