@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import pytest
 
@@ -83,6 +84,12 @@ def commanded(
             flown.effects.append(effect_of(i.command, before, result.outputs[k]))
     assert len(flown.effects) == len(script), "the flight was over before a command came"
     return flown
+
+
+@cache
+def ordinary() -> Commanded:
+    """A flight without a command."""
+    return commanded()
 
 
 def off_its_way(since_s: float, until_s: float, x_m: float = 0.65) -> Change:
@@ -177,8 +184,7 @@ def test_commands_while_it_goes_back_along_the_tether() -> None:
 def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
     flown = commanded((3.9, HOLD))
     assert flown.effects == [(True, "too low to hold: landing")]
-    whole = commanded()
-    begin_s = next(o.t_s for o in whole.outputs if o.phase == "land")
+    begin_s = times_of(ordinary())["land"]
     flown = commanded((begin_s + 0.5, HOLD), (begin_s + 1.0, RESUME))
     assert flown.effects == [(False, "not held: it is landing"), (True, "the landing goes on")]
     assert flown.outcome is Outcome.COMPLETED
@@ -229,7 +235,7 @@ def times_of(flown: Commanded) -> dict[str, float]:
     ],
 )
 def test_called_off_before_it_lifts(phase: str, command: OperatorCommand, text: str) -> None:
-    begin_s = times_of(commanded())[phase]
+    begin_s = times_of(ordinary())[phase]
     flown = commanded((begin_s + 0.004, command))
     assert flown.effects == [(True, text)]
     assert flown.outcome is Outcome.ABORTED
@@ -239,7 +245,7 @@ def test_called_off_before_it_lifts(phase: str, command: OperatorCommand, text: 
 
 @pytest.mark.parametrize("phase", ["wait", "offboard", "arm", "spool up"])
 def test_a_flight_that_takes_off_by_itself_needs_no_start(phase: str) -> None:
-    begin_s = times_of(commanded())[phase]
+    begin_s = times_of(ordinary())[phase]
     flown = commanded((begin_s + 0.004, START), (begin_s + 0.104, RESUME))
     if phase == "wait":
         text = "start refused: this flight takes off by itself as soon as it can"
@@ -352,8 +358,7 @@ def test_armed_by_somebody_else_while_it_waits_it_is_not_flown() -> None:
 
 
 def test_after_the_flight_nothing_is_to_be_done() -> None:
-    flown = commanded()
-    over = flown.outputs[-1]
+    over = ordinary().outputs[-1]
     assert [effect_of(command, over, over) for command in (LAND, HOLD, RESUME, START)] == [
         (True, "down already"),
         (False, "not held: the flight is over"),

@@ -73,7 +73,10 @@ class WorldLoop(asyncio.SelectorEventLoop):
 
 
 def emitted(config: FlightConfig, end: int, usual: Emitted | None = None) -> Emitted:
-    """Return what the ends emit in so many steps of the physics; the flight ends at the first step in which that is not what they emit in `usual`."""
+    """Return what the ends emit in so many steps of the physics.
+
+    The flight ends at the first step in which that is not what they emit in `usual`.
+    """
     with asyncio.Runner(loop_factory=WorldLoop) as runner:
         return runner.run(_emitted(in_time(config), end, usual))
 

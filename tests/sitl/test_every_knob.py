@@ -36,8 +36,10 @@ ON_WIRES_ONLY = {
 """Knobs without a meaning in the fast closed loop, and why."""
 
 EARLY_S, LIMIT_S = 1.05, 6.0
-"""Flight times in the fast loop: most shows in the first, before the rotors are armed; in the second everything does, the catch included.
-A flight to the second is flown only for what has not shown in the first."""
+"""Flight times in the fast loop. The servos give torque from 1.0 s on; in the second everything shows, the catch included.
+
+A flight to the second is flown only for what has not shown in the first.
+"""
 EARLY_STEPS = 660
 """The same on the wires, whose whole flight is `END_STEPS`."""
 
