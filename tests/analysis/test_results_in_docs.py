@@ -13,12 +13,15 @@ import pytest
 from companion.analysis import compare_doc, faults_table, robustness_doc
 from companion.cli import main
 from companion.doc_tables import flown_by
-from tests.support import CATCH
+from tests.support import SHORT_CATCH
 
 RUNS = {
-    "compare": ("compare.json", shlex.split("--presets recommended --payloads 0.2 --seeds 1 --ablation")),
-    "robustness": ("robustness.json", [str(CATCH), "--draws", "2"]),
-    "faults": ("faults.json", [str(CATCH), "--kinds", "force_loss", "--phases", "line"]),
+    "compare": (
+        "compare.json",
+        ["--mission", str(SHORT_CATCH), *shlex.split("--presets recommended --payloads 0.2 --seeds 1 --ablation")],
+    ),
+    "robustness": ("robustness.json", [str(SHORT_CATCH), "--draws", "2"]),
+    "faults": ("faults.json", [str(SHORT_CATCH), "--kinds", "force_loss", "--phases", "line"]),
 }
 PAGES = {
     "compare": (("laws", "ablation"), compare_doc.main),

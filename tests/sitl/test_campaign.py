@@ -26,9 +26,9 @@ from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from companion.types import Outcome, PhaseKind
 from sitl import campaign
 from sitl.fast import FastFlight, FastResult
-from tests.support import CATCH, DEADLINE_S, Ended, Sandbox, position_error_m, sandbox_in, wait_until
+from tests.support import DEADLINE_S, SHORT_CATCH, Ended, Sandbox, position_error_m, sandbox_in, wait_until
 
-CONFIG = load_flight(CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
+CONFIG = load_flight(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
 FLIGHT: dict[str, Any] = {
     "variant": 0,
     "controller": "adaptive",
@@ -49,7 +49,7 @@ def fast() -> tuple[FastFlight, FastResult]:
 @pytest.fixture(scope="module")
 def result() -> dict[str, Any]:
     """The same flight, flown by the campaign from a configuration with another payload and seed."""
-    other = load_flight(CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
+    other = load_flight(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
     return campaign.fly(other.model_dump_json(), FLIGHT)
 
 
@@ -154,7 +154,7 @@ TINY = (
     *(
         "compare",
         "--mission",
-        CATCH,
+        SHORT_CATCH,
         "--payloads",
         "0.2",
         "--controllers",

@@ -12,14 +12,9 @@ from companion.config.world import World
 from sitl.fast import FastFlight, FastResult
 from tests.sitl.device_ends import END_STEPS, Emitted, emitted
 from tests.sitl.knobs import Pair, Settings, fault_pairs, pairs
-from tests.support import CATCH
+from tests.support import SHORT_CATCH
 
-_PHASES = (
-    "mission.phases=[{type: takeoff, height_m: 0.5, duration_s: 1.5}, "
-    "{type: line, name: catch, to_m: [0.4, 0, 0.5], duration_s: 2.0}, {type: land, speed_m_s: 0.35}]"
-)
-BASE = load_flight(CATCH, overrides=[_PHASES, "mission.start.position_m=[-0.2, 0]"])
-"""The catch mission, shortened: the payload is caught 5.5 s after the start."""
+BASE = load_flight(SHORT_CATCH)
 PAIRS = [*pairs(), *fault_pairs()]
 
 _SET_UP = "the companion's set-up of the bus writes this register, or a row of its preflight judges it; the fast loop has neither"

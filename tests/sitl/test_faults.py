@@ -23,7 +23,7 @@ from sitl.fault_campaign import fly, grid
 from sitl.faults import FaultError, in_time
 from sitl.flight_faults import environment
 from sitl.robustness import draw, throws
-from tests.support import CATCH, HOVER, sandbox_in
+from tests.support import CATCH, HOVER, SHORT_CATCH, sandbox_in
 
 CONFIG = load_flight(CATCH, preset="recommended")
 LINE_M_S = 0.74
@@ -303,7 +303,7 @@ def test_the_flight_process_is_told_for_how_long_it_stalls() -> None:
 def test_the_campaign_as_a_process(tmp_path: Any) -> None:
     with sandbox_in(tmp_path / "sandbox") as sandbox:
         kinds = ("--kinds", "kill_flight,servo_hot", "--phases", "landing")
-        ended = sandbox.run("faults", CATCH, *kinds, "--json", "--out", "out")
+        ended = sandbox.run("faults", SHORT_CATCH, *kinds, "--json", "--out", "out")
         sandbox.assert_nobody_left()
     assert ended.code == 0, ended.err
     table = json.loads(ended.out)
