@@ -32,6 +32,7 @@ from companion.io.edges import DeviceError
 from companion.preflight.checks import Check
 from companion.preflight.rows import Row
 from companion.px4.wanted import WANTED
+from companion.realtime import FLIGHT_PRIORITY, claim_realtime
 from companion.terminal import tell
 from companion.types import MocapPose
 
@@ -131,6 +132,8 @@ async def measure(vehicle: Vehicle, taps: int, seconds: float, *, write: bool = 
             LatencyLink(devices.autopilot, clock) as link,
         ):
             _refuse_armed(link, devices.autopilot.address)
+            # As in flight: a busy computer would stamp motion capture late.
+            claim_realtime(FLIGHT_PRIORITY, cpus=vehicle.computer.cpus, lock_memory=False)
             tell(
                 f"hold the machine up by its legs, propellers off, and have somebody tap its frame {taps} times with the flat of the "
                 "hand, one tap a second, from several sides"

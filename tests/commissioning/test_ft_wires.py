@@ -16,22 +16,25 @@ from companion.config.vehicle import ForceDevice
 from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from sitl.force_torque import ForceTorqueServer
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle, wait_for_error
-from tests.support import Sandbox, World
+from tests.support import Sandbox, World, run_here
 
 pytestmark = pytest.mark.waits
 
 __all__ = ["sandbox", "vehicle"]
 WEIGHT_KG = 0.5
+HUNG_S = 5.0
+"""After the first reading: well after the look at the empty net."""
+HUNG = (f"world.net_weight_kg={WEIGHT_KG}", f"world.net_weight_t_s={HUNG_S}")
 
 
 def checked(
-    sandbox: Sandbox, vehicle: Path, *knobs: str, options: tuple[object, ...] = (), more: tuple[object, ...] = ()
+    sandbox: Sandbox, vehicle: Path, *knobs: str, more: tuple[object, ...] = ()
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """What the first check finds; and what a second one does, with the file as the first one left it."""
-    with World(sandbox, overrides=[f"world.net_weight_kg={WEIGHT_KG}", *knobs]) as world:
-        words = ["ft", "check", "--weight", WEIGHT_KG, "--json", "--vehicle", vehicle, *world.addresses(), *options]
-        first = document(sandbox.run(*words, *more))
-        second = document(sandbox.run(*words)) if more else None
+    with World(sandbox, overrides=[*HUNG, *knobs]) as world:
+        words = ["ft", "check", "--weight", WEIGHT_KG, "--json", "--vehicle", vehicle, *world.addresses()]
+        first = document(run_here(*words, *more))
+        second = document(run_here(*words)) if more else None
     return first, second
 
 
@@ -66,11 +69,11 @@ def test_a_wrong_scale_is_the_sensors_and_no_patch(sandbox: Sandbox) -> None:
 
 
 def test_the_arm_need_not_be_wired(sandbox: Sandbox) -> None:
-    without_bus = ("--arm-pose", "165,140", "--set", "vehicle.devices.arm.port=/dev/null")
-    found, _ = checked(sandbox, VEHICLE, options=without_bus)
+    with World(sandbox, overrides=HUNG) as world:
+        words = ["ft", "check", "--vehicle", VEHICLE, *world.addresses(arm={"port": "/dev/null"})]
+        found = document(run_here(*words, "--weight", WEIGHT_KG, "--json", "--arm-pose", "165,140"))
+        ended = run_here(*words)
     assert found["weight"]["off_deg"] < 2.0
-    with World(sandbox) as world:
-        ended = sandbox.run("ft", "check", "--vehicle", VEHICLE, *world.addresses(arm={"port": "/dev/null"}))
     assert ended.code == EXIT_REFUSED
     assert "--arm-pose A1,A2" in ended.out
 
@@ -78,11 +81,11 @@ def test_the_arm_need_not_be_wired(sandbox: Sandbox) -> None:
 def test_tare_shows_the_drift_and_writes_to_the_sensor_only_when_asked(sandbox: Sandbox) -> None:
     with World(sandbox, overrides=["world.force_bias_n=[30,0,0]"]) as world:
         words = ["ft", "tare", "--seconds", 5, "--json", "--vehicle", VEHICLE, *world.addresses()]
-        before = json.loads(sandbox.run(*words).out)
-        unasked = sandbox.run(*words, "--sensor")
-        zeroed = json.loads(sandbox.run(*words, "--sensor", "--yes").out)
-        after = json.loads(sandbox.run(*words).out)
-        cleared = json.loads(sandbox.run(*words, "--clear", "--yes").out)
+        before = json.loads(run_here(*words).out)
+        unasked = run_here(*words, "--sensor")
+        zeroed = json.loads(run_here(*words, "--sensor", "--yes").out)
+        after = json.loads(run_here(*words).out)
+        cleared = json.loads(run_here(*words, "--clear", "--yes").out)
     assert unasked.code == EXIT_ABORTED
     assert "say --yes" in unasked.err
     assert [axis["axis"] for axis in before["drift"]] == ["x", "y", "z"]
@@ -93,10 +96,10 @@ def test_tare_shows_the_drift_and_writes_to_the_sensor_only_when_asked(sandbox: 
     assert cleared["tare"]["bias_n"] == pytest.approx([30.0, 0.0, 0.0], abs=0.1)
 
 
-def test_a_sensor_that_is_not_there_is_one_line(sandbox: Sandbox) -> None:
+def test_a_sensor_that_is_not_there_is_one_line() -> None:
     for part in ("check", "tare"):
         options = ("--vehicle", VEHICLE, "--arm-pose", "90,0", "--set", "vehicle.devices.force.port=/dev/no-such-port")
-        ended = sandbox.run("ft", part, *options)
+        ended = run_here("ft", part, *options)
         assert ended.code == EXIT_REFUSED
         assert "no such port" in ended.out
         assert "Traceback" not in ended.err
@@ -112,8 +115,8 @@ def test_a_sensor_that_is_not_there_is_one_line(sandbox: Sandbox) -> None:
         ("tare", "--seconds", "1"),
     ],
 )
-def test_bad_input_opens_nothing(sandbox: Sandbox, options: tuple[str, ...]) -> None:
-    ended = sandbox.run("ft", *options, "--vehicle", VEHICLE)
+def test_bad_input_opens_nothing(options: tuple[str, ...]) -> None:
+    ended = run_here("ft", *options, "--vehicle", VEHICLE)
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1
 

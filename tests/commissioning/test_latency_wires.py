@@ -9,12 +9,12 @@ import pytest
 
 from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, document, sandbox, wait_for_error
-from tests.support import Ended, Sandbox, World
+from tests.support import Ended, Sandbox, World, run_here
 
 pytestmark = pytest.mark.waits
 
 __all__ = ["sandbox"]
-TAPPED = ("world.hand=true", "world.hand_t_s=2", "world.hand_taps=12", "world.payload_kg=0")
+TAPPED = ("world.hand=true", "world.hand_t_s=2", "world.hand_taps=60", "world.payload_kg=0")
 FEW_TAPS = 5
 """Where the usual eight are not what is tested."""
 STEP_MS = 1.0
@@ -76,15 +76,15 @@ def test_weak_taps_are_refused(sandbox: Sandbox) -> None:
 def test_without_px4_it_says_so(sandbox: Sandbox) -> None:
     with World(sandbox) as world:
         address = {"address": "udpin://127.0.0.1:0"}
-        ended = sandbox.run("latency", "--vehicle", VEHICLE, *world.addresses(autopilot=address))
+        ended = run_here("latency", "--vehicle", VEHICLE, *world.addresses(autopilot=address))
     assert ended.code == EXIT_REFUSED
     assert "a port from 1 to 65535" in ended.out
     assert "Traceback" not in ended.err
 
 
 @pytest.mark.parametrize("options", [("--taps", "2"), ("--seconds", "nan"), ("--taps", "many")])
-def test_bad_input_opens_nothing(sandbox: Sandbox, options: tuple[str, ...]) -> None:
-    ended = sandbox.run("latency", "--vehicle", VEHICLE, *options)
+def test_bad_input_opens_nothing(options: tuple[str, ...]) -> None:
+    ended = run_here("latency", "--vehicle", VEHICLE, *options)
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1
 
