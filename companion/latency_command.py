@@ -19,6 +19,7 @@ from companion.commissioning.latency_fit import (
     PoseSample,
     Tap,
     TapDelay,
+    agreeing,
     combine,
     find_taps,
     measure_tap,
@@ -182,7 +183,7 @@ async def _tapped(
             if from_s <= tap.t_s <= felt[-1].t_s + 0.1:
                 near = [sample for sample in imu if abs(sample.t_s - tap.t_s) < 1.0]
                 done.append(measure_tap(tap, near, [pose for pose in seen if abs(pose.t_s - tap.t_s) < 1.0], noise))
-        missing = wanted - sum(not tap.problem for tap in done)
+        missing = wanted - len(agreeing(done))
         from_s = clock() + _LOOK_S
         if missing > 0:
             tell(f"{missing} of {wanted} are missing, the last problem: {_last_problem(done)}; go on tapping")
@@ -203,7 +204,7 @@ async def _count(link: LatencyLink, clock: Clock, from_s: float, end_s: float, w
 
 
 def _last_problem(taps: list[TapDelay]) -> str:
-    return next((tap.problem for tap in reversed(taps) if tap.problem), "none")
+    return next((tap.problem for tap in reversed(taps) if tap.problem), "their delays differ")
 
 
 async def _about_link(link: LatencyLink, poses: list[MocapPose]) -> Measured:

@@ -164,13 +164,19 @@ def measure_tap(
     return TapDelay(tap, delay_s, error_s, correlation, problem)
 
 
+def agreeing(taps: Sequence[TapDelay]) -> list[TapDelay]:
+    """Return the taps that count and whose delays agree with the others'."""
+    good = [tap for tap in taps if not tap.problem]
+    if not good:
+        return []
+    middle = float(np.median([tap.delay_s for tap in good]))
+    scale = 1.4826 * float(np.median([abs(tap.delay_s - middle) for tap in good]))
+    return [tap for tap in good if abs(tap.delay_s - middle) <= max(0.0015, 3.5 * scale)]
+
+
 def combine(taps: Sequence[TapDelay]) -> Delay | str:
     """The mean of all taps that count and agree; or why there is none."""
-    good = [tap for tap in taps if not tap.problem]
-    if good:
-        middle = float(np.median([tap.delay_s for tap in good]))
-        scale = 1.4826 * float(np.median([abs(tap.delay_s - middle) for tap in good]))
-        good = [tap for tap in good if abs(tap.delay_s - middle) <= max(0.0015, 3.5 * scale)]
+    good = agreeing(taps)
     if len(good) < TAPS_MIN:
         weak = [tap.problem for tap in taps if tap.problem]
         why = f"; {len(weak)} do not count, the last: {weak[-1]}" if weak else ""
