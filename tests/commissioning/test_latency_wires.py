@@ -52,7 +52,7 @@ def test_more_latency_is_found_written_and_then_right(sandbox: Sandbox) -> None:
     assert set(bad(first)) == {"latency.delay"}
     assert first["written_ms"] == pytest.approx(first["parameter"]["EKF2_EV_DELAY"], abs=1e-4)
     assert second["px4_ms"] == pytest.approx(first["written_ms"], abs=1e-4)
-    assert bad(second) == {}
+    assert bad(second) == {}, second
 
 
 def test_30_ms_more_are_found_and_too_many_to_be_written(sandbox: Sandbox) -> None:
