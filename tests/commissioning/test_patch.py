@@ -162,9 +162,8 @@ def test_a_new_key_is_quoted_where_it_must_be() -> None:
 
 
 def every_scalar() -> list[tuple[str | int, ...]]:
-    return [
-        at for at in read_document(SHIPPED).values if at and not isinstance(read_document(SHIPPED).get(at), dict | list)
-    ]
+    document = read_document(SHIPPED)
+    return [at for at in document.values if at and not isinstance(document.get(at), dict | list)]
 
 
 @pytest.mark.parametrize("location", every_scalar(), ids=lambda at: ".".join(map(str, at)))

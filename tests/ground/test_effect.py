@@ -280,15 +280,15 @@ def lifted_off_its_place(since_s: float, until_s: float) -> Change:
 
 
 def test_what_is_lost_while_it_waits_is_told_and_may_come_back_at_any_time() -> None:
-    flown = commanded((10.0, START), (40.0, START), change=lifted_off_its_place(6.0, 30.0), sets=(*WAITS, *FORGIVING))
+    flown = commanded((10.0, START), (22.0, START), change=lifted_off_its_place(6.0, 18.0), sets=(*WAITS, *FORGIVING))
     assert flown.effects[0][0] is False
     assert "start refused: mission 'hover': starts at" in flown.effects[0][1]
     assert flown.effects[1] == (True, "taking off")
     assert [id_ for id_ in flown.ids if id_.startswith("operator_") or "ready" in id_ or "declined" in id_] == [
         *("not_ready", "operator_start", "start_declined", "operator_start"),
     ]
-    assert flown.at(20.0).phase == "wait"
-    assert flown.at(35.0).phase == "waits for start"
+    assert flown.at(15.0).phase == "wait"
+    assert flown.at(21.0).phase == "waits for start"
     assert flown.outcome is Outcome.COMPLETED
 
 
@@ -319,11 +319,11 @@ def test_the_net_is_weighed_right_before_the_start() -> None:
     def change(i: Inputs) -> Inputs:
         if i.force is None:
             return i
-        drift_n = 2.0 * min(1.0, i.t_s / 30.0)
+        drift_n = 2.0 * min(1.0, i.t_s / 10.0)
         x, y, z = i.force.force_sensor_n
         return put("force", force_sensor_n=(x + drift_n, y, z))(i)
 
-    flown = commanded((40.0, START), change=change, sets=WAITS)
+    flown = commanded((12.0, START), change=change, sets=WAITS)
     felt = [o.control.force_ext_world_n for o in flown.outputs if o.control is not None and o.phase == "hold"]
     assert felt
     assert max(math.hypot(*force_n) for force_n in felt) < 0.6
