@@ -471,6 +471,12 @@ def flights(tmp_path: Path, reported: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return tmp_path
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures without a stroke: for tests that are about files and figures."""
+    monkeypatch.setattr(side_by_side_plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
@@ -479,7 +485,7 @@ WHOLE, GAINS, SHORT = (f"flights/{name}/flight.mcap" for name in ("whole", "gain
 
 
 def test_two_logs_get_a_folder_of_their_own_and_keep_their_reports(
-    flights: Path, capsys: pytest.CaptureFixture[str]
+    flights: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
 ) -> None:
     before = contents(flights / "flights")
     assert before.keys() >= {"whole/report.html", "whole/tracking.png", "whole/summary.json"}
@@ -491,10 +497,12 @@ def test_two_logs_get_a_folder_of_their_own_and_keep_their_reports(
     pictures = {f"side_by_side_{name}.png" for name in ("errors", "actuation", "path", "lateness")}
     assert written == pictures | {"side_by_side.html", "side_by_side.json"}
     # Even into a flight's own folder.
+    request.getfixturevalue("undrawn")
     assert main(["report", WHOLE, GAINS, "--out", "flights/whole"]) == EXIT_OK
     assert {name: contents(flights / "flights")[name] for name in before} == before
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_comparison_of_other_flights_is_never_overwritten(flights: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", WHOLE, GAINS, "--out", "x"]) == EXIT_OK
     held = contents(flights / "x")
@@ -545,6 +553,7 @@ def test_json_is_printed_alone_and_nothing_is_written(flights: Path, capsys: pyt
         ((WHOLE, "--out", WHOLE), r"companion report: flights/whole/flight\.mcap: cannot be written: .*--out"),
     ],
 )  # fmt: skip
+@pytest.mark.usefixtures("undrawn")
 def test_a_mistake_is_one_line_and_leaves_nothing(
     flights: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], line: str
 ) -> None:
@@ -560,6 +569,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing(
     assert contents(flights) == before
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_log_without_a_catch_beside_one_with_a_catch_works_and_says_so(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
