@@ -23,6 +23,7 @@ from sitl.fast import FastFlight, FastResult
 from tests.analysis.recorded import record
 from tests.control.states import POSE, ZERO, at
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
+from tests.support import SHORT_CATCH
 
 MISSION = "configs/missions/catch.yaml"
 MASS_KG, G = 3.0, 9.81
@@ -149,11 +150,11 @@ def test_the_mass_estimate_converges_after_the_catch(payload_kg: float) -> None:
 
 
 def test_the_estimate_is_in_the_log_and_comes_out_of_a_replay_bit_for_bit(tmp_path: Path) -> None:
-    flight = FastFlight(configured("world.payload_kg=0.2"))
+    flight = FastFlight(load_flight(SHORT_CATCH, controller_law="psc"))
     log = FlightLog.read(record(log_of(flight.config, flight.run(), None), tmp_path / "flight.mcap"))
     estimates = [o.control.payload_estimate_kg for o in log.outputs if o.control is not None]
     assert None not in estimates
-    assert len(set(estimates)) > 1000
+    assert len(set(estimates)) > 900
     assert replay(log, flight_core).first_difference is None
 
 

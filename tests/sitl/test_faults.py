@@ -256,7 +256,7 @@ def test_a_gap_shorter_than_the_timeout_is_flown_through() -> None:
 
 def test_a_second_payload_is_carried_too() -> None:
     flight = FastFlight(with_faults({"kind": "payload_double", "after": "catch", "t_s": 0.5, "size": 0.2}))
-    result = flight.run()
+    result = flight.run(14.0)
     begun_s = flight.faults.begun_s
     assert begun_s is not None
     assert _load_n(result, begun_s + 2.0) == pytest.approx(0.4 * 9.81, abs=0.6)
@@ -264,7 +264,7 @@ def test_a_second_payload_is_carried_too() -> None:
 
 def test_a_payload_that_is_dropped_is_felt_no_more() -> None:
     flight = FastFlight(with_faults({"kind": "payload_dropped", "after": "catch", "t_s": 1.0}))
-    result = flight.run()
+    result = flight.run(14.0)
     begun_s = flight.faults.begun_s
     assert begun_s is not None
     assert _load_n(result, begun_s - 0.3) == pytest.approx(0.2 * 9.81, abs=0.5)
