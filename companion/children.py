@@ -59,6 +59,12 @@ def write_text(path: Path, text: str) -> None:
         raise LaunchError(f"{path}: cannot be written: {error.strerror}; choose another --out") from None
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file of the flight's folder, if it can be removed: the number of a process that is gone may become another's."""
+    with contextlib.suppress(OSError):
+        path.unlink()
+
+
 @contextlib.contextmanager
 def scratch_folder(out: Path) -> Iterator[Path]:
     """Make a new folder for temporary files in `out`, yield its absolute path, and remove it with all that children left in it.

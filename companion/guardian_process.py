@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from companion import status
-from companion.children import holds_traceback, how_it_ended, last_line, terminate, write_text
+from companion.children import holds_traceback, how_it_ended, last_line, remove_file, terminate, write_text
 from companion.types import Outcome
 
 SILENT_S = 5.0
@@ -55,7 +55,8 @@ class GuardianProcess:
             raise
         finally:
             os.close(pidfd)
-        write_text(out / "guardian.pid", str(self.process.pid))
+        self._number = out / "guardian.pid"
+        write_text(self._number, str(self.process.pid))
         self.events: list[status.Message] = []
         self.result: status.Message | None = None
         self.open = True
@@ -100,6 +101,7 @@ class GuardianProcess:
     def end(self, patience_s: float) -> None:
         """Make sure that it is gone. After the flight's end it leaves by itself."""
         terminate(self.process, patience_s)
+        remove_file(self._number)
         self.listen()
         self.channel.close()
 

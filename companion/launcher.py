@@ -26,6 +26,7 @@ from companion.children import (
     holds_traceback,
     how_it_ended,
     last_line,
+    remove_file,
     scratch_folder,
     terminate,
     write_text,
@@ -202,6 +203,7 @@ class Launcher:
             finally:
                 self._channel = None
                 terminate(process, patience_s=30.0 if self._result is None else 10.0)
+                remove_file(self._out / "flight.pid")
                 if self._guardian is not None:
                     self._guardian.end(GUARDIAN_LEAVE_TIMEOUT_S)
         self._await_recorder()

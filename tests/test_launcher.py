@@ -21,7 +21,7 @@ from companion.analysis.log import FlightLog
 from companion.config.loader import load_flight
 from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
 from companion.sitl_process import SitlProcess
-from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options
+from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options, wait_until
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=1.0")
 IN_FLIGHT = "  hold\n"
@@ -82,6 +82,24 @@ def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signa
     assert (ended.code, ended.err) == (EXIT_ABORTED, "")
     assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
     assert not (sandbox.cwd / "out/flight.mcap").exists()
+
+
+@pytest.mark.waits
+def test_the_numbers_of_flight_and_guardian_are_there_for_as_long_as_they_live(sandbox: Sandbox) -> None:
+    """A number that is left behind may be another process's by the time that somebody signals it."""
+    numbers = [sandbox.cwd / "out/flight.pid", sandbox.cwd / "out/guardian.pid"]
+    with (
+        motive_that_never_answers() as (motive, options),
+        sandbox.start("fly", HOVER, "--out", "out", *options) as running,
+    ):
+        assert motive.recv(100)
+        wait_until(lambda: all(number.exists() for number in numbers), lambda: "no process numbers")
+        assert [sandbox.pid_of("companion.app"), sandbox.pid_of("companion.guardian")] == [
+            int(number.read_text()) for number in numbers
+        ]
+        running.signal(signal.SIGINT)
+        running.end()
+    assert not any(number.exists() for number in numbers)
 
 
 @pytest.mark.waits

@@ -105,6 +105,7 @@ class LinkClaim:
             yield
         finally:
             calls.cancel()
+            await asyncio.wait([calls])  # the port may be closed next, and the loop
 
     def pin(self) -> int:
         """Connect the UDP socket that MAVSDK opened since `find_px4` to PX4's address; its local port, 0 if the link is not UDP.

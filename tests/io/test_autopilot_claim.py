@@ -26,6 +26,7 @@ from companion.io.ground_frames import AutopilotHeartbeat
 from companion.types import MocapPose
 from tests.io.autopilot_peer import Px4Peer, free_udp_port
 from tests.io.test_autopilot import edge, eventually, refused
+from tests.support import DEADLINE_S
 
 pytestmark = pytest.mark.waits
 
@@ -143,6 +144,20 @@ def test_px4_that_broadcasts_until_it_has_a_partner_is_found() -> None:
             async with MavsdkAutopilot(device, flight_clock()) as autopilot:
                 assert autopilot.identity().peer == px4.address
                 await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+
+    asyncio.run(main())
+
+
+def test_calling_px4_leaves_no_task_behind() -> None:
+    """It was cancelled and not waited for: it still ran when its port was closed."""
+
+    async def main() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as px4, closing(LinkClaim(f"udpin://127.0.0.1:{port}")) as claim:
+            await claim.find_px4(DEADLINE_S)
+            async with claim.calling((1, 191)):
+                await eventually(lambda: bool(px4.of("HEARTBEAT")), "a call")
+            assert asyncio.all_tasks() == {asyncio.current_task()}
 
     asyncio.run(main())
 
