@@ -113,7 +113,7 @@ def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
         sandbox.assert_nobody_left(DEADLINE_S)
 
 
-@pytest.mark.waits
+@pytest.mark.flight
 def test_given_up_before_arming(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("  wait\n")  # it weighs the net for a second

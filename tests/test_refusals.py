@@ -147,7 +147,7 @@ def test_refuses(sandbox: Sandbox, world: World, case: str) -> None:
     assert_one_line(ended, wrong.line)
 
 
-@pytest.mark.waits
+@pytest.mark.flight
 def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: World) -> None:
     """The arm and the vehicle both stand elsewhere: one line for each, and no other."""
     start = {"mission.start.arm_deg": [150.0, 140.0], "mission.start.position_m": [-0.5, 0.0]}
@@ -279,7 +279,7 @@ def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world:
         assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
 
 
-@pytest.mark.waits
+@pytest.mark.flight
 def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox, tmp_path: Path) -> None:
     refuses = ("world.faults=[{kind: arming_refused, phase: ground}]",)
     with sandbox_in(tmp_path / "world") as around, World(around, CATCH, refuses) as world:

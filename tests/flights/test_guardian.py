@@ -71,7 +71,7 @@ def test_a_guardian_that_dies_in_the_air_is_told_and_the_flight_goes_on(sandbox:
     assert "guardian_lost" in events_of(read_summary(sandbox.cwd / "out"))
 
 
-@pytest.mark.waits
+@pytest.mark.flight
 def test_without_a_guardian_nothing_takes_off(tmp_path: Path) -> None:
     """It cannot even start: what it needs is broken."""
     broken = tmp_path / "packages"
@@ -87,7 +87,7 @@ def test_without_a_guardian_nothing_takes_off(tmp_path: Path) -> None:
     assert summary["outcome"] == "refused"
 
 
-@pytest.mark.waits
+@pytest.mark.flight
 def test_a_guardian_that_dies_before_take_off_refuses_the_flight(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("  wait\n")

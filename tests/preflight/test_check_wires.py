@@ -23,8 +23,6 @@ from sitl.servo_model import ServoModel, ServoRefusal
 from sitl.servo_protocol import StatusError
 from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
-pytestmark = pytest.mark.waits
-
 OPERATING_MODE, MODE_POSITION = 11, 3
 
 
@@ -48,6 +46,7 @@ def refusing(rows: dict[str, dict[str, Any]]) -> set[str]:
     return {name for name, row in rows.items() if not row["ok"] and row["level"] == "refuse"}
 
 
+@pytest.mark.flight
 def test_a_sound_world_may_fly_and_every_row_is_told(sandbox: Sandbox) -> None:
     ended = sandbox.run("check", CATCH, "--sitl", "--json")
     sandbox.assert_nobody_left()
@@ -60,6 +59,7 @@ def test_a_sound_world_may_fly_and_every_row_is_told(sandbox: Sandbox) -> None:
     assert all(row["read"] and row["why"] for row in rows.values())
 
 
+@pytest.mark.flight
 def test_what_is_spoiled_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
     """Wrong joint angle, force bias and one parameter of PX4, in the world alone: the companion believes its files."""
     spoiled = (
@@ -115,6 +115,7 @@ class StubbornServo(ServoModel):
         super().write(address, data)
 
 
+@pytest.mark.waits
 def test_devices_that_do_not_open_are_rows_and_the_others_are_looked_at(sandbox: Sandbox, tmp_path: Path) -> None:
     """No force sensor, and a servo that refuses its operating mode."""
 
@@ -134,6 +135,7 @@ def test_devices_that_do_not_open_are_rows_and_the_others_are_looked_at(sandbox:
     assert rows["px4.vision"]["ok"] and rows["mocap.rate"]["ok"] and rows["frames.gravity"]["ok"]
 
 
+@pytest.mark.waits
 def test_ctrl_c_during_the_preflight_of_a_flight_ends_it_with_nothing_armed(sandbox: Sandbox, tmp_path: Path) -> None:
     longer = set_options(**{"vehicle.safety.preflight_s": 60.0})
     with sandbox_in(tmp_path / "world") as around, World(around, HOVER) as world:
@@ -148,6 +150,7 @@ def test_ctrl_c_during_the_preflight_of_a_flight_ends_it_with_nothing_armed(sand
     assert not (sandbox.cwd / "out/preflight.json").exists()
 
 
+@pytest.mark.waits
 def test_ctrl_c_during_a_check_leaves_nothing(sandbox: Sandbox) -> None:
     master, slave = os.openpty()
     try:
