@@ -73,7 +73,7 @@ class GuardianProcess:
         """How the flight ended that it took over; None: it did not."""
         if not self.took_over:
             return None
-        return Outcome.ABORTED if self.result is not None and self.result["landed"] else Outcome.LOST
+        return outcome_of(self.result)
 
     def listen(self) -> list[status.Message]:
         """What it has said since the last call; never waits."""
@@ -128,3 +128,10 @@ class GuardianProcess:
             }
             for event in self.events
         ]
+
+
+def outcome_of(result: status.Message | None) -> Outcome:
+    """How a flight ended that the guardian took over, by its `guardian_result`; None: it reported none."""
+    if result is None or not result["landed"]:
+        return Outcome.LOST
+    return Outcome.CRASHED if result["overturned"] else Outcome.ABORTED

@@ -247,8 +247,10 @@ class Launcher:
     @staticmethod
     def _after_take_over(guardian: GuardianProcess, code: int, log_path: Path) -> str:
         """One line: what became of the flight process, and of the vehicle."""
-        landed = guardian.outcome is Outcome.ABORTED
-        vehicle = "the guardian landed the vehicle" if landed else "the guardian could not confirm a landing"
+        vehicle = {
+            Outcome.ABORTED: "the guardian landed the vehicle",
+            Outcome.CRASHED: "the vehicle was flipped or tipped over, the guardian had its rotors stopped",
+        }.get(guardian.outcome or Outcome.LOST, "the guardian could not confirm a landing")
         hung = guardian.events[0]["text"].startswith(HANGS)
         what = "hung and was killed" if hung else f"{how_it_ended(code)}{last_line(log_path)}"
         return f"flight: the flight process {what}; {vehicle}; see {log_path}"

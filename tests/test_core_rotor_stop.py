@@ -11,8 +11,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from companion.core import FlightCore
+from companion.flight_guard import Heartbeats
 from companion.frames import quat_from_euler_zyx
-from companion.types import AutopilotRequest, FlightMode, LandedState, OperatorCommand, Outcome, Outputs
+from companion.types import AutopilotRequest, FlightMode, LandedState, LinkIdentity, OperatorCommand, Outcome, Outputs
 from tests.core_walk import (
     ON_ITS_BACK,
     ON_ITS_ROTORS,
@@ -331,3 +332,30 @@ def test_in_manual_a_pilot_flies_whatever_failsafe_acts() -> None:
     outputs = walked(core, machine, 30)
     assert requests(outputs) == {AutopilotRequest.NONE}
     assert "pilot_took_over" in ids(outputs)
+
+
+@pytest.mark.parametrize("mode", [FlightMode.MANUAL, FlightMode.HOLD])
+@pytest.mark.parametrize("phase", [*PHASES, "autopilot land", "reattached"])
+def test_in_every_stage_a_pilot_who_takes_over_is_in_the_heartbeat_to_the_guardian(
+    phase: str, mode: FlightMode
+) -> None:
+    heartbeats = Heartbeats(LinkIdentity(1, 1, 195, 0), 0.0)
+
+    def pilot_in(ticks: int) -> bool:
+        for _ in range(ticks):
+            i = machine.tick()
+            beat = heartbeats.of(i, core.step(i))
+        return beat.pilot
+
+    if phase == "reattached":
+        core, machine, _ = machine_from("wait", armed=True)
+        machine.position = (*machine.position[:2], 1.0)
+    elif phase == "autopilot land":
+        core, machine, _ = machine_from("hold", seen=False)
+        assert not pilot_in(20)
+        machine.mode = FlightMode.LAND
+        assert not pilot_in(10)
+    else:
+        core, machine, _ = machine_from(phase)
+    machine.mode = mode
+    assert pilot_in(10)

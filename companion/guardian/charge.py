@@ -101,6 +101,8 @@ class Charge:
         self._request = AutopilotRequest.NONE
         self._requested_s = float("-inf")
         self._told: set[str] = set()
+        self.overturned = False
+        """The vehicle was flipped or tipped over, and its rotors were to be stopped for that."""
         self.landed: bool | None = None
         """Set at the end: the vehicle stands disarmed (or stands, and nobody answers), or nothing more can be done."""
 
@@ -162,7 +164,9 @@ class Charge:
                 t_s, self._clearance_m, self._tilt_max_rad, self._pilot, pose_s=self._pose_s
             )
         self._tick += 1
-        self._carry_out(t_s, status, self._landing.step(self._inputs(t_s, status)))
+        step = self._landing.step(self._inputs(t_s, status))
+        self.overturned = self.overturned or self._landing.overturned
+        self._carry_out(t_s, status, step)
 
     def begin_again(self, t_s: float) -> None:
         """The landing met an error of its own: a new one begins with the next step. If none gets anywhere, PX4 is told all the same."""

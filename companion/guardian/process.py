@@ -343,6 +343,7 @@ class Guardian:
         message = {
             "type": "guardian_result",
             "landed": landed,
+            "overturned": charge is not None and charge.overturned,
             "took_over_position_m": list(last.position_world_m),
             "position_m": None if pose is None else list(pose.position_world_m),
         }

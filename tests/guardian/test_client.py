@@ -15,7 +15,6 @@ from companion.flight_guard import FlightGuard, Heartbeats
 from companion.guardian import beat as words
 from companion.guardian.client import SILENT_S, GuardianClient
 from companion.io.edges import DeviceError
-from companion.mission.sequencer import PILOT_FLIES
 from companion.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -167,17 +166,6 @@ def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiti
     guard.goodbye(inputs(armed=False).status)
     beats = [words.unpack(guardian.recv(words.MAX_BYTES)) for _ in range(2)]
     assert [beat is not None and (beat.goodbye, beat.lifting) for beat in beats] == [(False, True), (True, True)]
-
-
-@pytest.mark.parametrize("found", ["taken over from PX4's landing", "flying on a reattach"])
-def test_a_pilot_without_an_event_is_in_the_heartbeat(waiting: Outputs, found: str) -> None:
-    """The landing reports no `pilot_took_over`: it is the phase that says so."""
-    outputs = dataclasses.replace(waiting, phase=PILOT_FLIES, phase_kind=PhaseKind.LANDING)
-    heartbeats = Heartbeats(LinkIdentity(1, 1, 195, 0), 0.0)
-    if found == "taken over from PX4's landing":
-        assert not heartbeats.of(inputs(armed=True), dataclasses.replace(outputs, phase="autopilot land")).pilot
-    assert heartbeats.of(inputs(armed=True), outputs).pilot
-    assert heartbeats.of(inputs(armed=True), dataclasses.replace(outputs, phase="done")).pilot, "a pilot stays one"
 
 
 @pytest.mark.parametrize("event_id", ["mocap_dragged", "mocap_two_streams", "mocap_swapped", "mocap_frozen"])

@@ -14,6 +14,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.frames import ned_from_enu, wrap_rad
 from companion.guardian.beat import PROBLEM, READY
+from companion.guardian_process import outcome_of
+from companion.types import Outcome
 from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
 
@@ -85,6 +87,7 @@ def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, numb
         assert rig.flight.wait(DEADLINE_S) == -signal.SIGKILL
         ids = ["guardian_took_over", "guardian_land", "guardian_landed"]
         assert rig.events == ids
+        assert outcome_of(rig.result) is Outcome.ABORTED
         assert rig.log_ids == ids, "the recorder got the same"
         assert rig.result is not None and rig.result["landed"] is True
         sources = {(m.get_srcSystem(), m.get_srcComponent()) for m in rig.peer.received}
@@ -214,6 +217,7 @@ def test_a_flipped_vehicle_is_disarmed_by_force_again_and_again(tmp_path: Path, 
         rig.peer.base_mode = DISARMED
         assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
         assert "guardian_landing" in rig.events
+        assert rig.result is not None and outcome_of(rig.result) is Outcome.CRASHED
 
 
 def test_a_jump_of_motion_capture_is_held_back(tmp_path: Path) -> None:
