@@ -104,8 +104,13 @@ def test_it_is_bounded(thrust: float, bound: float) -> None:
 # -- whole flights in the fast loop ----------------------------------------------------------------------------------------------
 
 
-@cache
 def flown(error: float, adapt: bool = True, preset: str = "recommended", faults: str = "[]") -> FastResult:
+    return _flown(error, adapt, preset, faults)
+
+
+@cache
+def _flown(error: float, adapt: bool, preset: str, faults: str) -> FastResult:
+    """`cache` tells a default from the same value given, so all are given."""
     result = FastFlight(configured(error, adapt, preset, faults)).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     return result

@@ -288,7 +288,7 @@ def test_a_restart_of_px4_in_the_air_is_a_fall_and_is_called_so() -> None:
 
 def test_a_row_is_the_same_wherever_it_is_flown() -> None:
     again: Row = fly(CONFIG_JSON, {"kind": "bus_noise", "size": 0.6, "duration_s": None, "phase": "takeoff"})["row"]
-    assert again == flown("bus_noise", "takeoff", 0.6)
+    assert again == flown("bus_noise", "takeoff", 0.6, None)
 
 
 # -- processes ---------------------------------------------------------------------------------------------------------
