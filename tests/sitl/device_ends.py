@@ -105,7 +105,8 @@ async def _emitted(config: FlightConfig, end: int, usual: Emitted | None) -> Emi
                     steps.append((*partner.heard(), fate))
                     if usual is not None and not usual.goes_on_as(steps, partner.force):
                         break
-                partner.read_force(_LAST_BYTES_S)
+                else:
+                    partner.read_force(_LAST_BYTES_S)
     return Emitted(tuple(steps), partner.force)
 
 
