@@ -136,6 +136,7 @@ class FlightCore:
             self._monitors.mocap_trusted,
             self._situation.tether,
             self._bent_by,
+            self._monitors.mocap_innovation_m,
         )
 
     # -- judgement -------------------------------------------------------------------------------------------------

@@ -148,6 +148,10 @@ class VehicleState:
     """What the accelerometer feels: +9.81 on z at rest, level."""
     boot_s: float | None = None
     """PX4's own clock, seconds since it started (time_boot_ms of ATTITUDE or ODOMETRY); None: not told."""
+    imu_boot_s: float | None = None
+    """End of the newest IMU sample's interval on PX4's clock (HIGHRES_IMU.time_usec), s; None: unknown, as in old logs."""
+    delta_velocity_body_m_s: Vec3 = (0.0, 0.0, 0.0)
+    """Integral of the specific force over all IMU samples since the link was opened, up to `imu_boot_s`."""
 
 
 @quick
@@ -180,6 +184,8 @@ class MocapPose:
     attitude_wxyz: Quat
     tracking_valid: bool
     marker_error_m: float
+    exposure_server_s: float | None = None
+    """Mid-exposure on the server's own clock (NatNet >= 3.0), s; None: unknown, as in old logs."""
 
 
 @quick
@@ -357,6 +363,8 @@ class Outputs:
     tether: TetherState | None = None
     bent_by: tuple[str, ...] = ()
     """What the governor bent the reference for."""
+    mocap_innovation_m: float = 0.0
+    """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged, and in old logs."""
 
 
 @quick

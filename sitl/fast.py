@@ -21,6 +21,7 @@ from companion.frames import (
     flu_from_frd,
     ned_from_enu,
 )
+from companion.io.delta_velocity import DeltaVelocity
 from companion.io.dynamixel import WATCHDOG_ERROR
 from companion.types import (
     ArmState,
@@ -36,13 +37,14 @@ from companion.types import (
     Outputs,
     Quat,
     Vec3,
+    Vec4,
     VehicleState,
 )
-from sitl.autopilot.autopilot import Command7
+from sitl.autopilot.autopilot import Command7, Px4Stub
 from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.telemetry import system_status
-from sitl.autopilot.types import AttitudeTarget
+from sitl.autopilot.types import AttitudeTarget, ImuSample
 from sitl.ends import set_hover_thrust, stub_of
 from sitl.fast_bus import scales_of
 from sitl.fast_guardian import TAKE_OVER_S, Landing, StandIn
@@ -115,6 +117,21 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
+class _Heard:
+    """PX4, and every IMU sample that it sends on."""
+
+    def __init__(self, px4: Px4Stub) -> None:
+        self._px4 = px4
+        self.total = DeltaVelocity()
+
+    def step(self, imu: ImuSample) -> Vec4:
+        """One sample; PX4's clock starts anew with PX4."""
+        boot_s = imu.t_s - self._px4.booted_at_s
+        if boot_s >= 0.0:
+            self.total.add(boot_s, imu.accel_frd_m_s2)
+        return self._px4.step(imu)
+
+
 class FastFlight:
     """One flight in the fast closed loop.
 
@@ -131,7 +148,8 @@ class FastFlight:
         servos = servos_of(vehicle, world)
         self._drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-        self.plant = Plant(vehicle, world, self.px4, self._drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
+        self._heard = _Heard(self.px4)
+        self.plant = Plant(vehicle, world, self._heard, self._drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
         self.faults = Faults(world, self.plant.world, self.px4, self._drives, vehicle.tether.anchor_world_m)
         if world.faults:
             self.plant.faults = self.faults
@@ -262,10 +280,11 @@ class FastFlight:
     def _pose(self, frame: MocapFrame) -> MocapPose:
         t_s = self.plant.world.t_s
         number, exposure_s, position, attitude, valid = frame
-        latency_s = t_s - exposure_s
+        latency_s, exposure_server_s = t_s - exposure_s, exposure_s
         if self.plant.faults is not None:
-            latency_s = self.faults.server_clock_s(t_s) - self.faults.server_clock_s(exposure_s)
-        return MocapPose(t_s, latency_s, number, position, attitude, valid, 0.0002)
+            exposure_server_s = self.faults.server_clock_s(exposure_s)
+            latency_s = self.faults.server_clock_s(t_s) - exposure_server_s
+        return MocapPose(t_s, latency_s, number, position, attitude, valid, 0.0002, exposure_server_s)
 
     def _inputs(self, tick: int) -> Inputs:
         plant, t_s = self.plant, self.plant.world.t_s
@@ -328,6 +347,8 @@ class FastFlight:
             flu_from_frd(estimate.rates_frd_rad_s),
             flu_from_frd(estimate.accel_frd_m_s2),
             None if self.plant.faults is None else t_s - self.px4.booted_at_s,
+            self._heard.total.boot_s,
+            flu_from_frd(self._heard.total.sum_m_s),
         )
 
     def _status(self, t_s: float) -> AutopilotStatus:

@@ -23,7 +23,7 @@ from sitl.autopilot.types import ImuSample
 from sitl.faults import Faults
 from sitl.hand import Hand, HungWeight
 from sitl.mocap_axes import SpoiledFrame
-from sitl.world import Truth, World
+from sitl.world import PHYSICS_DT_S, Truth, World
 
 IMU_EVERY = 2
 """Physics steps per IMU sample: 250 Hz, as PX4's rate loop is stepped."""
@@ -72,6 +72,7 @@ _NOISE_BLOCK = 4096
 
 
 _MOCAP, _IMU, _FORCE = range(3)
+_PHASES = (0.0, math.tau / 3.0, 2.0 * math.tau / 3.0)
 
 
 def noise(seed: int, sensor: int) -> Iterator[Vec3]:
@@ -218,11 +219,23 @@ class Plant:
         gyro, accel = config.gyro_noise_rad_s, config.accel_noise_m_s2
         nx, ny, nz = next(self._imu_noise)
         mx, my, mz = next(self._imu_noise)
+        ax, ay, az = s[a] + accel * mx, s[a + 1] + accel * my, s[a + 2] + accel * mz
+        if config.accel_vibration_m_s2 and self.armed_t_s is not None:
+            vx, vy, vz = self._vibration(world.t_s)
+            ax, ay, az = ax + vx, ay + vy, az + vz
         return ImuSample(
-            world.t_s,
-            (s[g] + gyro * nx, -(s[g + 1] + gyro * ny), -(s[g + 2] + gyro * nz)),
-            (s[a] + accel * mx, -(s[a + 1] + accel * my), -(s[a + 2] + accel * mz)),
+            world.t_s, (s[g] + gyro * nx, -(s[g + 1] + gyro * ny), -(s[g + 2] + gyro * nz)), (ax, -ay, -az)
         )
+
+    def _vibration(self, t_s: float) -> Vec3:
+        """Mean of the vibration over the sample's interval, as PX4 integrates its raw samples; a third of a turn apart on the axes."""
+        interval_s = IMU_EVERY * PHYSICS_DT_S
+        turns = math.tau * self._config.accel_vibration_hz
+        k = self._config.accel_vibration_m_s2 / (turns * interval_s)
+        x, y, z = (
+            k * (math.cos(turns * (t_s - interval_s) + phase) - math.cos(turns * t_s + phase)) for phase in _PHASES
+        )
+        return (x, y, z)
 
     def _expose_mocap(self, t_s: float) -> None:
         config, world = self._config, self.world

@@ -267,8 +267,8 @@ class Sitl:
         body = self._vehicle.devices.mocap.rigid_body_id
         pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
         others = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
-        clock = self.faults.server_clock_s
-        self.mocap.publish(clock(t_s), (*others, pose), clock(frame.exposure_t_s))
+        clock, ahead_s = self.faults.server_clock_s, 0.0 if self.autopilot.lockstep else self.slipped_s
+        self.mocap.publish(clock(t_s) + ahead_s, (*others, pose), clock(frame.exposure_t_s) + ahead_s)
 
     def _plant_faults(self) -> None:
         plant = self.plant

@@ -72,6 +72,10 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
 def _tracking(log: FlightLog) -> Figure | None:
     figure, axes, t = _stack(log, "Tracking errors and arm", (1.0, 1.0, 1.25))
     _line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", _SERIES[0])
+    _line(
+        axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", _SERIES[1]
+    )
+    _legend(axes[0], columns=2)
     _line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", _SERIES[0])
     axes[0].set_ylabel("position error [m]")
     axes[1].set_ylabel("attitude error [deg]")

@@ -228,9 +228,9 @@ class Safety(Model):
     """The same for its attitude, beside what the rates explain."""
     mocap_frozen_s: Positive = 0.10
     """New frames with the very same pose for this long, while the vehicle moves."""
-    mocap_inertial_m: Positive = 0.04
-    """Largest distance between a pose and the position predicted by the IMU; above it PX4 lands without motion capture. A sound flight
-    over wires reached 0.017 on a busy computer. 0.015 finds drags that begin at 0.25 m/s or faster, 0.04 at about 1 m/s."""
+    mocap_inertial_m: Positive = 0.025
+    """Largest distance between a pose and the position predicted by the IMU; above it PX4 lands without motion capture. Sound flights
+    with 10 m/s2 of vibration reached 0.0084. 0.015 finds drags that begin at 0.2 m/s or faster, 0.025 at 0.3 m/s, 0.04 at 0.5 m/s."""
     mocap_inertial_s: NonNegative = 0.05
     """Hold time of `mocap_inertial_m`."""
     estimate_disagreement_m: Positive = 0.30

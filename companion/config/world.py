@@ -101,6 +101,9 @@ class World(Model):
     mocap_noise_deg: NonNegative = 0.05
     gyro_noise_rad_s: NonNegative = 0.01
     accel_noise_m_s2: NonNegative = 0.15
+    accel_vibration_m_s2: NonNegative = 0.0
+    """Amplitude of the vibration of armed rotors on each axis of the accelerometer, as its raw samples have it; PX4 sends means."""
+    accel_vibration_hz: Positive = 120.0
     force_noise_n: NonNegative = 0.05
     force_bias_n: Vector3 = (1.2, -0.8, 2.5)
     force_scale: Positive = 1.0

@@ -11,7 +11,7 @@ from companion.control.disturbance import DisturbanceObserver
 from companion.control.factory import build_controller
 from companion.control.hover import HoverThrust, off_the_ground
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
-from companion.control.sensing import CatchDetector, ForceSensing, acceleration_world_m_s2
+from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
 from companion.control.types import Controller, PlantState
 from companion.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
 from companion.frozen import quick
@@ -55,6 +55,7 @@ class Pilot:
         self._force_timeout_s = vehicle.safety.force_timeout_s
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._sensing = ForceSensing(vehicle.tool, self._manipulator)
+        self._acceleration = MeanAcceleration()
         self._catch = CatchDetector()
         self._state: PlantState | None = None
         """Of the last tick that the law flew."""
@@ -135,7 +136,7 @@ class Pilot:
         state = PlantState(
             vehicle.position_world_m,
             vehicle.velocity_world_m_s,
-            acceleration_world_m_s2(vehicle),
+            self._acceleration.update(vehicle),
             vehicle.attitude_wxyz,
             vehicle.angular_rate_body_rad_s,
             arm_rad,

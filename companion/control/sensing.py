@@ -16,6 +16,35 @@ def acceleration_world_m_s2(vehicle: VehicleState) -> Vec3:
     return (x, y, z - GRAVITY_M_S2)
 
 
+class MeanAcceleration:
+    """Coordinate acceleration over all IMU samples since the last call: one for each tick would alias vibration to a steady pull."""
+
+    GAP_MAX_S = 0.05
+    """Over a longer interval between two calls, or without PX4's times, the newest sample stands for itself."""
+
+    def __init__(self) -> None:
+        self._before: VehicleState | None = None
+        self._value_m_s2: Vec3 | None = None
+
+    def update(self, vehicle: VehicleState) -> Vec3:
+        """Return the acceleration, m/s2, world frame; the last one while no new sample has come."""
+        before, boot_s = self._before, vehicle.imu_boot_s
+        if before is None or boot_s is None or before.imu_boot_s is None:
+            self._before = vehicle
+            return acceleration_world_m_s2(vehicle)
+        dt_s = boot_s - before.imu_boot_s
+        if dt_s == 0.0 and self._value_m_s2 is not None:
+            return self._value_m_s2
+        self._before = vehicle
+        if 0.0 < dt_s <= self.GAP_MAX_S:
+            (x, y, z), (bx, by, bz) = vehicle.delta_velocity_body_m_s, before.delta_velocity_body_m_s
+            x, y, z = quat_rotate(vehicle.attitude_wxyz, ((x - bx) / dt_s, (y - by) / dt_s, (z - bz) / dt_s))
+            self._value_m_s2 = (x, y, z - GRAVITY_M_S2)
+        else:
+            self._value_m_s2 = acceleration_world_m_s2(vehicle)
+        return self._value_m_s2
+
+
 class ForceSensing:
     """Tare and gravity compensation of the force-torque sensor."""
 

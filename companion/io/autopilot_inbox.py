@@ -13,10 +13,12 @@ from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkM
 from mavsdk.plugins.telemetry.telemetry import Telemetry
 
 from companion.clock import Clock
+from companion.frames import flu_from_frd
 from companion.io import autopilot_messages as messages
 from companion.io.autopilot_calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.autopilot_link import device_error
 from companion.io.autopilot_requests import RequestDesk
+from companion.io.delta_velocity import DeltaVelocity
 from companion.io.native_threads import keep_interpreter_state
 from companion.preflight.observations import EstimatorReport, StateCounts
 from companion.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
@@ -43,7 +45,8 @@ class Inbox:
         self._position: tuple[float, Vec3, Vec3] | None = None
         self._attitude: tuple[float, Quat, int] | None = None
         self._rates: Vec3 | None = None
-        self._imu: tuple[float, Vec3] | None = None
+        self._imu: tuple[float, Vec3, float | None, Vec3] | None = None
+        self._delta_velocity_frd = DeltaVelocity()
         self._heartbeat: tuple[float, str] | None = None
         self._estimator: tuple[float, str] | None = None
         self._positions = self._attitudes = self._imus = 0
@@ -83,8 +86,10 @@ class Inbox:
             state = messages.vehicle_state(
                 position[0], position[1], position[2], attitude[0], attitude[1], rates, imu[0], imu[1]
             )
-            if state is not None and attitude[2]:
-                state = replace(state, boot_s=attitude[2] * 1e-6)
+            if state is not None:
+                boot_s = attitude[2] * 1e-6 if attitude[2] else None
+                total = flu_from_frd(imu[3])
+                state = replace(state, boot_s=boot_s, imu_boot_s=imu[2], delta_velocity_body_m_s=total)
             # Values that are not finite are as good as not arrived: the last good state stays, and its stamps grow old.
             self._vehicle = state or self._vehicle
         return self._vehicle
@@ -147,7 +152,11 @@ class Inbox:
     def _on_imu(self, value: Any, _: Any) -> None:
         keep_interpreter_state()
         a = value.acceleration_frd
-        self._imu = (self._clock(), (a.forward_m_s2, a.right_m_s2, a.down_m_s2))
+        force_m_s2 = (a.forward_m_s2, a.right_m_s2, a.down_m_s2)
+        total = self._delta_velocity_frd
+        if value.timestamp_us:
+            total.add(value.timestamp_us * 1e-6, force_m_s2)
+        self._imu = (self._clock(), force_m_s2, total.boot_s, total.sum_m_s)
         self._imus += 1
 
     def _on_landed(self, value: Any, _: Any) -> None:

@@ -31,4 +31,5 @@ def mocap_pose(frame: natnet.Frame, arrived_s: float, up_axis: str) -> MocapPose
         attitude_wxyz=quat_wxyz,
         tracking_valid=body.tracking_valid,
         marker_error_m=body.error_m,
+        exposure_server_s=frame.exposure_s,
     )

@@ -116,6 +116,8 @@ class Frame:
     """On the server's own time base."""
     latency_s: float | None
     """Mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency."""
+    exposure_s: float | None
+    """Mid-exposure on the server's own clock; None as above."""
     body: RigidBody | None
     """None: the wanted id is not in this frame."""
     body_ids: tuple[int, ...]
@@ -278,9 +280,11 @@ def _frame(data: bytes, sized: bool, body_id: int, clock_frequency_hz: int | Non
         offset = _skip_channels(data, offset)  # devices
     _, _, timestamp_s, exposure, _, transmit = _SUFFIX.unpack_from(data, offset)
     latency_s: float | None = None
+    exposure_s: float | None = None
     if clock_frequency_hz and exposure and transmit >= exposure:
         latency_s = (transmit - exposure) / clock_frequency_hz
-    return Frame(number, timestamp_s, latency_s, body, ids)
+        exposure_s = exposure / clock_frequency_hz
+    return Frame(number, timestamp_s, latency_s, exposure_s, body, ids)
 
 
 def _rigid_body(data: bytes, offset: int) -> RigidBody | Malformed:

@@ -87,6 +87,7 @@ def _vehicle_is_sound(v: VehicleState) -> bool:
     low, high, old, new, boot_s = -ABSURD, ABSURD, -_STAMP_MAX_S, _STAMP_MAX_S, v.boot_s
     (px, py, pz), (vx, vy, vz), (w, x, y, z) = v.position_world_m, v.velocity_world_m_s, v.attitude_wxyz
     (rx, ry, rz), (fx, fy, fz) = v.angular_rate_body_rad_s, v.specific_force_body_m_s2
+    imu_boot_s, (dx, dy, dz) = v.imu_boot_s, v.delta_velocity_body_m_s
     return (
         (low < px < high and low < py < high and low < pz < high)
         and (low < vx < high and low < vy < high and low < vz < high)
@@ -97,6 +98,8 @@ def _vehicle_is_sound(v: VehicleState) -> bool:
         and old < v.attitude_stamp_s < new
         and old < v.imu_stamp_s < new
         and (boot_s is None or old < boot_s < new)
+        and (imu_boot_s is None or old < imu_boot_s < new)
+        and (old < dx < new and old < dy < new and old < dz < new)
     )
 
 
@@ -104,6 +107,7 @@ def _mocap_is_sound(m: MocapPose) -> bool:
     return (
         _stamp(m.stamp_s)
         and (m.latency_s is None or _stamp(m.latency_s))
+        and (m.exposure_server_s is None or _stamp(m.exposure_server_s))
         # Motive may send anything for a body that it does not see; nobody looks at it then.
         and (not m.tracking_valid or (_sound3(m.position_world_m) and _is_rotation(m.attitude_wxyz)))
     )

@@ -6,6 +6,10 @@ minus predicted position, stays near zero while both measure the same motion. A 
 0.2 s; then the observer follows the drag, as it follows a constant acceleration error. A drag that begins slowly is not found.
 
 The attitude that turns the specific force into the world is PX4's. PX4 corrects its tilt by the same poses, but slowly (0.4 rad/s).
+
+The observer gets the integral of the specific force over every sample that PX4 sent (`companion.io.delta_velocity`). One sample for
+each tick would alias vibration of 5 to 10 m/s2 into the velocity. Times are those of exposure and sample, on the clocks of cameras and
+PX4 (`RemoteClock`), not of arrival: a message that waits on its way does not change when its sample was taken.
 """
 
 from __future__ import annotations
@@ -20,6 +24,33 @@ SETTLE_S = 9.0 / POLE_RAD_S
 """The innovation is not judged for this time after a start: velocity and bias are unknown then."""
 IMU_GAP_MAX_S = 0.05
 """The observer starts again after a longer gap between IMU samples: motion in the gap was not measured."""
+
+
+CLOCK_GROWTH = 1e-3
+"""Two clocks may drift apart by this, s/s."""
+CLOCK_RESTART_S = 0.5
+"""Later than this, it is another clock: its device restarted."""
+
+
+class RemoteClock:
+    """Maps a device's clock to the flight clock by the least delay of its messages: what comes later was only late."""
+
+    def __init__(self) -> None:
+        self._offset_s = math.inf
+        self._arrived_s = 0.0
+
+    def local_s(self, remote_s: float, arrived_s: float) -> float:
+        """Return the flight time of `remote_s`, plus the least delay.
+
+        Args:
+            remote_s: time on the device's clock at which it sent a message.
+            arrived_s: arrival of that message, flight clock.
+        """
+        offset_s = arrived_s - remote_s
+        grown_s = self._offset_s + CLOCK_GROWTH * max(0.0, arrived_s - self._arrived_s)
+        self._arrived_s = arrived_s
+        self._offset_s = offset_s if offset_s > grown_s + CLOCK_RESTART_S else min(grown_s, offset_s)
+        return remote_s + self._offset_s
 
 
 class InertialCheck:
@@ -41,28 +72,25 @@ class InertialCheck:
         self.innovation_m = 0.0
         """Length of the newest innovation; 0 while the observer settles."""
 
-    def imu(self, stamp_s: float, acceleration_world_m_s2: Vec3) -> None:
-        """Predict up to an IMU sample; a sample that was used before changes nothing.
+    def imu(self, stamp_s: float, dt_s: float, delta_velocity_world_m_s: Vec3) -> None:
+        """Predict up to the newest IMU sample.
 
         Args:
-            stamp_s: time of the sample.
-            acceleration_world_m_s2: specific force turned into the world, gravity removed.
+            stamp_s: arrival of that sample.
+            dt_s: interval since the last call, by the clock of the samples; unless it is positive and short, the observer starts again.
+            delta_velocity_world_m_s: change of the velocity in that interval: specific force turned into the world, gravity removed.
         """
-        before_s, self._imu_s = self._imu_s, stamp_s
-        if before_s is None or stamp_s == before_s:
-            return
-        dt_s = stamp_s - before_s
+        self._imu_s = stamp_s
         if not 0.0 < dt_s <= IMU_GAP_MAX_S:
             self._pose_s = None
             return
-        half = 0.5 * dt_s * dt_s
-        ax, ay, az = acceleration_world_m_s2
+        dx, dy, dz = delta_velocity_world_m_s
         bx, by, bz = self._bias
         vx, vy, vz = self._velocity
         px, py, pz = self._position
-        ax, ay, az = ax + bx, ay + by, az + bz
-        self._position = (px + vx * dt_s + ax * half, py + vy * dt_s + ay * half, pz + vz * dt_s + az * half)
-        self._velocity = (vx + ax * dt_s, vy + ay * dt_s, vz + az * dt_s)
+        dx, dy, dz, half_s = dx + bx * dt_s, dy + by * dt_s, dz + bz * dt_s, 0.5 * dt_s
+        self._position = (px + vx * dt_s + dx * half_s, py + vy * dt_s + dy * half_s, pz + vz * dt_s + dz * half_s)
+        self._velocity = (vx + dx, vy + dy, vz + dz)
 
     def pose(self, stamp_s: float, position_world_m: Vec3, age_s: float) -> bool:
         """Compare a new pose with the prediction and correct the observer.

@@ -69,6 +69,11 @@ class Monitors:
         """Poses may be passed on to PX4. In the air no repeated one, long before that is a finding: PX4 would think that it stands."""
         return self._mocap.trusted and not (self._mocap.repeats and self._airborne)
 
+    @property
+    def mocap_innovation_m(self) -> float:
+        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged."""
+        return self._mocap.innovation_m
+
     def forget(self) -> None:
         """Tell again what is still there: a HOLD was taken back."""
         self._findings.forget()

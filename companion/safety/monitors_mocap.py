@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
-from companion.control.sensing import acceleration_world_m_s2
-from companion.frames import euler_zyx_from_quat, wrap_rad
+from companion.control.manipulator import GRAVITY_M_S2
+from companion.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
 from companion.safety.findings import Findings, Situation
-from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck
+from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck, RemoteClock
 from companion.safety.rules import (
     ESTIMATE_DISAGREES,
     MOCAP_DRAGGED,
@@ -78,7 +78,11 @@ class MocapMonitor:
         self._moved = False
         self._streams = StreamWatch()
         self._inertial = InertialCheck(s.mocap_inertial_m, s.mocap_inertial_s, s.mocap_timeout_s)
-        self._imu_s: float | None = None
+        self._imu: VehicleState | None = None
+        """The state whose IMU samples were used last."""
+        self._imu_s = 0.0
+        """End of the newest of them, flight clock."""
+        self._px4_clock, self._server_clock = RemoteClock(), RemoteClock()
         self._against_imu = False
         """The newest believed pose does not move as the IMU says."""
         self._dragged = False
@@ -97,9 +101,8 @@ class MocapMonitor:
         """One tick; `moving`: the IMU or PX4's velocity say that the vehicle moves."""
         pose, vehicle, s = i.mocap, i.vehicle, self._s
         self._moved = self._moved or moving
-        if vehicle is not None and vehicle.imu_stamp_s != self._imu_s:
-            self._imu_s = vehicle.imu_stamp_s
-            self._inertial.imu(self._imu_s, acceleration_world_m_s2(vehicle))
+        if vehicle is not None and vehicle.imu_boot_s is not None:
+            self._predict(vehicle, vehicle.imu_boot_s)
         if pose is not None and (self._frame is None or pose.stamp_s != self._frame.stamp_s):
             self._judge(pose, vehicle, awake_s)
         if awake_s - self._believed_awake_s > s.mocap_timeout_s:
@@ -133,6 +136,24 @@ class MocapMonitor:
         fresh = self.trusted and pose.tracking_valid and awake_s - self._frame_awake_s < s.mocap_timeout_s
         if fresh and vehicle is not None and situation.airborne:
             self._compare(pose, vehicle, findings)
+
+    @property
+    def innovation_m(self) -> float:
+        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged."""
+        return self._inertial.innovation_m
+
+    def _predict(self, vehicle: VehicleState, boot_s: float) -> None:
+        """All IMU samples that came since the last tick; `boot_s` is the time of the newest."""
+        before = self._imu
+        if before is not None and boot_s == before.imu_boot_s:
+            return
+        self._imu, self._imu_s = vehicle, self._px4_clock.local_s(boot_s, vehicle.imu_stamp_s)
+        if before is None or before.imu_boot_s is None:
+            return
+        dt_s = boot_s - before.imu_boot_s
+        (x, y, z), (bx, by, bz) = vehicle.delta_velocity_body_m_s, before.delta_velocity_body_m_s
+        x, y, z = quat_rotate(vehicle.attitude_wxyz, (x - bx, y - by, z - bz))
+        self._inertial.imu(vehicle.imu_stamp_s, dt_s, (x, y, z - GRAVITY_M_S2 * dt_s))
 
     def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float) -> None:
         """A new frame."""
@@ -168,9 +189,10 @@ class MocapMonitor:
 
     def _age_s(self, pose: MocapPose) -> float:
         """Time from the exposure of a pose to the newest IMU sample, limited; negative if the pose is newer."""
-        if self._imu_s is None:
-            return 0.0
-        return min(max(-IMU_GAP_MAX_S, self._imu_s - pose.stamp_s + (pose.latency_s or 0.0)), self._s.mocap_timeout_s)
+        latency_s, sent_s = pose.latency_s or 0.0, pose.stamp_s
+        if pose.exposure_server_s is not None:
+            sent_s = self._server_clock.local_s(pose.exposure_server_s + latency_s, sent_s)
+        return min(max(-IMU_GAP_MAX_S, self._imu_s - sent_s + latency_s), self._s.mocap_timeout_s)
 
     def _follows(self, before: MocapPose, pose: MocapPose, vehicle: VehicleState) -> bool:
         """The pose is where the body can be by now."""

@@ -86,3 +86,16 @@ def test_a_lost_arm_lands_it(tmp_path_factory: pytest.TempPathFactory) -> None:
     assert ended.code == EXIT_ABORTED, ended
     assert summary["outcome"] == "aborted"
     assert {"takeoff", "arm_lost", "touchdown"} <= {event["id"] for event in summary["events"]}
+
+
+def test_poses_that_are_dragged_are_found_and_px4_lands_it(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """PX4 fuses the dragged poses; what is found is that its IMU does not move with them."""
+    with sandbox_in(tmp_path_factory.mktemp("drag")) as sandbox:
+        fault = set_options(**{"world.faults": [{"kind": "mocap_drag", "t_s": HOVERS_S, "size": 1.0}]})
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *fault)
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+    assert ended.code == EXIT_ABORTED, ended
+    assert summary["outcome"] == "aborted"
+    wanted = ["takeoff", "mocap_dragged", "autopilot_landing"]
+    assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted

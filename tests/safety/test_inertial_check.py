@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from companion.safety.inertial_check import IMU_GAP_MAX_S, SETTLE_S, InertialCheck
+from companion.safety.inertial_check import IMU_GAP_MAX_S, SETTLE_S, InertialCheck, RemoteClock
 
 IMU_S = 0.005
 GAP_MAX_S = 0.12
@@ -51,7 +51,7 @@ def found_s(
             return None
         # The mean acceleration over the sample's interval, as an IMU measures it.
         mean = (swaying_m(t_s) - 2.0 * swaying_m(t_s - IMU_S) + swaying_m(t_s - 2.0 * IMU_S)) / IMU_S**2
-        observer.imu(t_s, (mean + bias_m_s2, 0.0, 0.0))
+        observer.imu(t_s, IMU_S, ((mean + bias_m_s2) * IMU_S, 0.0, 0.0))
         if k % every:
             continue
         since_s = max(0.0, t_s - start_s)
@@ -97,11 +97,14 @@ def test_after_a_gap_the_observer_starts_again(imu_gap: bool) -> None:
     """Whatever happened in the gap was not measured: 1 m further afterwards is no drag."""
     observer = check()
     gap_s = IMU_GAP_MAX_S + 0.01 if imu_gap else GAP_MAX_S + 0.01
+    before_s = -IMU_S
     alarms = []
     for k in range(2000):
         late_s, there_m = (gap_s, 1.0) if k >= 1000 else (0.0, 0.0)
         t_s = k * IMU_S + late_s
-        observer.imu(t_s if imu_gap else k * IMU_S, (0.0, 0.0, 0.0))
+        imu_s = t_s if imu_gap else k * IMU_S
+        observer.imu(imu_s, imu_s - before_s, (0.0, 0.0, 0.0))
+        before_s = imu_s
         alarms.append(observer.pose(t_s, (there_m, 0.0, 1.0), 0.0))
     assert not any(alarms)
     assert observer.innovation_m < 1e-6
@@ -113,7 +116,8 @@ def test_an_imu_that_falls_silent_in_flight_makes_no_drag() -> None:
     for k in range(1400):
         t_s = k * IMU_S
         imu_s = min(t_s, 6.0)
-        observer.imu(imu_s, (0.0, 0.0, 0.0))
+        if imu_s == t_s:
+            observer.imu(imu_s, IMU_S, (0.0, 0.0, 0.0))
         assert not observer.pose(t_s, (t_s, 0.0, 1.0), max(-IMU_GAP_MAX_S, imu_s - t_s))
 
 
@@ -123,5 +127,21 @@ def test_an_old_pose_of_a_moving_vehicle_is_held_against_where_it_was_then() -> 
     for k in range(2400):
         t_s = k * IMU_S
         age_s = 0.05 if k >= 1200 else 0.0
-        observer.imu(t_s, (0.0, 0.0, 0.0))
+        observer.imu(t_s, IMU_S, (0.0, 0.0, 0.0))
         assert not observer.pose(t_s, (t_s - age_s, 0.0, 1.0), age_s)
+
+
+def test_a_late_message_moves_no_clock() -> None:
+    """Messages take 2 ms, every fifth one up to 80 ms more, and the device's clock is 50 ppm slow."""
+    clock = RemoteClock()
+    for k in range(10_000):
+        remote_s = k * IMU_S
+        arrived_s = 1000.0 + remote_s * (1.0 + 50e-6) + 0.002 + (0.02 * (k % 5) if k % 5 == 4 else 0.0)
+        assert clock.local_s(remote_s, arrived_s) == pytest.approx(1000.002 + remote_s * (1.0 + 50e-6), abs=1e-4)
+
+
+@pytest.mark.parametrize("jump_s", [-300.0, 300.0])
+def test_the_clock_of_a_device_that_restarts_is_learned_anew(jump_s: float) -> None:
+    clock = RemoteClock()
+    assert clock.local_s(500.0, 7.0) == pytest.approx(7.0)
+    assert clock.local_s(500.0 + jump_s, 8.0) == pytest.approx(8.0)
