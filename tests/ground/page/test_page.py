@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from companion.ground.messages import Presence, Stream
 from tests.ground.page_browser import Page, events_of, playing, watching
-from tests.ground.page_stand import BROKER, NAME, Stand, ack, event, flown, hello, retained, state, told
+from tests.ground.page_stand import BROKER, NAME, Message, Stand, ack, event, flown, hello, retained, state, told
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
@@ -28,6 +29,20 @@ def stand() -> Iterator[Stand]:
 def page(browser: Any, stand: Stand) -> Iterator[Page]:
     with watching(browser, stand) as page:
         yield page
+
+
+@pytest.fixture(scope="module")
+def watched(browser: Any) -> Iterator[Page]:
+    """One page for all tests that let the vehicle tell something and look: to open one takes seconds of computing time."""
+    with Stand(retained()) as stand, watching(browser, stand) as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def newest() -> Callable[[Stream], Message]:
+    """Of the tests that share a page: each record is newer than those before."""
+    number = itertools.count(1)
+    return lambda stream: told(replace(stream, t_s=1000.0 + 100.0 * next(number)))
 
 
 def in_flight(**changes: Any) -> Stream:
@@ -54,9 +69,9 @@ def test_values_are_those_of_the_newest_record(page: Page) -> None:
     assert page.tab.evaluate("document.getElementById('progress').value") == pytest.approx(stream.progress, abs=1e-3)
 
 
-def test_every_light_of_the_vehicle_is_shown_with_its_state(page: Page) -> None:
-    page.tell(told(in_flight()))
-    rows = page.tab.locator("#light-list li")
+def test_every_light_of_the_vehicle_is_shown_with_its_state(watched: Page, newest: Callable[[Stream], Message]) -> None:
+    watched.tell(newest(in_flight()))
+    rows = watched.tab.locator("#light-list li")
     shown = [(rows.nth(k).get_attribute("data-light"), rows.nth(k).locator(".text").inner_text()) for k in range(10)]
     assert shown == [(light.light.value, light.text) for light in in_flight().lights]
 
@@ -114,12 +129,13 @@ def test_figures_look_dead_when_they_are_old(page: Page, how: str) -> None:
     assert all(one != other for one, other in zip(alive, look(), strict=True))
 
 
-def test_a_record_that_was_long_on_its_way_is_old_when_it_comes(page: Page) -> None:
-    news = playing(in_flight())
-    page.tell(news() | {"age_s": 0.9})
-    assert page.body("stale") == "true" and float(page.tab.get_attribute("#age", "data-age")) >= 0.9
-    page.tell(news() | {"age_s": 0.01})
-    assert page.body("stale") == "false"
+def test_a_record_that_was_long_on_its_way_is_old_when_it_comes(
+    watched: Page, newest: Callable[[Stream], Message]
+) -> None:
+    watched.tell(newest(in_flight()) | {"age_s": 0.9})
+    assert watched.body("stale") == "true" and float(watched.tab.get_attribute("#age", "data-age")) >= 0.9
+    watched.tell(newest(in_flight()) | {"age_s": 0.01})
+    assert watched.body("stale") == "false"
 
 
 def test_a_backlog_does_not_look_alive(page: Page) -> None:
@@ -184,24 +200,26 @@ def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) ->
     ],
 )
 def test_the_word_says_what_it_does_and_how_grave_that_is(
-    page: Page, changes: dict[str, Any], word: str, level: str
+    watched: Page, newest: Callable[[Stream], Message], changes: dict[str, Any], word: str, level: str
 ) -> None:
-    page.tell(told(in_flight(**changes)))
-    assert (page.text("#word"), page.body("level")) == (word, level)
+    watched.tell(newest(in_flight(**changes)))
+    assert (watched.text("#word"), watched.body("level")) == (word, level)
 
 
 @pytest.mark.parametrize(
     ("slack_m", "taut", "snagged", "level"),
     [(1.0, False, False, "ok"), (0.2, False, False, "warn"), (0.03, True, False, "bad"), (1.0, False, True, "bad")],
 )
-def test_tether_slack_shows_in_its_colour(page: Page, slack_m: float, taut: bool, snagged: bool, level: str) -> None:
+def test_tether_slack_shows_in_its_colour(
+    watched: Page, newest: Callable[[Stream], Message], slack_m: float, taut: bool, snagged: bool, level: str
+) -> None:
     tether = in_flight().tether
     assert tether is not None
     view = replace(tether, slack_m=slack_m, stop_slack_m=slack_m, taut=taut, snagged=snagged)
-    page.tell(told(in_flight(tether=view)))
-    assert page.figure("tether") == f"{slack_m:.2f}"
-    assert page.tab.get_attribute(".tile:first-child", "data-level") == level
-    assert page.body("level") == level
+    watched.tell(newest(in_flight(tether=view)))
+    assert watched.figure("tether") == f"{slack_m:.2f}"
+    assert watched.tab.get_attribute(".tile:first-child", "data-level") == level
+    assert watched.body("level") == level
 
 
 def test_the_catch_appears_among_the_events_and_is_read_out(page: Page) -> None:

@@ -31,6 +31,13 @@ def stand() -> Iterator[Stand]:
         yield stand
 
 
+@pytest.fixture(scope="module")
+def opened(browser: Any) -> Iterator[Page]:
+    """One page for all tests that only call its geometry."""
+    with Stand(retained()) as stand, watching(browser, stand) as page:
+        yield page
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_nothing_scrolls_sideways_and_safety_is_always_in_reach(browser: Any, stand: Stand, size: str) -> None:
     with watching(browser, stand, size=size, touch=True) as page:
@@ -182,25 +189,23 @@ def test_the_camera_moves_by_mouse_wheel_and_keys(browser: Any, stand: Stand) ->
         assert len(set(seen)) == 7
 
 
-def test_the_arm_is_drawn_as_the_controller_knows_it(browser: Any, stand: Stand) -> None:
+def test_the_arm_is_drawn_as_the_controller_knows_it(opened: Page) -> None:
     vehicle = load_flight(CATCH).vehicle
     arm = Manipulator(vehicle.arm, vehicle.tool)
     angles = list(itertools.product((-0.5, 0.4, 1.7, 2.9), (-0.2, 0.0, 1.0, 2.4)))
     script = "const { armBody } = await import('/geometry.js'); return a.map((q) => armBody(scene, q));"
-    with watching(browser, stand) as page:
-        drawn = page.tab.evaluate(
-            f"async ([scene, a]) => {{ {script} }}", [to_jsonable(flown().scene), [list(pair) for pair in angles]]
-        )
+    drawn = opened.tab.evaluate(
+        f"async ([scene, a]) => {{ {script} }}", [to_jsonable(flown().scene), [list(pair) for pair in angles]]
+    )
     for pair, parts in zip(angles, drawn, strict=True):
         assert parts["elbow"] == pytest.approx(arm.elbow_body_m(pair), abs=1e-12)
         assert parts["net"] == pytest.approx(arm.net_body_m(pair), abs=1e-12)
 
 
-def test_vectors_turn_as_the_controller_turns_them(browser: Any, stand: Stand) -> None:
+def test_vectors_turn_as_the_controller_turns_them(opened: Page) -> None:
     q, v = quat_from_euler_zyx(0.3, -0.4, 2.0), (0.3, -1.2, 0.7)
-    with watching(browser, stand) as page:
-        script = "async ([q, v]) => (await import('/geometry.js')).rotate(q, v)"
-        assert page.tab.evaluate(script, [list(q), list(v)]) == pytest.approx(quat_rotate(q, v), abs=1e-12)
+    script = "async ([q, v]) => (await import('/geometry.js')).rotate(q, v)"
+    assert opened.tab.evaluate(script, [list(q), list(v)]) == pytest.approx(quat_rotate(q, v), abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -215,11 +220,10 @@ def test_vectors_turn_as_the_controller_turns_them(browser: Any, stand: Stand) -
     ],
 )
 def test_the_tether_has_its_length_and_its_ends(
-    browser: Any, stand: Stand, end: tuple[float, float, float], length_m: float, floor_m: float
+    opened: Page, end: tuple[float, float, float], length_m: float, floor_m: float
 ) -> None:
-    with watching(browser, stand) as page:
-        script = "async ([a, b, l, f]) => (await import('/geometry.js')).hanging(a, b, l, f)"
-        points = page.tab.evaluate(script, [[0.0, 0.0, 0.0], list(end), length_m, floor_m])
+    script = "async ([a, b, l, f]) => (await import('/geometry.js')).hanging(a, b, l, f)"
+    points = opened.tab.evaluate(script, [[0.0, 0.0, 0.0], list(end), length_m, floor_m])
     assert points[0] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
     assert points[-1] == pytest.approx(end, abs=1e-6)
     assert sum(math.dist(a, b) for a, b in itertools.pairwise(points)) == pytest.approx(length_m, rel=0.01)
