@@ -150,8 +150,8 @@ class VehicleState:
     """PX4's own clock, seconds since it started (time_boot_ms of ATTITUDE or ODOMETRY); None: not told."""
     imu_boot_s: float | None = None
     """End of the newest IMU sample's interval on PX4's clock (HIGHRES_IMU.time_usec), s; None: unknown, as in old logs."""
-    delta_velocity_body_m_s: Vec3 = (0.0, 0.0, 0.0)
-    """Integral of the specific force over all IMU samples since the link was opened, up to `imu_boot_s`."""
+    delta_velocity_body_m_s: Vec3 | None = None
+    """Integral of the specific force over all IMU samples since the link was opened, up to `imu_boot_s`; None: unknown."""
 
 
 @quick
@@ -363,8 +363,8 @@ class Outputs:
     tether: TetherState | None = None
     bent_by: tuple[str, ...] = ()
     """What the governor bent the reference for."""
-    mocap_innovation_m: float = 0.0
-    """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged, and in old logs."""
+    mocap_innovation_m: float | None = None
+    """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged, None in old logs."""
 
 
 @quick

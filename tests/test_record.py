@@ -130,3 +130,11 @@ def test_differences_tells_the_field_and_sees_the_last_bit() -> None:
     assert differences(one, other) == ("attitude_wxyz[3]", value, next_value)
     assert differences(-0.0, 0.0) is not None
     assert differences(1, 1.0) is not None
+
+
+def test_a_state_of_a_log_from_before_the_imu_was_summed_is_read() -> None:
+    zero = (0.0, 0.0, 0.0)
+    state = types.VehicleState(1.0, 1.0, 1.0, zero, zero, (1.0, 0.0, 0.0, 0.0), zero, (0.0, 0.0, 9.81))
+    old = to_jsonable(state)
+    assert old.keys().isdisjoint({"boot_s", "imu_boot_s", "delta_velocity_body_m_s"})
+    assert from_jsonable(types.VehicleState, old) == state

@@ -28,8 +28,11 @@ class MeanAcceleration:
 
     def update(self, vehicle: VehicleState) -> Vec3:
         """Return the acceleration, m/s2, world frame; the last one while no new sample has come."""
-        before, boot_s = self._before, vehicle.imu_boot_s
-        if before is None or boot_s is None or before.imu_boot_s is None:
+        before, boot_s, total = self._before, vehicle.imu_boot_s, vehicle.delta_velocity_body_m_s
+        if before is None or boot_s is None or total is None:
+            self._before = vehicle
+            return acceleration_world_m_s2(vehicle)
+        if before.imu_boot_s is None or before.delta_velocity_body_m_s is None:
             self._before = vehicle
             return acceleration_world_m_s2(vehicle)
         dt_s = boot_s - before.imu_boot_s
@@ -37,7 +40,7 @@ class MeanAcceleration:
             return self._value_m_s2
         self._before = vehicle
         if 0.0 < dt_s <= self.GAP_MAX_S:
-            (x, y, z), (bx, by, bz) = vehicle.delta_velocity_body_m_s, before.delta_velocity_body_m_s
+            (x, y, z), (bx, by, bz) = total, before.delta_velocity_body_m_s
             x, y, z = quat_rotate(vehicle.attitude_wxyz, ((x - bx) / dt_s, (y - by) / dt_s, (z - bz) / dt_s))
             self._value_m_s2 = (x, y, z - GRAVITY_M_S2)
         else:

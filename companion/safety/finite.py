@@ -87,7 +87,7 @@ def _vehicle_is_sound(v: VehicleState) -> bool:
     low, high, old, new, boot_s = -ABSURD, ABSURD, -_STAMP_MAX_S, _STAMP_MAX_S, v.boot_s
     (px, py, pz), (vx, vy, vz), (w, x, y, z) = v.position_world_m, v.velocity_world_m_s, v.attitude_wxyz
     (rx, ry, rz), (fx, fy, fz) = v.angular_rate_body_rad_s, v.specific_force_body_m_s2
-    imu_boot_s, (dx, dy, dz) = v.imu_boot_s, v.delta_velocity_body_m_s
+    imu_boot_s, (dx, dy, dz) = v.imu_boot_s, v.delta_velocity_body_m_s or (0.0, 0.0, 0.0)
     return (
         (low < px < high and low < py < high and low < pz < high)
         and (low < vx < high and low < vy < high and low < vz < high)

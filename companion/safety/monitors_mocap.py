@@ -150,8 +150,11 @@ class MocapMonitor:
         self._imu, self._imu_s = vehicle, self._px4_clock.local_s(boot_s, vehicle.imu_stamp_s)
         if before is None or before.imu_boot_s is None:
             return
+        now, then = vehicle.delta_velocity_body_m_s, before.delta_velocity_body_m_s
+        if now is None or then is None:
+            return
         dt_s = boot_s - before.imu_boot_s
-        (x, y, z), (bx, by, bz) = vehicle.delta_velocity_body_m_s, before.delta_velocity_body_m_s
+        (x, y, z), (bx, by, bz) = now, then
         x, y, z = quat_rotate(vehicle.attitude_wxyz, (x - bx, y - by, z - bz))
         self._inertial.imu(vehicle.imu_stamp_s, dt_s, (x, y, z - GRAVITY_M_S2 * dt_s))
 
