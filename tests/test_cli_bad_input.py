@@ -119,6 +119,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (*FLY, "--set", "mission.phases[2].to_m=[2.0, 0, 1]"),
         (
             r"phase 'catch' flies too fast",
+            r"phase 'catch' could not stop within the tether sphere",
             r"mission\.yaml:\d+:\d+: .*phase 'catch' leaves the room.*x = 2\.45 m.*inwards",
         ),
     ),

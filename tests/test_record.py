@@ -31,8 +31,11 @@ from companion.record import (
 from tests.support import ROOT
 
 RECORDS: list[type] = [
-    value for value in vars(types).values() if isinstance(value, type) and dataclasses.is_dataclass(value)
+    value
+    for value in vars(types).values()
+    if isinstance(value, type) and dataclasses.is_dataclass(value) and value is not types.LinkIdentity
 ]
+"""The guardian's heartbeat has a layout of its own, and with it `LinkIdentity`."""
 
 st.register_type_strategy(float, st.floats(allow_nan=False, allow_infinity=False))
 st.register_type_strategy(int, st.integers(-(2**62), 2**62))

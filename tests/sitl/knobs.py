@@ -64,6 +64,7 @@ TOGETHER: dict[str, Settings] = {
     "hand_tap_n": {**_HANDLED_FOR_LONG, "hand_taps": 3},
     "net_weight_kg": {"net_weight_t_s": 1.0},
     "net_weight_t_s": {"net_weight_kg": 0.5, "net_weight_t_s": 1.0},
+    "accel_vibration_hz": {"accel_vibration_m_s2": 5.0},
     "keep_s": {"throws": 2, "keep_s": 0.2},
     "throws": {"keep_s": 0.2},
 }
