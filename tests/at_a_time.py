@@ -11,7 +11,7 @@ import sys
 
 from companion.realtime import FLIGHT_PRIORITY
 
-AT_A_TIME = {"waits": (3, 4), "flights": (1, 2)}
+AT_A_TIME = {"waits": (2, 3), "flights": (1, 2)}
 """Without and with real-time priority, on two cores or more."""
 
 

@@ -1,11 +1,12 @@
 """What tests of whole programs share: a place to run `companion` in, a simulated world on its own, proof that nothing is left.
 
-Everything that a `Sandbox` starts carries a mark in its environment, and children inherit it: whoever still has it afterwards was
-left behind. A pty lives as long as the process that holds its master, so no process means no pty.
+Everything that a `Sandbox` starts works in its folder, and children inherit that: whoever is still there afterwards was left behind.
+A pty lives as long as the process that holds its master, so no process means no pty.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import json
@@ -17,12 +18,11 @@ import subprocess
 import sys
 import threading
 import time
-import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from companion.cli import main
 from companion.config.loader import load_flight
@@ -37,7 +37,6 @@ DEADLINE_S = 90.0
 """For everything that a test waits for: far beyond what it takes, on a loaded machine too."""
 IN_BACKGROUND = ("sh", "-c", 'trap "" INT TERM CHLD; exec "$@"', "sh")
 """Starts a program with signals ignored, as it may inherit them."""
-_MARK = "COMPANION_TEST_MARK"
 PREFLIGHT = "vehicle.safety.preflight_s"
 PATIENT: dict[str, object] = {
     PREFLIGHT: 2.0,
@@ -52,6 +51,10 @@ PATIENT: dict[str, object] = {
 vehicle file allows; what these limits are for is tested where time is simulated, and the preflight has tests of its own. And no flight
 of a test speaks to whatever broker this computer may have.
 """
+
+Result = TypeVar("Result")
+DEVICE_PRIORITY = 20
+"""Of a test's own thread that speaks to a device: below those of the simulated world and of a flight."""
 
 LOW_HOVER: dict[str, object] = {
     "mission.phases[0].height_m": 0.5,
@@ -99,7 +102,7 @@ class Ended:
 
 
 class Sandbox:
-    """A current directory, a TMPDIR and a mark for everything started in it."""
+    """A current directory and a TMPDIR for everything started in it."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str] | None = None) -> None:
         self.cwd = folder / "cwd"
@@ -107,12 +110,11 @@ class Sandbox:
         self.cwd.mkdir(parents=True)
         self.tmp.mkdir()
         self.config = folder / "config"
-        self._mark = uuid.uuid4().hex
         self._environment = dict(environment or {})
 
     @property
     def environment(self) -> dict[str, str]:
-        own = {"TMPDIR": str(self.tmp), "XDG_CONFIG_HOME": str(self.config), _MARK: self._mark, "COLUMNS": "200"}
+        own = {"TMPDIR": str(self.tmp), "XDG_CONFIG_HOME": str(self.config), "COLUMNS": "200"}
         return {**os.environ, **own, **self._environment}
 
     def start(self, *arguments: object, report: bool = False, background: bool = False) -> Running:
@@ -135,19 +137,23 @@ class Sandbox:
             return running.end()
 
     def survivors(self) -> dict[int, str]:
-        """Processes that carry the mark: pid and command line."""
-        mark = f"{_MARK}={self._mark}".encode()
+        """Processes that work in this sandbox: pid and command line.
+
+        Of all others nothing is read that lies in their memory, as command line and environment do: the kernel locks a process's
+        memory map meanwhile, and a flight beside this test would wait for a test that waits for a core.
+        """
+        here = str(self.cwd.resolve())
         found = {}
         for entry in Path("/proc").iterdir():
-            if not entry.name.isdecimal():
+            if not entry.name.isdecimal() or int(entry.name) == os.getpid():
                 continue
             with contextlib.suppress(OSError):  # it ended while we looked, or is another user's
-                if mark in (entry / "environ").read_bytes().split(b"\0"):
+                if os.readlink(entry / "cwd").startswith(here):
                     found[int(entry.name)] = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
         return found
 
     def pid_of(self, module: str) -> int:
-        """The one marked process that runs `python -m MODULE`."""
+        """The one process here that runs `python -m MODULE`."""
         found = [pid for pid, command in self.survivors().items() if f"-m {module} " in f"{command} "]
         assert len(found) == 1, (module, self.survivors())
         return found[0]
@@ -245,10 +251,32 @@ class Running:
         return True
 
 
+@contextlib.contextmanager
+def at_device_priority(priority: int = DEVICE_PRIORITY) -> Iterator[None]:
+    """This thread, and those that it starts meanwhile, run before other tests where that is permitted: whoever speaks to a device in
+    real time must answer in time, whatever the tests beside it compute."""
+    before = os.sched_getscheduler(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, before, os.sched_param(0))
+
+
+def run_on_time(main: Coroutine[Any, Any, Result]) -> Result:
+    """`asyncio.run` for a test that speaks to a device."""
+    with at_device_priority():
+        return asyncio.run(main)
+
+
 def run_here(*arguments: object) -> Ended:
     """`companion ARGUMENTS` in this process, to its end: spares the half second of processor time that the start of a process takes."""
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), at_device_priority():
         try:
             code = main([str(word) for word in arguments])
         except SystemExit as end:

@@ -25,10 +25,22 @@ from companion.io.edges import DeviceError
 from companion.preflight import arm as preflight
 from companion.preflight.observe import observe
 from companion.preflight.rows import Row
+from companion.realtime import WORLD_PRIORITY
 from sitl.server import start_of
 from sitl.servo_bus import ServoBus
 from sitl.servo_knobs import plugged_in, servos_of
-from tests.support import CATCH, ROOT, Ended, Running, Sandbox, World, run_here, sandbox_in
+from tests.support import (
+    CATCH,
+    ROOT,
+    Ended,
+    Running,
+    Sandbox,
+    World,
+    at_device_priority,
+    run_here,
+    run_on_time,
+    sandbox_in,
+)
 
 HAND = "world.arm_hand=true"
 FILES = "3000000"
@@ -82,7 +94,7 @@ class Rig:
 
     def check_rows(self) -> dict[str, Row]:
         """What the preflight finds of the arm, by the vehicle file as it is now."""
-        return asyncio.run(self._look())
+        return run_on_time(self._look())
 
     async def _look(self) -> dict[str, Row]:
         config = load_flight(CATCH, self.vehicle, overrides=self.overrides(_LOOK))
@@ -140,7 +152,12 @@ def bench(folder: Path, servos: str = "[{}, {}]") -> Iterator[Rig]:
 def _served(bus: ServoBus) -> Iterator[str]:
     """The bus's port; its event loop runs in a thread."""
     loop = asyncio.new_event_loop()
-    thread = threading.Thread(target=loop.run_forever, name="bench")
+
+    def serve() -> None:
+        with at_device_priority(WORLD_PRIORITY):
+            loop.run_forever()
+
+    thread = threading.Thread(target=serve, name="bench")
     thread.start()
     try:
         asyncio.run_coroutine_threadsafe(bus.__aenter__(), loop).result()
