@@ -40,6 +40,7 @@ class Page:
 
     def __init__(self, context: Any, stand: Stand | None, script: str) -> None:
         self._stand = stand
+        self._number = itertools.count()
         self.shown = NAME
         self.complaints: list[str] = []
         self.tab = context.new_page()
@@ -60,6 +61,27 @@ class Page:
         self.tab.goto(url)
         settle(self)
         self.tab.clock.pause_at(self.tab.evaluate("Date.now()") + 1000)
+
+    def open_anew(self, stand: Stand, *, size: str = "desktop", scheme: str = "dark") -> None:
+        """Load the page anew: nothing of what it knew or what was heard of it remains.
+
+        This takes a third of the computing time of a new tab.
+        """
+        stand.hang_up()
+        self.shown = NAME
+        self.complaints.clear()
+        self.tab.mouse.move(0, 0)
+        width, height = SIZES[size]
+        self.tab.set_viewport_size({"width": width, "height": height})
+        self.tab.emulate_media(color_scheme=scheme, reduced_motion="reduce")
+        self.tab.goto(stand.url.replace("#", f"?{next(self._number)}#"))
+        greeted(self)
+        self.tab.clock.fast_forward(1000)
+
+    def check_complaints(self, may: str = "") -> None:
+        """Fail if the browser complained of anything that does not contain `may`."""
+        assert self.tab.evaluate("window.violations") == []
+        assert [text for text in self.complaints if not may or may not in text] == []
 
     def tell(self, *messages: Message) -> None:
         """Let the stand say this, until the page has shown it."""
@@ -139,8 +161,7 @@ def watching(
     try:
         page.open(source if isinstance(source, str) else source.url, settle)
         yield page
-        assert page.tab.evaluate("window.violations") == []
-        assert [text for text in page.complaints if not may or may not in text] == []
+        page.check_complaints(may)
     finally:
         context.close()
 

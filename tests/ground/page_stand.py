@@ -158,6 +158,12 @@ class Stand:
         """Gone, with all connections."""
         self._do(self._stop())
 
+    def hang_up(self) -> None:
+        """Close every connection, and forget what was heard."""
+        self._do(self._hang_up())
+        with self._change:
+            self._heard.clear()
+
     def say(self, *messages: Message) -> None:
         """To every page that is connected."""
         self._do(self._say(messages))
@@ -192,9 +198,12 @@ class Stand:
         await web.TCPSite(self._runner, "127.0.0.1", self.port).start()
         self.port = self._runner.addresses[0][1]
 
-    async def _stop(self) -> None:
+    async def _hang_up(self) -> None:
         for socket in list(self._sockets):
             await socket.close()
+
+    async def _stop(self) -> None:
+        await self._hang_up()
         if self._runner is not None:
             await self._runner.cleanup()
             self._runner = None

@@ -20,15 +20,10 @@ HOSTILE = "<img src=x onerror='window.pwned = 1'><script>window.pwned = 1</scrip
 
 
 @pytest.fixture
-def stand() -> Iterator[Stand]:
+def stand_alone() -> Iterator[Stand]:
+    """A stand for a test that stops it: its page is opened for that test."""
     with Stand(retained()) as stand:
         yield stand
-
-
-@pytest.fixture
-def page(browser: Any, stand: Stand) -> Iterator[Page]:
-    with watching(browser, stand) as page:
-        yield page
 
 
 @pytest.fixture(scope="module")
@@ -294,36 +289,36 @@ def test_several_vehicles(stand: Stand, page: Page) -> None:
     assert stand.wait_heard("command", 1) == [{"kind": "command", "vehicle": "second", "command": "hold"}]
 
 
-def test_a_restarted_monitor_is_found_again(browser: Any, stand: Stand) -> None:
-    with watching(browser, stand, may="WebSocket connection to") as page:
+def test_a_restarted_monitor_is_found_again(browser: Any, stand_alone: Stand) -> None:
+    with watching(browser, stand_alone, may="WebSocket connection to") as page:
         page.tell(told(in_flight()))
-        stand.stop()
+        stand_alone.stop()
         page.until_text("#stale", "NO CONNECTION")
         assert page.body("frame") == "bad" and page.enabled() <= SAFE
-        stand.start()
+        stand_alone.start()
         page.tab.clock.resume()
-        stand.wait_heard("token", 2)
+        stand_alone.wait_heard("token", 2)
         page.tell(told(in_flight(t_s=5000.0, position_world_m=(0.0, 0.0, 1.55))))
         page.until_text("[data-figure='height']", "1.55")
 
 
-def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, stand: Stand) -> None:
-    with watching(browser, stand, may="WebSocket connection to") as page:
+def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, stand_alone: Stand) -> None:
+    with watching(browser, stand_alone, may="WebSocket connection to") as page:
         page.tell(told(in_flight()))
-        stand.stop()
+        stand_alone.stop()
         page.until_text("#stale", "NO CONNECTION")
         page.press("hold")
         assert "NOT SENT" in page.text("#answers [data-for='hold']")
 
 
-def test_a_page_that_may_only_watch_says_why(browser: Any, stand: Stand) -> None:
+def test_a_page_that_may_only_watch_says_why(stand: Stand, shared: Page) -> None:
     stand.greeting[0] = hello(can_command=False, operator=None, why_not="this monitor was started with --view-only")
-    with watching(browser, stand) as page:
-        page.tell(told(in_flight()))
-        assert page.enabled() == set()
-        assert page.text("#commands-why") == "this monitor was started with --view-only"
-        assert page.tab.is_visible("#badge-view")
-        page.tab.keyboard.press("Shift+H")
-        page.tell(hello())
-        page.press("abort")
-        assert [message["command"] for message in stand.wait_heard("command", 1)] == ["abort"]
+    shared.open_anew(stand)
+    shared.tell(told(in_flight()))
+    assert shared.enabled() == set()
+    assert shared.text("#commands-why") == "this monitor was started with --view-only"
+    assert shared.tab.is_visible("#badge-view")
+    shared.tab.keyboard.press("Shift+H")
+    shared.tell(hello())
+    shared.press("abort")
+    assert [message["command"] for message in stand.wait_heard("command", 1)] == ["abort"]

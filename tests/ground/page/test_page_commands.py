@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from companion.ground.messages import Presence
-from tests.ground.page_browser import Page, playing, watching
+from tests.ground.page_browser import Page, playing
 from tests.ground.page_stand import NAME, Message, Stand, ack, flown, retained, state, told
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
@@ -25,16 +25,10 @@ NO_ANSWER = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's 
 
 
 @pytest.fixture
-def stand() -> Iterator[Stand]:
-    with Stand(retained()) as stand:
-        yield stand
-
-
-@pytest.fixture
-def page(browser: Any, stand: Stand) -> Iterator[Page]:
-    with watching(browser, stand) as page:
-        page.tell(told(flown().at(8.5)))
-        yield page
+def page(page: Page) -> Page:
+    """The page, told of a flight."""
+    page.tell(told(flown().at(8.5)))
+    return page
 
 
 def sent(command: str, nonce: str = NONCE) -> Message:
