@@ -25,29 +25,37 @@ LARGE_PX, LARGE_BOLD_PX = 24.0, 18.66
 """WCAG 2.2, 1.4.3: text of this size needs 3 : 1, all other 4.5 : 1."""
 
 
+@pytest.fixture(scope="module")
+def tablet(browser: Any) -> Iterator[tuple[Page, Stand]]:
+    """The page on a screen that is touched, and its stand."""
+    with Stand(retained()) as stand, watching(browser, stand, touch=True) as page:
+        yield page, stand
+
+
 @pytest.fixture
-def stand() -> Iterator[Stand]:
-    with Stand(retained()) as stand:
-        yield stand
+def touched(tablet: tuple[Page, Stand]) -> Iterator[tuple[Page, Stand]]:
+    """Both, for a test that loads the page itself, by `Page.open_anew`."""
+    yield tablet
+    tablet[0].check_complaints()
 
 
 @pytest.fixture(scope="module")
-def opened(browser: Any) -> Iterator[Page]:
-    """One page for all tests that only call its geometry."""
-    with Stand(retained()) as stand, watching(browser, stand) as page:
-        yield page
+def geometry(opened: tuple[Page, Stand]) -> Page:
+    """The page for tests that only call its geometry."""
+    return opened[0]
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_nothing_scrolls_sideways_and_safety_is_always_in_reach(browser: Any, stand: Stand, size: str) -> None:
-    with watching(browser, stand, size=size, touch=True) as page:
-        page.tell(told(flown().at(8.5)), told(flown().events))
-        for down_px in (0, 100_000):
-            page.tab.evaluate("y => window.scrollTo(0, y)", down_px)
-            wide, shown = page.tab.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-            assert wide <= shown
-            for command in ("hold", "land", "abort"):
-                _assert_in_reach(page, command)
+def test_nothing_scrolls_sideways_and_safety_is_always_in_reach(touched: tuple[Page, Stand], size: str) -> None:
+    page, stand = touched
+    page.open_anew(stand, size=size)
+    page.tell(told(flown().at(8.5)), told(flown().events))
+    for down_px in (0, 100_000):
+        page.tab.evaluate("y => window.scrollTo(0, y)", down_px)
+        wide, shown = page.tab.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        assert wide <= shown
+        for command in ("hold", "land", "abort"):
+            _assert_in_reach(page, command)
 
 
 def _assert_in_reach(page: Page, command: str) -> None:
@@ -60,62 +68,63 @@ def _assert_in_reach(page: Page, command: str) -> None:
     assert found == command
 
 
-def test_every_control_of_a_tablet_is_large_enough(browser: Any, stand: Stand) -> None:
-    stand.greeting += retained("second")
-    with watching(browser, stand, size="tablet", touch=True) as page:
-        page.tell(told(flown().at(8.5)))
-        for control in page.tab.locator("button:visible, select:visible, summary:visible").all():
-            box = control.bounding_box()
-            assert box["height"] >= TOUCH_PX and box["width"] >= TOUCH_PX, control.inner_text()
+def test_every_control_of_a_tablet_is_large_enough(touched: tuple[Page, Stand]) -> None:
+    page, stand = touched
+    page.open_anew(stand, size="tablet")
+    page.tell(*retained("second"))
+    page.tell(told(flown().at(8.5)))
+    for control in page.tab.locator("button:visible, select:visible, summary:visible").all():
+        box = control.bounding_box()
+        assert box["height"] >= TOUCH_PX and box["width"] >= TOUCH_PX, control.inner_text()
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_every_plots_values_stand_beside_its_title(browser: Any, stand: Stand, size: str) -> None:
+def test_every_plots_values_stand_beside_its_title(shared: Page, stand: Stand, size: str) -> None:
     """Its head has room for one line; a second one is cut off."""
     late = dataclasses.replace(flown().at(8.5).timing, lateness_ms=12.3, mocap_age_ms=16.5, whole_ms=10.4)
-    with watching(browser, stand, size=size) as page:
-        page.tell(told(dataclasses.replace(flown().at(8.5), timing=late)))
-        cut = page.tab.evaluate(
-            "[...document.querySelectorAll('.plot header')].filter((h) => h.scrollHeight > h.clientHeight).map((h) => h.innerText)"
-        )
-        assert cut == []
-        assert page.tab.locator(".plot header").count() >= 7
+    shared.open_anew(stand, size=size)
+    shared.tell(told(dataclasses.replace(flown().at(8.5), timing=late)))
+    cut = shared.tab.evaluate(
+        "[...document.querySelectorAll('.plot header')].filter((h) => h.scrollHeight > h.clientHeight).map((h) => h.innerText)"
+    )
+    assert cut == []
+    assert shared.tab.locator(".plot header").count() >= 7
 
 
-def test_buttons_stay_where_they_are_when_things_go_wrong(browser: Any, stand: Stand) -> None:
+def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stand: Stand) -> None:
     """A finger may be on its way."""
     for size in SIZES:
-        with watching(browser, stand, size=size) as page:
-            page.tell(told(flown().at(8.5)))
+        shared.open_anew(stand, size=size)
+        shared.tell(told(flown().at(8.5)))
 
-            def boxes(page: Page = page) -> list[Any]:
-                commands = ("hold", "land", "abort")
-                return [page.tab.locator(f"[data-command='{command}']").bounding_box() for command in commands]
+        def boxes() -> list[Any]:
+            commands = ("hold", "land", "abort")
+            return [shared.tab.locator(f"[data-command='{command}']").bounding_box() for command in commands]
 
-            before = boxes()
-            for command in ("hold", "land"):
-                text = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch (sent again, 2 of 3)"
-                page.tell({"kind": "refused", "vehicle": page.shown, "command": command, "text": text})
-            page.run(5.0)
-            assert page.tab.is_visible("#stale") and boxes() == before
-            page.tell({**BROKER, "rubbish": 7, "rubbish_text": "no JSON"})
-            assert page.tab.is_visible("#notice") and boxes() == before
-            page.tell(hello(can_command=False, why_not="this monitor was started with --view-only"))
-            assert page.tab.is_visible("#commands-why") and boxes() == before
+        before = boxes()
+        for command in ("hold", "land"):
+            text = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch (sent again, 2 of 3)"
+            shared.tell({"kind": "refused", "vehicle": shared.shown, "command": command, "text": text})
+        shared.run(5.0)
+        assert shared.tab.is_visible("#stale") and boxes() == before
+        shared.tell({**BROKER, "rubbish": 7, "rubbish_text": "no JSON"})
+        assert shared.tab.is_visible("#notice") and boxes() == before
+        shared.tell(hello(can_command=False, why_not="this monitor was started with --view-only"))
+        assert shared.tab.is_visible("#commands-why") and boxes() == before
 
 
 @pytest.mark.parametrize(("scheme", "stale"), list(itertools.product(("dark", "light"), (False, True))))
-def test_text_has_enough_contrast(browser: Any, stand: Stand, scheme: str, stale: bool) -> None:
-    with watching(browser, stand, scheme=scheme) as page:
-        lines = [event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")]
-        page.tell(told(flown().at(8.5)), events_of(*lines))
-        page.tell({"kind": "refused", "vehicle": page.shown, "command": "land", "text": "no answer"})
-        page.tab.click("#control summary")
-        page.tab.click("#preflight summary")
-        if stale:
-            page.run(2.0)
-        weak = [text for text in page.tab.evaluate(_CONTRAST, [LARGE_PX, LARGE_BOLD_PX]) if text]
-        assert weak == []
+def test_text_has_enough_contrast(shared: Page, stand: Stand, scheme: str, stale: bool) -> None:
+    shared.open_anew(stand, scheme=scheme)
+    lines = [event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")]
+    shared.tell(told(flown().at(8.5)), events_of(*lines))
+    shared.tell({"kind": "refused", "vehicle": shared.shown, "command": "land", "text": "no answer"})
+    shared.tab.click("#control summary")
+    shared.tab.click("#preflight summary")
+    if stale:
+        shared.run(2.0)
+    weak = [text for text in shared.tab.evaluate(_CONTRAST, [LARGE_PX, LARGE_BOLD_PX]) if text]
+    assert weak == []
 
 
 _CONTRAST = """([large, largeBold]) => {
@@ -148,53 +157,51 @@ _CONTRAST = """([large, largeBold]) => {
 }"""
 
 
-def test_everything_can_be_reached_by_keyboard_and_the_commands_first(browser: Any, stand: Stand) -> None:
-    with watching(browser, stand) as page:
-        page.tell(told(flown().at(8.5)))
+def test_everything_can_be_reached_by_keyboard_and_the_commands_first(page: Page) -> None:
+    page.tell(told(flown().at(8.5)))
+    page.tab.keyboard.press("Tab")
+    page.tab.keyboard.press("Enter")
+    order = []
+    for _ in range(3):
         page.tab.keyboard.press("Tab")
-        page.tab.keyboard.press("Enter")
-        order = []
-        for _ in range(3):
-            page.tab.keyboard.press("Tab")
-            order.append(page.tab.evaluate("document.activeElement.dataset.command"))
-        assert order == ["hold", "land", "abort"]
+        order.append(page.tab.evaluate("document.activeElement.dataset.command"))
+    assert order == ["hold", "land", "abort"]
 
 
-def test_the_camera_moves_by_mouse_wheel_and_keys(browser: Any, stand: Stand) -> None:
-    with watching(browser, stand) as page:
-        page.tell(told(flown().at(8.5)))
+def test_the_camera_moves_by_mouse_wheel_and_keys(page: Page) -> None:
+    page.tell(told(flown().at(8.5)))
 
-        def picture() -> str:
-            page.run(0.5)
-            found: str = page.tab.evaluate("document.getElementById('scene').toDataURL()")
-            return found
+    def picture() -> str:
+        page.run(0.5)
+        found: str = page.tab.evaluate("document.getElementById('scene').toDataURL()")
+        return found
 
-        seen = [picture()]
-        for preset in ("behind", "top", "side", "room"):
-            page.tab.click(f"[data-preset='{preset}']")
-            seen.append(picture())
-        assert seen[0] == seen[4] and len(set(seen)) == 4
-        page.tab.hover("#scene")
-        page.tab.mouse.down()
-        page.tab.mouse.move(400, 400)
-        page.tab.mouse.up()
+    seen = [picture()]
+    for preset in ("behind", "top", "side", "room"):
+        page.tab.click(f"[data-preset='{preset}']")
         seen.append(picture())
-        page.tab.evaluate("window.wheels = 0; addEventListener('wheel', () => { window.wheels += 1; })")
-        page.tab.mouse.wheel(0, -300)
-        page.until("() => window.wheels > 0")
-        seen.append(picture())
-        page.tab.focus("#scene")
-        page.tab.keyboard.press("ArrowLeft")
-        seen.append(picture())
-        assert len(set(seen)) == 7
+    assert seen[0] == seen[4] and len(set(seen)) == 4
+    page.tab.hover("#scene")
+    page.tab.mouse.down()
+    page.tab.mouse.move(400, 400)
+    page.tab.mouse.up()
+    seen.append(picture())
+    page.tab.evaluate("window.wheels = 0; addEventListener('wheel', () => { window.wheels += 1; })")
+    page.tab.mouse.wheel(0, -300)
+    page.until("() => window.wheels > 0")
+    seen.append(picture())
+    page.tab.focus("#scene")
+    page.tab.keyboard.press("ArrowLeft")
+    seen.append(picture())
+    assert len(set(seen)) == 7
 
 
-def test_the_arm_is_drawn_as_the_controller_knows_it(opened: Page) -> None:
+def test_the_arm_is_drawn_as_the_controller_knows_it(geometry: Page) -> None:
     vehicle = load_flight(CATCH).vehicle
     arm = Manipulator(vehicle.arm, vehicle.tool)
     angles = list(itertools.product((-0.5, 0.4, 1.7, 2.9), (-0.2, 0.0, 1.0, 2.4)))
     script = "const { armBody } = await import('/geometry.js'); return a.map((q) => armBody(scene, q));"
-    drawn = opened.tab.evaluate(
+    drawn = geometry.tab.evaluate(
         f"async ([scene, a]) => {{ {script} }}", [to_jsonable(flown().scene), [list(pair) for pair in angles]]
     )
     for pair, parts in zip(angles, drawn, strict=True):
@@ -202,10 +209,10 @@ def test_the_arm_is_drawn_as_the_controller_knows_it(opened: Page) -> None:
         assert parts["net"] == pytest.approx(arm.net_body_m(pair), abs=1e-12)
 
 
-def test_vectors_turn_as_the_controller_turns_them(opened: Page) -> None:
+def test_vectors_turn_as_the_controller_turns_them(geometry: Page) -> None:
     q, v = quat_from_euler_zyx(0.3, -0.4, 2.0), (0.3, -1.2, 0.7)
     script = "async ([q, v]) => (await import('/geometry.js')).rotate(q, v)"
-    assert opened.tab.evaluate(script, [list(q), list(v)]) == pytest.approx(quat_rotate(q, v), abs=1e-12)
+    assert geometry.tab.evaluate(script, [list(q), list(v)]) == pytest.approx(quat_rotate(q, v), abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -220,10 +227,10 @@ def test_vectors_turn_as_the_controller_turns_them(opened: Page) -> None:
     ],
 )
 def test_the_tether_has_its_length_and_its_ends(
-    opened: Page, end: tuple[float, float, float], length_m: float, floor_m: float
+    geometry: Page, end: tuple[float, float, float], length_m: float, floor_m: float
 ) -> None:
     script = "async ([a, b, l, f]) => (await import('/geometry.js')).hanging(a, b, l, f)"
-    points = opened.tab.evaluate(script, [[0.0, 0.0, 0.0], list(end), length_m, floor_m])
+    points = geometry.tab.evaluate(script, [[0.0, 0.0, 0.0], list(end), length_m, floor_m])
     assert points[0] == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
     assert points[-1] == pytest.approx(end, abs=1e-6)
     assert sum(math.dist(a, b) for a, b in itertools.pairwise(points)) == pytest.approx(length_m, rel=0.01)

@@ -38,18 +38,40 @@ def log_of(streams: tuple[Stream, ...] | None = None) -> Message:
     }
 
 
+def replays(stand: Stand) -> None:
+    """Let a stand offer two logs."""
+    stand.greeting = [hello(can_command=False, replay=True, logs=["first.mcap", "second.mcap"], why_not="a log")]
+    stand.replay = [log_of(), log_of(tuple(replace(s, phase="second log") for s in flown().streams))]
+
+
 @pytest.fixture
 def stand() -> Iterator[Stand]:
+    """A stand for a test with a log, or none, of its own."""
     with Stand() as stand:
-        stand.greeting = [hello(can_command=False, replay=True, logs=["first.mcap", "second.mcap"], why_not="a log")]
-        stand.replay = [log_of(), log_of(tuple(replace(s, phase="second log") for s in flown().streams))]
+        replays(stand)
         yield stand
 
 
+@pytest.fixture(scope="module")
+def opened_log(browser: Any) -> Iterator[tuple[Page, Stand]]:
+    """One page for all tests that play the log."""
+    with Stand() as stand:
+        replays(stand)
+        with watching(browser, stand, settle=loaded) as page:
+            yield page, stand
+
+
 @pytest.fixture
-def page(browser: Any, stand: Stand) -> Iterator[Page]:
-    with watching(browser, stand, settle=loaded) as page:
-        yield page
+def page(opened_log: tuple[Page, Stand]) -> Page:
+    """The page at the beginning of the log, as it is after loading; it does not play."""
+    page = opened_log[0]
+    if page.tab.get_attribute("#replay-play", "aria-label") == "Pause":
+        page.tab.click("#replay-play")
+    page.tab.select_option("#replay-speed", "1")
+    page.tab.evaluate("document.activeElement.blur()")
+    page.tab.keyboard.press("Home")
+    assert (page.text("#word"), shown_s(page), page.text("#phase")) == ("GROUND", 0.0, flown().streams[0].phase)
+    return page
 
 
 def loaded(page: Page) -> None:
@@ -138,13 +160,14 @@ def test_another_log_can_be_picked(page: Page) -> None:
     loaded(page)
     page.tab.select_option("#replay-log", "0")
     page.until("() => document.getElementById('phase').textContent !== 'second log'")
+    loaded(page)
 
 
-def test_nothing_can_be_commanded(stand: Stand, page: Page) -> None:
+def test_nothing_can_be_commanded(opened_log: tuple[Page, Stand], page: Page) -> None:
     assert not page.tab.is_visible("#commands")
     page.tab.keyboard.press("Shift+H")
     page.tab.keyboard.press("End")
-    assert page.text("#word") == "ENDED" and stand.heard("command") == []
+    assert page.text("#word") == "ENDED" and opened_log[1].heard("command") == []
 
 
 def test_a_log_that_is_not_to_be_had_is_one_line(browser: Any, stand: Stand) -> None:
