@@ -21,12 +21,13 @@ from typing import Any
 import pytest
 
 from companion.analysis import metrics
+from companion.campaign_process import CampaignProcess
 from companion.config.loader import load_flight
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
+from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT
 from companion.types import Outcome, PhaseKind
 from sitl import campaign
 from sitl.fast import FastFlight, FastResult
-from tests.support import DEADLINE_S, SHORT_CATCH, Ended, Sandbox, position_error_m, sandbox_in, wait_until
+from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, position_error_m, sandbox_in, wait_until
 
 CONFIG = load_flight(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
 FLIGHT: dict[str, Any] = {
@@ -151,42 +152,43 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sandbox]:
 
 
 TINY = (
-    *(
-        "compare",
-        "--mission",
-        SHORT_CATCH,
-        "--payloads",
-        "0.2",
-        "--controllers",
-        "adaptive",
-        "--presets",
-        "paper,recommended",
-    ),
-    "--json",
+    *("compare", "--mission", SHORT_CATCH, "--payloads", "0.2", "--controllers", "adaptive"),
+    *("--presets", "paper,recommended", "--json"),
 )
+PAPER = load_flight(SHORT_CATCH, preset="paper", overrides=("world.payload_kg=0.2", "world.seed=3"))
 
 
 @pytest.fixture(scope="module")
-def flown(place: Sandbox) -> Ended:
-    """Two presets with one seed, one after the other in one process."""
-    ended = place.run(*TINY, "--seeds", "1", "--jobs", "1", "--out", "one")
-    assert ended.code == EXIT_OK, ended.err
-    return ended
+def expected(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """`FLIGHT` and the same with the paper's preset, one after the other in this process."""
+    return [result, campaign.fly(PAPER.model_dump_json(), {**FLIGHT, "preset": "paper"})]
 
 
-def test_two_processes_fly_the_same_rows(flown: Ended, place: Sandbox) -> None:
-    two = place.run(*TINY, "--seeds", "1", "--jobs", "2", "--out", "two")
-    assert two.code == EXIT_OK, two.err
-    assert two.out == flown.out
-    place.assert_nobody_left(DEADLINE_S)
+def flown_by(folder: Path, jobs: int | None, scheduler: str | None) -> list[dict[str, Any]]:
+    """The flights of `expected`, flown by a campaign."""
+    job = {
+        "configs": [config.model_dump(mode="json") for config in (CONFIG, PAPER)],
+        "flights": [FLIGHT, {**FLIGHT, "variant": 1, "preset": "paper"}],
+        "jobs": jobs,
+        "scheduler": scheduler,
+    }
+    with CampaignProcess(job, folder / "campaign.log") as process:
+        return sorted(process.results(), key=lambda message: int(message["index"]))
 
 
-def test_a_dask_cluster_flies_the_same_rows(flown: Ended, place: Sandbox, tmp_path: Path) -> None:
+def assert_same_flights(flown: list[dict[str, Any]], expected: list[dict[str, Any]]) -> None:
+    for key in ("row", "series"):
+        assert [message[key] for message in flown] == [message[key] for message in expected]
+
+
+def test_two_processes_fly_the_same_rows(expected: list[dict[str, Any]], tmp_path: Path) -> None:
+    assert_same_flights(flown_by(tmp_path, 2, None), expected)
+
+
+def test_a_dask_cluster_flies_the_same_rows(expected: list[dict[str, Any]], place: Sandbox, tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed (extra cluster)")
     with cluster(place, tmp_path, workers=2) as address:
-        ended = place.run(*TINY, "--seeds", "1", "--scheduler", address, "--out", "dask")
-    assert ended.code == EXIT_OK, ended.err
-    assert ended.out == flown.out
+        assert_same_flights(flown_by(tmp_path, None, address), expected)
 
 
 def test_a_scheduler_that_is_not_there_is_bad_input(place: Sandbox) -> None:
