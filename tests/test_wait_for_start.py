@@ -9,7 +9,7 @@ import pytest
 
 from companion.config.loader import load_flight
 from companion.exit_codes import EXIT_BAD_INPUT
-from tests.support import HOVER, sandbox_in, set_options
+from tests.support import HOVER, run_here, sandbox_in, set_options
 
 
 @pytest.mark.parametrize(
@@ -23,11 +23,18 @@ from tests.support import HOVER, sandbox_in, set_options
 )
 @pytest.mark.parametrize("by_key", [False, True], ids=["by the option", "by the key"])
 def test_a_flight_that_would_wait_for_ever_is_refused(
-    tmp_path: Path, mqtt: dict[str, object], why: str, by_key: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    mqtt: dict[str, object],
+    why: str,
+    by_key: bool,
 ) -> None:
     key = set_options(**{"mission.start.takeoff": "by_operator"}) if by_key else ["--wait-for-start"]
     with sandbox_in(tmp_path) as sandbox:
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *key, *set_options(**mqtt))
+        monkeypatch.chdir(sandbox.cwd)
+        for name, value in sandbox.environment.items():
+            monkeypatch.setenv(name, value)
+        ended = run_here("fly", HOVER, "--sitl", "--out", "out", *key, *set_options(**mqtt))
         sandbox.assert_nobody_left()
         assert not (sandbox.cwd / "out").exists()
     assert ended.code == EXIT_BAD_INPUT

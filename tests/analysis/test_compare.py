@@ -28,7 +28,7 @@ from companion.analysis.printed import TABLE, printed
 from companion.config.controller import PRESETS
 from companion.config.loader import load_flight
 from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from tests.support import CATCH, DEADLINE_S, SHORT_CATCH, Ended, Sandbox, sandbox_in
+from tests.support import CATCH, DEADLINE_S, SHORT_CATCH, Ended, Sandbox, run_here, sandbox_in
 
 AVAILABLE = {"adaptive": ("paper", "recommended"), "csc": ("tuned",), "psc": ("tuned",)}
 CRASHING = "world.throw_velocity_m_s=[-40, 0, -40]"
@@ -305,12 +305,15 @@ def test_the_table_shows_ours_and_the_papers_and_a_crash_as_one(place: Sandbox) 
         (("--out", "taken"), r"^companion compare: --out taken: there is a compare\.json already"),
     ],
 )
-def test_bad_input_is_one_line_and_nothing_flies(place: Sandbox, arguments: tuple[str, ...], why: str) -> None:
+def test_bad_input_is_one_line_and_nothing_flies(
+    place: Sandbox, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], why: str
+) -> None:
     taken = place.cwd / "taken"
     taken.mkdir(exist_ok=True)
     (taken / "compare.json").write_text("{}", encoding="utf-8")
     before = sorted(place.cwd.iterdir())
-    ended = place.run("compare", "--mission", CATCH, *arguments)
+    monkeypatch.chdir(place.cwd)
+    ended = run_here("compare", "--mission", CATCH, *arguments)
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1 and re.search(why, ended.err), ended.err
     assert ended.out == ""

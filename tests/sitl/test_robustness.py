@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +21,7 @@ from sitl.campaign import CampaignError
 from sitl.fast import FastFlight
 from sitl.model import link_masses_kg
 from sitl.world import World as SimulatedWorld
-from tests.support import CATCH, DEADLINE_S, HOVER, position_error_m, sandbox_in
+from tests.support import CATCH, DEADLINE_S, HOVER, SHORT_CATCH, position_error_m, run_here, sandbox_in
 
 CONFIG = load_flight(CATCH, preset="recommended")
 PLACES = robustness.throws(CONFIG.mission, CONFIG.vehicle)
@@ -193,14 +194,17 @@ def test_links_weigh_what_the_world_says() -> None:
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_flies_writes_and_flies_its_worst_again(tmp_path: Any) -> None:
+def test_the_command_flies_writes_and_flies_its_worst_again(tmp_path: Path) -> None:
+    config = load_flight(SHORT_CATCH)
+    places = robustness.throws(config.mission, config.vehicle)
     with sandbox_in(tmp_path) as place:
         options = ("--jobs", "1", "--json")
-        ended = place.run("robustness", str(CATCH), "--draws", "2", "--seed", "7", *options, "--out", "one")
+        ended = place.run("robustness", SHORT_CATCH, "--draws", "2", "--seed", "1", *options, "--out", "one")
         assert ended.code == EXIT_OK, ended.err
         found = json.loads(ended.out)
-        assert [row["world"] for row in found["rows"]] == DRAWS[:2]
+        assert [row["world"] for row in found["rows"]] == [robustness.draw(1, n, places) for n in range(2)]
         assert found["summary"]["outcomes"] == {"completed": 2}
+        assert all(row["e_p_m"] is not None for row in found["rows"])
         written = {path.name for path in (place.cwd / "one").iterdir()}
         assert written == {"draws.csv", "robustness.json", "worst.yaml", "distribution.png"}
         again = place.run("robustness", "--cases", "one/worst.yaml", *options, "--out", "two")
@@ -221,9 +225,11 @@ def test_the_command_flies_writes_and_flies_its_worst_again(tmp_path: Any) -> No
         ((str(CATCH), "--set", "world.wind=3"), "wind"),
     ],
 )
-def test_bad_input_is_one_line_and_nothing_is_left(words: tuple[str, ...], why: str, tmp_path: Any) -> None:
-    with sandbox_in(tmp_path) as place:
-        ended = place.run("robustness", *words)
-        assert ended.code == EXIT_BAD_INPUT
-        assert len(ended.err_lines) == 1 and why in ended.err
-        assert not (place.cwd / "robustness").exists()
+def test_bad_input_is_one_line_and_nothing_is_left(
+    words: tuple[str, ...], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = run_here("robustness", *words)
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1 and why in ended.err
+    assert not any(tmp_path.iterdir())
