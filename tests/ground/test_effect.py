@@ -190,13 +190,12 @@ def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
     assert flown.outcome is Outcome.COMPLETED
 
 
-@pytest.mark.parametrize("command", [HOLD, RESUME, LAND, ABORT, START])
-def test_nothing_is_done_against_a_pilot(command: OperatorCommand) -> None:
+def test_nothing_is_done_against_a_pilot() -> None:
     def change(i: Inputs) -> Inputs:
         return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 7.0 else i
 
-    flown = commanded((7.5, command), change=change)
-    assert flown.effects == [(False, "a pilot has the vehicle: nothing is sent against them")]
+    flown = commanded((7.5, HOLD), (7.6, RESUME), (7.7, LAND), (7.8, ABORT), (7.9, START), change=change)
+    assert flown.effects == [(False, "a pilot has the vehicle: nothing is sent against them")] * 5
     assert flown.at(7.5).phase == "a pilot flies"
     assert all(o.attitude is None for o in flown.outputs if o.t_s > 7.1)
 
@@ -243,16 +242,17 @@ def test_called_off_before_it_lifts(phase: str, command: OperatorCommand, text: 
     assert not flown.flight.px4.armed
 
 
-@pytest.mark.parametrize("phase", ["wait", "offboard", "arm", "spool up"])
-def test_a_flight_that_takes_off_by_itself_needs_no_start(phase: str) -> None:
-    begin_s = times_of(ordinary())[phase]
-    flown = commanded((begin_s + 0.004, START), (begin_s + 0.104, RESUME))
-    if phase == "wait":
-        text = "start refused: this flight takes off by itself as soon as it can"
-        assert flown.effects[0] == (False, text)
-    else:
-        assert flown.effects[0] == (True, "taking off already")
-    assert flown.effects[1] == (False, "nothing to resume: on the ground")
+def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
+    phases = times_of(ordinary())
+    begin_s = [phases[phase] for phase in ("wait", "offboard", "arm", "spool up")]
+    flown = commanded(
+        *((t_s + late_s, command) for t_s in begin_s for late_s, command in ((0.004, START), (0.104, RESUME)))
+    )
+    assert flown.effects[0::2] == [
+        (False, "start refused: this flight takes off by itself as soon as it can"),
+        *[(True, "taking off already")] * 3,
+    ]
+    assert flown.effects[1::2] == [(False, "nothing to resume: on the ground")] * 4
     assert flown.outcome is Outcome.COMPLETED
 
 
