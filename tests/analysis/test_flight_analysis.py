@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,12 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
     return FlightLog.read(path)
 
 
+@cache
+def flown() -> list[Row]:
+    """The ticks of `flight`."""
+    return list(synthetic_flight())
+
+
 def made_of(rows: list[Row], config: dict[str, Any] | None = None) -> FlightLog:
     metadata = {"companion": {"version_companion": "0.1.0"}, "config": {"json": json.dumps(config or CONFIG)}}
     inputs, outputs, sent = zip(*rows, strict=True)
@@ -41,14 +48,14 @@ def made_of(rows: list[Row], config: dict[str, Any] | None = None) -> FlightLog:
 
 
 def changed(change: Callable[[Inputs, Outputs, Sent], Row]) -> FlightLog:
-    return made_of([change(*row) for row in synthetic_flight()])
+    return made_of([change(*row) for row in flown()])
 
 
 def test_a_log_gives_back_every_record_bit_for_bit(flight: FlightLog) -> None:
-    rows = list(synthetic_flight())
+    rows = flown()
     assert len(flight.inputs) == len(rows)
-    for logged, flown in zip(flight.rows(), rows, strict=True):
-        assert differences(logged, flown) is None
+    for logged, row in zip(flight.rows(), rows, strict=True):
+        assert differences(logged, row) is None
     assert flight.closed
     assert flight.config == CONFIG
     assert flight.missing_ticks() == 0
@@ -125,7 +132,7 @@ def test_a_frame_is_held_against_the_reference_of_its_exposure() -> None:
 
 
 def test_a_catch_that_was_noticed_late_counts_from_the_time_it_is_dated() -> None:
-    contact_s = next(i.t_s for i, o, _ in synthetic_flight() if o.mission_t_s >= CATCH_S - 0.25)
+    contact_s = next(i.t_s for i, o, _ in flown() if o.mission_t_s >= CATCH_S - 0.25)
 
     def date_back(i: Inputs, o: Outputs, s: Sent) -> Row:
         events = tuple(replace(event, t_s=contact_s) if event.id == "catch" else event for event in o.events)
@@ -318,7 +325,7 @@ def test_every_key_is_there_whatever_is_missing(flight: FlightLog, tmp_path: Pat
 
 
 def test_without_a_catch_the_whole_flight_is_before_it() -> None:
-    log = made_of([(i, replace(o, events=()), s) for i, o, s in synthetic_flight()])
+    log = made_of([(i, replace(o, events=()), s) for i, o, s in flown()])
     pre, post = metrics.flight_masks(log)
     assert pre.sum() == sum(o.phase_kind is PhaseKind.FLIGHT for o in log.outputs)
     assert not post.any()

@@ -23,7 +23,7 @@ TICKS = 500
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("flight") / "flight.mcap"
-    record_flight(path)
+    record_flight(path, rate_hz=100.0)
     return path
 
 

@@ -16,7 +16,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from companion import flight as flight_module
-from companion.analysis import side_by_side_plots
+from companion.analysis import plots, side_by_side_plots
 from companion.analysis.log import FlightLog
 from companion.analysis.metrics import min_slack_m
 from companion.analysis.side_by_side import Comparison, Figure, Flight, NotAlignable, compare, flight_of, jsonable
@@ -459,7 +459,9 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
         log = root / name / "flight.mcap"
         end_s = 5.0 if name == "short" else LANDED_S
         assert record_flight(log, config=config, end_s=end_s, rate_hz=50.0).error is None
-    assert main(["report", str(root / "whole/flight.mcap")]) == EXIT_OK
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+        assert main(["report", str(root / "whole/flight.mcap")]) == EXIT_OK
     return root
 
 
