@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import socket
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
 
 import pytest
 
@@ -16,7 +17,7 @@ from companion.core import FlightCore
 from companion.launcher import with_devices
 from companion.preflight import run as before_arming
 from companion.types import Inputs, Outcome, Outputs
-from tests.support import HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
+from tests.support import HOVER, LOW_HOVER, PATIENT, World, run_on_time, sandbox_in, set_options
 
 BREAKS_AFTER_S = 2.5
 
@@ -31,6 +32,17 @@ class BreakingCore(FlightCore):
         return outputs
 
 
+@contextlib.contextmanager
+def full_disk() -> Iterator[TextIO]:
+    """A file that cannot be written, not even when it is closed."""
+    full = open("/dev/full", "w", buffering=1, encoding="utf-8")  # noqa: SIM115 - closed below
+    try:
+        yield full
+    finally:
+        with contextlib.suppress(OSError):
+            full.close()
+
+
 @pytest.mark.flight
 def test_an_internal_error_in_the_air_lands_by_px4(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
@@ -41,16 +53,13 @@ def test_an_internal_error_in_the_air_lands_by_px4(
         monkeypatch.setattr(room, "claim_realtime", lambda priority, **_: "not for the test's own process")
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.setblocking(False)
-    full = open("/dev/full", "w", buffering=1, encoding="utf-8")  # noqa: SIM115 - closed below, which it resents
-    monkeypatch.setattr(sys, "stderr", full)
     options = [word for word in set_options(**PATIENT, **LOW_HOVER) if word != "--set"]
-    with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs:
+    with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs, full_disk() as full:
+        monkeypatch.setattr(sys, "stderr", full)
         config = with_devices(load_flight(HOVER, overrides=options), world.devices)
-        outcome = asyncio.run(app.fly(config, tmp_path, theirs))
+        outcome = run_on_time(app.fly(config, tmp_path, theirs))
         assert outcome is Outcome.ABORTED
         rest = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]
         assert rest[-2:] == [False, True], "it armed, and stands disarmed"
         assert not world.crashes
-    with contextlib.suppress(OSError):
-        full.close()
     assert "ZeroDivisionError: a bug" not in capfd.readouterr().err, "it went to the disk that is full"
