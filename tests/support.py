@@ -6,7 +6,6 @@ A pty lives as long as the process that holds its master, so no process means no
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import io
 import json
@@ -18,11 +17,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from companion.cli import main
 from companion.config.loader import load_flight
@@ -51,10 +50,6 @@ PATIENT: dict[str, object] = {
 vehicle file allows; what these limits are for is tested where time is simulated, and the preflight has tests of its own. And no flight
 of a test speaks to whatever broker this computer may have.
 """
-
-Result = TypeVar("Result")
-DEVICE_PRIORITY = 20
-"""Of a test's own thread that speaks to a device: below those of the simulated world and of a flight."""
 
 LOW_HOVER: dict[str, object] = {
     "mission.phases[0].height_m": 0.5,
@@ -251,32 +246,10 @@ class Running:
         return True
 
 
-@contextlib.contextmanager
-def at_device_priority(priority: int = DEVICE_PRIORITY) -> Iterator[None]:
-    """This thread, and those that it starts meanwhile, run before other tests where that is permitted: whoever speaks to a device in
-    real time must answer in time, whatever the tests beside it compute."""
-    before = os.sched_getscheduler(0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
-    except OSError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, before, os.sched_param(0))
-
-
-def run_on_time(main: Coroutine[Any, Any, Result]) -> Result:
-    """`asyncio.run` for a test that speaks to a device."""
-    with at_device_priority():
-        return asyncio.run(main)
-
-
 def run_here(*arguments: object) -> Ended:
     """`companion ARGUMENTS` in this process, to its end: spares the half second of processor time that the start of a process takes."""
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), at_device_priority():
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             code = main([str(word) for word in arguments])
         except SystemExit as end:

@@ -24,20 +24,10 @@ from pymavlink import mavutil
 from companion.clock import flight_clock
 from companion.config.loader import load_flight
 from companion.devices import open_edges
+from companion.event_loop import run
 from companion.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.io.edges import DeviceError
-from tests.support import (
-    CATCH,
-    DEADLINE_S,
-    HOVER,
-    Ended,
-    Sandbox,
-    World,
-    read_summary,
-    run_on_time,
-    sandbox_in,
-    set_options,
-)
+from tests.support import CATCH, DEADLINE_S, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
 SHARED = pytest.mark.xdist_group("the world that refuses")
 """Tests that share one world run in one process."""
@@ -178,7 +168,7 @@ def refused_at_opening(world: World, *options: str) -> str:
             pass
 
     with pytest.raises(DeviceError) as caught:
-        run_on_time(opening())
+        run(opening())
     assert (world.armings, world.crashes) == (0, 0)
     with (
         serial.Serial(world.devices["arm"]["port"], exclusive=True),

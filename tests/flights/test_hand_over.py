@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import socket
 import sys
@@ -17,7 +18,7 @@ from companion.core import FlightCore
 from companion.launcher import with_devices
 from companion.preflight import run as before_arming
 from companion.types import Inputs, Outcome, Outputs
-from tests.support import HOVER, LOW_HOVER, PATIENT, World, run_on_time, sandbox_in, set_options
+from tests.support import HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
 
 BREAKS_AFTER_S = 2.5
 
@@ -57,7 +58,7 @@ def test_an_internal_error_in_the_air_lands_by_px4(
     with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs, full_disk() as full:
         monkeypatch.setattr(sys, "stderr", full)
         config = with_devices(load_flight(HOVER, overrides=options), world.devices)
-        outcome = run_on_time(app.fly(config, tmp_path, theirs))
+        outcome = asyncio.run(app.fly(config, tmp_path, theirs))
         assert outcome is Outcome.ABORTED
         rest = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]
         assert rest[-2:] == [False, True], "it armed, and stands disarmed"

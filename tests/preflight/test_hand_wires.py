@@ -28,7 +28,7 @@ from companion.types import AutopilotRequest, FlightMode
 from tests.io.autopilot_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 from tests.io.test_autopilot_stub import companion
-from tests.support import CATCH, DEADLINE_S, Sandbox, World, run_on_time, sandbox_in
+from tests.support import CATCH, DEADLINE_S, Sandbox, World, sandbox_in
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("the world with a hand")]
 
@@ -98,7 +98,7 @@ def test_any_key_ends_it_and_the_terminal_is_as_before(config: FlightConfig, mon
                 assert termios.tcgetattr(tty) != before
                 os.write(keyboard, b" ")
 
-            rows = run_on_time(over_wires(config, console, beside=press))
+            rows = asyncio.run(over_wires(config, console, beside=press))
             assert termios.tcgetattr(tty) == before
     finally:
         os.close(keyboard)
@@ -119,13 +119,13 @@ def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: FlightConfig) -> 
         assert signal.getsignal(signal.SIGINT) == before
         return rows
 
-    (row,) = run_on_time(both())
+    (row,) = asyncio.run(both())
     assert (row.id, row.read) == ("hand.done", "ended by hand")
 
 
 def test_a_whole_round_passes_and_is_kept(config: FlightConfig, tmp_path: Path) -> None:
     console, path = terminal(), tmp_path / "state" / "hand-tests.json"
-    rows = run_on_time(over_wires(config, console, path))
+    rows = asyncio.run(over_wires(config, console, path))
     assert [row.id for row in rows] == [*(check.id for check in hand_judge.CHECKS), "hand.record"], rows
     assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
     for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
@@ -153,14 +153,14 @@ def test_it_is_refused_when_px4_is_armed() -> None:
             edges = SomeEdges(VisionValve(), half.autopilot, mocap)
             return await run_hand_test(edges, config, terminal())
 
-    (row,) = run_on_time(go())
+    (row,) = asyncio.run(go())
     assert row.refuses
     assert row.read.startswith("PX4 says that it is armed")
 
 
 def test_without_motion_capture_or_px4_it_says_which() -> None:
     config = load_flight(CATCH)
-    (row,) = run_on_time(run_hand_test(SomeEdges(VisionValve()), config, terminal()))
+    (row,) = asyncio.run(run_hand_test(SomeEdges(VisionValve()), config, terminal()))
     assert row.read == "motion capture is not open"
 
 
@@ -174,7 +174,7 @@ def test_scripts_keep_their_standard_output(config: FlightConfig, capsys: pytest
             group.create_task(interrupt())
             return await run_hand_test(edges, config, Console(), True)
 
-    (row,) = run_on_time(go())
+    (row,) = asyncio.run(go())
     assert row.read == "ended by hand"
     captured = capsys.readouterr()
     assert captured.out == ""
