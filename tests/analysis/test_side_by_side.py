@@ -31,7 +31,7 @@ from companion.types import Event, Inputs, Outputs, SafetyAction, Sent, Severity
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, GROUND_S, LANDED_S, record_flight, synthetic_flight
 
 Row = tuple[Inputs, Outputs, Sent]
-ROWS = list(synthetic_flight())
+ROWS = list(synthetic_flight(rate_hz=100.0))
 IN_WORLD = CONFIG | {"vehicle": CONFIG["vehicle"] | {"devices": {"arm": {"port": "/dev/pts/4"}}}}
 VERSIONS = {"version_companion": "0.1.0", "version_git": "abc", "version_numpy": "2"}
 
@@ -266,7 +266,7 @@ def test_flights_of_different_laws_alone_are_said_to_be_comparable() -> None:
             {"config": configured(vehicle__devices={"arm": {"port": "/dev/ttyUSB0"}})},
             "Flown in different places: A in the simulated world, B on the vehicle.",
         ),
-        ({"rows": ROWS[::2]}, "Different rates of the control loop: A 200 Hz, B 100 Hz."),
+        ({"rows": ROWS[::2]}, "Different rates of the control loop: A 100 Hz, B 50 Hz."),
     ],
 )  # fmt: skip
 def test_whatever_else_differs_is_said_on_top(changes: dict[str, Any], caution: str) -> None:
@@ -404,7 +404,7 @@ def test_whatever_a_log_holds_is_text_on_the_page(tmp_path: Path) -> None:
 
     def shout(i: Inputs, o: Outputs, s: Sent) -> Row:
         event = Event(i.t_s, evil, Severity.WARNING, SafetyAction.HOLD, evil)
-        return i, replace(o, events=(*o.events, event) if i.tick == 1500 else o.events), s
+        return i, replace(o, events=(*o.events, event) if i.tick == 750 else o.events), s
 
     config = configured(mission__name=evil, controller__preset=evil, controller__note=evil, sources__overrides=[evil])
     config[evil] = {evil: evil}
