@@ -1,7 +1,8 @@
 """`python -m tests.at_a_time waits|flights`: how many tests of a kind run at a time.
 
-A flight takes about half a core, a waiting test a third. Where the flight, the guardian and the simulated world get real-time priority,
-they go on in time whatever else two cores have to do. Without it their limits are met by fewer.
+A flight takes about half a core, a waiting test a third. The bytes of a pty are carried by a thread of the kernel that waits for a core
+like any other program, so two cores are not filled. Where the flight, the guardian and the simulated world get real-time priority, they
+go on in time whatever else two cores have to do. Without it their limits are met by fewer.
 """
 
 from __future__ import annotations

@@ -1,14 +1,12 @@
 """`python -m tests.stages [STAGE ...]`: run the stages of `make test`, all of them, and sum them up.
 
-A stage that fails does not stop the others. What computes runs beside those that wait, in time that nothing else wants (SCHED_IDLE):
-it takes none of theirs. The last line counts tests; each check (format, lint, types) counts as one.
+A stage that fails does not stop the others. The last line counts tests; each check (format, lint, types) counts as one.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
 import signal
 import subprocess
@@ -17,10 +15,8 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
 from tests.at_a_time import AT_A_TIME
 from tests.marked import TESTS, files_of
@@ -29,11 +25,6 @@ _BIN = Path(sys.executable).parent
 _PYTEST = (sys.executable, "-m", "pytest")
 _TOGETHER = {"waiting": "waits", "flights": "flights"}
 """Stages whose number of simultaneous tests depends on the computer, with their names in `tests.at_a_time`."""
-_COMPUTING = ("-n", "2", "--dist", "worksteal", "--timeout", "900")
-"""A test that gets idle time only may take long."""
-_LOOK_S = 0.5
-NICE = 10
-"""Of all tests: the kernel's own threads, which carry the bytes of a pty and have nice 0, come before them."""
 _INTERRUPTED = 130
 _LINE_MAX = 120
 
@@ -46,8 +37,6 @@ class Stage:
     command: tuple[str, ...]
     tests: bool
     """Whether the command is pytest, which lists its results."""
-    beside: bool = False
-    """Whether it runs beside the others, in idle time; its output follows theirs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +61,8 @@ def _files_of(mark: str) -> Iterable[str]:
 STAGES = (
     Stage("format", (str(_BIN / "ruff"), "format", "--check", "."), tests=False),
     Stage("lint", (str(_BIN / "ruff"), "check", "."), tests=False),
-    Stage("types", (str(_BIN / "mypy"),), tests=False, beside=True),
-    Stage("computing", (*_PYTEST, *_COMPUTING, "-m", "not flight and not waits"), tests=True, beside=True),
+    Stage("types", (str(_BIN / "mypy"),), tests=False),
+    Stage("computing", (*_PYTEST, "-n", "3", "--dist", "worksteal", "-m", "not flight and not waits"), tests=True),
     Stage("waiting", (*_PYTEST, "--dist", "loadgroup", "-m", "waits", *_files_of("waits")), tests=True),
     Stage("flights", (*_PYTEST, "--dist", "loadgroup", "-m", "flight and not alone", *_files_of("flight")), tests=True),
     Stage("alone", (*_PYTEST, "-m", "alone", *_files_of("alone")), tests=True),
@@ -87,40 +76,21 @@ def _shown(words: Iterable[str]) -> str:
     return shlex.join(word.removeprefix(here) for word in words)
 
 
-def run(stage: Stage, output: IO[str] | None = None) -> Result:
-    """Run one stage; its output goes where ours goes, or to a file."""
+def run(stage: Stage) -> Result:
+    """Run one stage; its output goes where ours goes."""
     words = _shown(stage.command)
-    words = words if len(words) < _LINE_MAX else f"{words[:_LINE_MAX]} ..."
-    print(f"\n=== {stage.name}: {words}", file=output, flush=True)
+    print(f"\n=== {stage.name}: {words if len(words) < _LINE_MAX else f'{words[:_LINE_MAX]} ...'}", flush=True)
     begun_s = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         tally = Path(folder) / "tally.json"
         more = (*_at_a_time(stage), "-p", "tests.tally", "--tally", str(tally), "--durations=10") if stage.tests else ()
-        code = _wait(subprocess.Popen((*stage.command, *more), stdout=output, stderr=output))
+        code = _wait(subprocess.Popen((*stage.command, *more)))
         duration_s = time.monotonic() - begun_s
         if not tally.exists():
             return Result(stage, code == 0, duration_s, int(code == 0), int(code != 0))
         counts = json.loads(tally.read_text(encoding="utf-8"))
     failed = max(len(counts["failed"]), int(code != 0))
     return Result(stage, code == 0, duration_s, counts["passed"], failed, tuple(counts["failed"]), counts["skipped"])
-
-
-def _run_in_idle_time(stage: Stage, path: Path) -> Result:
-    """Run one stage from a thread of its own, whose scheduling its processes inherit."""
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    with path.open("a", encoding="utf-8") as output:
-        return run(stage, output)
-
-
-def _follow(path: Path, result: Future[Result]) -> Result:
-    """Show what a stage has written to a file, and goes on writing until it ends."""
-    path.touch()
-    with path.open(encoding="utf-8", errors="replace") as written:
-        ended = False
-        while not ended:
-            ended = bool(wait((result,), _LOOK_S).done)
-            print(written.read(), end="", flush=True)
-    return result.result()
 
 
 def _wait(process: subprocess.Popen[bytes]) -> int:
@@ -167,24 +137,16 @@ def _again(result: Result) -> Iterable[str]:
     return [_shown(result.stage.command)]
 
 
-def run_all(stages: Sequence[Stage]) -> int:
-    """Run the stages and print the summary; returns the exit code."""
+def run_all(stages: Iterable[Stage]) -> int:
+    """Run the stages in turn and print the summary; returns the exit code."""
     results: list[Result] = []
     interrupted = False
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as one_by_one:
-        outputs = {stage: Path(folder) / stage.name for stage in stages if stage.beside}
-        beside = {stage: one_by_one.submit(_run_in_idle_time, stage, path) for stage, path in outputs.items()}
-        try:
-            for stage in stages:
-                if not stage.beside:
-                    results.append(run(stage))
-            for stage, result in beside.items():
-                results.append(_follow(outputs[stage], result))
-        except KeyboardInterrupt:
-            interrupted = True
-            print("\ninterrupted; the stages below had ended")
-            one_by_one.shutdown(cancel_futures=True)
-    results.sort(key=lambda result: stages.index(result.stage))
+    try:
+        for stage in stages:
+            results.append(run(stage))
+    except KeyboardInterrupt:
+        interrupted = True
+        print("\ninterrupted; the stages below had ended")
     print(summary(results), flush=True)
     if interrupted:
         return _INTERRUPTED
@@ -200,8 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         parser.error(f"no stage {unknown[0]!r}; there are {', '.join(names)}")
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if a shell started us in the background
-    os.nice(NICE)
-    return run_all([stage for stage in STAGES if stage.name in wanted])
+    return run_all(stage for stage in STAGES if stage.name in wanted)
 
 
 if __name__ == "__main__":

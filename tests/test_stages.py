@@ -67,22 +67,6 @@ def test_all_green_is_exit_0(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr().out.splitlines()[-1] == "1 passed, 0 failed, 0 skipped"
 
 
-def test_a_stage_beside_the_others_takes_idle_time_and_is_summed_up_with_them(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    idle = "import os, sys; print('policy', os.sched_getscheduler(0), flush=True); sys.exit(3)"
-    stages = [
-        Stage("types", (sys.executable, "-c", idle), tests=False, beside=True),
-        Stage("alone", (sys.executable, "-c", idle.replace("3", "0")), tests=False),
-    ]
-    assert run_all(stages) == 1
-    lines = capfd.readouterr().out.splitlines()
-    policies = [int(line.split()[1]) for line in lines if line.startswith("policy")]
-    assert policies == [os.sched_getscheduler(0), os.SCHED_IDLE]
-    assert [line.split()[:2] for line in lines[-5:-2]] == [["types", "FAILED"], ["alone", "passed"], ["failed;", "run"]]
-    assert lines[-1] == "1 passed, 1 failed, 0 skipped"
-
-
 GROUP = """
 import os, time
 import pytest
