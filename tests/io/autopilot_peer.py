@@ -30,16 +30,21 @@ def free_udp_port() -> int:
 
 
 class Px4Peer:
-    """Heartbeats at 10 Hz to `port` on loopback; streams what SET_MESSAGE_INTERVAL asked for; records all that arrives."""
+    """Heartbeats to `port` on loopback, 10 Hz by default; streams what SET_MESSAGE_INTERVAL asked for; records all that arrives."""
 
     def __init__(
-        self, port: int, autopilot: int = mavlink.MAV_AUTOPILOT_PX4, at: tuple[str, int] = ("127.0.0.1", 0)
+        self,
+        port: int,
+        autopilot: int = mavlink.MAV_AUTOPILOT_PX4,
+        at: tuple[str, int] = ("127.0.0.1", 0),
+        beat_period_s: float = 0.1,
     ) -> None:
         self.remote = ("127.0.0.1", port)
         self.autopilot = autopilot
         self.base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self.custom_mode = 3 << 16
         self.beating = True
+        self._beat_period_s = beat_period_s
         self.origin: Any = True
         """True: there was one from the start. None: there is none. Else the SET_GPS_GLOBAL_ORIGIN that was taken."""
         self.params = dict(PARAMS)
@@ -120,7 +125,7 @@ class Px4Peer:
         while not self._stop.is_set():
             now_s = time.monotonic()
             if self.beating and now_s >= beat_s:
-                beat_s = now_s + 0.1
+                beat_s = now_s + self._beat_period_s
                 self._say_slow()
             if self.beating and now_s >= stream_s:
                 stream_s = now_s + 0.02

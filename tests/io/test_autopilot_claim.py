@@ -91,7 +91,8 @@ def _is_locked(port: str) -> bool:
 
 def test_two_senders_that_claim_to_be_px4_are_refused_by_address() -> None:
     port = free_udp_port()
-    with Px4Peer(port) as one, Px4Peer(port) as other:
+    # So often that each is heard while the link opens, however short that is.
+    with Px4Peer(port, beat_period_s=0.01) as one, Px4Peer(port, beat_period_s=0.01) as other:
         with pytest.raises(DeviceError) as caught:
             asyncio.run(_enter(port))
         text = str(caught.value)

@@ -30,7 +30,7 @@ from tests.io.stub_rig import standing_stub
 from tests.io.test_autopilot_stub import companion
 from tests.support import CATCH, DEADLINE_S, Sandbox, World, sandbox_in
 
-pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("the world with a hand")]
+pytestmark = [pytest.mark.flight, pytest.mark.xdist_group("the world with a hand")]
 
 FIRST_ROUND_S = 12.0
 
