@@ -48,13 +48,15 @@ def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file of the flight's folder.
+    """Write a file of the flight's folder at once: a reader finds it whole or as it was before.
 
     Raises:
         LaunchError: it cannot be written.
     """
     try:
-        path.write_text(text, encoding="utf-8")
+        part = path.with_name(f".{path.name}.part")
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
     except OSError as error:
         raise LaunchError(f"{path}: cannot be written: {error.strerror}; choose another --out") from None
 
