@@ -53,11 +53,13 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         LaunchError: it cannot be written.
     """
+    part = path.with_name(f".{path.name}.part")
     try:
-        part = path.with_name(f".{path.name}.part")
         part.write_text(text, encoding="utf-8")
         part.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink()
         raise LaunchError(f"{path}: cannot be written: {error.strerror}; choose another --out") from None
 
 

@@ -64,7 +64,7 @@ class Heartbeats:
 
 
 class FlightGuard:
-    """The guardian, for the flight process.
+    """The flight process's connection to the guardian: sends it a heartbeat in each tick.
 
     Args:
         client: to the guardian.

@@ -7,7 +7,7 @@ import math
 from companion.types import Vec3
 
 GAP_MAX_S = 0.05
-"""What happened in a longer gap between two samples was not measured: the gap adds nothing."""
+"""A longer gap between two samples adds nothing to the sum: the motion in it was not measured."""
 _REORDERED_MAX_S = 1.0
 _LOST_INTERVALS = 1.5
 """After more than this many usual intervals at least one sample was lost."""

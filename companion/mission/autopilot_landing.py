@@ -30,8 +30,8 @@ BEGUN_S = 1.0
 """PX4 takes a moment from LAND to a descent: until then a vehicle that does not sink proves nothing."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
-FLIPPED = "flipped: PX4 is told to disarm at once"
-TIPPED = "tipped over on the floor: PX4 is told to disarm at once"
+FLIPPED = "flipped: FORCE_DISARM is requested at once"
+TIPPED = "tipped over on the floor: FORCE_DISARM is requested at once"
 
 
 @dataclass(frozen=True, slots=True)

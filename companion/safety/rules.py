@@ -146,7 +146,7 @@ MOCAP_TWO_STREAMS = _rule(
 MOCAP_DRAGGED = _rule(
     "mocap_dragged",
     Part.MOCAP,
-    "poses do not move as the IMU measures: somebody drags them, or they are shifted",
+    "poses do not move as the IMU measures: an attacker drags them, or the calibration shifts",
     ("mocap_inertial_m", "mocap_inertial_s"),
     0.0,
     None,

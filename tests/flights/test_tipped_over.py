@@ -62,5 +62,5 @@ def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_guardian() -> No
     flight = TippedOver(0.35, 6.5, "{kind: kill_flight, t_s: 4.4}")
     result = flight.run()
     assert result.guardian_landed is True
-    assert "tipped over on the floor: PX4 is told to disarm at once" in [e.text for e in result.guardian_events]
+    assert "tipped over on the floor: FORCE_DISARM is requested at once" in [e.text for e in result.guardian_events]
     assert flight.stopped_s - flight.begun_s < STOPPED_WITHIN_S

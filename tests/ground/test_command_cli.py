@@ -161,7 +161,7 @@ def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_quiet(
 def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
     name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Anybody may have retained it; one vehicle alone proves its stream, and the other is named."""
+    """A retained state of a vehicle may be forged: the one vehicle whose stream is proven is commanded, and the other is named."""
 
     async def scene() -> None:
         async with played_vehicle(broker.port, OPERATORS, "rig") as vehicle:

@@ -155,7 +155,7 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
     assert not landing.forced
     landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
     assert landing.forced
-    assert "tipped over on the floor: PX4 is told to disarm at once" in [told.text for told in landing.told]
+    assert "tipped over on the floor: FORCE_DISARM is requested at once" in [told.text for told in landing.told]
 
 
 def test_poses_that_the_flight_process_did_not_believe_are_neither_passed_on_nor_judged_by() -> None:

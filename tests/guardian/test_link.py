@@ -107,7 +107,7 @@ def test_only_the_address_that_the_flight_proved_is_heard(kind: str) -> None:
 def test_px4_that_a_router_moved_to_another_port_is_heard_there(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Only after silence at its own port, at its own IP address, and with its own system id."""
+    """PX4 is accepted at another port only after 1 s of silence, from the same IP address and with the same system id."""
     sockets = [socket.socket(type=socket.SOCK_DGRAM) for _ in range(4)]
     with contextlib.ExitStack() as stack:
         px4, moved, other_host, other_system = (stack.enter_context(closing(one)) for one in sockets)

@@ -1,4 +1,4 @@
-"""mocap_dragged and tether_snagged on an IMU that vibrates as one on a frame with rotors does, in the fast loop."""
+"""`mocap_dragged` and `tether_snagged` in the fast loop, with the vibration of rotors on the accelerometer."""
 
 from __future__ import annotations
 
