@@ -36,7 +36,7 @@ test: install debian
 	@$(BIN)/python -m tests.stages
 
 lint: install
-	@$(BIN)/python -m tests.stages format lint types
+	@$(BIN)/python -m tests.stages format lint imports types
 
 # Property tests and damaged input at every wire, at random, for whoever changes a parser: make explore MINUTES=10
 explore: install

@@ -33,7 +33,7 @@ from rich.console import Console
 from benchmarks.measuring.figures import problems
 from benchmarks.measuring.page import markdown, show
 from benchmarks.measuring.rows import sections
-from companion.recording.versions import versions
+from companion.recorder.versions import versions
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "build" / "benchmarks"

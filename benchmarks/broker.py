@@ -35,7 +35,7 @@ from benchmarks.soaking.lateness import tick_for_nothing
 from companion.analysis.log import FlightLog
 from companion.config.ground import topic_name
 from companion.config.loader import load_flight
-from companion.core import NOMINAL_DT_S
+from companion.core.flight_core import NOMINAL_DT_S
 from tests.broker import LOOPBACK, Broker, free_port
 
 SETTLE_S = 3.0

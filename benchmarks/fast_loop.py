@@ -32,11 +32,11 @@ from rich.table import Table
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.types import PlantState, Wrench
-from companion.core import FlightCore
-from companion.types import Inputs, Outcome, Reference
-from sitl import campaign
-from sitl.fast import TICK_S, FastFlight, FastResult
-from sitl.world import PHYSICS_DT_S, World
+from companion.core.flight_core import FlightCore
+from companion.model.types import Inputs, Outcome, Reference
+from sitl.campaigns import flights as campaign
+from sitl.fast.loop import TICK_S, FastFlight, FastResult
+from sitl.world.world import PHYSICS_DT_S, World
 
 _HERE = Path(__file__).parent
 _MISSION = _HERE.parent / "configs" / "missions" / "catch.yaml"

@@ -31,11 +31,10 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.config.vehicle import AutopilotDevice
-from companion.io.autopilot import MavsdkAutopilot
-from companion.io.ground_station import VALUES_EVERY, GroundStation
-from companion.realtime import FLIGHT_PRIORITY, claim_realtime
-from companion.ticker import Ticker
-from companion.types import (
+from companion.flight.ticker import Ticker
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.qgroundcontrol.station import VALUES_EVERY, GroundStation
+from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,
     Event,
@@ -48,6 +47,7 @@ from companion.types import (
     Severity,
     TetherState,
 )
+from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 RATE_HZ = 200.0
 FLOOD_HZ = 1000.0

@@ -27,13 +27,13 @@ from typing import Any
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.manipulator import Manipulator
-from companion.frames import quat_rotate
 from companion.mission.check import check_mission
 from companion.mission.check_judge import TRACKING_M
+from companion.model.frames import quat_rotate
+from companion.model.types import PhaseKind
 from companion.safety.governor import BODY_TOP_M
 from companion.safety.tether import slack_m
-from companion.types import PhaseKind
-from sitl.fast import FastFlight, FastResult
+from sitl.fast.loop import FastFlight, FastResult
 
 BASE = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
 FLIGHT_LIMIT_S = 120.0

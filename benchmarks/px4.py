@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis.log import FlightLog, LogError
-from companion.faults_wires import WITNESS
-from sitl.px4_link import Px4Error
+from companion.campaigns.faults_over_wires import WITNESS
+from sitl.px4.link import Px4Error
 from sitl.px4_log import Px4Log, newest
 
 ROOT = Path(__file__).parents[1]
@@ -90,7 +90,16 @@ def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
     """One flight, unless it lies there already."""
     if (folder / "summary.json").exists():
         return
-    command = [sys.executable, "-m", "companion.cli", "fly", str(MISSION), f"--sitl={autopilot}", "--out", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "companion",
+        "fly",
+        str(MISSION),
+        f"--sitl={autopilot}",
+        "--out",
+        str(folder),
+    ]
     command += ["--set", *case.overrides, f"world.seed={run}"]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with open(folder.with_name(f"{folder.name}.txt"), "wb") as output:

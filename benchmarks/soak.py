@@ -77,7 +77,7 @@ def fly(
     ]
     before = [] if nice is None else ["nice", "-n", str(nice)]
     command = [
-        *(*before, sys.executable, "-m", "companion.cli", "fly", str(MISSION), "--sitl"),
+        *(*before, sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl"),
         *("--out", str(folder / "flight"), "--set", *settings),
     ]
     console.print(f"{count} repetitions, {planned_s / 60.0:.1f} minutes; {folder}", highlight=False, soft_wrap=True)

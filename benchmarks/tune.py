@@ -37,9 +37,9 @@ from companion.config.controller import LAWS, PRESETS
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.manipulator import Manipulator
-from companion.frames import quat_conjugate, quat_rotate
-from companion.types import Inputs, Outcome, Outputs, PhaseKind
-from sitl.fast import TICK_S, FastFlight
+from companion.model.frames import quat_conjugate, quat_rotate
+from companion.model.types import Inputs, Outcome, Outputs, PhaseKind
+from sitl.fast.loop import TICK_S, FastFlight
 
 Array = npt.NDArray[np.float64]
 Gains = dict[str, Any]

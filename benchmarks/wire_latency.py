@@ -61,7 +61,7 @@ def fly(mission: Path, out: Path) -> Path:
     Raises:
         RuntimeError: it did not complete or wrote no summary.
     """
-    command = [sys.executable, "-m", "companion.cli", "fly", str(mission), "--sitl", "--out", str(out)]
+    command = [sys.executable, "-m", "companion", "fly", str(mission), "--sitl", "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=_FLIGHT_DEADLINE_S, check=False)
     summary = out / "summary.json"
     if done.returncode != 0 or not summary.is_file():

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from companion.config.loader import FlightConfig
-from companion.event_loop import run
-from companion.realtime import WORLD_PRIORITY, claim_realtime
+from companion.runtime.event_loop import run
+from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime
 from sitl.autopilot.mavlink import LinkError
 from sitl.faults import FaultError, in_time
-from sitl.px4 import RealPx4
-from sitl.px4_link import Px4Error
+from sitl.px4.link import Px4Error
+from sitl.px4.world import RealPx4
 from sitl.server import Ports, Sitl, start_of
 
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)

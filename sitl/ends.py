@@ -1,6 +1,6 @@
 """The autopilot's end of the simulated world: what the world's server needs of it, and the stub's way of giving it.
 
-The other way is a real PX4: `sitl.px4`.
+The other way is a real PX4: `sitl.px4.world`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol
 
 from companion.config.world import World as WorldConfig
-from companion.types import Vec4
+from companion.model.types import Vec4
 from sitl.autopilot.autopilot import Battery, Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.estimator import Estimator
@@ -20,7 +20,7 @@ from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
 from sitl.autopilot.types import ImuSample
 from sitl.faults import Autopilot as FaultyAutopilot
-from sitl.world import World
+from sitl.world.world import World
 
 STUB_VERSION = "1.16"
 """PX4's version that the stub behaves like."""

@@ -16,15 +16,15 @@ import numpy as np
 from companion.config.faults import Fault, FaultKind, FlightPhase
 from companion.config.loader import FlightConfig
 from companion.config.world import World as WorldConfig
-from companion.frames import quat_from_euler_zyx, tilt_rad
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
-from companion.mission.sequencer import SPOOL_S
-from companion.types import PhaseKind, Quat, Vec3, Vec4
+from companion.model.flight_stage import SPOOL_S
+from companion.model.frames import quat_from_euler_zyx, tilt_rad
+from companion.model.types import PhaseKind, Quat, Vec3, Vec4
 from sitl.autopilot.modes import NavState
-from sitl.model import SECOND, SECOND_CATCH
-from sitl.servo_drive import COUNTS_PER_TURN, ServoDrive
-from sitl.world import Ball, World
+from sitl.servo.drive import COUNTS_PER_TURN, ServoDrive
+from sitl.world.model import SECOND, SECOND_CATCH
+from sitl.world.world import Ball, World
 
 AFTER_CATCH_S = 0.1
 """Phase "catch"."""
@@ -49,7 +49,7 @@ class FaultError(Exception):
 
 
 class Servo(Protocol):
-    """A servo behind its control table (`sitl.servo_model.ServoModel`)."""
+    """A servo behind its control table (`sitl.servo.model.ServoModel`)."""
 
     def trip_overload(self) -> None:
         """Overload error."""

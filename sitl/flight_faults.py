@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from companion.config.faults import FaultKind
-from companion.frames import tilt_rad
-from companion.types import Vec3
+from companion.model.frames import tilt_rad
+from companion.model.types import Vec3
 from sitl.autopilot.modes import NavState
 
 FlightFaultKind = Literal["kill_flight", "stop_flight", "hold_gil", "stall_loop"]
@@ -45,7 +45,7 @@ def strike(kind: FaultKind, flight_pid: int) -> bool:
         kind: kill_recorder, kill_guardian or disk_full.
         flight_pid: of the flight process, whose child the recorder is, and whose sibling the guardian.
     """
-    module = "companion.guardian" if kind == "kill_guardian" else "companion.recorder_process"
+    module = "companion.guardian" if kind == "kill_guardian" else "companion.recorder.main"
     parent = os.getppid() if kind == "kill_guardian" else flight_pid
     pid = next((pid for pid in _children(parent) if module in _command(pid)), None)
     if pid is None:

@@ -1,8 +1,8 @@
 """A Robotous RFT60-HA01 on a pty: the sensor's end of the serial line.
 
-Answers as the sensor does (see `companion.io.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17; while it streams only STOP and
-SET_BIAS are executed, and those two have no answer. Readings are quantised to 1/50 N and 1/2000 N m. Noise and latency are made by the
-caller.
+Answers as the sensor does (see `companion.io.force_torque.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17; while it streams
+only STOP and SET_BIAS are executed, and those two have no answer. Readings are quantised to 1/50 N and 1/2000 N m. The caller adds
+noise and latency.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import tty
 from types import TracebackType
 from typing import Final, Self
 
-from companion.io import rft
-from companion.io.rft import Command, Overload, PacketScanner, SetError, Wrench
-from companion.types import Vec3
+from companion.io.force_torque import rft
+from companion.io.force_torque.rft import Command, Overload, PacketScanner, SetError, Wrench
+from companion.model.types import Vec3
 
 FORCE_CAPACITY_N: Final = 200.0
 TORQUE_CAPACITY_NM: Final = 4.0

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
-from companion.frames import quat_rotate
-from companion.io.natnet import Descriptor, Message, NatNetVersion
-from companion.types import Quat, Vec3
+from companion.io.mocap.natnet import Descriptor, Message, NatNetVersion
+from companion.model.frames import quat_rotate
+from companion.model.types import Quat, Vec3
 
 CLOCK_FREQUENCY_HZ: Final = 10_000_000
 """Windows' performance counter, as Motive reports it."""

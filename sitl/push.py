@@ -20,9 +20,9 @@ from companion.config.loader import FlightConfig
 from companion.config.mission import ArmMove, Hold, Land, Takeoff
 from companion.config.world import Push
 from companion.control.manipulator import Manipulator
-from companion.mission.sequencer import SPOOL_S
-from companion.types import Vec2, Vec3
-from sitl.fast import FastFlight
+from companion.model.flight_stage import SPOOL_S
+from companion.model.types import Vec2, Vec3
+from sitl.fast.loop import FastFlight
 
 Array = npt.NDArray[np.float64]
 

@@ -18,20 +18,20 @@ from typing import Any
 from companion.config.faults import FaultKind
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
-from companion.types import IDENTITY_QUAT, Vec2
-from sitl.arm_hand import ArmHand
+from companion.model.types import IDENTITY_QUAT, Vec2
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.ends import AutopilotEnd, StubEnd
 from sitl.faults import Faults, Sample, sample
 from sitl.flight_faults import SIGNALS, FlightFaults, environment, strike
 from sitl.force_torque import ForceTorqueServer
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
-from sitl.plant import MocapFrame, Plant
-from sitl.px4_link import Px4Error
-from sitl.servo_bus import ServoBus
-from sitl.servo_knobs import plugged_in, servos_of
-from sitl.servo_model import ServoModel
-from sitl.world import PHYSICS_DT_S
+from sitl.px4.link import Px4Error
+from sitl.servo.bus import ServoBus
+from sitl.servo.knobs import plugged_in, servos_of
+from sitl.servo.model import ServoModel
+from sitl.world.arm_hand import ArmHand
+from sitl.world.plant import MocapFrame, Plant
+from sitl.world.world import PHYSICS_DT_S
 
 _CATCH_UP_S = 0.03
 COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5

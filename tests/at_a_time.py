@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 
-from companion.realtime import FLIGHT_PRIORITY
+from companion.runtime.realtime import FLIGHT_PRIORITY
 
 AT_A_TIME = {"waits": (2, 3), "flights": (1, 2)}
 """Without and with real-time priority, on two cores or more."""

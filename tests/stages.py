@@ -1,6 +1,6 @@
 """`python -m tests.stages [STAGE ...]`: run the stages of `make test`, all of them, and sum them up.
 
-A stage that fails does not stop the others. The last line counts tests; each check (format, lint, types) counts as one.
+A stage that fails does not stop the others. The last line counts tests; each check (format, lint, imports, types) counts as one.
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ def _files_of(mark: str) -> Iterable[str]:
 STAGES = (
     Stage("format", (str(_BIN / "ruff"), "format", "--check", "."), tests=False),
     Stage("lint", (str(_BIN / "ruff"), "check", "."), tests=False),
+    Stage("imports", (str(_BIN / "lint-imports"), "--no-cache"), tests=False),
     Stage("types", (str(_BIN / "mypy"),), tests=False),
     Stage("computing", (*_PYTEST, "-n", "3", "--dist", "worksteal", "-m", "not flight and not waits"), tests=True),
     Stage("waiting", (*_PYTEST, "--dist", "loadgroup", "-m", "waits", *_files_of("waits")), tests=True),

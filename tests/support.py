@@ -23,9 +23,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from companion.cli import main
+from companion.cli.main import main
 from companion.config.loader import load_flight
-from companion.types import Inputs, Outputs
+from companion.model.types import Inputs, Outputs
 
 ROOT = Path(__file__).parents[1]
 CATCH = ROOT / "configs/missions/catch.yaml"
@@ -181,7 +181,7 @@ class Running:
 
     def __init__(self, sandbox: Sandbox, arguments: Sequence[object], started_by: Sequence[str] = ()) -> None:
         self.process = subprocess.Popen(
-            [*started_by, sys.executable, "-m", "companion.cli", *map(str, arguments)],
+            [*started_by, sys.executable, "-m", "companion", *map(str, arguments)],
             cwd=sandbox.cwd,
             env=sandbox.environment,
             stdin=subprocess.DEVNULL,

@@ -72,7 +72,7 @@ async def person(url: str, vehicle: str) -> None:
 @contextlib.asynccontextmanager
 async def _monitor(url: str) -> AsyncIterator[str]:
     """`companion monitor` on a free port; the address of its page, token and all."""
-    command = [sys.executable, "-m", "companion.cli", "monitor", "--broker", url, "--port", "0"]
+    command = [sys.executable, "-m", "companion", "monitor", "--broker", url, "--port", "0"]
     process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE, env=_unbuffered())
     assert process.stdout is not None
     try:

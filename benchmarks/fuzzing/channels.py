@@ -10,10 +10,10 @@ from typing import ClassVar, Self
 
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
 from benchmarks.fuzzing.mutate import mutated
-from companion.guardian import beat as words
-from companion.guardian.beat import Beat
-from companion.io.recorder import RecorderClient
-from companion.types import OperatorCommand
+from companion.guardian import heartbeat as words
+from companion.guardian.heartbeat import Beat
+from companion.model.types import OperatorCommand
+from companion.recorder.client import RecorderClient
 from tests.analysis.synthetic_flight import synthetic_flight
 
 _SIZE_MAX_BYTES = 4000

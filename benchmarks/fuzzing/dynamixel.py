@@ -17,12 +17,12 @@ from typing import ClassVar, Self
 from benchmarks.fuzzing.campaign import Endless, Target, Wrong, one_line
 from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import Arm, ArmDevice, Joint
-from companion.io import dynamixel as dxl
-from companion.io.arm import DynamixelArm
-from companion.io.dynamixel_bus import ArmBus
-from sitl.servo_bus import ServoBus, ServoLine
-from sitl.servo_model import ServoModel
-from sitl.servo_protocol import ALERT, Instruction, fast_status, packet, status
+from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.dynamixel.bus import ArmBus
+from sitl.servo.bus import ServoBus, ServoLine
+from sitl.servo.model import ServoModel
+from sitl.servo.protocol import ALERT, Instruction, fast_status, packet, status
 
 IDS = (11, 12)
 _WATCHDOG_MS = 100
@@ -310,7 +310,7 @@ def _parse_program(program: bytes) -> dict[int, list[tuple[int, bytes]]]:
 
 
 def _block(position_count: int, watchdog: int) -> bytes:
-    """Indirect data of one servo, as `companion.io.dynamixel.BLOCK` lays it out."""
+    """Indirect data of one servo, as `companion.io.dynamixel.registers.BLOCK` lays it out."""
     return dxl._BLOCK.pack(position_count, 0, -7, 35, 12, watchdog)
 
 

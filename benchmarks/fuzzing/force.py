@@ -13,9 +13,9 @@ from typing import ClassVar, Self
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
 from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import ForceDevice
-from companion.io import rft
-from companion.io.force_torque import RobotousForceTorque
-from companion.io.rft import RATE_CODES, Command, Wrench
+from companion.io.force_torque import rft
+from companion.io.force_torque.driver import RobotousForceTorque
+from companion.io.force_torque.rft import RATE_CODES, Command, Wrench
 from sitl.force_torque import ForceTorqueServer
 
 _SIZE_MAX_BYTES = 3000

@@ -20,10 +20,10 @@ from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import AutopilotDevice
 from companion.guardian.link import Link, UdpWire
 from companion.guardian.px4 import Px4State
-from companion.io import autopilot_messages as messages
-from companion.io.autopilot import MavsdkAutopilot
-from companion.types import FlightMode, VehicleState
-from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from companion.io.px4 import messages
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.model.types import FlightMode, VehicleState
+from tests.io.px4_peer import Px4Peer, free_udp_port
 
 _SIZE_MAX_BYTES = 1500
 _HEADER_BYTES, _CRC_BYTES, _STX = 10, 2, 0xFD

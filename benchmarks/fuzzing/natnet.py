@@ -14,12 +14,12 @@ from typing import ClassVar, Self
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
 from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import MocapDevice
-from companion.io import natnet
-from companion.io.autopilot_messages import vision_ned
-from companion.io.edges import DeviceError
-from companion.io.mocap import NatNetMocap
-from companion.io.natnet import Message, NatNetVersion
-from companion.types import MocapPose
+from companion.io.mocap import natnet
+from companion.io.mocap.driver import NatNetMocap
+from companion.io.mocap.natnet import Message, NatNetVersion
+from companion.io.protocols import DeviceError
+from companion.io.px4.messages import vision_ned
+from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, NatNetServer, encode_frame, encode_model_definitions
 
 VERSIONS: tuple[NatNetVersion, NatNetVersion] = ("3.0", "4.1")

@@ -14,8 +14,8 @@ from typing import Any
 from benchmarks.measuring.far_end import stand_apart
 from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
 from companion.config.loader import load_flight
-from companion.event_loop import run
-from companion.sitl_process import SitlProcess
+from companion.launcher.sitl_process import SitlProcess
+from companion.runtime.event_loop import run
 
 # Present current, velocity and position of an XM430 lie together (126, 10 bytes); goal current is 102.
 _PRESENT_ADDRESS, _PRESENT_BYTES, _GOAL_CURRENT_ADDRESS, _GOAL_CURRENT_BYTES = 126, 10, 102, 2
@@ -28,8 +28,8 @@ FAILED_MAX = 0.1
 
 def _servos(parent: Connection) -> None:
     """Two emulated servos on a pty until the parent says stop."""
-    from sitl.servo_bus import ServoBus
-    from sitl.servo_model import ServoModel
+    from sitl.servo.bus import ServoBus
+    from sitl.servo.model import ServoModel
 
     stand_apart()
 

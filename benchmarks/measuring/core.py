@@ -9,8 +9,8 @@ from typing import Any
 from benchmarks.fast_loop import core_us, flight_us, law_us, raw_step_us
 from benchmarks.measuring.latency import Latency
 from companion.config.loader import load_flight
-from sitl.fast import TICK_S
-from sitl.world import PHYSICS_DT_S
+from sitl.fast.loop import TICK_S
+from sitl.world.world import PHYSICS_DT_S
 from tests.support import CATCH
 
 REPEATS = 5

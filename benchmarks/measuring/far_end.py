@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 
-from companion.realtime import WORLD_PRIORITY, claim_realtime
+from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime
 
 
 def stand_apart() -> None:

@@ -20,7 +20,7 @@ from typing import Any
 from benchmarks.measuring.latency import DEADLINE_S, WARM_UP
 from benchmarks.measuring.wires import receive
 from companion.io.arrival import stamp_arrivals
-from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 
 async def loop(port: int, mocap: socket.socket, frames: int) -> list[float]:

@@ -32,8 +32,8 @@ from benchmarks.measuring.late import alone_late
 from benchmarks.measuring.latency import RATE_HZ, Latency
 from benchmarks.soaking.processes import Usage, family, usage
 from benchmarks.soaking.verdict import ROLES as FLIGHT_ROLES
-from companion.core import NOMINAL_DT_S
-from companion.realtime import FLIGHT_PRIORITY, realtime_permitted
+from companion.core.flight_core import NOMINAL_DT_S
+from companion.runtime.realtime import FLIGHT_PRIORITY, realtime_permitted
 from tests.broker import loopback_broker
 from tests.support import ROOT
 

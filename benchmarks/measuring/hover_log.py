@@ -12,8 +12,8 @@ import numpy.typing as npt
 from mcap.reader import make_reader
 
 from companion.analysis.timing import Stopwatch, Timing
-from companion.record import from_jsonable
-from companion.types import Inputs, Sent
+from companion.model.codec import from_jsonable
+from companion.model.types import Inputs, Sent
 
 Array = npt.NDArray[np.float64]
 

@@ -38,7 +38,7 @@ class NoFlight(Exception):
 def start_hover(folder: Path, hover_s: float, broker_url: str, *, report: bool = True) -> subprocess.Popen[bytes]:
     """`companion fly`, in a process group of its own; what it prints goes to fly.txt, all else to flight/, both in the folder."""
     command = [
-        *(sys.executable, "-m", "companion.cli", "fly", str(MISSION), "--sitl", "--mqtt", broker_url),
+        *(sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl", "--mqtt", broker_url),
         *("--out", str(folder / "flight"), *([] if report else ["--no-report"])),
         *set_options(**LIMITS),
         *set_options(**{"mission.phases[1].duration_s": hover_s, "world.battery_life_s": BATTERY_MARGIN * hover_s}),

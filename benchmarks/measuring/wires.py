@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from benchmarks.measuring.far_end import stand_apart
 from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
-from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 POSE = struct.Struct("<I7f")
 LOST_MAX = 0.01
@@ -152,10 +152,10 @@ def bare_mavsdk(frames: int) -> tuple[Latency, Latency]:
 
 def autopilot_edge(frames: int) -> tuple[Latency, Latency]:
     """recv -> MavsdkAutopilot.send_attitude: frames converted and checked, sent through MavlinkDirect."""
-    from companion.clock import flight_clock
     from companion.config.vehicle import AutopilotDevice
-    from companion.io.autopilot import MavsdkAutopilot
-    from companion.types import IDENTITY_QUAT, AttitudeSetpoint
+    from companion.io.px4.driver import MavsdkAutopilot
+    from companion.model.types import IDENTITY_QUAT, AttitudeSetpoint
+    from companion.runtime.clock import flight_clock
 
     def run(port: int, go: Callable[[], None], mocap: socket.socket) -> list[float]:
         async def loop() -> list[float]:

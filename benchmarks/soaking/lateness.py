@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
-from companion.clock import flight_clock
-from companion.core import NOMINAL_DT_S
-from companion.event_loop import run
-from companion.realtime import FLIGHT_PRIORITY, claim_realtime
-from companion.ticker import Ticker
+from companion.core.flight_core import NOMINAL_DT_S
+from companion.flight.ticker import Ticker
+from companion.runtime.clock import flight_clock
+from companion.runtime.event_loop import run
+from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 MINUTE_S = 60.0
 

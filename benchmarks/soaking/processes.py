@@ -7,11 +7,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.realtime import FLIGHT_PRIORITY, GUARDIAN_PRIORITY, WORLD_PRIORITY
+from companion.runtime.realtime import FLIGHT_PRIORITY, GUARDIAN_PRIORITY, WORLD_PRIORITY
 
 ROLES = {
-    "companion.app": "flight",
-    "companion.recorder_process": "recorder",
+    "companion.flight.main": "flight",
+    "companion.recorder.main": "recorder",
     "companion.guardian": "guardian",
     "sitl": "world",
 }

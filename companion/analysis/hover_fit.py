@@ -12,7 +12,7 @@ import numpy as np
 from companion.analysis.log import Array, FlightLog
 from companion.control.hover import Balance
 from companion.control.sensing import acceleration_world_m_s2
-from companion.types import PhaseKind
+from companion.model.types import PhaseKind
 
 FIT_MIN_S = 2.0
 PIECE_S = 1.0

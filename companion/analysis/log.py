@@ -1,4 +1,4 @@
-"""Reads a flight log (MCAP) back into the records of `companion.types`, also one that was never closed."""
+"""Reads a flight log (MCAP) back into the records of `companion.model.types`, also one that was never closed."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
 from companion.analysis.timing import Stopwatch, Timing, timing_of
-from companion.frames import euler_zyx_from_quat
-from companion.record import RecordError, from_jsonable
-from companion.types import Inputs, Outputs, Sent
+from companion.model.codec import RecordError, from_jsonable
+from companion.model.frames import euler_zyx_from_quat
+from companion.model.types import Inputs, Outputs, Sent
 
 Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector
-from companion.frames import quat_rotate
-from companion.types import PhaseKind
+from companion.model.frames import quat_rotate
+from companion.model.types import PhaseKind
 
 Mask = npt.NDArray[np.bool_]
 SLIDING_LOWPASS_HZ = 10.0

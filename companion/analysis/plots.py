@@ -18,8 +18,8 @@ from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, DASHED, INK, dress, mark_catch, new_figure, write_png
 from companion.analysis.timing import end_s
 from companion.control.manipulator import GRAVITY_M_S2
-from companion.frames import tilt_rad
-from companion.types import Outputs, PhaseKind
+from companion.model.frames import tilt_rad
+from companion.model.types import Outputs, PhaseKind
 
 _REFERENCE = "#55626e"
 _SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")

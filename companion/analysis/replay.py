@@ -10,12 +10,12 @@ from typing import Protocol
 
 from companion import __version__
 from companion.analysis.log import FlightLog, LogError, writer
-from companion.record import differences, fingerprint
-from companion.types import Inputs, Outputs, Sent
+from companion.model.codec import differences, fingerprint
+from companion.model.types import Inputs, Outputs, Sent
 
 
 class Core(Protocol):
-    """`companion.core.FlightCore`, as far as replay needs it."""
+    """`companion.core.flight_core.FlightCore`, as far as replay needs it."""
 
     def step(self, inputs: Inputs) -> Outputs:
         """One tick."""
@@ -103,7 +103,7 @@ def check_replayable(log: FlightLog) -> str:
 def flight_core(config_json: str) -> Core:
     """The real core, made from a recorded configuration."""
     from companion.config.loader import FlightConfig
-    from companion.core import FlightCore
+    from companion.core.flight_core import FlightCore
 
     core: Core = FlightCore(FlightConfig.model_validate_json(config_json))
     return core

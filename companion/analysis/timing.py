@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from companion.types import Inputs, Outputs, Sent
+from companion.model.types import Inputs, Outputs, Sent
 
 Array = npt.NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 from companion.commissioning.patch import Patch, propose
 from companion.config.base import Location
 from companion.config.document import Data
-from companion.exit_codes import EXIT_OK, EXIT_REFUSED
-from companion.preflight.rows import Level, Row, refusals
-from companion.terminal import tell
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
+from companion.model.rows import Level, Row, refusals
+from companion.runtime.console import tell
 
 VEHICLE = "configs/vehicles/tarot650_2r.yaml"
 _TITLE_WIDTH = 34

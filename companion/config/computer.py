@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from companion.config.base import Model
-from companion.cores import CPU_MAX
+from companion.runtime.cores import CPU_MAX
 
 Cpu = Annotated[int, Field(ge=0, le=CPU_MAX)]
 

@@ -20,8 +20,8 @@ from companion.control.impedance import Impedance
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
-from companion.frames import body_x_z_axes_world
-from companion.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
+from companion.model.frames import body_x_z_axes_world
+from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
 
 FRICTION_RATE_RAD_S = 0.1
 """Below it the friction that is fed forward fades: a joint at rest is not to be shaken."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from companion.control.manipulator import Manipulator
-from companion.types import Quat, Vec2
+from companion.model.types import Quat, Vec2
 
 STIFFNESS_NM_RAD = 5.0
 DAMPING_NMS_RAD = 0.45

@@ -12,7 +12,7 @@ import math
 
 from companion.config.vehicle import Vehicle
 from companion.control.dynamics import Dynamics
-from companion.types import Vec2
+from companion.model.types import Vec2
 
 
 class ArmInertia:

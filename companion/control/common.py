@@ -19,8 +19,8 @@ from companion.control.thrust import (
     saturate_force,
 )
 from companion.control.types import PlantState
-from companion.frames import wrap_rad
-from companion.types import IDENTITY_QUAT, Quat, Reference, Vec2, Vec3, Vec8
+from companion.model.frames import wrap_rad
+from companion.model.types import IDENTITY_QUAT, Quat, Reference, Vec2, Vec3, Vec8
 
 ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

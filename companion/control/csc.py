@@ -19,8 +19,8 @@ from companion.control.common import tracking_errors
 from companion.control.dynamics import chi_rate_from_body_rate, rotation_matrix
 from companion.control.model_based import ModelBasedLaw
 from companion.control.types import PlantState, Wrench
-from companion.frames import body_x_z_axes_world, euler_zyx_from_quat, yaw_from_quat
-from companion.types import Reference, Vec3, Vec8
+from companion.model.frames import body_x_z_axes_world, euler_zyx_from_quat, yaw_from_quat
+from companion.model.types import Reference, Vec3, Vec8
 
 
 class CscController(ModelBasedLaw):

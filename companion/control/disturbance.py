@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from companion.types import Vec3
+from companion.model.types import Vec3
 
 
 class DisturbanceObserver:

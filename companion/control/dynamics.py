@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2
-from companion.types import Quat, Vec2, Vec3, Vec8
+from companion.model.types import Quat, Vec2, Vec3, Vec8
 
 Mat2 = tuple[Vec2, Vec2]
 Mat3 = tuple[Vec3, Vec3, Vec3]

@@ -11,8 +11,8 @@ import math
 
 from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.types import PlantState
-from companion.frames import body_z_component
-from companion.types import Inputs, LandedState, Quat, Vec3
+from companion.model.frames import body_z_component
+from companion.model.types import Inputs, LandedState, Quat, Vec3
 
 SHARE_MAX = 0.25
 """The estimate stays within this share of its start value: a broken accelerometer must not take the vehicle down."""

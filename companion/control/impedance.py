@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from companion.config.controller import AdaptiveConfig
 from companion.control.zero_order_hold import HoldTable
-from companion.types import Vec8
+from companion.model.types import Vec8
 
 
 class Impedance:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Arm, Tool
-from companion.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.types import Quat, Vec2, Vec3
+from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.types import Quat, Vec2, Vec3
 
 GRAVITY_M_S2 = 9.81
 

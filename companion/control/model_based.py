@@ -9,8 +9,8 @@ from companion.control.common import ZERO8, Actuation, ActuationConfig, DesiredF
 from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
-from companion.frames import quat_conjugate, quat_rotate
-from companion.types import ControlLog, Vec2, Vec3, Vec8
+from companion.model.frames import quat_conjugate, quat_rotate
+from companion.model.types import ControlLog, Vec2, Vec3, Vec8
 
 
 class ModelBasedConfig(ActuationConfig, Protocol):

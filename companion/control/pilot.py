@@ -13,9 +13,9 @@ from companion.control.hover import HoverThrust, off_the_ground
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
 from companion.control.types import Controller, PlantState
-from companion.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
-from companion.frozen import quick
-from companion.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2, Vec3
+from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
+from companion.model.frozen import quick
+from companion.model.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2, Vec3
 
 FOLD_RATE_RAD_S = 1.2
 PULL_TIME_S, PULL_LAG_S, PULL_MAX_N = 0.1, 0.05, 100.0

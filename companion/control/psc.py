@@ -20,8 +20,8 @@ from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.model_based import ModelBasedLaw
 from companion.control.thrust import collective_n
 from companion.control.types import PlantState, Wrench
-from companion.frames import body_x_z_axes_world
-from companion.types import Reference, Vec2, Vec3, Vec8
+from companion.model.frames import body_x_z_axes_world
+from companion.model.types import Reference, Vec2, Vec3, Vec8
 
 
 class PayloadEstimator:

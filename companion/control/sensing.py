@@ -6,8 +6,8 @@ import math
 
 from companion.config.vehicle import Tool
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
-from companion.frames import quat_conjugate, quat_multiply, quat_rotate
-from companion.types import ForceSample, Quat, Vec2, Vec3, VehicleState
+from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate
+from companion.model.types import ForceSample, Quat, Vec2, Vec3, VehicleState
 
 
 def acceleration_world_m_s2(vehicle: VehicleState) -> Vec3:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.frames import quat_from_euler_zyx
-from companion.types import Quat, Vec3
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import Quat, Vec3
 
 
 @dataclass(frozen=True, slots=True)

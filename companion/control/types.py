@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from companion.frozen import quick
-from companion.types import ControlLog, Quat, Reference, Vec2, Vec3
+from companion.model.frozen import quick
+from companion.model.types import ControlLog, Quat, Reference, Vec2, Vec3
 
 
 @quick

@@ -25,7 +25,7 @@ from companion.config.ground import VEHICLE_NAME
 from companion.ground.keys import OPERATOR_NAME, SAFER, Operators
 from companion.ground.messages import COMMAND_MAX_BYTES, VERSION, Command, CommandName
 from companion.ground.wire import WireError, parse
-from companion.record import RecordError, from_jsonable
+from companion.model.codec import RecordError, from_jsonable
 
 DOMAIN = "companion command 2"
 """First line of every signed text: a signature made for anything else is none of a command."""

@@ -10,10 +10,10 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
-from companion.frames import wrap_rad, yaw_from_quat
 from companion.ground.messages import Health, Light
+from companion.model.frames import wrap_rad, yaw_from_quat
+from companion.model.types import Inputs, Outputs, PhaseKind
 from companion.safety.monitors_arm import WATCHDOG_RESTARTED, error_text
-from companion.types import Inputs, Outputs, PhaseKind
 
 NAMES = (
     "PX4", "estimate", "motion capture", "arm", "force sensor", "loop", "recorder", "guardian", "battery", "tether",

@@ -14,7 +14,7 @@ topic          record     QoS       what
 ``ack``        `Ack`      1         what came of a command
 =============  =========  ========  ============================================================================
 
-World ENU, body FLU, SI units, quaternions (w, x, y, z), as in `companion.types`. A field that is None is left out of the JSON.
+World ENU, body FLU, SI units, quaternions (w, x, y, z), as in `companion.model.types`. A field that is None is left out of the JSON.
 ``t_s`` is the flight clock of the session; ``wall_s`` seconds since 1970 by the vehicle's wall clock, for people only.
 """
 
@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeVar
 
-from companion.frozen import quick
 from companion.ground.wire import WireError, check_finite, parse
-from companion.record import RecordError, from_jsonable, json_text, to_jsonable
-from companion.types import Quat, Vec2, Vec3, Vec4
+from companion.model.codec import RecordError, from_jsonable, json_text, to_jsonable
+from companion.model.frozen import quick
+from companion.model.types import Quat, Vec2, Vec3, Vec4
 
 VERSION = 2
 ROOT = "companion"
@@ -96,7 +96,7 @@ class State:
     commands: bool
     """Commands are heard."""
     outcome: str | None = None
-    """`companion.types.Outcome`, once known."""
+    """`companion.model.types.Outcome`, once known."""
     text: str | None = None
     """For people: why it is silent, why commands are not heard, ..."""
 
@@ -162,9 +162,9 @@ class EventLine:
     mission_t_s: float
     id: str
     severity: str
-    """`companion.types.Severity`."""
+    """`companion.model.types.Severity`."""
     action: str
-    """`companion.types.SafetyAction`."""
+    """`companion.model.types.SafetyAction`."""
     text: str
 
 
@@ -197,7 +197,7 @@ class Health:
 @quick
 @dataclass(frozen=True, slots=True)
 class TetherView:
-    """The tether as far as people need it; see `companion.types.TetherState`."""
+    """The tether as far as people need it; see `companion.model.types.TetherState`."""
 
     slack_m: float
     stop_slack_m: float
@@ -210,7 +210,7 @@ class TetherView:
 @quick
 @dataclass(frozen=True, slots=True)
 class ControlView:
-    """Inside of the controller; see `companion.types.ControlLog`."""
+    """Inside of the controller; see `companion.model.types.ControlLog`."""
 
     rho: float
     h_hat: Vec4
@@ -257,12 +257,12 @@ class Stream:
     mission_t_s: float
     phase: str
     kind: str
-    """`companion.types.PhaseKind`."""
+    """`companion.model.types.PhaseKind`."""
     progress: float
     action: str
-    """`companion.types.SafetyAction`."""
+    """`companion.model.types.SafetyAction`."""
     hold: int | None
-    """Number of the hold that stands, `companion.types.Sent.hold`: `resume` names it. None: it does not hold."""
+    """Number of the hold that stands, `companion.model.types.Sent.hold`: `resume` names it. None: it does not hold."""
     armed: bool | None
     mode: str | None
     landed: str | None

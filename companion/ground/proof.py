@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 from companion.ground.messages import Ack, Stream
-from companion.record import json_text, to_jsonable
+from companion.model.codec import json_text, to_jsonable
 
 _STREAM_DOMAIN = "companion stream 2"
 _ACK_DOMAIN = "companion ack 2"

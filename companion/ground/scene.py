@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from companion.config.loader import FlightConfig
 from companion.ground.messages import VERSION, Scene
 from companion.mission.plan import _name as phase_name
-from companion.types import Vec2, Vec3
+from companion.model.types import Vec2, Vec3
 
 PATH_POINTS_MAX = 300
 

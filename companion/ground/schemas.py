@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.ground.messages import RECORDS, Topic
-from companion.record import json_schema
+from companion.model.codec import json_schema
 
 FOLDER = Path(__file__).parents[2] / "docs/telemetry"
 

@@ -26,8 +26,8 @@ from companion.ground.messages import (
 )
 from companion.ground.timings import Worst, worst_of
 from companion.ground.wire import NUMBER_MAX
-from companion.mission.sequencer import Stage
-from companion.types import (
+from companion.model.flight_stage import Stage
+from companion.model.types import (
     ControlLog,
     Inputs,
     Outputs,
@@ -44,7 +44,7 @@ _TOUCHDOWN = Stage.TOUCHDOWN.value
 WAITS_FOR_START = Stage.READY.value
 """`Outputs.phase` of a flight that is ready and waits for the command."""
 PERIOD_S = 0.005
-"""Of the control loop: a tick that begins later than this is missed (`companion.core.NOMINAL_DT_S`)."""
+"""Of the control loop: a tick that begins later than this is missed (`companion.core.flight_core.NOMINAL_DT_S`)."""
 MOCAP_FRESH_S = 0.1
 """An older pose is not graded (`companion.analysis.log.MOCAP_FRESH_S`)."""
 TEXT_MAX = 300
@@ -118,7 +118,7 @@ class StreamMaker:
 
         Args:
             t_s: flight clock.
-            severity: a value of `companion.types.Severity`.
+            severity: a value of `companion.model.types.Severity`.
             source: who says it; the line's id.
             text: cut to `TEXT_MAX` characters.
             instead: of the last line of the same source, if it is still kept: what repeats for ever is to push out nothing else.

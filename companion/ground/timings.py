@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from companion.ground.lights import UNKNOWN_S
 from companion.ground.messages import Timing
-from companion.types import Inputs, Outputs, Sent
+from companion.model.types import Inputs, Outputs, Sent
 
 
 class Worst:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from companion.record import plain
+from companion.model.codec import plain
 
 NUMBER_MAX = 1e12
 """Magnitude of every number in a message, at most. Wall clocks in seconds and flight clocks in milliseconds are far below."""

@@ -6,10 +6,10 @@ import asyncio
 import contextlib
 import socket
 
-from companion.clock import Clock
-from companion.guardian import beat as words
-from companion.guardian.beat import Beat
-from companion.io.edges import DeviceError
+from companion.guardian import heartbeat as words
+from companion.guardian.heartbeat import Beat
+from companion.io.protocols import DeviceError
+from companion.runtime.clock import Clock
 
 READY_TIMEOUT_S = 10.0
 SILENT_S = 1.0

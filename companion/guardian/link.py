@@ -12,11 +12,11 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
-from companion.io import autopilot_messages as messages
-from companion.io.ground_frames import autopilot_heartbeat
-from companion.io.udp_peer import REPIN_SILENCE_S, disconnect_udp
-from companion.types import AutopilotRequest, MocapPose
+from companion.io.px4 import messages
+from companion.io.px4.udp_peer import REPIN_SILENCE_S, disconnect_udp
+from companion.io.qgroundcontrol.frames import autopilot_heartbeat
+from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
+from companion.model.types import AutopilotRequest, MocapPose
 
 Message = Any
 

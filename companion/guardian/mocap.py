@@ -1,7 +1,7 @@
 """The guardian's own motion capture: a second NatNet client, on plain sockets.
 
 In standby it only keeps its place at the server and looks at a frame now and then; in charge every frame counts. Parsing and frames
-are those of the flight (`companion.io.natnet`, `companion.io.mocap_pose`).
+are those of the flight (`companion.io.mocap.natnet`, `companion.io.mocap.pose`).
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import contextlib
 import socket
 
 from companion.guardian.settings import MocapSettings
-from companion.io import natnet
-from companion.io.mocap_pose import VERSIONS, mocap_pose
-from companion.io.natnet import Malformed, Message, NatNetVersion
-from companion.io.natnet_source import join_source
+from companion.io.mocap import natnet
+from companion.io.mocap.natnet import Malformed, Message, NatNetVersion
+from companion.io.mocap.natnet_source import join_source
+from companion.io.mocap.pose import VERSIONS, mocap_pose
+from companion.model.types import MocapPose
 from companion.safety.stream_watch import StreamWatch
-from companion.types import MocapPose
 
 CONNECT_PERIOD_S = 0.25
 KEEP_ALIVE_PERIOD_S = 0.5

@@ -18,18 +18,18 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
-from companion import status
-from companion.guardian import beat as words
-from companion.guardian.beat import Beat
-from companion.guardian.charge import Charge, Told
+from companion.guardian import heartbeat as words
+from companion.guardian.heartbeat import Beat
 from companion.guardian.link import Link, Wire, address_problem, is_udp, open_wire
 from companion.guardian.mocap import MocapClient, MocapProblem
 from companion.guardian.settings import Settings, read_settings
+from companion.guardian.takeover_landing import Charge, Told
 from companion.guardian.watch import StallWatch
-from companion.io.packets import TEXT, UNNUMBERED
-from companion.realtime import GUARDIAN_PRIORITY, claim_realtime
-from companion.record import pack_plain
-from companion.types import SafetyAction, Severity
+from companion.model.codec import pack_plain
+from companion.model.types import SafetyAction, Severity
+from companion.runtime import ipc
+from companion.runtime.packets import TEXT, UNNUMBERED
+from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
 
 PERIOD_S = 0.01
 MOCAP_FRESH_S = 0.5
@@ -315,7 +315,7 @@ class Guardian:
         now_s = time.monotonic()
         if now_s - self._status_s >= STATUS_PERIOD_S:
             self._status_s = now_s
-            status.send(self._channel, {"type": "guardian_status", "poses_sent": poses_sent})
+            ipc.send(self._channel, {"type": "guardian_status", "poses_sent": poses_sent})
 
     def _tell(self, last: Beat, told: Told) -> None:
         """To the launcher and into the log."""
@@ -331,7 +331,7 @@ class Guardian:
             "action": told.action.value,
             "text": told.text,
         }
-        status.send(self._channel, message)
+        ipc.send(self._channel, message)
         _say(f"{told.t_s:.3f} {told.id}: {told.text}")
         if self._beats.recorder is not None:
             packet = pack_plain((TEXT, UNNUMBERED, told.t_s, told.severity.value, told.id, told.text))
@@ -347,7 +347,7 @@ class Guardian:
             "took_over_position_m": list(last.position_world_m),
             "position_m": None if pose is None else list(pose.position_world_m),
         }
-        status.send(self._channel, message)
+        ipc.send(self._channel, message)
 
 
 def _say(text: str) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.frames import attitude_enu_flu_from_ned_frd, euler_zyx_from_quat
-from companion.io import autopilot_messages as messages
-from companion.mission.sequencer import people_fly
-from companion.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
+from companion.io.px4 import messages
+from companion.model.flight_stage import people_fly
+from companion.model.frames import attitude_enu_flu_from_ned_frd, euler_zyx_from_quat
+from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
 
 # SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
 _NO_MANOEUVRES = (511, 512)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.types import Vec3
+from companion.model.types import Vec3
 
 AWAKE_STEP_MAX_S = 0.02
 """A round of the guardian's loop (10 ms) counts for no more than this: what it slept through proves nothing."""

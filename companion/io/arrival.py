@@ -8,7 +8,7 @@ import struct
 import time
 from typing import Final
 
-from companion.clock import Clock
+from companion.runtime.clock import Clock
 
 _SO_TIMESTAMPNS: Final = 35  # <asm-generic/socket.h>: of x86 and ARM; Python has no name for it
 _TIMESPEC: Final = struct.Struct("=qq")

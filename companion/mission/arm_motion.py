@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import ruckig
 
 from companion.mission.reference import Shape
-from companion.types import Vec2
+from companion.model.types import Vec2
 
 _DECIMALS = 12
 """Times of the profile are rounded, so that a replay on another machine, whose roots differ in the last bit, builds the same plan."""

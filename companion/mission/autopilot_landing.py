@@ -4,7 +4,7 @@ PX4 lands on its own estimate. Without vision its height becomes invalid 4.5 s a
 thrust and never finds that it stands (measured). So the companion watches for touch-down as long as the dead-reckoned height can be
 trusted, takes OFFBOARD back with zero thrust once the vehicle stands, and disarms. No single source decides: PX4's estimate and motion
 capture must both see a vehicle that stands while PX4 wants it down, and if PX4 alone never notices, it is disarmed all the same.
-`companion.mission.rotor_stop` decides when a stop of the rotors may be requested, also of a vehicle that is flipped or tipped over.
+`companion.safety.rotor_stop` decides when a stop of the rotors may be requested, also of a vehicle that is flipped or tipped over.
 Pure; time is an argument.
 """
 
@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.mission.rotor_stop import (
+from companion.model.flight_stage import in_offboard, is_armed, on_ground, people_chose
+from companion.model.types import AutopilotRequest, FlightMode, Inputs
+from companion.safety.rotor_stop import (
     ESTIMATE_TRUSTED_S,
     FORCE_DISARM_S,
     STATE_FRESH_S,
@@ -20,9 +22,7 @@ from companion.mission.rotor_stop import (
     fresh_pose,
     hears_px4,
 )
-from companion.mission.sequencer import in_offboard, is_armed, on_ground, people_chose
-from companion.mission.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking
-from companion.types import AutopilotRequest, FlightMode, Inputs
+from companion.safety.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking
 
 ZERO_THRUST_STREAM_S = 0.6
 """Zero-thrust setpoints flow for this long before OFFBOARD is asked for: no older setpoint may take effect."""

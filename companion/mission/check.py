@@ -10,13 +10,13 @@ from collections.abc import Iterator, Sequence
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.frames import wrap_rad
 from companion.mission.check_judge import CATCH_NEAR_M, STOP, Judge, Violation
 from companion.mission.minsnap import Progress
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
+from companion.model.frames import wrap_rad
+from companion.model.types import PhaseKind, Reference, Vec2, Vec3
 from companion.safety.governor import SafeSet
-from companion.types import PhaseKind, Reference, Vec2, Vec3
 
 SAMPLE_S = 0.02
 SAMPLES_PER_SEGMENT_MAX = 3000

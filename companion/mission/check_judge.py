@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
-from companion.frames import quat_from_euler_zyx
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import PhaseKind, Quat, Reference, Vec2, Vec3
 from companion.safety.governor import BODY_TOP_M, SafeSet
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
-from companion.types import PhaseKind, Quat, Reference, Vec2, Vec3
 
 ARM_RADIUS_M = 0.03
 """Half the thickness of servos and links."""

@@ -11,7 +11,7 @@ import math
 from companion.mission.plan import STOP_MIN_S, Plan
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, slow_down, speed_up
 from companion.mission.segments import Segment
-from companion.types import Reference
+from companion.model.types import Reference
 
 HOLD_DECELERATION_M_S2 = 1.5
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 from companion.mission.reference import Septic
-from companion.types import Vec3
+from companion.model.types import Vec3
 
 if TYPE_CHECKING:
     import numpy as np

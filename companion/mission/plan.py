@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 from companion.config.mission import ArmMove, Land, Line, Mission, Path, Phase, Takeoff
 from companion.config.vehicle import Vehicle
-from companion.frames import wrap_rad
 from companion.mission.arm_motion import ArmLimits, plan_arm
 from companion.mission.minsnap import Progress, VehicleLimits, least_line_s, route
 from companion.mission.reference import (
@@ -29,7 +28,8 @@ from companion.mission.reference import (
     steady,
 )
 from companion.mission.segments import Repeats, Segment, counted, flown_phases, repeats_of
-from companion.types import PhaseKind, Reference, Vec2, Vec3
+from companion.model.frames import wrap_rad
+from companion.model.types import PhaseKind, Reference, Vec2, Vec3
 
 BELOW_GROUND_M = 0.25
 """A landing's reference goes on below the floor, so that the vehicle is pressed down until touchdown is detected."""

@@ -6,9 +6,9 @@ before the companion does. Nothing is ever lifted then.
 
 from __future__ import annotations
 
-from companion.mission.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
-from companion.mission.sequencer import on_ground, people_fly
-from companion.types import Inputs
+from companion.model.flight_stage import on_ground, people_fly
+from companion.model.types import Inputs
+from companion.safety.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
 
 
 def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:

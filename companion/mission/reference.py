@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
 
-from companion.types import Reference, Vec2, Vec3
+from companion.model.types import Reference, Vec2, Vec3
 
 Shape: TypeAlias = tuple[float, float, float, float]
 """f, f', f'', f''' of a profile at u in [0, 1]."""

@@ -14,7 +14,7 @@ from companion.mission.plan import (
 )
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
 from companion.mission.segments import Segment
-from companion.types import PhaseKind, Vec2, Vec3
+from companion.model.types import PhaseKind, Vec2, Vec3
 
 LEAST_WAY_M = 0.5
 """So far inward in any case: a tether that pulls is shorter than the file says, or caught."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from companion.config.mission import Mission
-from companion.types import PhaseKind
+from companion.model.types import PhaseKind
 
 
 @dataclass(frozen=True, slots=True)

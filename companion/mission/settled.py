@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from companion.frames import euler_zyx_from_quat, wrap_rad
-from companion.mission.sequencer import TARE_S
-from companion.types import MocapPose, Vec3, VehicleState
+from companion.model.flight_stage import TARE_S
+from companion.model.frames import euler_zyx_from_quat, wrap_rad
+from companion.model.types import MocapPose, Vec3, VehicleState
 
 SETTLED_S = TARE_S
 """So long it must have been near and steady; as long as the tare, which runs meanwhile."""

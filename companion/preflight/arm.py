@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from companion.config.vehicle import Vehicle
+from companion.model.observations import Observations, ServoReport
+from companion.model.rows import Row
+from companion.model.types import ArmState
 from companion.preflight.checks import Check
-from companion.preflight.observations import Observations, ServoReport
-from companion.preflight.rows import Row
 from companion.safety.monitors_arm import error_text
-from companion.types import ArmState
 
 DEVICE = Check(
     "arm.device", "arm bus", "the port opens, both servos answer and take their settings", "no arm, no flight"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
-from companion.frames import quat_normalize
-from companion.types import Quat, Vec3
+from companion.model.frames import quat_normalize
+from companion.model.types import Quat, Vec3
 
 _LETTERS = "xyz"
 

@@ -10,13 +10,13 @@ import math
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
-from companion.frames import wrap_rad, yaw_from_quat
+from companion.model.frames import wrap_rad, yaw_from_quat
+from companion.model.observations import EstimatorReport, Observations
+from companion.model.rows import Row
+from companion.model.types import FlightMode, MocapPose, VehicleState
 from companion.preflight.checks import Check
-from companion.preflight.observations import EstimatorReport, Observations
-from companion.preflight.rows import Row
 from companion.px4.wanted import HOVER as HOVER_PARAM
 from companion.safety.monitors_mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
-from companion.types import FlightMode, MocapPose, VehicleState
 
 DEVICE = Check("px4.device", "PX4", "the link opens, PX4 answers", "without PX4 nothing flies")
 HEARTBEAT = Check(

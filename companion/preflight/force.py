@@ -9,11 +9,11 @@ from collections.abc import Iterator, Sequence
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.control.sensing import ForceSensing
+from companion.model.observations import ForceStream, Observations
+from companion.model.rows import Row
+from companion.model.types import ForceSample, Vec3
 from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check
-from companion.preflight.observations import ForceStream, Observations
-from companion.preflight.rows import Row
-from companion.types import ForceSample, Vec3
 
 DEVICE = Check(
     "force.device", "force sensor", "the port opens, an RFT60 answers and streams", "the law would not feel the payload"

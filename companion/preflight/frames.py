@@ -1,7 +1,7 @@
 """Do motion capture, PX4 and the mission mean the same axes? What a machine at rest can tell of it. Pure.
 
 PX4 fuses motion capture: a wrong yaw is invisible to EKF2. Gravity by the accelerometer finds what is tilted; the mission's start place
-and yaw find what is turned; the rest is found by the hand test (`companion.preflight.hand_test`).
+and yaw find what is turned; the rest is found by the hand test (`companion.preflight.hand_test.run`).
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Final, NamedTuple
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.frames import quat_conjugate, quat_multiply, quat_rotate, wrap_rad, yaw_from_quat
+from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate, wrap_rad, yaw_from_quat
+from companion.model.observations import Observations
+from companion.model.rows import Row
+from companion.model.types import MocapPose, Quat, Vec3, VehicleState
 from companion.preflight.axes import IDENTITY, MIRRORINGS, ROTATIONS, Y_UP, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_motion import angle_rad, mean_attitude, mean_vector, norm, turned_rad
-from companion.preflight.observations import Observations
-from companion.preflight.rows import Row
-from companion.types import MocapPose, Quat, Vec3, VehicleState
+from companion.preflight.hand_test.motion import angle_rad, mean_attitude, mean_vector, norm, turned_rad
 
 HAND_TEST = Check(
     "frames.hand_test",

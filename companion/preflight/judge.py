@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from companion.config.loader import FlightConfig
+from companion.model.observations import Observations, Waiting
+from companion.model.rows import Row, refusals
 from companion.preflight import arm, estimator, force, frames, machine, mission, mocap, px4, tether
 from companion.preflight.checks import Check
-from companion.preflight.observations import Observations, Waiting
-from companion.preflight.rows import Row, refusals
 from companion.px4 import wanted
 
 CHECKS: tuple[Check, ...] = (

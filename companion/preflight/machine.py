@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 from companion.config.computer import Computer
 from companion.config.vehicle import Vehicle
-from companion.cores import listed
+from companion.model.observations import Machine, Observations
+from companion.model.rows import Row
 from companion.preflight.checks import Check
-from companion.preflight.observations import Machine, Observations
-from companion.preflight.rows import Row
+from companion.runtime.cores import listed
 
 DISK = Check(
     "machine.disk",

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from companion.config.loader import FlightConfig
 from companion.config.mission import Start
 from companion.config.vehicle import Room
+from companion.model.observations import Observations
+from companion.model.rows import Row
+from companion.model.types import Vec2, Vec3
 from companion.preflight.checks import Check
-from companion.preflight.observations import Observations
-from companion.preflight.rows import Row
-from companion.types import Vec2, Vec3
 
 PLAN = Check(
     "mission.plan",

@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
+from companion.model.observations import MocapStream, Observations
+from companion.model.rows import Row
+from companion.model.types import MocapPose
 from companion.preflight.checks import Check
-from companion.preflight.observations import MocapStream, Observations
-from companion.preflight.rows import Row
-from companion.types import MocapPose
 
 DEVICE = Check("mocap.device", "motion capture", "the server answers and streams", "without it PX4 has no position")
 RATE = Check(

@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from companion.clock import Clock
 from companion.config.loader import FlightConfig
-from companion.cores import usable_cpus
-from companion.devices import Edges, SomeEdges
-from companion.io.autopilot import MavsdkAutopilot
-from companion.io.dynamixel import usb_latency_ms
-from companion.io.edges import DeviceError
-from companion.preflight.observations import (
+from companion.io.devices import Edges, SomeEdges
+from companion.io.dynamixel.registers import usb_latency_ms
+from companion.io.protocols import DeviceError
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.model.observations import (
     EstimatorReport,
     ForceStream,
     Machine,
@@ -29,8 +27,10 @@ from companion.preflight.observations import (
     StateCounts,
     Waiting,
 )
-from companion.realtime import FLIGHT_PRIORITY, memory_lock_refused, realtime_permitted
-from companion.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
+from companion.model.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
+from companion.runtime.clock import Clock
+from companion.runtime.cores import usable_cpus
+from companion.runtime.realtime import FLIGHT_PRIORITY, memory_lock_refused, realtime_permitted
 
 LOOK_PERIOD_S = 0.005
 """As in flight: the servo bus is worked as hard as it will be."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 
 from companion.config.vehicle import Vehicle
-from companion.preflight.rows import Level, Row
+from companion.model.rows import Level, Row
 from companion.px4.wanted import WANTED, Value, Wanted
 
 KNOWN_GOOD = ((1, 16), (1, 18))

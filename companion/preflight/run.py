@@ -8,14 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from companion.clock import Clock
 from companion.config.loader import FlightConfig
-from companion.devices import Edges, SomeEdges
-from companion.preflight import hand_record, judge
-from companion.preflight.observations import Observations
+from companion.io.devices import Edges, SomeEdges
+from companion.model.observations import Observations
+from companion.model.rows import Row, refusals
+from companion.preflight import judge
+from companion.preflight.hand_test import record as hand_record
 from companion.preflight.observe import Tell, observe
-from companion.preflight.rows import Row, refusals
-from companion.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.runtime.clock import Clock
+from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 SCHEMA_VERSION = 1
 FILE = "preflight.json"

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
-from companion.frames import quat_rotate
+from companion.model.frames import quat_rotate
+from companion.model.observations import Observations
+from companion.model.rows import Row
 from companion.preflight.checks import Check
-from companion.preflight.observations import Observations
-from companion.preflight.rows import Row
 
 LINE = Check(
     "tether.line",

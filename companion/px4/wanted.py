@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
-from companion.mission.sequencer import SPOOL_S
-from companion.preflight.rows import Level
+from companion.model.flight_stage import SPOOL_S
+from companion.model.rows import Level
 
 GRAVITY_M_S2 = 9.81
 HOVER = "MPC_THR_HOVER"

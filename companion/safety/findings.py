@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Safety
-from companion.negative_zero import without_negative_zero
+from companion.model.negative_zero import without_negative_zero
+from companion.model.types import ControlLog, Event, SafetyAction, Severity, TetherState
 from companion.safety.rules import BY_PEOPLE, REATTACHED, RULES, Rule
-from companion.types import ControlLog, Event, SafetyAction, Severity, TetherState
 
 QUIET_S = 1.0
 """What comes and goes is told again only after it was gone for so long; until then it stands."""

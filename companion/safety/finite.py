@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
 from companion.safety.findings import Findings
 from companion.safety.rules import (
     ARM_NOT_FINITE,
@@ -12,7 +13,6 @@ from companion.safety.rules import (
     STATUS_NOT_FINITE,
     VEHICLE_NOT_FINITE,
 )
-from companion.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
 
 ABSURD = 1.0e4
 """No quantity here, in its unit, is ever so large."""

@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
-from companion.frames import tilt_rad
-from companion.frozen import quick
-from companion.types import AttitudeSetpoint, Vec2
+from companion.model.frames import tilt_rad
+from companion.model.frozen import quick
+from companion.model.types import AttitudeSetpoint, Vec2
 
 SLEW_MEMORY_S = 0.1
 """After so long without a setpoint, which is what PX4 forgets the last one after, the next may be any."""

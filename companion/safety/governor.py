@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
-from companion.frozen import quick
+from companion.model.frozen import quick
+from companion.model.types import Reference, TetherState, Vec3
 from companion.safety.stop import StopModel
-from companion.types import Reference, TetherState, Vec3
 
 BODY_TOP_M = 0.15
 """Rotors and markers above the body's origin."""

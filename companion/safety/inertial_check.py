@@ -7,7 +7,7 @@ minus predicted position, stays near zero while both measure the same motion. A 
 
 The attitude that turns the specific force into the world is PX4's. PX4 corrects its tilt by the same poses, but slowly (0.4 rad/s).
 
-The observer gets the integral of the specific force over every sample that PX4 sent (`companion.io.delta_velocity`). One sample for
+The observer gets the integral of the specific force over every sample that PX4 sent (`companion.io.px4.delta_velocity`). One sample for
 each tick would alias vibration of 5 to 10 m/s2 into the velocity. Times are those of exposure and sample, on the clocks of cameras and
 PX4 (`RemoteClock`), not of arrival: a message that waits on its way does not change when its sample was taken.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from companion.types import Vec3
+from companion.model.types import Vec3
 
 POLE_RAD_S = 3.0
 """All three poles of the observer."""

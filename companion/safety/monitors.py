@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from companion.config.vehicle import Vehicle
+from companion.model.types import Event, Inputs, OperatorCommand, VehicleState
 from companion.safety.findings import Findings, Situation
 from companion.safety.finite import FiniteInputs
 from companion.safety.monitors_arm import ArmMonitor, ForceMonitor
@@ -23,7 +24,6 @@ from companion.safety.rules import (
     REATTACHED,
     RECORDER_DROPS,
 )
-from companion.types import Event, Inputs, OperatorCommand, VehicleState
 
 __all__ = ["Monitors", "Situation", "unfused"]
 

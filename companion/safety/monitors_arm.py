@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
+from companion.model.types import ArmState, ForceSample, Inputs, Vec2
 from companion.safety.findings import Age, Findings, Situation
 from companion.safety.rules import (
     ARM_LET_GO,
@@ -23,7 +24,6 @@ from companion.safety.rules import (
     SERVO_OVERLOAD,
     SERVO_WARM,
 )
-from companion.types import ArmState, ForceSample, Inputs, Vec2
 
 WATCHDOG_RESTARTED = 0x80
 """Bit of `ArmState.hardware_error` that is the companion's own."""

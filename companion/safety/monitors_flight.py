@@ -6,10 +6,11 @@ import math
 
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2
-from companion.frames import tilt_rad
-from companion.mission.rotor_stop import FLIPPED_TILT_RAD, seems_flipped
+from companion.model.frames import tilt_rad
+from companion.model.types import ControlLog, Inputs, TetherState, Vec3
 from companion.safety.findings import Findings, Situation
 from companion.safety.governor import BODY_TOP_M
+from companion.safety.rotor_stop import FLIPPED_TILT_RAD, seems_flipped
 from companion.safety.rules import (
     CLIMBS,
     CRASHED,
@@ -30,7 +31,6 @@ from companion.safety.rules import (
     TRACKING_WARN,
 )
 from companion.safety.stop import StopModel
-from companion.types import ControlLog, Inputs, TetherState, Vec3
 
 
 class FlightMonitor:

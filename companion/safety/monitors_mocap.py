@@ -10,7 +10,8 @@ import math
 
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2
-from companion.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
+from companion.model.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
+from companion.model.types import Inputs, MocapPose, Quat, VehicleState
 from companion.safety.findings import Findings, Situation
 from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck, RemoteClock
 from companion.safety.rules import (
@@ -28,7 +29,6 @@ from companion.safety.rules import (
     YAW_DISAGREES,
 )
 from companion.safety.stream_watch import StreamWatch
-from companion.types import Inputs, MocapPose, Quat, VehicleState
 
 FUSED_WITHIN_M = 0.10
 FUSED_WITHIN_RAD = math.radians(8.0)

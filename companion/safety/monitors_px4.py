@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
-from companion.mission.sequencer import failsafe_chose, people_chose
+from companion.model.flight_stage import failsafe_chose, people_chose
+from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
 from companion.safety.findings import Age, Findings, Situation
 from companion.safety.rules import (
     BATTERY_LOW,
@@ -20,7 +21,6 @@ from companion.safety.rules import (
     PX4_REBOOTED,
     VEHICLE_STATE_LOST,
 )
-from companion.types import AutopilotStatus, FlightMode, Inputs, VehicleState
 
 DISARMED_ABOVE_M = 0.15
 """Lower than this above standing, PX4's own disarm after a landing is nothing to wonder about."""

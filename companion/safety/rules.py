@@ -1,6 +1,6 @@
 """Every event that a monitor can raise, in one table: what is found, by which limits, and what is done about it.
 
-The monitors refer to these records, `companion.safety.table` prints them into docs/safety.md, and the tests walk them. Ids are stable:
+The monitors refer to these records, `tools.docs.safety` prints them into docs/safety.md, and the tests walk them. Ids are stable:
 logs, summaries and outside scripts name them.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from companion.types import SafetyAction
+from companion.model.types import SafetyAction
 
 
 class Part(Enum):

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from companion.config.vehicle import Safety
-from companion.types import Event, SafetyAction
+from companion.model.types import Event, SafetyAction
 
 RESUME = "operator_resume"
 HOLD_EXPIRED, RETRACT_EXPIRED = "hold_expired", "retract_expired"

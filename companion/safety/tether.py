@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Tether, Vehicle
-from companion.frames import quat_rotate
+from companion.model.frames import quat_rotate
+from companion.model.types import Quat, TetherState, Vec2, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
-from companion.types import Quat, TetherState, Vec2, Vec3
 
 _TWO_PI = 2.0 * math.pi
 _ABOVE_M = 0.05

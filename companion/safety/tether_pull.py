@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Tether
-from companion.types import Vec3
+from companion.model.types import Vec3
 
 HORIZONTAL_N = 0.7
 """Standard deviation of the horizontal residual without a tether: wind of a room, drag, tilt errors."""

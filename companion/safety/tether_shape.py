@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
-from companion.types import Vec2, Vec3
+from companion.model.types import Vec2, Vec3
 
 _NEVER = 1.0
 """How far a line is followed that never leaves the disk, m."""

@@ -10,8 +10,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from companion.frames import quat_multiply
-from companion.types import Quat, Vec3
+from companion.model.frames import quat_multiply
+from companion.model.types import Quat, Vec3
 from sitl.autopilot.cascade import Cascade, CascadeGains
 from sitl.autopilot.commander import Command, Commander, Notice, Result, Severity
 from sitl.autopilot.estimator import Estimator

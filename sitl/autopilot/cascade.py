@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.types import Quat, Vec3
+from companion.model.types import Quat, Vec3
 from sitl.autopilot.types import AttitudeTarget, Estimate, RotorCommands
 
 # Sign of each rotor's contribution to roll, pitch and yaw (FRD), in PX4's order.

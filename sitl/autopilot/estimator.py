@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from companion.frames import quat_multiply, quat_normalize, wrap_rad, yaw_from_quat
-from companion.types import IDENTITY_QUAT, Quat, Vec3
+from companion.model.frames import quat_multiply, quat_normalize, wrap_rad, yaw_from_quat
+from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 from sitl.autopilot.types import Estimate, Fusion, ImuSample
 
 GRAVITY_M_S2 = 9.81

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from enum import Enum, auto
 
-from companion.types import Vec3
+from companion.model.types import Vec3
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
 from sitl.autopilot.position_control import GRAVITY_M_S2, PositionControl, heading_rad

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.frames import euler_zyx_from_quat, wrap_rad
-from companion.types import Quat, Vec3
+from companion.model.frames import euler_zyx_from_quat, wrap_rad
+from companion.model.types import Quat, Vec3
 from sitl.autopilot.params import Params
 from sitl.autopilot.setpoints import PositionTarget
 from sitl.autopilot.types import AttitudeTarget, Estimate

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.frames import quat_from_euler_zyx
-from companion.types import Vec3
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import Vec3
 from sitl.autopilot import telemetry
 from sitl.autopilot.autopilot import Command7, Origin, Px4Stub
 from sitl.autopilot.commander import Command, Result

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.types import Quat, Vec3
+from companion.model.types import Quat, Vec3
 from sitl.autopilot.modes import OffboardKind
 from sitl.autopilot.types import AttitudeTarget
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from companion.types import Vec2
+from companion.model.types import Vec2
 from sitl.autopilot.params import Params
 
 _SETTLE_S = 0.1

@@ -10,7 +10,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.frames import euler_zyx_from_quat
+from companion.model.frames import euler_zyx_from_quat
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.types import Estimate

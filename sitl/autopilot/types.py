@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from companion.types import Quat, Vec3, Vec4
+from companion.model.types import Quat, Vec3, Vec4
 
 
 class ImuSample(NamedTuple):

@@ -24,6 +24,6 @@ def _stall_loop(*_: object) -> None:
         time.sleep(min(left_s, 3600.0))
 
 
-if "companion.app" in sys.orig_argv:
+if "companion.flight.main" in sys.orig_argv:
     signal.signal(signal.SIGUSR1, _hold_gil)
     signal.signal(signal.SIGUSR2, _stall_loop)

@@ -6,7 +6,7 @@ import select
 from pathlib import Path
 
 from companion.analysis.log import FlightLog
-from companion.io.recorder import RecorderProcess
+from companion.recorder.client import RecorderProcess
 from tests.support import DEADLINE_S
 
 

@@ -10,9 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from companion.frames import quat_from_euler_zyx
-from companion.io.recorder import RecorderProcess, RecorderReport
-from companion.types import (
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import (
     ArmState,
     AttitudeSetpoint,
     AutopilotRequest,
@@ -36,6 +35,7 @@ from companion.types import (
     Vec3,
     VehicleState,
 )
+from companion.recorder.client import RecorderProcess, RecorderReport
 
 RATE_HZ = 200.0
 GROUND_S = 1.0

@@ -20,8 +20,8 @@ from companion.analysis.log import FlightLog, LogError
 from companion.analysis.replay import replay
 from companion.analysis.report import write_report
 from companion.analysis.summary import empty_summary, summarise, write_summary
-from companion.record import differences
-from companion.types import Inputs, Outputs, PhaseKind, Sent
+from companion.model.codec import differences
+from companion.model.types import Inputs, Outputs, PhaseKind, Sent
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, record_flight, synthetic_flight
 
 Row = tuple[Inputs, Outputs, Sent]

@@ -10,8 +10,8 @@ import pytest
 
 from companion.analysis.hover_fit import FIT_MIN_S, SLOPE_MIN_V, HoverFitError, fit_hover_thrust
 from companion.analysis.log import FlightLog
-from companion.types import Inputs, Outputs
-from sitl.campaign import log_of
+from companion.model.types import Inputs, Outputs
+from sitl.campaigns.flights import log_of
 from tests.control.test_hover import configured, flown, true_hover_thrust
 
 

@@ -13,8 +13,8 @@ from companion.analysis.log import FlightLog
 from companion.analysis.metrics import catch_index
 from companion.analysis.report import write_report
 from companion.analysis.summary import summarise
-from companion.flight import TICKS_MAX
-from companion.io.recorder import RecorderProcess
+from companion.launcher.run import TICKS_MAX
+from companion.recorder.client import RecorderProcess
 from tests.analysis.synthetic_flight import CONFIG, record_flight, synthetic_flight
 
 TICKS = 500

@@ -17,20 +17,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.clock import flight_clock
 from companion.config.loader import load_flight
-from companion.devices import SomeEdges, VisionValve
-from companion.exit_codes import EXIT_OK
-from companion.io import dynamixel as dxl
-from companion.io.arm import DynamixelArm
-from companion.io.edges import DeviceError
+from companion.io.devices import SomeEdges, VisionValve
+from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.protocols import DeviceError
+from companion.model.exit_codes import EXIT_OK
+from companion.model.rows import Row
 from companion.preflight import arm as preflight
 from companion.preflight.observe import observe
-from companion.preflight.rows import Row
-from companion.realtime import WORLD_PRIORITY
+from companion.runtime.clock import flight_clock
+from companion.runtime.realtime import WORLD_PRIORITY
 from sitl.server import start_of
-from sitl.servo_bus import ServoBus
-from sitl.servo_knobs import plugged_in, servos_of
+from sitl.servo.bus import ServoBus
+from sitl.servo.knobs import plugged_in, servos_of
 from tests.support import CATCH, ROOT, Ended, Running, Sandbox, World, run_here, sandbox_in
 
 HAND = "world.arm_hand=true"

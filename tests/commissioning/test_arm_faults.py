@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli import main
-from companion.commissioning.arm_scan import judge, scan
+from companion.cli.main import main
+from companion.commissioning.arm.scan import judge, scan
 from companion.config.loader import load_vehicle
-from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from sitl.servo_bus import ServoBus
-from sitl.servo_model import ServoModel
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from sitl.servo.bus import ServoBus
+from sitl.servo.model import ServoModel
 from tests.commissioning.arm_rig import FILES, HAND, SHIPPED, bad_ids, bench, keys, rig, row_of
 from tests.support import set_options
 

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from companion.commissioning.arm_friction import FrictionFit, JointFit, fit
-from companion.commissioning.arm_sweep import HANGING_DEG, REACH_DEG, SPEEDS_DEG_S, Sample
+from companion.commissioning.arm.friction import FrictionFit, JointFit, fit
+from companion.commissioning.arm.sweep import HANGING_DEG, REACH_DEG, SPEEDS_DEG_S, Sample
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
-from companion.types import IDENTITY_QUAT, Vec2
+from companion.model.types import IDENTITY_QUAT, Vec2
 from tests.commissioning.arm_rig import SHIPPED
 
 RATE_HZ = 200.0

@@ -16,9 +16,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from companion.commissioning.arm_scan import scan
+from companion.commissioning.arm.scan import scan
 from companion.config.loader import load_vehicle
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.commissioning.arm_rig import FILES, HAND, Rig, rig
 from tests.support import DEADLINE_S
 
@@ -61,7 +61,7 @@ def test_keys_at_a_terminal_move_the_arm_and_q_lets_go(held: Rig) -> None:
     ours, theirs = os.openpty()
     try:
         process = subprocess.Popen(
-            [sys.executable, "-m", "companion.cli", "arm", "jog", "--yes", *held.options()],
+            [sys.executable, "-m", "companion", "arm", "jog", "--yes", *held.options()],
             cwd=held.sandbox.cwd,
             env={**held.sandbox.environment, "TERM": "xterm"},
             stdin=theirs,

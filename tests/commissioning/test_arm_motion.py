@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import pytest
 
-from companion.commissioning.arm_jog import KEY_TIMEOUT_S, STEP_DEG, ByKeys, ToAngle, keys_in
-from companion.commissioning.arm_motion import SPEED_MAX_DEG_S, TORQUE_SHARE, Motion, Moved, walls_deg
-from companion.commissioning.arm_sweep import Sweeper, legs_of
+from companion.commissioning.arm.jog import KEY_TIMEOUT_S, STEP_DEG, ByKeys, ToAngle, keys_in
+from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, TORQUE_SHARE, Motion, Moved, walls_deg
+from companion.commissioning.arm.sweep import Sweeper, legs_of
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
-from companion.types import IDENTITY_QUAT, ArmState, Vec2
+from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
 from tests.commissioning.arm_rig import SHIPPED
 
 DT_S = 0.005

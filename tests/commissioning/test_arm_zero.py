@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.commissioning.arm_poses import steps_of
-from companion.commissioning.arm_zero import HELD_S, ZeroGuide, ZeroView
+from companion.commissioning.arm.poses import steps_of
+from companion.commissioning.arm.zero import HELD_S, ZeroGuide, ZeroView
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Arm
-from companion.io.dynamixel import COUNTS_PER_TURN, RAD_PER_COUNT
-from companion.types import Vec2
+from companion.io.dynamixel.registers import COUNTS_PER_TURN, RAD_PER_COUNT
+from companion.model.types import Vec2
 from tests.commissioning.arm_rig import SHIPPED
 
 STEP_S = 0.02

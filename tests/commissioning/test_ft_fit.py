@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from companion.commissioning import ft_fit
-from companion.commissioning.ft_fit import Loaded
+from companion.commissioning.force_torque import fit as ft_fit
+from companion.commissioning.force_torque.fit import Loaded
 from companion.config.loader import load_vehicle
 from companion.config.world import World
 from companion.control.manipulator import Manipulator
-from companion.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.types import ForceSample, Quat, Vec2, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
-from companion.types import ForceSample, Quat, Vec2, Vec3
-from sitl.hand import HungWeight
+from sitl.world.hand import HungWeight
 from tests.support import ROOT
 
 VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")

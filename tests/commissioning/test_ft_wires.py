@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from companion.clock import flight_clock
-from companion.commissioning.ft_watch import FtSensor
+from companion.commissioning.force_torque.watch import FtSensor
 from companion.config.vehicle import ForceDevice
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle, wait_for_error
 from tests.support import Sandbox, World, run_here

@@ -9,8 +9,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from companion.commissioning import latency_fit
-from companion.commissioning.latency_fit import (
+from companion.cli.latency import Measured, rows, text
+from companion.commissioning.latency import fit as latency_fit
+from companion.commissioning.latency.fit import (
     ImuSample,
     PoseSample,
     Tap,
@@ -21,8 +22,7 @@ from companion.commissioning.latency_fit import (
     measure_tap,
     mocap_noise,
 )
-from companion.latency_command import Measured, rows, text
-from companion.types import Quat, Vec3
+from companion.model.types import Quat, Vec3
 
 TAPS_AT_S = (2.0, 3.13, 4.21, 5.4, 6.52, 7.61)
 TAP_S = 0.024

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, document, sandbox, wait_for_error
 from tests.support import Ended, Sandbox, World, run_here
 

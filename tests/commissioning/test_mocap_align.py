@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from companion.commissioning import mocap_align
-from companion.commissioning.mocap_align import Alignment
-from companion.preflight.hand_test import HandResult, HandTest
+from companion.commissioning.mocap import align as mocap_align
+from companion.commissioning.mocap.align import Alignment
+from companion.preflight.hand_test.run import HandResult, HandTest
 from tests.preflight.hand_rig import Standing, world
 
 

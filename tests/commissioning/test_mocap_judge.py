@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from companion.commissioning import mocap_judge
-from companion.commissioning.mocap_judge import FrameSeen, Judged, Route, Timing
+from companion.commissioning.mocap import judge as mocap_judge
+from companion.commissioning.mocap.judge import FrameSeen, Judged, Route, Timing
 from companion.config.loader import load_vehicle
-from companion.io.natnet import RigidBody, ServerInfo
-from companion.types import IDENTITY_QUAT, Vec3
+from companion.io.mocap.natnet import RigidBody, ServerInfo
+from companion.model.types import IDENTITY_QUAT, Vec3
 from tests.support import ROOT
 
 VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.support import CATCH, DEADLINE_S, ROOT, Ended, Running, Sandbox, World, run_here, sandbox_in, set_options
 
 pytestmark = pytest.mark.waits

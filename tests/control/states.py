@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.control.types import PlantState
-from companion.types import IDENTITY_QUAT, Vec2, Vec3
+from companion.model.types import IDENTITY_QUAT, Vec2, Vec3
 
 POSE: Vec2 = (math.radians(100), math.radians(60))
 ZERO: Vec3 = (0.0, 0.0, 0.0)

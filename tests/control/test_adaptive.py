@@ -14,7 +14,7 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.impedance import Impedance
 from companion.control.types import PlantState, Wrench
-from companion.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+from companion.model.types import IDENTITY_QUAT, Reference, Vec2, Vec3
 
 FOLD: Vec2 = (math.radians(165), math.radians(140))
 HOVER = 0.49

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from companion.control.sensing import CatchDetector
-from companion.types import Vec3
+from companion.model.types import Vec3
 
 DT_S = 0.005
 G_M_S2 = 9.81

@@ -14,10 +14,10 @@ from companion.control.csc import CscController
 from companion.control.dynamics import Dynamics, rotation_matrix
 from companion.control.factory import build_controller
 from companion.control.types import PlantState, Wrench
-from companion.core import FlightCore
-from companion.frames import quat_rotate
-from companion.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference, Vec3
-from sitl.fast import FastFlight, FastResult
+from companion.core.flight_core import FlightCore
+from companion.model.frames import quat_rotate
+from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference, Vec3
+from sitl.fast.loop import FastFlight, FastResult
 from tests.control.states import POSE, ZERO, at
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 

@@ -12,8 +12,8 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_body_rate, rotation_matrix
 from companion.control.manipulator import Manipulator
-from companion.frames import quat_from_euler_zyx
-from companion.types import Vec2, Vec3, Vec8
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import Vec2, Vec3, Vec8
 from tests.pinocchio_or_skip import pin
 from tests.sitl.test_world_dynamics import oracle
 

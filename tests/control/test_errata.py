@@ -20,7 +20,7 @@ from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.impedance import Impedance
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.control.types import PlantState
-from companion.types import IDENTITY_QUAT, Reference, Vec3
+from companion.model.types import IDENTITY_QUAT, Reference, Vec3
 
 Array = npt.NDArray[np.float64]
 DT_S = 0.005

@@ -11,9 +11,9 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.control.hover import SHARE_MAX, HoverThrust
 from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.types import PlantState
-from companion.frames import quat_from_euler_zyx
-from companion.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
-from sitl.fast import FastFlight, FastResult
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
+from sitl.fast.loop import FastFlight, FastResult
 
 MASS_KG = 3.0
 START, TRUE = 0.5, 0.45

@@ -15,7 +15,7 @@ from companion.control.arm_inertia import ArmInertia
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.dynamics import Dynamics
 from companion.control.types import PlantState
-from companion.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+from companion.model.types import IDENTITY_QUAT, Reference, Vec2, Vec3
 
 POSE: Vec2 = (math.radians(100), math.radians(60))
 ZERO: Vec3 = (0.0, 0.0, 0.0)

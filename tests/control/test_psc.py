@@ -16,10 +16,10 @@ from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
 from companion.control.psc import PayloadEstimator, PscController
 from companion.control.types import PlantState, Wrench
-from companion.core import FlightCore
-from companion.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference
-from sitl.campaign import log_of
-from sitl.fast import FastFlight, FastResult
+from companion.core.flight_core import FlightCore
+from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference
+from sitl.campaigns.flights import log_of
+from sitl.fast.loop import FastFlight, FastResult
 from tests.analysis.recorded import record
 from tests.control.states import POSE, ZERO, at
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids

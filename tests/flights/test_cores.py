@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from companion.exit_codes import EXIT_ABORTED
+from companion.model.exit_codes import EXIT_ABORTED
+from tests.runtime.test_cores import CORES, affinities, several
 from tests.support import HOVER, sandbox_in, set_options
-from tests.test_cores import CORES, affinities, several
 
 pytestmark = pytest.mark.flight
 OF = {
-    "flight": "companion.app",
+    "flight": "companion.flight.main",
     "guardian": "companion.guardian",
-    "recorder": "companion.recorder_process",
+    "recorder": "companion.recorder.main",
     "world": "sitl",
-    "launcher": "companion.cli",
+    "launcher": "companion",
 }
 
 

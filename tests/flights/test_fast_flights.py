@@ -8,9 +8,9 @@ from functools import cache
 import pytest
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.frames import tilt_rad
-from companion.types import Outcome, PhaseKind
-from sitl.fast import FastFlight, FastResult
+from companion.model.frames import tilt_rad
+from companion.model.types import Outcome, PhaseKind
+from sitl.fast.loop import FastFlight, FastResult
 
 
 def configured(*overrides: str, preset: str = "recommended") -> FlightConfig:

@@ -18,7 +18,6 @@ from mcap.reader import make_reader
 from companion.analysis.log import FlightLog
 from companion.config.ground import topic_name
 from companion.config.loader import load_flight
-from companion.exit_codes import EXIT_ABORTED
 from companion.ground.commands import FlightClock, make_command
 from companion.ground.keys import load_operators
 from companion.ground.messages import (
@@ -33,7 +32,8 @@ from companion.ground.messages import (
     vehicle_of,
 )
 from companion.ground.proof import ack_proven, stream_proven
-from companion.types import OperatorCommand, Outcome, SafetyAction
+from companion.model.exit_codes import EXIT_ABORTED
+from companion.model.types import OperatorCommand, Outcome, SafetyAction
 from tests.broker import loopback_broker
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options
 
@@ -176,7 +176,7 @@ def test_started_held_let_go_on_and_landed_from_the_ground(sandbox: Sandbox, tmp
     assert any(f"hold of {operator}: holding" in line for line in lines)
 
     replayed = subprocess.run(
-        [sys.executable, "-m", "companion.cli", "replay", str(out / "flight.mcap")],
+        [sys.executable, "-m", "companion", "replay", str(out / "flight.mcap")],
         capture_output=True,
         text=True,
         timeout=DEADLINE_S,
@@ -192,7 +192,7 @@ def test_without_its_recorder_it_still_stands_down_on_ctrl_c(sandbox: Sandbox, t
         with sandbox.start("fly", HOVER, "--sitl", "--wait-for-start", "--out", "out", *options) as flying:
             flying.wait_for("take off with: companion command start")
             flying.wait_for("connected to")
-            recorder = sandbox.pid_of("companion.recorder_process")
+            recorder = sandbox.pid_of("companion.recorder.main")
             os.kill(recorder, signal.SIGKILL)
             flying.wait_for("no telemetry and no commands any more")
             flying.signal(signal.SIGINT)

@@ -12,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 
 from companion.analysis.log import FlightLog
-from companion.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from tests.support import HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=2.0")
@@ -118,15 +118,15 @@ def test_an_error_of_the_flight_process_lands_by_the_guardian(tmp_path: Path) ->
 _BUG = """
 import sys
 
-if "companion.app" in sys.orig_argv:
-    import companion.core
+if "companion.flight.main" in sys.orig_argv:
+    import companion.core.flight_core
 
-    class Breaking(companion.core.FlightCore):
+    class Breaking(companion.core.flight_core.FlightCore):
         def step(self, inputs):
             outputs = super().step(inputs)
             if outputs.mission_t_s > 2.5:
                 raise ZeroDivisionError("a bug")
             return outputs
 
-    companion.core.FlightCore = Breaking
+    companion.core.flight_core.FlightCore = Breaking
 """

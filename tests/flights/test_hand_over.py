@@ -12,12 +12,12 @@ from typing import TextIO
 
 import pytest
 
-from companion import app
 from companion.config.loader import load_flight
-from companion.core import FlightCore
-from companion.launcher import with_devices
+from companion.core.flight_core import FlightCore
+from companion.flight import main as app
+from companion.launcher.launcher import with_devices
+from companion.model.types import Inputs, Outcome, Outputs
 from companion.preflight import run as before_arming
-from companion.types import Inputs, Outcome, Outputs
 from tests.support import HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
 
 BREAKS_AFTER_S = 2.5

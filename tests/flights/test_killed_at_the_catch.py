@@ -12,10 +12,10 @@ from rich.console import Console
 
 from companion.analysis.summary import summarise
 from companion.config.loader import load_flight
-from companion.terminal import print_result
-from companion.types import Event
-from sitl.campaign import log_of
-from sitl.fast import FastFlight
+from companion.model.types import Event
+from companion.runtime.console import print_result
+from sitl.campaigns.flights import log_of
+from sitl.fast.loop import FastFlight
 from tests.flights.test_fast_flights import event_ids
 from tests.support import SHORT_CATCH
 

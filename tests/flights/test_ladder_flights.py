@@ -11,10 +11,10 @@ from itertools import pairwise
 import pytest
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.core import FlightCore
-from companion.frames import tilt_rad
-from companion.record import differences
-from companion.types import (
+from companion.core.flight_core import FlightCore
+from companion.model.codec import differences
+from companion.model.frames import tilt_rad
+from companion.model.types import (
     AutopilotRequest,
     FlightMode,
     Inputs,
@@ -24,7 +24,7 @@ from companion.types import (
     SafetyAction,
     VehicleState,
 )
-from sitl.fast import FastFlight, FastResult
+from sitl.fast.loop import FastFlight, FastResult
 from tests.support import SHORT_CATCH
 
 replace = dataclasses.replace

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from companion.analysis.log import FlightLog
-from companion.exit_codes import EXIT_OK
+from companion.model.exit_codes import EXIT_OK
 from tests.support import HOVER, read_summary, sandbox_in
 
 _DEAF_ONCE = """

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import sync_playwright
 
-from companion.exit_codes import EXIT_ABORTED
+from companion.model.exit_codes import EXIT_ABORTED
 from tests.broker import loopback_broker
 from tests.browser import ARGUMENTS, chromium
 from tests.support import CATCH, DEADLINE_S, Sandbox, read_summary, sandbox_in, set_options
@@ -24,7 +24,7 @@ SLACK = "[data-figure='tether']"
 @contextmanager
 def monitor(sandbox: Sandbox, broker: str) -> Iterator[str]:
     """`companion monitor`; yields the address that it prints, token and all."""
-    command = [sys.executable, "-m", "companion.cli", "monitor", "--broker", broker, "--port", "0"]
+    command = [sys.executable, "-m", "companion", "monitor", "--broker", broker, "--port", "0"]
     environment = {**sandbox.environment, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(command, cwd=sandbox.cwd, env=environment, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

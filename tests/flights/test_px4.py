@@ -17,11 +17,11 @@ import pytest
 
 from companion.analysis.log import FlightLog
 from companion.config.loader import load_flight
-from companion.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.launcher.sitl_process import PX4_FOLDER
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.model.types import AutopilotRequest, PhaseKind
 from companion.safety.stop import StopModel
-from companion.sitl_process import PX4_FOLDER
-from companion.types import AutopilotRequest, PhaseKind
-from sitl.px4_process import MODEL, VARIABLE, Instance, find
+from sitl.px4.process import MODEL, VARIABLE, Instance, find
 from tests.support import CATCH, DEADLINE_S, HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in, set_options
 
 REAL = [
@@ -259,7 +259,7 @@ _OLD_WORLD = """
 import sys
 
 if "sitl" in sys.orig_argv:
-    from sitl.px4_link import SimulatorLink
+    from sitl.px4.link import SimulatorLink
 
     send = SimulatorLink.send
     SimulatorLink.send = lambda self, imu, *rest: send(self, imu._replace(t_s=imu.t_s + 1000.0), *rest)

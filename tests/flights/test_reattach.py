@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from companion.analysis.log import FlightLog
-from companion.exit_codes import EXIT_ABORTED, EXIT_REFUSED
-from companion.types import AutopilotRequest
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_REFUSED
+from companion.model.types import AutopilotRequest
 from tests.support import HOVER, Running, Sandbox, World, read_summary, sandbox_in, set_options, wait_until
 
 LONG = set_options(
@@ -31,7 +31,7 @@ def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
 
 def kill_the_companion(sandbox: Sandbox, first: Running) -> None:
     """Launcher, flight and guardian at once, as when the computer goes down; the recorder with them."""
-    names = ("companion.app", "companion.guardian", "companion.recorder_process")
+    names = ("companion.flight.main", "companion.guardian", "companion.recorder.main")
     pids = [first.process.pid, *(sandbox.pid_of(name) for name in names)]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)  # none of them may react to another's end

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from companion.exit_codes import EXIT_ABORTED, EXIT_OK
-from sitl.campaign import row_of
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
+from sitl.campaigns.flights import row_of
 from tests.flights.test_fast_flights import configured, flown
 from tests.support import CATCH, HOVER, HOVERS_S, Ended, Sandbox, read_summary, sandbox_in, set_options
 

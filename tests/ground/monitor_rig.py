@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from companion.ground.access import broker_access
 from companion.ground.keys import Operator, Operators
-from companion.ground.page_server import Monitor, Serving, serve_live
 from companion.ground.proof import Signer
+from companion.ground.station.page_server import Monitor, Serving, serve_live
 from tests.support import DEADLINE_S
 
 ANNA = Operator("anna", b"a" * 32)

@@ -33,11 +33,11 @@ from companion.ground.messages import (
 )
 from companion.ground.scene import scene_of
 from companion.ground.snapshot import replay
-from companion.ground.web import PAGE
-from companion.ground.web_guard import HEADERS
-from companion.record import to_jsonable
-from companion.types import Sent
-from sitl.fast import FastFlight
+from companion.ground.station.web import PAGE
+from companion.ground.station.web_guard import HEADERS
+from companion.model.codec import to_jsonable
+from companion.model.types import Sent
+from sitl.fast.loop import FastFlight
 from tests.support import CATCH, DEADLINE_S
 
 SESSION = "5e55104e"

@@ -15,7 +15,7 @@ from pathlib import Path
 from PIL import Image
 
 from companion.ground.messages import Presence
-from companion.record import to_jsonable
+from companion.model.codec import to_jsonable
 from tests.ground.page_browser import Page, chromium, events_of, greeted, watching
 from tests.ground.page_stand import Stand, ack, event, flown, hello, preflight, retained, state, told
 from tests.support import ROOT

@@ -23,8 +23,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from companion.ground import broker_setup
-from companion.ground.broker_files import supplied
+from companion.ground.broker import setup as broker_setup
+from companion.ground.broker.files import supplied
 from companion.ground.commands import Accepted, Reason, Refused, Verifier, make_command
 from companion.ground.keys import load_login, load_operators, new_key
 from companion.ground.messages import COMMAND_MAX_BYTES, Command, CommandName, Topic, encode
@@ -432,7 +432,7 @@ def test_open_broker_lets_it_pass_and_the_vehicle_refuses(site: Site, tmp_path: 
 
 
 def test_supplied_profile_is_what_broker_init_writes() -> None:
-    """Made by `python -m companion.ground.broker_files configs/mosquitto`."""
+    """Made by `python -m companion.ground.broker.files configs/mosquitto`."""
     folder = ROOT / "configs/mosquitto"
     assert {name: (folder / name).read_text() for name in supplied()} == supplied()
     assert {path.name for path in folder.iterdir()} == {*supplied(), LOOPBACK.name}

@@ -18,7 +18,6 @@ from rich.console import Console
 
 from companion.ground.access import broker_access
 from companion.ground.commands import Accepted, Verifier, make_command
-from companion.ground.hub import Hub, Outbox
 from companion.ground.messages import (
     VERSION,
     Ack,
@@ -32,11 +31,12 @@ from companion.ground.messages import (
 )
 from companion.ground.proof import with_proof, with_proofs
 from companion.ground.scene import scene_of
-from companion.ground.station import Station
-from companion.ground.tasks import until_first
-from companion.ground.text_view import Around, frame, line
-from companion.ground.watch import LIVE_S, VEHICLES_MAX, Watch
-from companion.record import to_jsonable
+from companion.ground.station.hub import Hub, Outbox
+from companion.ground.station.station import Station
+from companion.ground.station.tasks import until_first
+from companion.ground.station.text_view import Around, frame, line
+from companion.ground.station.watch import LIVE_S, VEHICLES_MAX, Watch
+from companion.model.codec import to_jsonable
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play, until
 from tests.ground.vehicle import flight, played_vehicle, state_of

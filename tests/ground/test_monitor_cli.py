@@ -15,13 +15,13 @@ from typing import Any
 import aiohttp
 import pytest
 
-from companion import cli
+from companion.cli import main as cli
 from companion.config.loader import load_flight
-from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.ground.keys import operators_text, write_private
 from companion.ground.messages import Events, Preflight, Scene, State, Stream, decode
-from companion.ground.replay_log import read_for_page
-from companion.record import json_text
+from companion.ground.station.replay_log import read_for_page
+from companion.model.codec import json_text
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.analysis.synthetic_flight import record_flight
 from tests.broker import Broker, free_port, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, play, self_signed

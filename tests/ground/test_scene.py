@@ -12,7 +12,7 @@ from companion.ground.messages import MESSAGE_MAX_BYTES, Scene, Topic, decode, e
 from companion.ground.scene import PATH_POINTS_MAX, scene_of
 from companion.ground.schemas import FOLDER, schema_file, schema_of, schema_text
 from companion.mission.plan import Plan
-from companion.types import Vec3
+from companion.model.types import Vec3
 from tests.support import CATCH
 
 

@@ -10,17 +10,17 @@ from typing import Any
 import jsonschema
 import pytest
 
-from companion import core
 from companion.analysis import log
 from companion.analysis.timing import timing_of
 from companion.config.loader import load_flight
-from companion.frames import quat_from_euler_zyx, quat_multiply
+from companion.core import flight_core as core
 from companion.ground import snapshot
 from companion.ground.lights import NAMES
 from companion.ground.messages import EVENTS_KEPT, MESSAGE_MAX_BYTES, Events, Light, Stream, Topic, decode, encode
 from companion.ground.schemas import schema_of
 from companion.ground.snapshot import TEXT_MAX, StreamMaker, replay
-from companion.types import (
+from companion.model.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.types import (
     AttitudeSetpoint,
     Event,
     Inputs,

@@ -24,10 +24,10 @@ from companion.ground.access import broker_access
 from companion.ground.keys import operators_text, write_private
 from companion.ground.messages import CommandName, Presence, encode
 from companion.ground.proof import with_proofs
-from companion.ground.station import Station
-from companion.ground.text_monitor import _Screen
-from companion.ground.text_view import STALE_S, Around, Note, frame, line, stale, word
-from companion.ground.watch import Vehicle, Watch
+from companion.ground.station.station import Station
+from companion.ground.station.text_monitor import _Screen
+from companion.ground.station.text_view import STALE_S, Around, Note, frame, line, stale, word
+from companion.ground.station.watch import Vehicle, Watch
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play
 from tests.ground.vehicle import flight, played_vehicle, state_of
@@ -134,7 +134,7 @@ class Terminal:
         termios.tcsetwinsize(theirs, (40, 140))
         self.before = termios.tcgetattr(theirs)
         self._theirs = theirs
-        command = [sys.executable, "-m", "companion.cli", "monitor", "--text", "--broker", broker.url]
+        command = [sys.executable, "-m", "companion", "monitor", "--text", "--broker", broker.url]
         self.process = subprocess.Popen(
             [*command, "--operators", str(keys), *more],
             cwd=ROOT,
@@ -269,7 +269,16 @@ def test_a_pipe_gets_a_line_a_second(broker: Broker) -> None:
     async def scene() -> None:
         async with played_vehicle(broker.port, OPERATORS):
             process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "companion.cli", "monitor", "--text", "--view-only", "--broker", broker.url),
+                *(
+                    sys.executable,
+                    "-m",
+                    "companion",
+                    "monitor",
+                    "--text",
+                    "--view-only",
+                    "--broker",
+                    broker.url,
+                ),
                 cwd=ROOT,
                 stdout=asyncio.subprocess.PIPE,
             )

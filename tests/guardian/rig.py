@@ -16,16 +16,16 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion import status
 from companion.config.loader import load_flight
-from companion.guardian import beat as words
-from companion.guardian.beat import Beat
-from companion.io.packets import TEXT
-from companion.launcher import with_devices
-from companion.record import unpack_plain
-from companion.types import Quat, Vec3
+from companion.guardian import heartbeat as words
+from companion.guardian.heartbeat import Beat
+from companion.launcher.launcher import with_devices
+from companion.model.codec import unpack_plain
+from companion.model.types import Quat, Vec3
+from companion.runtime import ipc
+from companion.runtime.packets import TEXT
 from sitl.natnet import BodyPose, NatNetServer
-from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from tests.io.px4_peer import Px4Peer, free_udp_port
 from tests.support import DEADLINE_S, HOVER, wait_until
 
 LAND_MODE = 4 << 16 | 6 << 24
@@ -100,7 +100,7 @@ class Rig:
         self.peer.landed = mavlink.MAV_LANDED_STATE_IN_AIR
         self.origin_s = time.monotonic() - 10.0
         self.tick = 0
-        self.messages: list[status.Message] = []
+        self.messages: list[ipc.Message] = []
         self._disk_full = disk_full
         self.logged: list[tuple[Any, ...]] = []
 
@@ -239,7 +239,7 @@ class Rig:
         return [packet[4] for packet in self.logged if packet[0] == TEXT]
 
     @property
-    def result(self) -> status.Message | None:
+    def result(self) -> ipc.Message | None:
         """The guardian's last word."""
         self.listen()
         return next((message for message in self.messages if message["type"] == "guardian_result"), None)

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 import pytest
 
 from companion.config.loader import load_flight
-from companion.core import FlightCore
-from companion.flight_guard import FlightGuard, Heartbeats
-from companion.guardian import beat as words
+from companion.core.flight_core import FlightCore
+from companion.flight.heartbeat import FlightGuard, Heartbeats
+from companion.guardian import heartbeat as words
 from companion.guardian.client import SILENT_S, GuardianClient
-from companion.io.edges import DeviceError
-from companion.types import (
+from companion.io.protocols import DeviceError
+from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
     Event,

@@ -16,13 +16,13 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.vehicle import AutopilotDevice
-from companion.frames import quat_from_euler_zyx
 from companion.guardian.link import Link, SerialWire, TcpWire, UdpWire, Wire, address_problem, open_wire
-from companion.io.autopilot import MavsdkAutopilot
-from companion.io.autopilot_claim import LinkClaim
-from companion.io.autopilot_link import UdpSocket, udp_sockets
-from companion.types import MocapPose
-from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from companion.io.px4.claim import LinkClaim
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.px4.link import UdpSocket, udp_sockets
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import MocapPose
+from tests.io.px4_peer import Px4Peer, free_udp_port
 from tests.support import DEADLINE_S, wait_until
 
 POSE = MocapPose(12.345678, None, 7, (1.25, -2.5, 0.75), quat_from_euler_zyx(0.1, -0.2, 2.3), True, 0.0002)

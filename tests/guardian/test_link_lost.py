@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.mocap import MocapClient
 from companion.guardian.settings import MocapSettings
-from companion.types import MocapPose
+from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, encode_frame
 from tests.guardian.rig import ARMED, ATTITUDE, DISARMED, LAND_MODE, OFFBOARD_MODE, Cameras, Rig
 from tests.support import DEADLINE_S, wait_until

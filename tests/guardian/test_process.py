@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.frames import ned_from_enu, wrap_rad
-from companion.guardian.beat import PROBLEM, READY
-from companion.guardian_process import outcome_of
-from companion.types import Outcome
+from companion.guardian.heartbeat import PROBLEM, READY
+from companion.launcher.guardian_process import outcome_of
+from companion.model.frames import ned_from_enu, wrap_rad
+from companion.model.types import Outcome
 from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
 
@@ -273,7 +273,7 @@ _BUGS = """
 import sys
 
 if "companion.guardian" in sys.orig_argv:
-    import companion.guardian.charge as charge
+    import companion.guardian.takeover_landing as charge
     import companion.guardian.mocap as mocap
 
     class Breaking(charge.{broken}):

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from companion.io.packets import TEXT, UNNUMBERED
-from companion.io.recorder import RecorderProcess
-from companion.record import pack_plain
-from companion.types import Severity
+from companion.model.codec import pack_plain
+from companion.model.types import Severity
+from companion.recorder.client import RecorderProcess
+from companion.runtime.packets import TEXT, UNNUMBERED
 
 
 def lines_of(path: Path) -> bytes:

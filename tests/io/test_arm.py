@@ -16,20 +16,20 @@ from typing import Any
 import pytest
 import serial
 
-from companion.clock import flight_clock
 from companion.config.vehicle import Arm as ArmConfig
 from companion.config.vehicle import ArmDevice, Joint
-from companion.io import dynamixel as dxl
-from companion.io.arm import DynamixelArm
-from companion.io.dynamixel import (
+from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.dynamixel.registers import (
     WATCHDOG_ERROR,
 )
-from companion.io.edges import Arm as ArmEdge
-from companion.io.edges import DeviceError
-from companion.preflight.observations import ServoReport
-from companion.types import ArmState
-from sitl.servo_bus import ServoBus
-from sitl.servo_model import ServoModel
+from companion.io.protocols import Arm as ArmEdge
+from companion.io.protocols import DeviceError
+from companion.model.observations import ServoReport
+from companion.model.types import ArmState
+from companion.runtime.clock import flight_clock
+from sitl.servo.bus import ServoBus
+from sitl.servo.model import ServoModel
 
 pytestmark = pytest.mark.waits
 

@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from companion.clock import flight_clock
 from companion.config.loader import load_flight
 from companion.io import arrival
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
+from companion.runtime.clock import flight_clock
 from tests.support import CATCH
 
 _SO_TIMESTAMPNS = 35

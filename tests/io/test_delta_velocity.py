@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from companion.io.delta_velocity import GAP_MAX_S, DeltaVelocity
+from companion.io.px4.delta_velocity import GAP_MAX_S, DeltaVelocity
 
 INTERVAL_S = 0.004
 AMPLITUDE_M_S2 = 10.0

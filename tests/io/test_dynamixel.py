@@ -10,8 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.vehicle import Joint
-from companion.io import dynamixel as dxl
-from companion.io.dynamixel import WATCHDOG_ERROR, hardware_error_text, joint_scale, turn_offset_counts, usb_latency_ms
+from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.registers import (
+    WATCHDOG_ERROR,
+    hardware_error_text,
+    joint_scale,
+    turn_offset_counts,
+    usb_latency_ms,
+)
 
 KT = 1.3
 NM_PER_COUNT = KT * 2.69e-3

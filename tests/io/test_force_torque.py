@@ -13,13 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.clock import flight_clock
 from companion.config.vehicle import ForceDevice
-from companion.io import rft
-from companion.io.edges import DeviceError, ForceTorque
-from companion.io.force_torque import RobotousForceTorque
-from companion.io.rft import Command, PacketScanner, Wrench
-from companion.types import ForceSample
+from companion.io.force_torque import rft
+from companion.io.force_torque.driver import RobotousForceTorque
+from companion.io.force_torque.rft import Command, PacketScanner, Wrench
+from companion.io.protocols import DeviceError, ForceTorque
+from companion.model.types import ForceSample
+from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
 
 WAIT_S = 20.0

@@ -14,15 +14,15 @@ from typing import Any, Literal
 
 import pytest
 
-from companion.clock import flight_clock
 from companion.config.vehicle import MocapDevice
-from companion.frames import quat_from_euler_zyx, quat_rotate
-from companion.io import natnet
-from companion.io.edges import DeviceError, Mocap
-from companion.io.mocap import NatNetMocap
-from companion.io.natnet import Message, NatNetVersion
+from companion.io.mocap import natnet
+from companion.io.mocap.driver import NatNetMocap
+from companion.io.mocap.natnet import Message, NatNetVersion
+from companion.io.protocols import DeviceError, Mocap
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.types import MocapPose, Quat, Vec3
+from companion.runtime.clock import flight_clock
 from companion.safety.stream_watch import StreamWatch
-from companion.types import MocapPose, Quat, Vec3
 from sitl.natnet import BodyPose, NatNetServer, encode_frame
 
 pytestmark = pytest.mark.waits

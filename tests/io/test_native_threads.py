@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from companion.io import autopilot_inbox
-from tests.io.autopilot_peer import Px4Peer, free_udp_port
-from tests.io.test_autopilot import edge, eventually
+from companion.io.px4 import inbox as autopilot_inbox
+from tests.io.px4_peer import Px4Peer, free_udp_port
+from tests.io.test_px4 import edge, eventually
 
 pytestmark = pytest.mark.waits
 

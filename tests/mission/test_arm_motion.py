@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from companion.mission.arm_motion import ArmLimits, plan_arm
 from companion.mission.reference import Move
-from companion.types import Vec2
+from companion.model.types import Vec2
 
 LIMITS = ArmLimits((math.radians(90.0), math.radians(90.0)), math.radians(180.0), math.radians(600.0))
 limit = st.floats(0.1, 20.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding
-from companion.types import (
+from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
     FlightMode,

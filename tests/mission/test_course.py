@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from companion.config.loader import load_flight
 from companion.mission.course import HOLD_DECELERATION_M_S2, Course
 from companion.mission.plan import Plan
-from companion.types import Reference
+from companion.model.types import Reference
 
 START_S = 100.0
 STEP_S = 0.005

@@ -22,7 +22,7 @@ from companion.mission.minsnap import (
     route,
 )
 from companion.mission.reference import Curve, minimum_snap
-from companion.types import Vec3
+from companion.model.types import Vec3
 
 LIMITS = VehicleLimits(0.8, 1.0, 4.0)
 limit = st.floats(0.2, 5.0)

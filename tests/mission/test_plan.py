@@ -26,7 +26,7 @@ from companion.mission.reference import (
     speed_up,
     steady,
 )
-from companion.types import PhaseKind, Reference, Vec2, Vec3
+from companion.model.types import PhaseKind, Reference, Vec2, Vec3
 
 ROOT = Path(__file__).parents[2]
 CONFIG = load_flight(ROOT / "configs/missions/catch.yaml")

@@ -15,7 +15,7 @@ from companion.mission.check import check_mission
 from companion.mission.check_judge import Judge
 from companion.mission.course import Course
 from companion.mission.plan import Plan
-from companion.types import PhaseKind, Reference
+from companion.model.types import PhaseKind, Reference
 
 ROOT = Path(__file__).parents[2]
 VEHICLE = load_flight(ROOT / "configs/missions/catch.yaml").vehicle

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from companion.config.loader import load_vehicle
 from companion.mission.plan import STOP_SPEED_MAX_M_S
 from companion.mission.retract import BESIDE_ANCHOR_M, inward_only, retract_from
-from companion.types import Vec2, Vec3
+from companion.model.types import Vec2, Vec3
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
 ANCHOR = VEHICLE.tether.anchor_world_m

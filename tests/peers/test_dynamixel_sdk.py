@@ -19,8 +19,8 @@ from dynamixel_sdk import (
     port_handler,
 )
 
-from sitl.servo_bus import ServoBus
-from sitl.servo_model import RAD_PER_COUNT, ServoModel
+from sitl.servo.bus import ServoBus
+from sitl.servo.model import RAD_PER_COUNT, ServoModel
 
 BAUD = 1_000_000
 IDS = (11, 12)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from natnet import NatNetClient
 
-from companion.io.natnet import NatNetVersion
+from companion.io.mocap.natnet import NatNetVersion
 from sitl.natnet import BodyPose, NatNetServer
 
 GROUP = "239.255.42.99"

@@ -5,22 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.frames import (
+from companion.model.frames import (
     attitude_enu_flu_from_ned_frd,
     attitude_ned_frd_from_enu_flu,
     enu_from_ned,
     flu_from_frd,
     ned_from_enu,
 )
-from companion.preflight.hand_test import HandSample
-from companion.types import MocapPose, VehicleState
+from companion.model.types import MocapPose, VehicleState
+from companion.preflight.hand_test.run import HandSample
 from sitl.autopilot.autopilot import Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.params import Params
-from sitl.plant import Plant
 from sitl.server import start_of
-from sitl.servo_drive import ServoDrive
+from sitl.servo.drive import ServoDrive
+from sitl.world.plant import Plant
 from tests.support import CATCH
 
 TICK_S = 0.005
@@ -47,7 +47,7 @@ class Standing:
         self._pose: MocapPose | None = None
 
     def samples(self, until_s: float) -> Iterator[HandSample]:
-        """As `companion.preflight.hand_command` takes them."""
+        """As `companion.preflight.hand_test.command` takes them."""
         tick = 0
         while self.plant.t_s < until_s:
             tick += 1

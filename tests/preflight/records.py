@@ -6,8 +6,8 @@ import math
 from functools import cache
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.frames import quat_from_euler_zyx
-from companion.preflight.observations import (
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.observations import (
     EstimatorReport,
     ForceStream,
     Machine,
@@ -16,8 +16,7 @@ from companion.preflight.observations import (
     ServoReport,
     StateCounts,
 )
-from companion.px4 import wanted
-from companion.types import (
+from companion.model.types import (
     ArmState,
     AutopilotStatus,
     FlightMode,
@@ -27,6 +26,7 @@ from companion.types import (
     Vec2,
     VehicleState,
 )
+from companion.px4 import wanted
 from tests.support import CATCH
 
 START_S, SPAN_S = 2.0, 5.0

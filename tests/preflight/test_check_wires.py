@@ -15,12 +15,12 @@ from typing import Any
 
 import pytest
 
-from companion.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from companion.preflight import frames, judge
 from companion.px4 import wanted
-from sitl.servo_bus import ServoBus
-from sitl.servo_model import ServoModel, ServoRefusal
-from sitl.servo_protocol import StatusError
+from sitl.servo.bus import ServoBus
+from sitl.servo.model import ServoModel, ServoRefusal
+from sitl.servo.protocol import StatusError
 from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
 OPERATING_MODE, MODE_POSITION = 11, 3

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from companion.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.observations import Observations
+from companion.model.rows import Row
+from companion.model.types import Vec3
 from companion.preflight import frames
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.preflight.frames import Pose, Wanted, explanation, standing
-from companion.preflight.observations import Observations
-from companion.preflight.rows import Row
-from companion.types import Vec3
 from tests.preflight.hand_rig import Standing, world
 
 G: Vec3 = (0.0, 0.0, 9.81)

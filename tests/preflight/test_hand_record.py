@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from companion.config.loader import load_flight
-from companion.preflight.hand_record import (
+from companion.model.rows import Row
+from companion.preflight.hand_test.record import (
     Passed,
     RecordError,
     Setup,
@@ -20,7 +21,6 @@ from companion.preflight.hand_record import (
     save,
     with_passed,
 )
-from companion.preflight.rows import Row
 from tests.support import CATCH
 
 SETUP = Setup("tarot650-2r", "192.168.1.10", 1, "z", "4.1")

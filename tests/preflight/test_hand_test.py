@@ -9,11 +9,12 @@ from functools import cache
 
 import pytest
 
-from companion.doc_tables import written
-from companion.frames import quat_rotate
-from companion.preflight import hand_judge
+from companion.model.frames import quat_rotate
+from companion.model.rows import Row, refusals
+from companion.model.types import MocapPose, Quat, Vec3
 from companion.preflight.axes import ALL, IDENTITY, MIRRORINGS, ROTATIONS, AxisMap
-from companion.preflight.hand_test import (
+from companion.preflight.hand_test import judge as hand_judge
+from companion.preflight.hand_test.run import (
     SILENCE_MAX_S,
     STEP_TIMEOUT_S,
     HandResult,
@@ -22,12 +23,11 @@ from companion.preflight.hand_test import (
     HandView,
     Step,
 )
-from companion.preflight.rows import Row, refusals
-from companion.preflight.table import checks_table
-from companion.types import MocapPose, Quat, Vec3
-from sitl.hand import ROUND_S
+from sitl.world.hand import ROUND_S
 from tests.preflight.hand_rig import Standing, world
 from tests.support import ROOT
+from tools.docs.preflight import checks_table
+from tools.docs.tables import written
 
 END_S = 4.0 + ROUND_S
 

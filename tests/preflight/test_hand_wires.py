@@ -16,18 +16,19 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.clock import flight_clock
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import MocapDevice
-from companion.devices import SomeEdges, VisionValve, open_what_opens
-from companion.io.mocap import NatNetMocap
-from companion.preflight import hand_judge, hand_record
-from companion.preflight.hand_command import run_hand_test
-from companion.preflight.rows import Row
-from companion.types import AutopilotRequest, FlightMode
-from tests.io.autopilot_peer import free_udp_port
+from companion.io.devices import SomeEdges, VisionValve, open_what_opens
+from companion.io.mocap.driver import NatNetMocap
+from companion.model.rows import Row
+from companion.model.types import AutopilotRequest, FlightMode
+from companion.preflight.hand_test import judge as hand_judge
+from companion.preflight.hand_test import record as hand_record
+from companion.preflight.hand_test.command import run_hand_test
+from companion.runtime.clock import flight_clock
+from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
-from tests.io.test_autopilot_stub import companion
+from tests.io.test_px4_stub import companion
 from tests.support import CATCH, DEADLINE_S, Sandbox, World, sandbox_in
 
 pytestmark = [pytest.mark.flight, pytest.mark.xdist_group("the world with a hand")]

@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 
 from companion.config.loader import FlightConfig
-from companion.doc_tables import written
+from companion.model.observations import ForceStream, Observations, StateCounts
+from companion.model.rows import Level, Row
+from companion.model.types import VehicleState
 from companion.preflight import frames, judge, px4
-from companion.preflight.observations import ForceStream, Observations, StateCounts
-from companion.preflight.rows import Level, Row
-from companion.preflight.table import ROOMS, tables
-from companion.types import VehicleState
 from tests.preflight import records as r
 from tests.support import ROOT
+from tools.docs.preflight import ROOMS, tables
+from tools.docs.tables import written
 
 
 @dataclass(frozen=True)
@@ -319,7 +319,7 @@ def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:
 
 
 def test_the_docs_tell_every_row() -> None:
-    """Made by `python -m companion.preflight.table docs/preflight.md`."""
+    """Made by `python -m tools.docs.preflight docs/preflight.md`."""
     page = (ROOT / "docs/preflight.md").read_text(encoding="utf-8")
     assert written(page, tables()) == page
     told = {check.id for checks in ROOMS.values() for check in checks}

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.cli import main
-from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.cli.main import main
+from companion.io.px4.transfer import compare
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.px4 import params_file
 from companion.px4.params_file import single
-from companion.px4.transfer import compare
 from companion.px4.wanted import file_values
-from tests.io.autopilot_peer import Px4Peer, free_udp_port
+from tests.io.px4_peer import Px4Peer, free_udp_port
 from tests.io.stub_rig import standing_stub
 
 SPOILED = {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 5.0, "EKF2_HGT_REF": 0}

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.document import ConfigError
-from companion.px4 import params_file, published
+from companion.px4 import params_file
 from companion.px4.wanted import BY_NAME, WANTED, file_values
+from tools.docs import px4 as published
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs/px4"
@@ -117,10 +118,10 @@ def test_single_precision_counts() -> None:
 
 
 def test_the_published_file_is_the_table() -> None:
-    """Made by `python -m companion.px4.published .`."""
+    """Made by `python -m tools.docs.px4 .`."""
     text = published.indoor_mocap_text()
     assert (CONFIGS / "indoor_mocap.params").read_text(encoding="utf-8") == text
-    assert published.PACKAGED.read_text(encoding="utf-8") == text
+    assert params_file.PACKAGED.read_text(encoding="utf-8") == text
     assert params_file.read(CONFIGS / "indoor_mocap.params") == pytest.approx(file_values())
     for wanted in WANTED:
         assert (wanted.name in file_values()) is (wanted.file and wanted.value is not None)
@@ -136,6 +137,6 @@ def test_the_pilots_radio_is_switched_off_by_a_file_of_its_own() -> None:
 
 
 def test_the_table_of_the_docs_is_the_table() -> None:
-    """Made by `python -m companion.px4.published .`."""
+    """Made by `python -m tools.docs.px4 .`."""
     page = (ROOT / "docs/px4.md").read_text(encoding="utf-8")
     assert published.table_markdown() in page

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from companion.clock import flight_clock
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle, load_world
+from companion.config.px4_defaults import PX4_DEFAULTS
 from companion.config.vehicle import AutopilotDevice, Vehicle
 from companion.config.world import World
-from companion.io.autopilot import MavsdkAutopilot
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.model.rows import Level, Row
 from companion.preflight.px4 import firmware_row, rows
-from companion.preflight.rows import Level, Row
-from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.wanted import HOVER, WANTED, file_values, names, simulated_values
-from tests.io.autopilot_peer import free_udp_port
+from companion.runtime.clock import flight_clock
+from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 
 VEHICLE_FILE = Path(__file__).parents[2] / "configs/vehicles/tarot650_2r.yaml"

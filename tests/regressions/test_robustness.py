@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.analysis.robustness import SAFE, WORST, Case, Cases, held_against, read_cases
+from companion.campaigns.robustness import SAFE, WORST, Case, Cases, held_against, read_cases
 from companion.config.loader import load_flight
-from sitl import robustness
+from sitl.campaigns import robustness
 from tests.support import ROOT
 
 FILE = Path(__file__).with_name("robustness.yaml")

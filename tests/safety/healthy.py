@@ -6,9 +6,8 @@ import dataclasses
 from collections.abc import Callable, Iterable
 
 from companion.config.vehicle import Vehicle
-from companion.frames import quat_from_euler_zyx
-from companion.safety.monitors import Monitors, Situation
-from companion.types import (
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import (
     ArmState,
     AutopilotStatus,
     ControlLog,
@@ -23,6 +22,7 @@ from companion.types import (
     Vec8,
     VehicleState,
 )
+from companion.safety.monitors import Monitors, Situation
 
 TICK_S = 0.005
 START_S = 10.0

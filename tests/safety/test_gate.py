@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
-from companion.frames import quat_from_euler_zyx, tilt_rad
+from companion.model.frames import quat_from_euler_zyx, tilt_rad
+from companion.model.types import AttitudeSetpoint, Vec2
 from companion.safety.gate import Gate
-from companion.types import AttitudeSetpoint, Vec2
 
 NAN = math.nan
 LEVEL = quat_from_euler_zyx(0, 0, 0.4)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from companion.config.loader import FlightConfig, load_flight
 from companion.mission.plan import Plan
 from companion.mission.reference import at_rest
+from companion.model.types import Reference, TetherState, Vec3
 from companion.safety.governor import Governed, Governor, SafeSet
-from companion.types import Reference, TetherState, Vec3
 
 DT_S = 0.005
 ARM = (2.0, 1.0)

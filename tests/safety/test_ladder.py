@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.model.types import Event, SafetyAction, Severity
 from companion.safety.rules import RULES
 from companion.safety.supervisor import (
     HOLD_EXPIRED,
@@ -17,7 +18,6 @@ from companion.safety.supervisor import (
     SupervisorState,
     update,
 )
-from companion.types import Event, SafetyAction, Severity
 
 TIMES = LadderTimes(hold_max_s=20.0, retract_max_s=12.0)
 EVENTS = [(rule.id, rule.air) for rule in RULES if rule.air is not None]

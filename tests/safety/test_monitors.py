@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 import pytest
 
 from companion.config.loader import load_vehicle
-from companion.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction
 from companion.safety.monitors import Monitors, Situation, unfused
 from companion.safety.monitors_arm import error_text
 from companion.safety.rules import RULES, Rule
-from companion.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction
 from tests.safety.healthy import (
     SLOW,
     START_S,

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Vehicle
-from companion.frames import quat_from_euler_zyx
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import Outcome, Outputs, PhaseKind, Quat, TetherState, Vec2, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 from companion.safety.tether_shape import Clearance, steepest_slope
-from companion.types import Outcome, Outputs, PhaseKind, Quat, TetherState, Vec2, Vec3
-from sitl.fast import FastFlight, FastResult
-from sitl.world import Truth
+from sitl.fast.loop import FastFlight, FastResult
+from sitl.world.world import Truth
 
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 STILL: Vec3 = (0.0, 0.0, 0.0)

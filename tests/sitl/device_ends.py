@@ -22,18 +22,18 @@ from urllib.parse import urlsplit
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.loader import FlightConfig
-from companion.frames import attitude_ned_frd_from_enu_flu, ned_from_enu, quat_from_euler_zyx
-from companion.io import rft
-from companion.io.natnet import Message
-from sitl import servo_registers as reg
+from companion.io.force_torque import rft
+from companion.io.mocap.natnet import Message
+from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu, quat_from_euler_zyx
 from sitl.autopilot.commander import Command
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.autopilot.types import AttitudeTarget
 from sitl.ends import StubEnd
 from sitl.faults import in_time
-from sitl.plant import Plant
 from sitl.server import Ports, Sitl, start_of
-from sitl.servo_protocol import Instruction, packet
+from sitl.servo import registers as reg
+from sitl.servo.protocol import Instruction, packet
+from sitl.world.plant import Plant
 from tests.support import DEADLINE_S
 
 START_M = (-0.2, 0.0)

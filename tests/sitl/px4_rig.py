@@ -7,8 +7,8 @@ import math
 import time
 from collections.abc import Mapping
 
-from companion.frames import euler_zyx_from_quat, quat_conjugate, quat_multiply, quat_normalize, quat_rotate
-from companion.types import Quat, Vec3
+from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_multiply, quat_normalize, quat_rotate
+from companion.model.types import Quat, Vec3
 from sitl.autopilot.autopilot import Px4Stub, gains_from_params
 from sitl.autopilot.cascade import MIX_PITCH, MIX_ROLL, MIX_YAW, Cascade
 from sitl.autopilot.commander import Command, Result

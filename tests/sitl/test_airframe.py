@@ -12,9 +12,9 @@ import pytest
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
-from companion.types import Outcome, Vec3, Vec4
-from sitl.fast import FastFlight
-from sitl.world import World
+from companion.model.types import Outcome, Vec3, Vec4
+from sitl.fast.loop import FastFlight
+from sitl.world.world import World
 from tests.support import CATCH
 
 HOVER = CATCH.parent / "hover.yaml"

@@ -21,12 +21,12 @@ from typing import Any
 import pytest
 
 from companion.analysis import metrics
-from companion.campaign_process import CampaignProcess
+from companion.campaigns.process import CampaignProcess
 from companion.config.loader import load_flight
-from companion.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT
-from companion.types import Outcome, PhaseKind
-from sitl import campaign
-from sitl.fast import FastFlight, FastResult
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT
+from companion.model.types import Outcome, PhaseKind
+from sitl.campaigns import flights as campaign
+from sitl.fast.loop import FastFlight, FastResult
 from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, position_error_m, sandbox_in, wait_until
 
 CONFIG = load_flight(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
@@ -204,7 +204,7 @@ def test_ctrl_c_ends_the_workers_and_shows_what_is_there(place: Sandbox) -> None
     with (
         terminal() as (theirs, seen),
         subprocess.Popen(
-            [sys.executable, "-m", "companion.cli", *arguments],
+            [sys.executable, "-m", "companion", *arguments],
             cwd=place.cwd,
             env={**place.environment, "TERM": "xterm"},
             stdin=subprocess.DEVNULL,
@@ -230,7 +230,7 @@ def test_a_campaign_leaves_with_whoever_started_it(place: Sandbox) -> None:
     flights = [{**FLIGHT, "seed": seed, "series": False} for seed in range(1, 500)]
     job = {"configs": [CONFIG.model_dump(mode="json")], "flights": flights, "jobs": 2, "scheduler": None}
     with subprocess.Popen(
-        [sys.executable, "-m", "sitl.campaign"],
+        [sys.executable, "-m", "sitl.campaigns.flights"],
         cwd=place.cwd,
         env=place.environment,
         stdin=subprocess.PIPE,

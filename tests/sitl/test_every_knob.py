@@ -9,7 +9,7 @@ import pytest
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.world import World
-from sitl.fast import FastFlight, FastResult
+from sitl.fast.loop import FastFlight, FastResult
 from tests.sitl.device_ends import END_STEPS, Emitted, emitted
 from tests.sitl.knobs import Pair, Settings, fault_pairs, pairs
 from tests.support import SHORT_CATCH

@@ -9,9 +9,9 @@ from functools import cache
 import pytest
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.io.dynamixel import WATCHDOG_ERROR
-from companion.types import Outcome
-from sitl.fast import FastFlight, FastResult
+from companion.io.dynamixel.registers import WATCHDOG_ERROR
+from companion.model.types import Outcome
+from sitl.fast.loop import FastFlight, FastResult
 
 
 def configured(*overrides: str) -> FlightConfig:

@@ -15,13 +15,13 @@ import pytest
 
 from companion.config.faults import Fault
 from companion.config.loader import load_flight
-from companion.types import AutopilotStatus, FlightMode, LandedState, VehicleState
-from sitl.fast import TICK_S, FastFlight
-from sitl.fast_link import FastLink
+from companion.model.types import AutopilotStatus, FlightMode, LandedState, VehicleState
+from sitl.fast.link import FastLink
+from sitl.fast.loop import TICK_S, FastFlight
 from sitl.flight_faults import strike
-from sitl.servo_bus import ServoBus
-from sitl.servo_model import ServoModel
-from sitl.servo_protocol import packet, status
+from sitl.servo.bus import ServoBus
+from sitl.servo.model import ServoModel
+from sitl.servo.protocol import packet, status
 from tests.support import CATCH, DEADLINE_S
 
 # -- the servo bus -----------------------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ with open(sys.argv[2], "wb", buffering=0) as file:
 @pytest.fixture
 def recorder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A child that is called as the recorder is, and writes when it is told to."""
-    command = [sys.executable, "-c", _WRITER, "companion.recorder_process", str(tmp_path / "log")]
+    command = [sys.executable, "-c", _WRITER, "companion.recorder.main", str(tmp_path / "log")]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

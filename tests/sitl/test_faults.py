@@ -9,20 +9,20 @@ from typing import Any
 
 import pytest
 
-from companion.analysis.faults import Row, Variant, good
+from companion.campaigns.faults import Row, Variant, good
 from companion.config.faults import KINDS, FaultKind, FlightPhase
 from companion.config.loader import FlightConfig, load_flight
-from companion.exit_codes import EXIT_BAD_INPUT
 from companion.mission.plan import Plan
-from companion.mission.sequencer import SPOOL_S
+from companion.model.exit_codes import EXIT_BAD_INPUT
+from companion.model.flight_stage import SPOOL_S
+from companion.model.types import SafetyAction
 from companion.safety.stop import StopModel
-from companion.types import SafetyAction
-from sitl.campaign import CampaignError
-from sitl.fast import FastFlight, FastResult
-from sitl.fault_campaign import fly, grid
+from sitl.campaigns.faults import fly, grid
+from sitl.campaigns.flights import CampaignError
+from sitl.campaigns.robustness import draw, throws
+from sitl.fast.loop import FastFlight, FastResult
 from sitl.faults import FaultError, in_time
 from sitl.flight_faults import environment
-from sitl.robustness import draw, throws
 from tests.support import CATCH, HOVER, SHORT_CATCH, sandbox_in
 
 CONFIG = load_flight(CATCH, preset="recommended")
@@ -90,7 +90,7 @@ def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
 def test_a_fault_that_means_nothing_is_refused(
     fault: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from companion.cli import main
+    from companion.cli.main import main
 
     assert main(["check", str(CATCH), "--set", f"world.faults={json.dumps([fault])}"]) == EXIT_BAD_INPUT
     assert told in capsys.readouterr().err

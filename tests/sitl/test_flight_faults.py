@@ -36,7 +36,7 @@ while True:
 def flight_process(kind: FlightFaultKind) -> Iterator[subprocess.Popen[bytes]]:
     """A process that takes itself for the flight process, with the hooks for this fault."""
     process = subprocess.Popen(
-        [sys.executable, "-c", _FLIGHT, "companion.app"],
+        [sys.executable, "-c", _FLIGHT, "companion.flight.main"],
         stdout=subprocess.PIPE,
         env={**os.environ, **environment({kind})},
     )

@@ -10,11 +10,11 @@ import pytest
 from companion.config.document import ConfigError
 from companion.config.loader import load_world
 from companion.config.world import World
-from companion.frames import euler_zyx_from_quat, quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.io.natnet import z_up_from_y_up
-from companion.types import Quat, Vec3
-from sitl.hand import FORWARD_M, LIFT_M, REST_S, ROUND_S, TURN_DEG
-from sitl.mocap_axes import SpoiledFrame
+from companion.io.mocap.natnet import z_up_from_y_up
+from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.types import Quat, Vec3
+from sitl.world.hand import FORWARD_M, LIFT_M, REST_S, ROUND_S, TURN_DEG
+from sitl.world.mocap_axes import SpoiledFrame
 from tests.preflight.hand_rig import Standing, world
 
 P: Vec3 = (1.0, 2.0, 0.5)

@@ -6,8 +6,8 @@ import pytest
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Safety
-from companion.types import Outcome
-from sitl.fast import FastFlight, FastResult
+from companion.model.types import Outcome
+from sitl.fast.loop import FastFlight, FastResult
 from tests.support import CATCH
 
 LIMIT_M = Safety().mocap_inertial_m

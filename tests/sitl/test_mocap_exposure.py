@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from companion.frames import quat_conjugate, quat_multiply
-from companion.types import Quat, Vec3, Vec4
+from companion.model.frames import quat_conjugate, quat_multiply
+from companion.model.types import Quat, Vec3, Vec4
 from sitl.autopilot.types import ImuSample
-from sitl.plant import MocapFrame, Plant
 from sitl.server import start_of
-from sitl.servo_drive import ServoDrive
+from sitl.servo.drive import ServoDrive
+from sitl.world.plant import MocapFrame, Plant
 from tests.preflight.hand_rig import world
 
 

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.io import natnet
-from companion.io.natnet import Frame, Malformed, Message, NatNetVersion
-from companion.types import Quat
+from companion.io.mocap import natnet
+from companion.io.mocap.natnet import Frame, Malformed, Message, NatNetVersion
+from companion.model.types import Quat
 from sitl.natnet import CLOCK_FREQUENCY_HZ, BodyPose, NatNetServer, encode_frame, encode_model_definitions
 
 VERSIONS: tuple[NatNetVersion, ...] = ("3.0", "4.1")

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.types import Vec3
-from sitl.fast import FastFlight
+from companion.model.types import Vec3
+from sitl.fast.loop import FastFlight
 from sitl.push import (
     PushResult,
     PushTestError,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.px4_link import Px4Error
+from sitl.px4.link import Px4Error
 from sitl.px4_log import AfterFault, Change, Px4Log, newest
 
 FAULT_S = 20.0

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from sitl.autopilot.types import ImuSample
-from sitl.px4_link import HilSensors, Px4Error, SimulatorLink
-from sitl.px4_process import Installation, Instance, Px4Process, find
+from sitl.px4.link import HilSensors, Px4Error, SimulatorLink
+from sitl.px4.process import Installation, Instance, Px4Process, find
 from tests.sitl import px4_peer
 
 DEADLINE_S = 20.0

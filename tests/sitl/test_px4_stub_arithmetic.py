@@ -7,8 +7,8 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion import frames
-from companion.types import Quat, Vec3
+from companion.model import frames
+from companion.model.types import Quat, Vec3
 from sitl.autopilot.cascade import MIX_PITCH, MIX_ROLL, MIX_YAW, Cascade, CascadeGains
 from sitl.autopilot.estimator import GRAVITY_M_S2, Estimator
 from sitl.autopilot.types import AttitudeTarget, ImuSample

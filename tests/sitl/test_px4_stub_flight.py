@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from companion.frames import quat_from_euler_zyx, tilt_rad
+from companion.model.frames import quat_from_euler_zyx, tilt_rad
 from sitl.autopilot.autopilot import Origin
 from sitl.autopilot.commander import FORCE_MAGIC, Command, Result
 from sitl.autopilot.modes import NavState

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.frames import quat_from_euler_zyx
+from companion.model.frames import quat_from_euler_zyx
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.receive import Receiver
 from sitl.autopilot.setpoints import PositionTarget, RateTarget, decode_attitude_target, decode_position_target

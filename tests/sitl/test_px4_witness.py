@@ -15,12 +15,12 @@ from companion.config.loader import load_vehicle
 from companion.config.world import World
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
-from sitl.px4 import OF_THE_STUB, refuse_what_needs_the_stub
-from sitl.px4_link import Px4Error
-from sitl.px4_process import Instance
-from sitl.px4_relay import Relay
-from sitl.px4_vehicle import parameters, rotor_geometry
-from sitl.px4_witness import Witness, same
+from sitl.px4.link import Px4Error
+from sitl.px4.process import Instance
+from sitl.px4.relay import Relay
+from sitl.px4.vehicle import parameters, rotor_geometry
+from sitl.px4.witness import Witness, same
+from sitl.px4.world import OF_THE_STUB, refuse_what_needs_the_stub
 from tests.sitl.px4_rig import Rig
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
@@ -62,7 +62,7 @@ def test_parameters_are_written_by_type_and_read_back() -> None:
 
 
 def test_a_parameter_that_is_not_taken_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sitl.px4_witness.PARAMS_DEADLINE_S", 0.5)
+    monkeypatch.setattr("sitl.px4.witness.PARAMS_DEADLINE_S", 0.5)
 
     async def scenario() -> None:
         async with witnessed() as (witness, _):
@@ -74,7 +74,7 @@ def test_a_parameter_that_is_not_taken_is_one_line(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sitl.px4_witness.HEARTBEAT_DEADLINE_S", 0.3)
+    monkeypatch.setattr("sitl.px4.witness.HEARTBEAT_DEADLINE_S", 0.3)
 
     async def scenario() -> None:
         with Instance.claim() as instance:

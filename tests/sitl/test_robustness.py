@@ -13,14 +13,14 @@ import pytest
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.world import World
 from companion.control.manipulator import Manipulator
-from companion.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.mission.plan import Plan
-from companion.types import PhaseKind
-from sitl import robustness
-from sitl.campaign import CampaignError
-from sitl.fast import FastFlight
-from sitl.model import link_masses_kg
-from sitl.world import World as SimulatedWorld
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.model.types import PhaseKind
+from sitl.campaigns import robustness
+from sitl.campaigns.flights import CampaignError
+from sitl.fast.loop import FastFlight
+from sitl.world.model import link_masses_kg
+from sitl.world.world import World as SimulatedWorld
 from tests.support import CATCH, DEADLINE_S, HOVER, SHORT_CATCH, position_error_m, run_here, sandbox_in
 
 CONFIG = load_flight(CATCH, preset="recommended")

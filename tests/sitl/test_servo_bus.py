@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.servo_bus import ServoBus, ServoLine
-from sitl.servo_model import RAD_PER_COUNT, ServoModel, ServoRefusal
-from sitl.servo_protocol import (
+from sitl.servo.bus import ServoBus, ServoLine
+from sitl.servo.model import RAD_PER_COUNT, ServoModel, ServoRefusal
+from sitl.servo.protocol import (
     HEADER,
     Instruction,
     PacketParser,

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.servo_drive import AMP_PER_COUNT, MODE_CURRENT, RAD_PER_COUNT, ServoDrive
-from sitl.servo_model import ServoModel
+from sitl.servo.drive import AMP_PER_COUNT, MODE_CURRENT, RAD_PER_COUNT, ServoDrive
+from sitl.servo.model import ServoModel
 
 STEP_S = 0.002
 goals = st.one_of(st.none(), st.integers(-1193, 1193))

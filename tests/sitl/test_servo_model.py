@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from sitl.servo_bus import ServoLine
-from sitl.servo_model import AMP_PER_COUNT as AMP
-from sitl.servo_model import RAD_PER_COUNT, RAD_S_PER_COUNT, ServoModel, ServoRefusal
-from sitl.servo_protocol import ALERT, StatusError, packet, status
+from sitl.servo.bus import ServoLine
+from sitl.servo.model import AMP_PER_COUNT as AMP
+from sitl.servo.model import RAD_PER_COUNT, RAD_S_PER_COUNT, ServoModel, ServoRefusal
+from sitl.servo.protocol import ALERT, StatusError, packet, status
 
 _PING = packet(1, b"\x01")
 

@@ -10,11 +10,11 @@ import pytest
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Vehicle
-from companion.types import Outcome, Outputs
-from sitl.fast import FastFlight, FastResult
-from sitl.plant import Plant
+from companion.model.types import Outcome, Outputs
+from sitl.fast.loop import FastFlight, FastResult
 from sitl.server import Ports, Sitl, start_of
-from sitl.world import World
+from sitl.world.plant import Plant
+from sitl.world.world import World
 
 ROOT = Path(__file__).parents[2]
 CATCH_S, PERIOD_S = 6.5, 15.0

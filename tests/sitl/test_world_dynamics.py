@@ -13,8 +13,8 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
 from companion.control.manipulator import Manipulator
-from sitl.model import base_mass_kg
-from sitl.world import PHYSICS_DT_S, World
+from sitl.world.model import base_mass_kg
+from sitl.world.world import PHYSICS_DT_S, World
 from tests.pinocchio_or_skip import pin
 
 Array = NDArray[np.float64]

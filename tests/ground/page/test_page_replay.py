@@ -14,8 +14,8 @@ import pytest
 from companion.analysis.log import FlightLog
 from companion.config.loader import load_flight
 from companion.ground.messages import Presence, Stream
-from companion.record import to_jsonable
-from sitl.fast import FastFlight
+from companion.model.codec import to_jsonable
+from sitl.fast.loop import FastFlight
 from tests.analysis.recorded import record
 from tests.broker import free_port
 from tests.ground.page_browser import Page, watching

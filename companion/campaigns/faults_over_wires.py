@@ -1,0 +1,163 @@
+"""Faults over real wires: each with a `companion fly --sitl` of its own, judged by its log and by what the world saw."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+from companion.analysis.log import FlightLog, LogError
+from companion.campaigns.faults import Flown, Point, Row, Tick, Variant, row_of
+from companion.config.faults import FlightPhase
+from companion.config.loader import FlightConfig
+from companion.model.exit_codes import EXIT_BAD_INPUT
+from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
+from companion.safety.touchdown import HEIGHT_MARGIN_M
+
+FLIGHT_TIMEOUT_S = 240.0
+LEAVE_TIMEOUT_S = 60.0
+"""After it was asked to land."""
+WITNESS = "world.json"
+"""What the world writes into the flight's folder when it has faults."""
+NEAR_FRAMES = 3
+"""A tick sees the newest frame only."""
+_POLL_S = 0.5
+
+
+class WireFlights:
+    """Some flights, `jobs` at a time.
+
+    Args:
+        options: of `companion fly`: mission and what else is the same for all.
+        config: effective configuration, for the judgement.
+        out: every flight gets a folder in here.
+        jobs: flights at the same time.
+    """
+
+    def __init__(self, options: Sequence[str], config: FlightConfig, out: Path, jobs: int) -> None:
+        self._options = list(options)
+        self._config = config
+        self._out = out
+        self._jobs = jobs
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._stop_asked = False
+
+    def ask_to_stop(self) -> None:
+        """Those in the air land, the others stay on the ground; safe in a signal handler."""
+        self._stop_asked = True
+        for process in tuple(self._running):
+            process.send_signal(signal.SIGINT)
+
+    def results(self, flights: Sequence[tuple[Variant, FlightPhase]]) -> Iterator[tuple[int, Row]]:
+        """Rows as flights end, each with its number."""
+        with ThreadPoolExecutor(self._jobs) as pool:
+            waiting: dict[Future[Row | None], int] = {
+                pool.submit(self._fly, n, variant, phase): n for n, (variant, phase) in enumerate(flights)
+            }
+            while waiting:
+                done, _ = wait(waiting, _POLL_S, FIRST_COMPLETED)
+                for future in done:
+                    number, row = waiting.pop(future), future.result()
+                    if row is not None:
+                        yield number, row
+
+    def _fly(self, number: int, variant: Variant, phase: FlightPhase) -> Row | None:
+        if self._stop_asked:
+            return None
+        folder = self._out / f"{number:02d}-{variant.kind}-{phase}"
+        faults = f"world.faults={json.dumps([variant.fault(phase)])}"
+        command = [sys.executable, "-m", "companion.cli.main", "fly", *self._options, "--sitl", "--set", faults]
+        with open(self._out / f"{folder.name}.txt", "wb") as console:
+            process = subprocess.Popen(
+                [*command, "--out", str(folder)], stdin=subprocess.DEVNULL, stdout=console, stderr=console
+            )
+        self._running.add(process)
+        try:
+            code = self._wait(process)
+        finally:
+            self._running.discard(process)
+        if self._stop_asked:
+            return None
+        if code == EXIT_BAD_INPUT or code is None:
+            last = (self._out / f"{folder.name}.txt").read_text(encoding="utf-8", errors="replace").strip()
+            why = "it did not end" if code is None else last.rpartition("\n")[2]
+            return row_of(variant, phase, _nothing(why), self._config.vehicle)
+        return row_of(variant, phase, flown(folder, self._config), self._config.vehicle)
+
+    @staticmethod
+    def _wait(process: subprocess.Popen[bytes]) -> int | None:
+        """Its exit code; None: it had to be killed."""
+        for timeout_s, number in ((FLIGHT_TIMEOUT_S, signal.SIGINT), (LEAVE_TIMEOUT_S, signal.SIGKILL)):
+            try:
+                return process.wait(timeout_s)
+            except subprocess.TimeoutExpired:
+                process.send_signal(number)
+        process.wait()
+        return None
+
+
+def _nothing(why: str) -> Flown:
+    return Flown(Outcome.LOST.value, None, (), (), (), False, False, why)
+
+
+def flown(folder: Path, config: FlightConfig) -> Flown:
+    """A flight over wires as the table judges it."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        world = json.loads((folder / WITNESS).read_text(encoding="utf-8"))
+        log = FlightLog.read(folder / "flight.mcap") if (folder / "flight.mcap").exists() else None
+    except (OSError, ValueError, LogError) as error:
+        return _nothing(str(error))
+    begun_s = world["fault_begun_s"]
+    ticks, events = _ticks(log), _events(log, summary)
+    offset_s = _offset_s(log.inputs if log is not None else (), world["mocap_frames"], begun_s or 0.0)
+    course = [
+        Point(t_s + offset_s, (x, y, z), tilt_rad, slack_m, abs(tension_n))
+        for t_s, (x, y, z), tilt_rad, slack_m, tension_n in world["course"]
+    ]
+    low_m = config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
+    stands = bool(course) and course[-1].position_world_m[2] < low_m and not world["armed"]
+    outcome = Outcome.CRASHED.value if world["crashed"] else summary["outcome"]
+    fault_s = None if begun_s is None else begun_s + offset_s
+    return Flown(outcome, fault_s, course, ticks, events, stands, bool(world["caught"]))
+
+
+def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], begun_s: float) -> float:
+    """Flight clock less world's clock. Both sides know motion-capture frames by their numbers; the one nearest to the fault counts."""
+    stamps = {i.mocap.frame_number: i.mocap.stamp_s for i in inputs if i.mocap is not None}
+    for number, world_s in sorted(frames, key=lambda frame: abs(frame[1] - begun_s)):
+        for near in range(number, number + NEAR_FRAMES):
+            if near in stamps:
+                return stamps[near] - world_s
+    return 0.0
+
+
+def _ticks(log: FlightLog | None) -> list[Tick]:
+    if log is None:
+        return []
+    return [
+        Tick(o.t_s, o.phase_kind, o.action, o.reference.position_world_m if o.reference is not None else None)
+        for o in log.outputs
+    ]
+
+
+def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:
+    """Of the core, as logged, and of the guardian; of a core whose recorder died, as it told the launcher."""
+    found = [event for o in log.outputs for event in o.events] if log is not None else []
+    known = {event.id for event in found}
+    for event in summary["events"]:
+        if event["id"] not in known:
+            severity, action = Severity(event["severity"]), SafetyAction(event["action"])
+            found.append(Event(event["t_s"], event["id"], severity, action, ""))
+    return sorted(found, key=lambda event: event.t_s)
+
+
+def default_jobs() -> int:
+    """Flights at the same time: one needs about two cores."""
+    return max(1, (os.cpu_count() or 1) // 2)

@@ -1,0 +1,95 @@
+"""The distribution of e_p over random draws, and what it depends on, as one picture.
+
+Needs matplotlib (extra `analysis`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.analysis.plot_style import CATCH, INK, dress, new_figure, write_png
+from companion.campaigns.robustness import DRIVERS, Row, drivers, graded, influence, sensor_of
+
+_SOFT = "#8a949d"
+_COLOURS = {"biased": "#1f6fb4", "lost after the catch": "#2e9d6b", "missing at the catch": "#e07b22"}
+_AGAINST = ("payload_kg", "throw_speed_m_s", "setpoint_delay_s", "catch_x_m")
+BARS = 10
+
+
+def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
+    """Draw the picture; False if no flight caught its payload and completed.
+
+    Args:
+        rows: of all flights.
+        title: what was flown.
+        path: PNG.
+    """
+    flown = graded(rows)
+    if not flown:
+        return False
+    figure = new_figure(6.0)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
+    axes = figure.subplots(2, 3)
+    sensors = [sensor_of(row) for row in flown]
+    error_mm = np.array([row["e_p_m"] for row in flown]) * 1e3
+    _histogram(axes[0, 0], error_mm, sensors)
+    for ax, key in zip((axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1]), _AGAINST, strict=True):
+        values = np.array([drivers(row["world"])[key] for row in flown], dtype=np.float64)
+        _scatter(ax, values, error_mm, sensors)
+        ax.set_xlabel(DRIVERS[key])
+        ax.set_ylabel(r"RMS $\|e_p\|$ [mm]")
+    _bars(axes[1, 2], influence(rows))
+    handles = [axes[0, 1].plot([], [], "o", color=colour, ms=5)[0] for colour in _COLOURS.values()]
+    names = [f"force sensor {name}" for name in _COLOURS]
+    figure.legend(handles, names, loc="outside lower left", ncols=3, fontsize=9, frameon=False)
+    write_png(figure, path)
+    return True
+
+
+def _histogram(ax: Any, error_mm: Any, sensors: Sequence[str]) -> None:
+    groups = [[e for e, s in zip(error_mm.tolist(), sensors, strict=True) if s == name] for name in _COLOURS]
+    bins = np.linspace(0.0, 1.02 * float(error_mm.max()), 31)
+    ax.hist(groups, bins=bins, stacked=True, color=list(_COLOURS.values()))
+    for share, text, height in ((50, "p50", 0.99), (90, "p90", 0.92)):
+        at = float(np.percentile(error_mm, share))
+        ax.axvline(at, color=CATCH, lw=1.2, ls=(0, (5, 3)))
+        ax.annotate(f"{text} {at:.1f}", (at, height), xycoords=ax.get_xaxis_transform(), xytext=(3, 0),
+                    textcoords="offset points", va="top", fontsize=8, color=CATCH)  # fmt: skip
+    ax.set_xlabel(r"RMS $\|e_p\|$ after the catch [mm]")
+    ax.set_ylabel("flights")
+    dress(ax)
+
+
+def _scatter(ax: Any, values: Any, error_mm: Any, sensors: Sequence[str]) -> None:
+    for name, colour in _COLOURS.items():
+        these = np.array([sensor == name for sensor in sensors])
+        ax.plot(values[these], error_mm[these], "o", ms=3, mew=0, color=colour, alpha=0.65)
+    ax.set_ylim(bottom=0.0)
+    dress(ax)
+
+
+def _bars(ax: Any, found: Sequence[tuple[str, float]]) -> None:
+    shown = list(found[:BARS])[::-1]
+    ax.barh(range(len(shown)), [value for _, value in shown], color=_SOFT, height=0.7)
+    # Beside the bar, on the other side of zero: before the axis they would take the room of a whole picture.
+    for at, (key, value) in enumerate(shown):
+        left = value > 0
+        ax.text(
+            -0.03 if left else 0.03,
+            at,
+            DRIVERS[key],
+            ha="right" if left else "left",
+            va="center",
+            fontsize=7,
+            color=INK,
+        )
+    ax.set_yticks([])
+    ax.axvline(0.0, color=INK, lw=0.8)
+    ax.set_xlim(-1.35, 1.35)
+    ax.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
+    ax.set_xlabel(r"rank correlation with $\|e_p\|$")
+    dress(ax)

@@ -1,0 +1,272 @@
+"""`companion check`: everything that a flight would look at before it arms, for people or scripts. Nothing moves, nothing is armed."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from companion.cli.campaign import wide_console
+from companion.config.loader import FlightConfig
+from companion.io.devices import open_what_opens
+from companion.io.protocols import DeviceError
+from companion.launcher.launcher import with_devices
+from companion.launcher.sitl_process import SitlProcess
+from companion.mission.plan import Plan
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.observations import Observations
+from companion.model.rows import Level, Row, refusals
+from companion.preflight import run as preflight
+from companion.preflight.hand_test.command import run_hand_test
+from companion.preflight.hand_test.record import record_path
+from companion.preflight.px4 import PARAM_ID
+from companion.recorder.client import RecorderProcess
+from companion.runtime.clock import flight_clock
+from companion.runtime.console import console_on, tell
+from companion.runtime.subprocesses import LaunchError
+
+GROUPS = {
+    "px4": "PX4",
+    "mocap": "Motion capture",
+    "frames": "Axes and frames",
+    "hand": "Hand test",
+    "arm": "Arm",
+    "force": "Force sensor",
+    "tether": "Tether",
+    "mission": "Mission",
+    "machine": "Computer",
+}
+"""Headings, by the first part of a row's id."""
+_MARK_WIDTH, _TITLE_WIDTH, _WIDTH_MAX, _GAP = 4, 34, 160, 2
+_STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
+
+Plans = Callable[[FlightConfig], list[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What was asked for."""
+
+    config: FlightConfig
+    mission: str
+    sitl: str | None
+    hand: bool
+    json: bool
+
+
+def run(arguments: argparse.Namespace, config: FlightConfig, problems: Plans) -> int:
+    """The command.
+
+    Args:
+        arguments: parsed.
+        config: loaded from them.
+        problems: why the mission cannot be flown as written.
+    """
+    found = problems(config)
+    if arguments.plan_only:
+        return _plan_only(arguments, config, found)
+    task = Task(config, arguments.mission, arguments.sitl, arguments.hand, arguments.json)
+    people = console_on(sys.stderr)
+    scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
+    try:
+        rows = _rows(task, tuple(found), scratch, people)
+    except LaunchError as error:  # it names a log, which stays
+        tell(f"companion check: {error}")
+        return EXIT_REFUSED
+    except BaseException:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+    shutil.rmtree(scratch, ignore_errors=True)
+    if task.json:
+        print(json.dumps(preflight.as_json(rows)))
+    else:
+        show(wide_console(), rows, task)
+    return EXIT_REFUSED if refusals(rows) else EXIT_OK
+
+
+def _plan_only(arguments: argparse.Namespace, config: FlightConfig, found: list[str]) -> int:
+    for line in found:
+        tell(line)
+    if found:
+        return EXIT_BAD_INPUT
+    print(f"{arguments.mission}: mission {config.mission.name!r} can be flown by {config.vehicle.name}")
+    return EXIT_OK
+
+
+def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> list[Row]:
+    """Raises: LaunchError: the simulated world does not start."""
+    config = task.config
+    with contextlib.ExitStack() as stack:
+        line = stack.enter_context(_Line(people))
+        if task.sitl is not None:
+            line("the simulated world starts")
+            world = SitlProcess(config, scratch, px4=task.sitl == "px4")
+            stack.callback(world.stop)
+            config = with_devices(config, world.devices(line.world))
+        line("recorder")
+        known = Observations(
+            0.0,
+            0.0,
+            plan=plan,
+            mission_s=None if plan else Plan.build(config.mission, config.vehicle).duration_s,
+            recorder=_recorder(config, scratch),
+        )
+        rows = asyncio.run(_unless_interrupted(_look(task, config, known, line, people)))
+        if rows is None:
+            raise KeyboardInterrupt
+        return rows
+
+
+async def _unless_interrupted(look: Coroutine[Any, Any, list[Row]]) -> list[Row] | None:
+    """None after Ctrl-C, whatever became of the cancellation on its way through the devices that were being opened."""
+    interrupted = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    looking = asyncio.ensure_future(look)
+
+    def interrupt() -> None:
+        interrupted.set()
+        looking.cancel()
+
+    loop.add_signal_handler(signal.SIGINT, interrupt)
+    try:
+        await asyncio.wait((looking,))
+    finally:
+        loop.remove_signal_handler(signal.SIGINT)
+    if interrupted.is_set():
+        if not looking.cancelled():
+            looking.exception()  # seen; it is not what ended the check
+        return None
+    return looking.result()
+
+
+async def _look(task: Task, config: FlightConfig, known: Observations, line: _Line, people: Console) -> list[Row]:
+    clock, sitl = flight_clock(), task.sitl is not None
+    async with open_what_opens(config, clock, lambda device: line(f"opening: {device}")) as edges:
+        rows = await preflight.preflight(edges, config, clock, out=Path("flights"), tell=line, known=known, sitl=sitl)
+        if task.hand:
+            line.stop()
+            rows += await run_hand_test(edges, config, people, task.json, record=None if sitl else record_path())
+        return rows
+
+
+def _recorder(config: FlightConfig, scratch: Path) -> str:
+    """Empty: a recorder process could open a log. Else why not."""
+    try:
+        recorder = RecorderProcess.start(
+            scratch / "check.mcap", config_json=config.model_dump_json(), epoch_offset_ns=time.time_ns()
+        )
+    except DeviceError as error:
+        return str(error)
+    return recorder.finish().error or ""
+
+
+class _Line:
+    """In a terminal, one line that says what is being looked at; elsewhere nothing."""
+
+    def __init__(self, people: Console) -> None:
+        self._status = people.status("companion check") if people.is_terminal else None
+
+    def __enter__(self) -> Self:
+        if self._status is not None:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def __call__(self, text: str, _share: float = 0.0) -> None:
+        if self._status is not None:
+            self._status.update(f"companion check: {escape(text)}")
+
+    def world(self, message: dict[str, Any]) -> None:
+        """What the simulated world says while it starts: perhaps that it waits for somebody."""
+        if message.get("type") == "progress":
+            if self._status is None:
+                tell(f"companion check: {message['text']}")
+            self(str(message["text"]))
+
+    def stop(self) -> None:
+        """Make room for something else."""
+        if self._status is not None:
+            self._status.stop()
+
+
+def show(console: Console, rows: list[Row], task: Task) -> None:
+    """For people: one table per device, what to do under what is wrong, and the verdict."""
+    where = " (SITL)" if task.sitl is not None else ""
+    console.print(Text(f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}'", style="bold"))
+    for prefix, heading in GROUPS.items():
+        group = [row for row in rows if row.id.partition(".")[0] == prefix]
+        if not group:
+            continue
+        console.print()
+        console.print(_line(console, "", heading, "read", "wanted", header=True))
+        fine = [row for row in group if row.ok and row.id.startswith(PARAM_ID)]
+        for row in group:
+            if row in fine:
+                continue
+            mark = "ok" if row.ok else "WARN" if row.level is Level.WARN else "FAIL"
+            console.print(_line(console, mark, row.title, row.read, row.wanted))
+            if not row.ok:
+                console.print(_under(row))
+        if fine:
+            all_of_them = (
+                "all" if len(fine) == len([row for row in group if row.id.startswith(PARAM_ID)]) else "the other"
+            )
+            console.print(
+                _line(console, "ok", "parameters", f"{all_of_them} {len(fine)} are as they must be", "docs/px4.md")
+            )
+    refused = refusals(rows)
+    warned = [row for row in rows if not row.ok and row.level is Level.WARN]
+    console.print()
+    verdict = Text()
+    if refused:
+        verdict.append(f"{len(refused)} of {len(rows)} checks refuse: the machine may not fly.", style="bold red")
+    else:
+        verdict.append(f"{len(rows)} checks: the machine may fly.", style="bold green")
+    if warned:
+        verdict.append(f" {len(warned)} to look at.", style="yellow")
+    console.print(verdict, soft_wrap=True)
+
+
+def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, header: bool = False) -> Table:
+    """One row; all of them have the same columns, so that they stand below each other. What needs no comparison takes both."""
+    width = min(console.width, _WIDTH_MAX)
+    title_width = min(_TITLE_WIDTH, width // 3)
+    left = max(20, width - _MARK_WIDTH - title_width - 4 * _GAP)
+    read_width = round(0.6 * left)
+    table = Table.grid(padding=(0, _GAP, 0, 0))
+    table.add_column(width=_MARK_WIDTH, no_wrap=True, style="bold" if header else _STYLES[mark])
+    table.add_column(width=title_width, style="bold" if header else "")
+    table.add_column(width=read_width if wanted else left, overflow="fold", style="bold" if header else "")
+    cells = [Text(mark), Text(title), Text(read)]
+    if wanted:
+        table.add_column(width=left - read_width, overflow="fold", style="bold" if header else "dim")
+        cells.append(Text(wanted))
+    table.add_row(*cells)
+    return table
+
+
+def _under(row: Row) -> Padding:
+    """What to do, and why, under a row that is not ok."""
+    table = Table.grid(padding=(0, 1, 0, 0))
+    if row.fix:
+        table.add_row("->", Text(row.fix, style="bold"))
+    table.add_row("", Text(row.why, style="dim"))
+    return Padding(table, (0, 0, 0, _MARK_WIDTH + _GAP))

@@ -1,0 +1,169 @@
+"""`companion command hold|land|abort|resume|start`: one signed command to one vehicle, and what came of it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import time
+from typing import Any
+
+from companion.cli.monitor import add_broker_options, vehicle_option
+from companion.config.document import ConfigError
+from companion.ground.access import broker_access
+from companion.ground.keys import SAFER
+from companion.ground.messages import CommandName, Topic
+from companion.ground.station.link import BrokerRefused
+from companion.ground.station.orders import INSTEAD, Failed, Sent, signer_of, told
+from companion.ground.station.station import Station
+from companion.ground.station.tasks import until_first
+from companion.ground.station.watch import LIVE_S, Vehicle
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.runtime.console import tell
+
+FOUND_S = 5.0
+"""For the broker, and for a first word of the vehicle."""
+_HELP = {
+    CommandName.HOLD: "come to rest and stay",
+    CommandName.LAND: "land",
+    CommandName.ABORT: "give the mission up and land at once",
+    CommandName.RESUME: "go on after a hold, if the supervisor agrees",
+    CommandName.START: "take off; for flights that wait for it",
+}
+
+
+def add_parser(commands: Any) -> None:
+    """Add `command` to the sub-parsers of `companion`."""
+    command = commands.add_parser(
+        "command",
+        help="command a vehicle from the ground: hold, land, abort, resume, start",
+        description="Send one signed command and wait for the vehicle's answer. Exit code 0: done, 3: refused, 5: no answer. "
+        + "; ".join(f"{name.value}: {text}" for name, text in _HELP.items())
+        + ".",
+    )
+    command.add_argument("name", choices=[name.value for name in CommandName], metavar="NAME", help="see above")
+    command.add_argument(
+        "--hold",
+        type=int,
+        metavar="N",
+        help="resume: number of the hold that is to end, as the telemetry has it; default: the one that stands now",
+    )
+    add_broker_options(command)
+    command.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Command; returns the exit code."""
+    only = vehicle_option(arguments)
+    access = broker_access(arguments.broker, arguments.login, arguments.ca)
+    signer = signer_of(access, arguments.operators, arguments.operator)
+    if isinstance(signer, str):
+        raise ConfigError([f"companion command: {signer}"])
+    name = CommandName(arguments.name)
+    if arguments.hold is not None and (name is not CommandName.RESUME or arguments.hold < 1):
+        raise ConfigError([f"--hold {arguments.hold}: expected the number of a hold, 1 or more, and only with resume"])
+    teller = _Commander(name, only, arguments.hold)
+    station = Station(
+        access,
+        signer,
+        None,  # all: whoever misspelt a name sees the others
+        lambda heard: teller.changed.set(),
+        lambda connected, text: teller.changed.set(),
+        topics=(Topic.STATE, Topic.ACK, Topic.STREAM),
+        in_order=True,
+    )
+    try:
+        asyncio.run(until_first(station.run(), teller.command(station)))
+    except BrokerRefused as error:
+        tell(f"companion command: {error}")
+        return EXIT_REFUSED
+    return teller.code
+
+
+class _Commander:
+    def __init__(self, command: CommandName, only: str | None, hold: int | None) -> None:
+        self._command = command
+        self._hold = hold
+        self._only = only
+        self.changed = asyncio.Event()
+        self.code = EXIT_LOST
+        self._sent = False
+
+    async def command(self, station: Station) -> None:
+        """Find the vehicle, command it, tell what came of it."""
+        try:
+            async with asyncio.timeout(FOUND_S):
+                vehicle = await self._found(station)
+        except TimeoutError:
+            self._end(EXIT_LOST, f"{self._why_nobody(station)}; {INSTEAD}")
+            return
+        if vehicle is None:
+            return
+        ack = await station.orders.give(vehicle, self._command, self._hear, self._hold)
+        if ack is None:
+            self.code = EXIT_LOST if self._sent else EXIT_REFUSED
+        elif ack.accepted:
+            self.code = EXIT_OK
+            print(f"{vehicle}: {told(ack)}", flush=True)
+        else:
+            self._end(EXIT_REFUSED, f"{vehicle}: {told(ack)}")
+
+    async def _found(self, station: Station) -> str | None:
+        """The one vehicle that is meant; None: there are several, and that was told.
+
+        What is retained comes before the link says that it is connected (`Station`, in_order): until then nobody is missing.
+        """
+        connected_s: float | None = None
+        while True:
+            self.changed.clear()
+            known = station.watch.vehicles
+            if station.link.connected:
+                connected_s = connected_s or time.monotonic()
+                # What flies has proven so by then, whatever its state says.
+                waited = time.monotonic() - connected_s > LIVE_S
+                names = [self._only] if self._only is not None else station.watch.there(time.monotonic())
+                if len(names) > 1 and self._command in SAFER:
+                    if not waited:
+                        names = []  # a state proves nothing, and anybody may have left it behind
+                    elif len(proven := station.watch.proven(time.monotonic())) == 1:
+                        others = ", ".join(name for name in names if name not in proven)
+                        tell(
+                            f"companion command: {proven[0]} is meant, nothing is proven by: {others}; "
+                            "to command another: --vehicle NAME"
+                        )
+                        return proven[0]
+                if len(names) > 1:
+                    self._end(
+                        EXIT_BAD_INPUT, f"there are several vehicles ({', '.join(names)}); say which: --vehicle NAME"
+                    )
+                    return None
+                if names and names[0] in known:
+                    vehicle = known[names[0]]
+                    if vehicle.proven is not None or (waited and (vehicle.stream is not None or vehicle.ended)):
+                        return names[0]
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LIVE_S):
+                    await self.changed.wait()
+
+    def _why_nobody(self, station: Station) -> str:
+        if not station.link.connected:
+            return station.link.text
+        there = [f"{name} ({_presence(vehicle)})" for name, vehicle in sorted(station.watch.vehicles.items())]
+        whom = "a vehicle" if self._only is None else repr(self._only)
+        return f"nothing heard from {whom} at the broker within {FOUND_S:g} s" + (
+            f"; known: {', '.join(there)}" if there else ""
+        )
+
+    def _hear(self, note: Sent | Failed) -> None:
+        if isinstance(note, Sent):
+            self._sent = True
+        else:
+            tell(f"companion command: {note.vehicle}: {note.command.value}: {note.text}")
+
+    def _end(self, code: int, text: str) -> None:
+        self.code = code
+        tell(f"companion command: {text}")
+
+
+def _presence(vehicle: Vehicle) -> str:
+    return vehicle.state.presence.value if vehicle.state is not None else "state unknown"

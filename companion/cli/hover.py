@@ -1,0 +1,105 @@
+"""`companion hover fit`: the hover thrust that a flight's log tells, beside the one that was flown with."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from companion.analysis.hover_fit import SLOPE_MIN_V, HoverFit, HoverFitError, fit_hover_thrust
+from companion.analysis.log import FlightLog, LogError
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.runtime.console import tell
+
+_DIGITS = 4
+"""Of a hover thrust that is printed or put into a file: 0.01 % of full thrust."""
+
+
+def add_parser(commands: Any) -> None:
+    """Add `hover` to the sub-parsers of `companion`."""
+    hover = commands.add_parser("hover", help="hover thrust: fit it from a flight's log")
+    parts = hover.add_subparsers(dest="part", required=True, metavar="PART")
+    fit = parts.add_parser(
+        "fit",
+        help="fit it from a log",
+        description="Fit the hover thrust of the machine without payload from the calm parts of a flight, and print the lines for "
+        "the vehicle file.",
+    )
+    fit.add_argument("log", type=Path, help="flight.mcap")
+    fit.add_argument("--json", action="store_true", help="print it as JSON, nothing else")
+    fit.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit, print; returns the exit code."""
+    try:
+        log = FlightLog.read(arguments.log)
+        fit = fit_hover_thrust(log)
+    except (LogError, HoverFitError) as error:
+        tell(error)
+        return EXIT_BAD_INPUT
+    if arguments.json:
+        print(json.dumps(jsonable(fit), indent=2, allow_nan=False))
+    else:
+        print("\n".join(lines(fit, _vehicle_file(log))))
+    return EXIT_OK
+
+
+def jsonable(fit: HoverFit) -> dict[str, Any]:
+    """For scripts; None where a value is not known. Thrust is normalised, 0 to 1."""
+    slope = fit.slope
+    return {
+        "hover_thrust": fit.hover_thrust,
+        "standard_error": fit.standard_error,
+        "used_s": fit.used_s,
+        "configured": fit.configured,
+        "configured_error": _relative(fit.configured, fit),
+        "last_estimate": fit.last_estimate,
+        "voltage_mean_v": fit.voltage_mean_v,
+        "voltage_span_v": fit.voltage_span_v,
+        "slope_per_v": slope.per_v if slope else None,
+        "slope_standard_error_per_v": slope.standard_error_per_v if slope else None,
+        "patch": {"airframe": {"hover_thrust": round(fit.hover_thrust, _DIGITS)}},
+    }
+
+
+def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
+    """For people."""
+    at = f" at {fit.voltage_mean_v:.2f} V" if fit.slope else ""
+    told = [
+        f"hover thrust      {fit.hover_thrust:.{_DIGITS}f} ± {fit.standard_error:.{_DIGITS}f} (standard error){at}, "
+        f"from {fit.used_s:.1f} s of calm flight"
+    ]
+    for name, value in (("flight began with", fit.configured), ("flight ended with", fit.last_estimate)):
+        relative = _relative(value, fit)
+        if value is not None and relative is not None:
+            told.append(f"{name} {value:.{_DIGITS}f}, {100 * relative:+.2f} % of the fitted one")
+    return [
+        *told,
+        f"battery           {_battery(fit)}",
+        "",
+        f"# {vehicle_file}",
+        "airframe:",
+        f"  hover_thrust: {fit.hover_thrust:.{_DIGITS}f}",
+    ]
+
+
+def _battery(fit: HoverFit) -> str:
+    if fit.voltage_mean_v is None or fit.voltage_span_v is None:
+        return "voltage not known throughout, no slope fitted"
+    about = f"{fit.voltage_mean_v:.2f} V on average, changed by {fit.voltage_span_v:.2f} V"
+    if fit.slope is None:
+        return f"{about}; {SLOPE_MIN_V:g} V or more are needed for a slope"
+    per_v, error = fit.slope.per_v, fit.slope.standard_error_per_v
+    return f"{about}; slope {per_v:+.{_DIGITS}f} ± {error:.{_DIGITS}f} per V"
+
+
+def _relative(value: float | None, fit: HoverFit) -> float | None:
+    """By how much a value differs from the fitted one; positive: it is larger."""
+    return None if value is None else value / fit.hover_thrust - 1.0
+
+
+def _vehicle_file(log: FlightLog) -> str:
+    named = (log.config.get("sources") or {}).get("vehicle")
+    return str(named) if named else "the vehicle file"

@@ -1,0 +1,294 @@
+"""`companion install`: make a computer the vehicle's, say what that changes, and take it back."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import re
+import signal
+import stat
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from companion.config.document import ConfigError
+from companion.config.loader import load_flight
+from companion.install import apply
+from companion.install.adapters import adapters, choose
+from companion.install.apply import Changes
+from companion.install.plan import Plan, Settings, isolation, plan
+from companion.install.record import PATH as RECORD
+from companion.install.record import inside, load
+from companion.install.state import InstallError
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.runtime.console import tell
+
+USER = "companion"
+MISSION = "/etc/companion/mission.yaml"
+PROGRAM = "/opt/companion/.venv/bin/companion"
+"""Of an image that is prepared elsewhere (--root); on the computer itself it is the one that runs."""
+_NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
+_SERIAL = re.compile(r"[A-Za-z0-9._:+-]{1,64}")
+_HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
+"""Folders that the service does not see (ProtectHome, PrivateTmp)."""
+
+
+def add_parser(commands: Any) -> None:
+    """Add `install` to the sub-parsers of `companion`."""
+    install = commands.add_parser(
+        "install",
+        help="on the vehicle's computer: service, adapters' names and latency, limits, full clock; and --undo",
+        description="Install companion as a systemd service that waits on the ground for an operator's start, with what its timing "
+        "needs; say what is changed, and take it back exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: it cannot be done, "
+        "nothing was changed; 4: given up.",
+    )
+    what = install.add_mutually_exclusive_group(required=True)
+    what.add_argument("--systemd", action="store_true", help="install")
+    what.add_argument("--undo", action="store_true", help="put everything back as it was before the first --systemd")
+    install.add_argument(
+        "--dry-run", action="store_true", help="only say what would be done, every file with its content"
+    )
+    install.add_argument("--yes", action="store_true", help="do not ask")
+    install.add_argument("--json", action="store_true", help="print it as JSON, nothing else; with --yes or --dry-run")
+    install.add_argument(
+        "--user", default=USER, metavar="NAME", help=f"who flies (default: {USER}); made if it is not there"
+    )
+    install.add_argument(
+        "--mission", default=MISSION, metavar="FILE", help=f"what the service flies (default: {MISSION})"
+    )
+    install.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
+    install.add_argument(
+        "--arm-serial", metavar="SERIAL", help="of the arm's U2D2 (default: the one that is plugged in)"
+    )
+    install.add_argument(
+        "--force-serial", metavar="SERIAL", help="of the force sensor's USB adapter (default: likewise)"
+    )
+    install.add_argument(
+        "--at-boot", action="store_true", help="the service starts with the computer, and waits on the ground"
+    )
+    install.add_argument("--program", metavar="FILE", help="the companion that the service starts (default: this one)")
+    install.add_argument(
+        "--root",
+        type=Path,
+        default=Path("/"),
+        metavar="DIR",
+        help="a system's files below DIR: they alone are changed, nothing is run",
+    )
+    install.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Plan, show, ask, do; returns the exit code."""
+    root = Path(os.path.abspath(arguments.root))
+    if not root.is_dir():
+        tell(f"companion install: --root {arguments.root}: expected a folder with a system in it, found none")
+        return EXIT_BAD_INPUT
+    if arguments.json and not (arguments.yes or arguments.dry_run):
+        tell("companion install: --json asks no questions: expected --yes or --dry-run with it")
+        return EXIT_BAD_INPUT
+    if root == Path("/") and os.geteuid() != 0 and not arguments.dry_run:
+        tell(
+            f"companion install: changes files of root: sudo {os.path.abspath(sys.argv[0])} install ...; --dry-run needs no sudo"
+        )
+        return EXIT_REFUSED
+    try:
+        with _terminable():
+            return _undo(arguments, root) if arguments.undo else _install(arguments, root)
+    except InstallError as error:
+        tell(f"companion install: {error}")
+        return EXIT_REFUSED
+    except (KeyboardInterrupt, EOFError):
+        tell("companion install: given up")
+        return EXIT_ABORTED
+
+
+def _install(arguments: argparse.Namespace, root: Path) -> int:
+    settings, told = _settings(arguments, root)
+    wanted = plan(settings)
+    found = apply.changes(root, wanted, load(root))
+    live = root == Path("/")
+    if arguments.dry_run:
+        if arguments.json:
+            print(json.dumps(_as_json(wanted, found, live, done=False), indent=1))
+        else:
+            print("\n".join([*told, *_shown(wanted, found, live)]))
+        return EXIT_OK
+    if not arguments.json:
+        print("\n".join([*told, *(line for _, line in _summary(wanted, found, live))]), flush=True)
+    if not arguments.yes and not _agreed("Do this?"):
+        tell("companion install: given up; nothing was changed")
+        return EXIT_ABORTED
+    say = (lambda _: None) if arguments.json else print
+    changed = apply.install(root, wanted, settings.user, say)
+    if arguments.json:
+        print(json.dumps(_as_json(wanted, found, live, done=changed), indent=1))
+    elif not changed:
+        print("nothing to do: everything is as it is to be")
+    else:
+        print("\n".join(["", *_afterwards(settings, live), *isolation(os.cpu_count() or 1)]))
+    return EXIT_OK
+
+
+def _undo(arguments: argparse.Namespace, root: Path) -> int:
+    record = load(root)
+    paths = [] if record is None else [path for path, entry in record.entries.items()]
+    if arguments.dry_run or record is None:
+        if arguments.json:
+            print(json.dumps({"schema_version": 1, "done": False, "files": paths}, indent=1))
+        elif record is None:
+            print(f"nothing to undo: there is no {RECORD}")
+        else:
+            for path, entry in record.entries.items():
+                print(f"{'takes away' if entry.before.absent else 'puts back '} {path}")
+            for user in record.users:
+                print(f"takes away the user {user}")
+        return EXIT_OK
+    if not arguments.yes and not _agreed(f"Put {len(paths)} files back as they were?"):
+        tell("companion install: given up; nothing was changed")
+        return EXIT_ABORTED
+    apply.undo(root, (lambda _: None) if arguments.json else print)
+    if arguments.json:
+        print(json.dumps({"schema_version": 1, "done": True, "files": paths}, indent=1))
+    return EXIT_OK
+
+
+def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tuple[str, ...]]:
+    """What is wanted, checked, and lines about how it was found.
+
+    Raises:
+        ConfigError: the command line or a file is wrong.
+    """
+
+    live = root == Path("/")
+    if _NAME.fullmatch(arguments.user) is None or arguments.user == "root":
+        raise ConfigError([f"--user {arguments.user!r:.60}: expected a user's name like {USER}, and not root"])
+    for option in ("arm_serial", "force_serial"):
+        given = getattr(arguments, option)
+        if given is not None and _SERIAL.fullmatch(given) is None:
+            raise ConfigError(
+                [f"--{option.replace('_', '-')} {given!r:.80}: expected a serial number, as udevadm info tells it"]
+            )
+    program = arguments.program or (str(Path(sys.prefix) / "bin/companion") if live else PROGRAM)
+    files = {"--program": program, "--mission": arguments.mission, "--vehicle": arguments.vehicle}
+    for option, file in files.items():
+        if file is not None:
+            files[option] = _seen_by_the_service(option, file, root)
+    mission, vehicle = files["--mission"], files["--vehicle"]
+    assert mission is not None and files["--program"] is not None
+    seen = None if vehicle is None else inside(root, vehicle)
+    config = load_flight(inside(root, mission), seen, overrides=["mission.start.takeoff=by_operator"], hardware=True)
+    mqtt = config.vehicle.ground.mqtt
+    if mqtt is None or not mqtt.commands:
+        key = "vehicle.ground.mqtt is null" if mqtt is None else "vehicle.ground.mqtt.commands is false"
+        raise ConfigError(
+            [f"{vehicle or mission}: the service waits for an operator's start, but nobody could command it: {key}"]
+        )
+    arm, force, told = choose(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
+    return Settings(arguments.user, files["--program"], mission, vehicle, arm, force, arguments.at_boot), told
+
+
+def _seen_by_the_service(option: str, file: str, root: Path) -> str:
+    """The path on the vehicle's computer, absolute.
+
+    Raises:
+        ConfigError: the service could not read it there.
+    """
+    path = os.path.abspath(file)
+    if any(ord(c) < 32 for c in path):
+        raise ConfigError([f"{option} {file!r:.80}: expected a name without control characters"])
+    if any(path.startswith(f"{folder}/") for folder in _HIDDEN):
+        raise ConfigError(
+            [
+                f"{option} {path}: the service does not see {'/'.join(path.split('/')[:2])}; copy it below /etc/companion or /opt"
+            ]
+        )
+    here = inside(root, path)
+    if option == "--program" and root != Path("/"):
+        return path
+    if not here.is_file():
+        raise ConfigError(
+            [f"{option} {here}: no such file; copy a mission and its vehicle file there, or name another"]
+        )
+    for part in (here.resolve(), *here.resolve().parents):
+        wanted = stat.S_IROTH if part == here.resolve() else stat.S_IXOTH
+        if part.is_relative_to(root) and part != root and not part.stat().st_mode & wanted:
+            raise ConfigError([f"{option} {path}: the service's user cannot read it: chmod o+rX {part}"])
+    return path
+
+
+def _summary(wanted: Plan, found: Changes, live: bool) -> Iterator[tuple[str, str]]:
+    """What will be done: paths ("" for a command), each with its line."""
+    to_do = set(found.to_do)
+    why = {item.path: f": {item.why}" for item in wanted.items}
+    for path, entry in found.entries.items():
+        if path not in to_do:
+            verb = "is there "
+        elif entry.after.absent:
+            verb = "takes off"
+        else:
+            verb = "writes   " if found.now[path].absent else "replaces "
+        yield path, f"{verb} {path}{why.get(path, '')}"
+    for command in wanted.commands:
+        yield "", f"{'runs     ' if live else 'next boot'} {command}: {command.why}"
+
+
+def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
+    """The same, every file with its content."""
+    content = {item.path: item.content if item.link is None else f"-> {item.link}" for item in wanted.items}
+    for path, line in _summary(wanted, found, live):
+        yield line
+        yield from (f"    {text}".rstrip() for text in (content.get(path) or "").splitlines())
+    yield f"writes    {RECORD}: what was there before, for --undo"
+    yield "Nothing was changed."
+
+
+def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
+    """What is left to people."""
+    arm, force = (
+        ("/dev/companion-arm" if settings.arm_serial else None),
+        ("/dev/companion-force" if settings.force_serial else None),
+    )
+    if arm or force:
+        yield f"Vehicle file: {', '.join(f'devices.{k}.port: {v}' for k, v in (('arm', arm), ('force', force)) if v)}"
+    if live:
+        yield "Log in again before you fly from a shell: limits and groups are those of the login."
+    boot = "; and at boot" if settings.at_boot else ""
+    yield f"It starts with: systemctl start companion{boot}. Then it waits for an operator's start."
+    yield "It stops with: systemctl stop companion; in the air that lands. Take it all back: companion install --undo"
+
+
+def _as_json(wanted: Plan, found: Changes, live: bool, *, done: bool) -> dict[str, Any]:
+    to_do = set(found.to_do)
+    return {
+        "schema_version": 1,
+        "done": done,
+        "files": [
+            {"path": item.path, "why": item.why, "content": item.content, "link": item.link, "mode": f"{item.mode:04o}",
+             "to_do": item.path in to_do, "replaces": item.path in to_do and not found.now[item.path].absent}
+            for item in wanted.items
+        ],
+        "taken_away": [path for path, entry in found.entries.items() if path in to_do and entry.after.absent],
+        "commands": [list(command.words) for command in wanted.commands] if live else [],
+    }  # fmt: skip
+
+
+def _agreed(question: str) -> bool:
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """While inside: SIGTERM and SIGHUP are as Ctrl-C: what was begun is put back."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,277 @@
+"""The commands: fly, check, schema, sitl, compare, robustness, faults, hover, report, replay."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from companion.cli.planning_progress import PlanningProgress
+from companion.config.document import ConfigError
+from companion.config.loader import FlightConfig, load_flight
+from companion.config.schema import schema_json
+from companion.install.extras import lacking
+from companion.mission.check import check_mission
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.runtime.console import tell, terminal_console
+from companion.runtime.subprocesses import use_default_signals
+
+_WITH_MODULES = (
+    *(
+        "compare",
+        "robustness",
+        "faults",
+        "hover",
+        "install",
+        "arm",
+        "px4",
+        "mocap",
+        "ft",
+        "latency",
+        "monitor",
+        "command",
+    ),
+    *("broker", "report"),
+)
+"""Commands whose parsers stand beside what they do, in `companion.NAME_command`."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse, with one line per mistake and no abbreviations."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(allow_abbrev=False, **settings)
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        sys.stderr.write(f"{self.prog}: {message}; see {self.prog} --help\n")
+        sys.exit(EXIT_BAD_INPUT)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of `companion`."""
+    use_default_signals()
+    words = _normalised(list(sys.argv[1:] if argv is None else argv))
+    arguments, unknown = _parser(words[:1]).parse_known_args(words)
+    if unknown:
+        tell(
+            f"companion {arguments.command}: unknown arguments: {' '.join(unknown)}; see companion {arguments.command} --help"
+        )
+        return EXIT_BAD_INPUT
+    arguments.command_line = shlex.join(["companion", *words])
+    missing = lacking(arguments)
+    if missing is not None:
+        tell(missing)
+        return EXIT_REFUSED
+    try:
+        code: int = arguments.run(arguments)
+    except ConfigError as error:
+        for line in error.lines:
+            tell(line)
+        return EXIT_BAD_INPUT
+    except BrokenPipeError:
+        return EXIT_OK
+    except KeyboardInterrupt:
+        tell(f"companion {arguments.command}: interrupted")
+        return EXIT_ABORTED
+    return code
+
+
+def _normalised(argv: list[str]) -> list[str]:
+    """`--sitl` without a value becomes `--sitl=stub`; `--set a=1 b=2` becomes one `--set` each."""
+    out: list[str] = []
+    in_set = False
+    for word in argv:
+        if word == "--sitl":
+            out.append("--sitl=stub")
+            in_set = False
+        elif in_set and "=" in word and not word.startswith("-"):
+            out += ["--set", word] if out[-1] != "--set" else [word]
+        else:
+            if in_set and out[-1] == "--set":
+                out.append(word)  # no KEY=VALUE: the loader says so
+                in_set = False
+                continue
+            in_set = word == "--set" or word.startswith("--set=")
+            out.append(word)
+    return out
+
+
+def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """All commands; if the first word of a command line names one, no others: to load them all takes half a second."""
+    parser = _Parser(
+        prog="companion", description="Flies an aerial manipulator on PX4 with adaptive impedance control."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+
+    fly = commands.add_parser("fly", help="fly a mission", description="Fly a mission, on the vehicle or in SITL.")
+    _add_flight_options(fly)
+    fly.add_argument(
+        "--sitl", metavar="stub|px4", help="fly in the simulated world: with our stub of PX4, or with a real PX4 (SITL)"
+    )
+    fly.add_argument("--out", metavar="DIR", help="where log and report go (default: flights/TIME-MISSION)")
+    fly.add_argument("--no-report", action="store_true", help="log and summary only; companion report makes the rest")
+    fly.add_argument(
+        "--mqtt", metavar="URL|off", help="broker for telemetry and commands (default: the vehicle file's)"
+    )
+    fly.add_argument(
+        "--qgroundcontrol",
+        metavar="ADDRESS",
+        help="forward MAVLink to a ground station, e.g. udpout://192.168.1.20:14550",
+    )
+    fly.add_argument(
+        "--wait-for-start",
+        action="store_true",
+        help="when everything is ready, wait on the ground until an operator commands start",
+    )
+    fly.set_defaults(run=_fly)
+
+    check = commands.add_parser(
+        "check",
+        help="may the machine fly? devices, PX4's parameters, frames and mission; nothing moves",
+        description="Look at everything that a flight would look at before it arms. Exit code 0: it may fly, 3: it may not.",
+    )
+    _add_flight_options(check, mission_default=True)
+    check.add_argument(
+        "--sitl",
+        metavar="stub|px4",
+        help="look at the simulated world's devices, with our stub of PX4 or with a real PX4",
+    )
+    check.add_argument("--hand", action="store_true", help="then do the guided hand test, for a new set-up")
+    check.add_argument("--json", action="store_true", help="print the rows as JSON, nothing else")
+    check.add_argument("--plan-only", action="store_true", help="look at the mission alone, at no device")
+    check.set_defaults(run=_check)
+
+    schema = commands.add_parser("schema", help="print the JSON Schema of a file, for editors")
+    schema.add_argument("kind", choices=("mission", "vehicle", "controller", "world"))
+    schema.set_defaults(run=lambda a: print(schema_json(a.kind)) or EXIT_OK)
+
+    sitl = commands.add_parser("sitl", help="run the simulated world alone, for QGroundControl or a script of your own")
+    _add_flight_options(sitl, mission_default=True)
+    sitl.add_argument("--px4", action="store_true", help="with a real PX4 (SITL) instead of our stub of it")
+    sitl.set_defaults(run=_sitl)
+
+    alone = bool(first) and first[0] in {"replay", *commands.choices, *_WITH_MODULES}
+    for name in _WITH_MODULES:
+        if not alone or name == first[0]:
+            importlib.import_module(f"companion.cli.{name}").add_parser(commands)
+
+    replay = commands.add_parser(
+        "replay", help="run the core on a log's inputs; exit 0 if every output is bit-identical"
+    )
+    replay.add_argument("log", type=Path)
+    replay.set_defaults(run=_replay)
+    return parser
+
+
+def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool = False) -> None:
+    if mission_default:
+        parser.add_argument("mission", nargs="?", default="configs/missions/catch.yaml")
+    else:
+        parser.add_argument("mission", help="mission file, YAML")
+    parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
+    parser.add_argument("--controller", metavar="LAW", help="control law: adaptive, csc or psc")
+    parser.add_argument("--preset", metavar="NAME", help="gains: paper or recommended (adaptive), tuned (csc, psc)")
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="e.g. world.payload_kg=0.3"
+    )
+
+
+def _load(arguments: argparse.Namespace, *, hardware: bool) -> FlightConfig:
+    for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
+        if path is not None and not path.strip():
+            raise ConfigError([f"companion {arguments.command}: {name}: expected the name of a file, got an empty one"])
+    return load_flight(
+        arguments.mission,
+        arguments.vehicle,
+        arguments.controller,
+        arguments.preset,
+        arguments.overrides,
+        hardware=hardware,
+    )
+
+
+def _problems(config: FlightConfig) -> list[str]:
+    with PlanningProgress() as progress:
+        return check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases, progress=progress)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from companion.cli import check as check_command  # with it comes MAVSDK
+
+    if arguments.sitl not in (None, "stub", "px4"):
+        tell(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
+        return EXIT_BAD_INPUT
+    hardware = arguments.sitl is None and not arguments.plan_only
+    return check_command.run(arguments, _load(arguments, hardware=hardware), _problems)
+
+
+def _fly(arguments: argparse.Namespace) -> int:
+    from companion.cli.campaign import why_unusable
+    from companion.launcher.run import run_flight
+
+    if arguments.sitl not in (None, "stub", "px4"):
+        tell(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
+        return EXIT_BAD_INPUT
+    if arguments.out is not None and not arguments.out.strip():
+        tell("companion fly: --out: expected the name of a folder, got an empty one")
+        return EXIT_BAD_INPUT
+    if arguments.mqtt is not None:
+        off = arguments.mqtt == "off"
+        arguments.overrides += ["vehicle.ground.mqtt=null"] if off else [f"vehicle.ground.mqtt.url={arguments.mqtt}"]
+    if arguments.qgroundcontrol is not None:
+        arguments.overrides += [f"vehicle.ground.qgroundcontrol={arguments.qgroundcontrol}"]
+    if arguments.wait_for_start:
+        arguments.overrides += ["mission.start.takeoff=by_operator"]
+    config = _load(arguments, hardware=arguments.sitl is None)
+    problems = [*_problems(config), *_nobody_could_start(config)]
+    if problems:
+        for line in problems:
+            tell(line)
+        return EXIT_BAD_INPUT
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    out = Path(arguments.out) if arguments.out else Path("flights") / f"{stamp}-{config.mission.name}"
+    problem = why_unusable(out, "flight.mcap")
+    if problem is not None:
+        tell(f"companion fly: --out {out}: {problem}")
+        return EXIT_BAD_INPUT
+    return run_flight(config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report)
+
+
+def _nobody_could_start(config: FlightConfig) -> list[str]:
+    """Why a flight that waits for its start would wait for ever, one line; empty: it would not."""
+    if config.mission.start.takeoff != "by_operator":
+        return []
+    mqtt = config.vehicle.ground.mqtt
+    if mqtt is None:
+        why = "vehicle.ground.mqtt is null"
+    elif not mqtt.commands:
+        why = "vehicle.ground.mqtt.commands is false"
+    elif not (mqtt.address.tls or mqtt.address.loopback):
+        why = f"vehicle.ground.mqtt.url is {mqtt.url}, and commands are not heard over a plain connection to another computer"
+    else:
+        return []
+    return [f"mission.start.takeoff is by_operator (--wait-for-start), but nobody could command start: {why}"]
+
+
+def _sitl(arguments: argparse.Namespace) -> int:
+    config = _load(arguments, hardware=False)
+    # In place of this process: signals reach the world itself, and there is nobody whom it could outlive.
+    file = os.memfd_create("sitl-config", 0)
+    os.write(file, config.model_dump_json().encode())
+    command = [sys.executable, "-m", "sitl", "--config", f"/proc/self/fd/{file}"]
+    if arguments.px4:
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        command += ["--px4", str((Path("flights") / f"{stamp}-sitl" / "px4").resolve())]
+    os.execv(sys.executable, command)
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from companion.analysis import replay
+
+    return replay.run(arguments.log)

@@ -1,0 +1,199 @@
+"""`companion monitor`: watch and command vehicles from the ground, in a browser or in a terminal; or look at logs of flights."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+import ssl
+import sys
+import threading
+import webbrowser
+from collections.abc import Coroutine, Sequence
+from pathlib import Path
+from typing import Any
+
+from companion.analysis.log import LogError
+from companion.config.document import ConfigError
+from companion.config.ground import VEHICLE_NAME, Mqtt
+from companion.ground.access import BrokerAccess, broker_access
+from companion.ground.proof import Signer
+from companion.ground.station.link import BrokerRefused
+from companion.ground.station.orders import signer_of
+from companion.ground.station.replayed import Replayed
+from companion.ground.station.tasks import until_first
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
+from companion.runtime.console import tell
+
+PORT = 8642
+
+
+def add_parser(commands: Any) -> None:
+    """Add `monitor` to the sub-parsers of `companion`."""
+    monitor = commands.add_parser(
+        "monitor",
+        help="watch and command from the ground: a page in the browser, or --text in the terminal",
+        description="Serve a page that shows what vehicles send over MQTT and takes commands; with LOG, a page that plays logs.",
+    )
+    monitor.add_argument(
+        "logs", nargs="*", type=Path, metavar="LOG", help="flight.mcap: look at it; no broker is needed"
+    )
+    add_broker_options(monitor)
+    monitor.add_argument("--view-only", action="store_true", help="nobody commands from here")
+    monitor.add_argument("--text", action="store_true", help="in this terminal instead of a page")
+    monitor.add_argument("--port", type=int, default=PORT, help="of the page (default: %(default)s; 0: any)")
+    monitor.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="where the page is served (default: %(default)s)"
+    )
+    monitor.add_argument("--cert", metavar="FILE", help="certificate (PEM) to serve the page with TLS")
+    monitor.add_argument("--key", metavar="FILE", help="its private key (PEM)")
+    monitor.add_argument("--open", action="store_true", help="open the page in this user's browser")
+    monitor.set_defaults(run=run)
+
+
+def add_broker_options(parser: argparse.ArgumentParser) -> None:
+    """What every command of the ground needs to know of broker and operator."""
+    parser.add_argument(
+        "--broker", metavar="URL", default=Mqtt().url, help="mqtt[s]://HOST:PORT (default: %(default)s)"
+    )
+    parser.add_argument("--login", metavar="FILE", help="YAML file with username and password")
+    parser.add_argument("--ca", metavar="FILE", help="certificates (PEM) of the authority that signed the broker's")
+    parser.add_argument("--operator", metavar="NAME", help="who commands (default: the only one in the file)")
+    parser.add_argument("--operators", metavar="FILE", help="keys of operators (default: this user's own)")
+    parser.add_argument("--vehicle", metavar="NAME", help="this one only")
+
+
+def vehicle_option(arguments: argparse.Namespace) -> str | None:
+    """The vehicle's name, looked at.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    name: str | None = arguments.vehicle
+    if name is not None and VEHICLE_NAME.fullmatch(name) is None:
+        raise ConfigError(
+            [f"--vehicle {name!r:.60}: expected the vehicle's name in topics: letters, digits, '_', '-' or '.'"]
+        )
+    return name
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Watch until Ctrl-C; returns the exit code."""
+    _check(arguments)
+    try:
+        if arguments.text:
+            from companion.ground.station.text_monitor import watch_in_terminal
+
+            asyncio.run(until_signal(watch_in_terminal(*_station_settings(arguments))))
+        else:
+            _serve(arguments)
+    except (_Refusal, BrokerRefused) as error:
+        tell(f"companion monitor: {error}")
+        return EXIT_REFUSED
+    return EXIT_OK
+
+
+class _Refusal(Exception):
+    """Something that is needed is not to be had; one line for the user."""
+
+
+async def until_signal(work: Coroutine[Any, Any, Any]) -> None:
+    """Do the work until SIGINT, SIGTERM or SIGHUP, and end it in order."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        loop.add_signal_handler(number, stop.set)
+    await until_first(work, stop.wait())
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Options against each other.
+
+    Raises:
+        ConfigError: one line.
+    """
+    if arguments.text and arguments.logs:
+        raise ConfigError(["companion monitor: --text shows a running flight; for logs, companion report, or the page"])
+    if not 0 <= arguments.port <= 65535:
+        raise ConfigError([f"companion monitor: --port {arguments.port}: expected 0 to 65535"])
+    if (arguments.cert is None) != (arguments.key is None):
+        raise ConfigError(["companion monitor: --cert and --key go together"])
+
+
+def _station_settings(arguments: argparse.Namespace) -> tuple[BrokerAccess, Signer | str, str | None]:
+    only = vehicle_option(arguments)
+    access = broker_access(arguments.broker, arguments.login, arguments.ca)
+    return access, signer_of(access, arguments.operators, arguments.operator, view_only=arguments.view_only), only
+
+
+def _serve(arguments: argparse.Namespace) -> None:
+    try:
+        from companion.ground.station import page_server
+    except ModuleNotFoundError as error:
+        if error.name != "aiohttp":
+            raise
+        raise _Refusal("the page needs aiohttp: pip install 'companion[ground]'; --text does not") from None
+    serving = page_server.Serving(arguments.host, arguments.port, _tls(arguments.cert, arguments.key))
+
+    def listening(monitor: page_server.Monitor) -> None:
+        print(f"companion monitor: {monitor.url}  (Ctrl-C ends)", flush=True)
+        if monitor.why_not is not None and not arguments.logs:
+            print(f"companion monitor: view only: {monitor.why_not}", flush=True)
+        if arguments.open:
+            threading.Thread(
+                target=_open, args=(monitor.url,), daemon=True
+            ).start()  # browsers of terminals stay in there
+
+    try:
+        if arguments.logs:
+            work = page_server.serve_logs(serving, _read(arguments.logs), listening)
+        else:
+            work = page_server.serve_live(serving, *_station_settings(arguments), listening)
+        asyncio.run(until_signal(work))
+    except page_server.WebError as error:
+        raise _Refusal(str(error)) from None
+    except LogError as error:
+        raise ConfigError([str(error)]) from None
+
+
+def _read(paths: Sequence[Path]) -> list[Replayed]:
+    """Before anything is served: an hour's log takes a minute or two, and Ctrl-C ends it."""
+    from companion.ground.station.replay_log import read_for_page
+
+    logs = []
+    for number, path in enumerate(paths):
+        if sys.stderr.isatty():
+            tell(f"companion monitor: reading {path} ...")
+        logs.append(read_for_page(path, number))
+    return logs
+
+
+def _open(url: str) -> None:
+    if not webbrowser.open(url):
+        tell("companion monitor: --open: found no browser here; open the address above in one")
+
+
+def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:
+    if cert is None or key is None:
+        return None
+    for option, file in (("--cert", cert), ("--key", key)):
+        try:
+            Path(file).read_bytes()
+        except OSError as error:
+            raise ConfigError([f"companion monitor: {option} {file}: cannot be read: {error.strerror}"]) from None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(cert, key, password=_no_password)
+    except (ssl.SSLError, ValueError) as error:
+        raise ConfigError(
+            [
+                f"companion monitor: --cert {cert}, --key {key}: expected a certificate and its private key without password, "
+                f"both PEM: {error}"
+            ]
+        ) from None
+    return context
+
+
+def _no_password() -> str:
+    raise ValueError("the key has a password")

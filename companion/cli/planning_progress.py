@@ -1,0 +1,60 @@
+"""What a person sees while a mission is planned and checked: nothing, or, if that takes long, a bar in the terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from companion.runtime.clock import Clock
+from companion.runtime.console import console_on
+
+SHOW_AFTER_S = 1.0
+"""What is over by then needs no bar."""
+
+
+class PlanningProgress:
+    """Told the share of the planning that is done, as `companion.mission.check.check_mission` wants it.
+
+    Args:
+        console: where the bar goes; None: standard error. Without a terminal there is none.
+        now_s: a clock.
+    """
+
+    def __init__(self, console: Console | None = None, now_s: Clock = time.monotonic) -> None:
+        self._now_s = now_s
+        self._start_s = now_s()
+        console = console or console_on(sys.stderr)
+        self._visible = console.is_terminal
+        self._shown = False
+        self._progress = Progress(
+            TextColumn("planning"),
+            BarColumn(bar_width=32),
+            TextColumn("{task.percentage:>3.0f} %"),
+            console=console,
+            transient=True,
+        )
+        self._task = self._progress.add_task("planning", total=1.0)
+
+    def __enter__(self) -> Self:
+        self._start_s = self._now_s()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._shown:
+            self._progress.stop()
+
+    def __call__(self, share: float) -> None:
+        """So much is done, 0 to 1."""
+        if not self._visible or self._now_s() - self._start_s < SHOW_AFTER_S:
+            return
+        self._progress.update(self._task, completed=share)
+        if not self._shown:
+            self._shown = True
+            self._progress.start()

@@ -1,0 +1,185 @@
+"""`companion px4 params`: compare the connected PX4's parameters with a file, or bring them to it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import datetime
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from companion.config.document import ConfigError
+from companion.config.loader import load_vehicle
+from companion.config.vehicle import AutopilotDevice
+from companion.io.protocols import DeviceError
+from companion.io.px4.transfer import Comparison, Difference, WriteResult, compare, write
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.px4 import params_file
+from companion.px4.params_file import PACKAGED, Value, value_text
+from companion.runtime.clock import flight_clock
+from companion.runtime.console import tell
+
+if TYPE_CHECKING:
+    from companion.io.px4.driver import MavsdkAutopilot
+
+VEHICLE = "configs/vehicles/tarot650_2r.yaml"
+_HEARTBEAT_DEADLINE_S = 5.0
+
+
+def add_parser(commands: Any) -> None:
+    """Add `px4` to the sub-parsers of `companion`."""
+    px4 = commands.add_parser("px4", help="PX4's parameters: compare, write")
+    parts = px4.add_subparsers(dest="part", required=True, metavar="PART")
+    params = parts.add_parser(
+        "params",
+        help="compare or write parameters",
+        description="Compare the connected PX4's parameters with a file in QGroundControl's format, or write what differs. Exit 0: "
+        "nothing differs (any more); 3: something differs, or could not be written.",
+    )
+    what = params.add_mutually_exclusive_group(required=True)
+    what.add_argument("--diff", action="store_true", help="only compare")
+    what.add_argument("--write", action="store_true", help="write what differs; refused while PX4 is armed")
+    params.add_argument(
+        "file", nargs="?", type=Path, metavar="FILE", help="default: indoor motion capture, configs/px4/"
+    )
+    where = params.add_mutually_exclusive_group()
+    where.add_argument("--vehicle", metavar="FILE", default=VEHICLE, help=f"whose address to use (default: {VEHICLE})")
+    where.add_argument("--address", help="MAVSDK's, e.g. udpin://0.0.0.0:14540")
+    params.add_argument("--backup", type=Path, metavar="FILE", help="old values go there (default: px4_TIME.params)")
+    params.add_argument("--json", action="store_true", help="print it as JSON, nothing else")
+    params.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare, perhaps write, print; returns the exit code.
+
+    Raises:
+        ConfigError: the parameter or the vehicle file is wrong.
+    """
+    path = arguments.file or PACKAGED
+    wanted = params_file.read(path)
+    if arguments.address is None:
+        device = load_vehicle(arguments.vehicle).devices.autopilot
+    else:
+        try:
+            device = AutopilotDevice(address=arguments.address)
+        except ValidationError as error:
+            raise ConfigError([f"--address {arguments.address}: {error.errors()[0]['msg']}"]) from None
+    try:
+        return asyncio.run(_run(arguments, wanted, device, path.name))
+    except DeviceError as error:
+        tell(error)
+        return EXIT_REFUSED
+
+
+async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: AutopilotDevice, source: str) -> int:
+    from companion.io.px4.driver import (
+        MavsdkAutopilot,  # MAVSDK's library takes a moment to load: not for every command
+    )
+
+    async with MavsdkAutopilot(device, flight_clock()) as autopilot:
+        comparison = compare(wanted, await autopilot.read_params(wanted))
+        if not arguments.write or not comparison.differences:
+            _print(arguments, comparison, None, None)
+            return EXIT_OK if comparison.same else EXIT_REFUSED
+        if await _armed(autopilot):
+            tell(f"autopilot {device.address}: expected a disarmed PX4, found it armed; land and disarm before writing")
+            return EXIT_REFUSED
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        backup = arguments.backup or Path(f"px4_{stamp}.params")
+        problem = _back_up(backup, comparison.differences, await autopilot.firmware(), source)
+        if problem is not None:
+            tell(problem)
+            return EXIT_BAD_INPUT
+        result = await write(autopilot, comparison.differences)
+    _print(arguments, comparison, result, backup)
+    return EXIT_OK if result.problem is None and not comparison.absent else EXIT_REFUSED
+
+
+async def _armed(autopilot: MavsdkAutopilot) -> bool:
+    async with asyncio.timeout(_HEARTBEAT_DEADLINE_S):
+        while (status := autopilot.status()) is None:  # noqa: ASYNC110 - written by MAVSDK's threads
+            await asyncio.sleep(0.02)
+    return status.armed
+
+
+def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str) -> str | None:
+    """Keep the old values; None, or why nothing may be written."""
+    heading = [f"Values of {firmware} before {source} was written.", ""]
+    text = params_file.text({difference.name: difference.px4 for difference in differences}, heading)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        return f"--backup {path}: is there already; choose another name (nothing was written)"
+    except OSError as error:
+        return (
+            f"--backup {path}: {error.strerror or error}; choose a place that can be written to (nothing was written)"
+        )
+    return None
+
+
+def _print(
+    arguments: argparse.Namespace, comparison: Comparison, result: WriteResult | None, backup: Path | None
+) -> None:
+    if arguments.json:
+        print(json.dumps(jsonable(comparison, result, backup), indent=2, allow_nan=False))
+        return
+    for line in lines(comparison, result):
+        print(line)
+    if backup is not None:
+        print(f"old values: {backup}")
+
+
+def jsonable(comparison: Comparison, result: WriteResult | None, backup: Path | None) -> dict[str, Any]:
+    """For scripts. `reboot` is null where it is not known; `written` is absent of a comparison alone."""
+    done: dict[str, Any] = {}
+    ok = comparison.same
+    if result is not None:
+        ok = result.problem is None and not comparison.absent
+        done = {
+            "written": [difference.name for difference in result.written],
+            "problem": result.problem,
+            "backup": str(backup),
+            "reboot": [difference.name for difference in result.written if difference.reboot],
+        }
+    return {
+        "schema_version": 1,
+        "ok": ok,
+        "differs": [{"name": d.name, "px4": d.px4, "file": d.file, "reboot": d.reboot} for d in comparison.differences],
+        "absent": list(comparison.absent),
+        "absent_port": list(comparison.absent_port),
+        "measured": [{"name": d.name, "px4": d.px4, "file": d.file} for d in comparison.measured],
+        **done,
+    }
+
+
+def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
+    """For people."""
+    told = [
+        f"{d.name:16}  {value_text(d.px4):>12} -> {value_text(d.file)}{'  (after a reboot)' if d.reboot else ''}"
+        for d in (comparison.differences if result is None else result.written)
+    ]
+    told += [f"{name:16}  PX4 does not have it" for name in comparison.absent]
+    differ = len(told)
+    told += [f"{name:16}  no such serial port in this PX4, left out" for name in comparison.absent_port]
+    told += [
+        f"{d.name:16}  {value_text(d.px4):>12}, measured on each installation, left as it is (the file: {value_text(d.file)})"
+        for d in comparison.measured
+    ]
+    if result is None:
+        told.append("nothing differs" if comparison.same else f"{differ} differ")
+        return told
+    told.append(f"{len(result.written)} of {len(comparison.differences)} written, each read back")
+    if result.problem is not None:
+        told.append(result.problem)
+    reboot = [difference.name for difference in result.written if difference.reboot]
+    if reboot:
+        told.append(f"reboot PX4: {', '.join(reboot)}")
+    if any(difference.reboot is None for difference in result.written):
+        told.append("of parameters beyond this project's own it is not known here whether they need a reboot")
+    return told

@@ -1,0 +1,274 @@
+"""`companion report`: summary and report of a flight's log again; of several logs one page that puts the flights side by side."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.analysis.log import FlightLog, LogError
+from companion.analysis.summary import summarise, write_summary
+from companion.campaigns.side_by_side import FLIGHTS_MAX, Comparison, NotAlignable, compare, jsonable
+from companion.campaigns.side_by_side_course import Flight, flight_of
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.types import Outcome
+from companion.runtime.console import tell
+
+PAGE = "side_by_side.html"
+RESULT = "side_by_side.json"
+_NAME_BYTES_MAX = 200
+"""Of a folder that is named after flights; file systems take 255."""
+
+
+def add_parser(commands: Any) -> None:
+    """Add `report` to the sub-parsers of `companion`."""
+    report = commands.add_parser(
+        "report",
+        help="make summary and report of a log again, or put several flights side by side",
+        description=f"One log: make its summary and report again. Two to {FLIGHTS_MAX} logs: one page with what was flown, what was "
+        "set differently, all figures and the pictures over each other.",
+    )
+    report.add_argument(
+        "log", type=Path, nargs="+", help="flight.mcap; several: side by side, the first is what the others are held to"
+    )
+    report.add_argument(
+        "--out",
+        metavar="DIR",
+        help="default: beside the log; of several: a new folder, reports/A-vs-B, in the current one",
+    )
+    report.add_argument(
+        "--align",
+        choices=("catch", "takeoff", "start"),
+        help="several: where their time axes agree (default: the catch if all have one, else the take-off)",
+    )
+    report.add_argument(
+        "--json",
+        action="store_true",
+        help="print summary or comparison as JSON, nothing else; files are written only with --out",
+    )
+    report.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, grade, write; returns the exit code."""
+    logs: list[Path] = arguments.log
+    problem = _problem(arguments)
+    if problem is not None:
+        tell(f"companion report: {problem}")
+        return EXIT_BAD_INPUT
+    try:
+        return _one(logs[0], arguments) if len(logs) == 1 else _several(logs, arguments)
+    except (LogError, NotAlignable) as error:
+        tell(error)
+        return EXIT_BAD_INPUT
+
+
+def _problem(arguments: argparse.Namespace) -> str | None:
+    if arguments.out is not None and not arguments.out.strip():
+        return "--out: expected the name of a folder, got an empty one"
+    if len(arguments.log) > FLIGHTS_MAX:
+        return f"{len(arguments.log)} logs: expected at most {FLIGHTS_MAX}, more cannot be told apart in one picture"
+    if arguments.align is not None and len(arguments.log) == 1:
+        return "--align: there is one log; it is for two and more"
+    return None
+
+
+# One flight
+
+
+@dataclass(frozen=True)
+class Graded:
+    """A log and its summary, as the launcher would have written it."""
+
+    log: FlightLog
+    summary: dict[str, Any]
+    note: str | None
+    """Why the summary beside the log was not used, if it was not."""
+
+
+def graded(path: Path) -> Graded:
+    """Read a log and grade it; what only the flight's launcher knew is taken from the summary beside the log.
+
+    Raises:
+        LogError: the file is no log.
+    """
+    from companion.launcher.run import TICKS_MAX, autopilot_of
+
+    log = FlightLog.read(path, ticks_max=TICKS_MAX)
+    own = summarise(log, outcome=Outcome.LOST.value, controller="", preset="")
+    known, note = _known(path.parent / "summary.json", own)
+    recorded = [outputs.outcome for outputs in log.outputs if outputs.outcome is not None]
+    summary = own | {
+        "outcome": known.get("outcome") or (recorded or [Outcome.LOST])[-1].value,
+        "controller": _setting(log, "law"),
+        "preset": _setting(log, "preset"),
+        "payload_kg": known.get("payload_kg"),
+        "recorder": {**own["recorder"], **(known.get("recorder") or {})},
+        "autopilot": known.get("autopilot") or autopilot_of(log, {}),
+    }
+    # The guardian acts after the last tick: its events are no outputs of the core.
+    recorded_ids = {event["id"] for event in summary["events"]}
+    summary["events"] = summary["events"] + [e for e in known.get("events", ()) if e["id"] not in recorded_ids]
+    return Graded(log, summary, note)
+
+
+def _known(path: Path, own: dict[str, Any]) -> tuple[dict[str, Any], str | None]:
+    """The summary beside the log, if it is of this flight: copied logs may lie beside the summary of another one."""
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}, None
+    except (OSError, ValueError) as error:
+        return {}, f"{path}: cannot be read ({error}); outcome and payload are told without it"
+    try:
+        times = {event["t_s"] for event in known["events"]}
+        same = known["loop"]["ticks"] == own["loop"]["ticks"] and times >= {event["t_s"] for event in own["events"]}
+    except (KeyError, TypeError):
+        return {}, f"{path}: is no summary of a flight; outcome and payload are told without it"
+    return (
+        (known, None)
+        if same
+        else ({}, f"{path}: is the summary of another flight; outcome and payload are told without it")
+    )
+
+
+def _setting(log: FlightLog, name: str) -> str:
+    controller = log.config.get("controller")
+    value = controller.get(name) if isinstance(controller, dict) else None
+    return str(value or log.metadata.get("flight", {}).get(name) or "unknown")
+
+
+def _one(path: Path, arguments: argparse.Namespace) -> int:
+    from companion.launcher.run import report_of
+
+    flight = graded(path)
+    if flight.note is not None:
+        tell(flight.note)
+    if arguments.json:
+        _print(flight.summary)
+        if arguments.out is None:
+            return EXIT_OK
+    out = path.parent if arguments.out is None else Path(arguments.out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_summary(flight.summary, out / "summary.json")
+        report = report_of(flight.log, flight.summary, out)
+    except OSError as error:
+        return _unwritable(out, error)
+    if report is None:
+        return _no_pictures()
+    if not arguments.json:
+        print(report)
+    return EXIT_OK
+
+
+# Several flights
+
+
+def _several(paths: Sequence[Path], arguments: argparse.Namespace) -> int:
+    flights: list[Flight] = []
+    for n, (path, name) in enumerate(zip(paths, names_of(paths), strict=True)):
+        flight = graded(path)
+        if flight.note is not None:
+            tell(flight.note)
+        flights.append(flight_of(chr(ord("A") + n), name, str(path), _digest(path), flight.log, flight.summary))
+        del flight  # one log at a time: the ticks of a long one take half a GB
+    comparison = compare(flights, arguments.align)
+    out = _place(arguments.out, flights)
+    if isinstance(out, str):
+        tell(f"companion report: {out}")
+        return EXIT_BAD_INPUT
+    if arguments.json:
+        _print(jsonable(comparison))
+        if arguments.out is None:
+            return EXIT_OK
+    try:
+        page = write_page(comparison, out)
+    except OSError as error:
+        return _unwritable(out, error)
+    except ImportError:
+        return _no_pictures()
+    for line in comparison.cautions:
+        tell(line)
+    if not arguments.json:
+        print(page)
+    return EXIT_OK
+
+
+def write_page(comparison: Comparison, out: Path) -> Path:
+    """Write side_by_side.html, its pictures as PNG and side_by_side.json into `out`; returns the path of the page.
+
+    Raises:
+        ImportError: matplotlib is missing.
+        OSError: it cannot be written.
+    """
+    from companion.campaigns.side_by_side_html import write_html
+    from companion.campaigns.side_by_side_plots import write_pictures
+
+    out.mkdir(parents=True, exist_ok=True)
+    (out / RESULT).write_text(json.dumps(jsonable(comparison), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_html(comparison, write_pictures(comparison, out), out / PAGE)
+    return out / PAGE
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """What to call each flight: its folder, or its file where that has a name of its own; distinct."""
+    own = [path.resolve().parent.name if path.name == "flight.mcap" else path.stem for path in paths]
+    if len(set(own)) < len(own) and len({path.resolve() for path in paths}) == len(paths):
+        own = [f"{path.resolve().parent.parent.name}/{name}" if path.name == "flight.mcap" else
+               f"{path.resolve().parent.name}/{name}" for path, name in zip(paths, own, strict=True)]  # fmt: skip
+    return [name if own.count(name) == 1 else f"{name} ({own[: n + 1].count(name)})" for n, name in enumerate(own)]
+
+
+def _place(asked: str | None, flights: Sequence[Flight]) -> Path | str:
+    """The folder to write to, or why it cannot be: what holds a comparison of other flights is never overwritten."""
+    digests = [flight.digest for flight in flights]
+    if asked is not None:
+        folder = Path(asked)
+        if _holds_others(folder, digests):
+            return f"--out {folder}: there is a {RESULT} of other flights already; choose another folder"
+        return folder
+    name = "-vs-".join(flight.name.replace("/", "-") for flight in flights)
+    if len(name.encode()) > _NAME_BYTES_MAX:
+        name = name.encode()[: _NAME_BYTES_MAX - 4].decode(errors="ignore")
+    folder, n = Path("reports") / name, 1
+    while _holds_others(folder, digests):
+        n += 1
+        folder = Path("reports") / f"{name}-{n}"
+    return folder
+
+
+def _holds_others(folder: Path, digests: list[str]) -> bool:
+    try:
+        held = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+        return [flight["sha256"] for flight in held["flights"]] != digests
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except (OSError, ValueError, KeyError, TypeError):
+        return True
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _print(tree: dict[str, Any]) -> None:
+    print(json.dumps(tree, indent=1, allow_nan=False))
+
+
+def _unwritable(out: Path, error: OSError) -> int:
+    tell(f"companion report: {out}: cannot be written: {error.strerror}; choose another folder with --out")
+    return EXIT_BAD_INPUT
+
+
+def _no_pictures() -> int:
+    tell("companion report: plots need matplotlib: pip install 'companion[analysis]'")
+    return EXIT_REFUSED

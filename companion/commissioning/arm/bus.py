@@ -1,0 +1,181 @@
+"""Talk with whatever servos are on a bus, at any baud rate: blocking, for people's tools; nothing here gives torque.
+
+The real dynamixel-sdk speaks on the wire, through the flight's own port (`companion.io.dynamixel.registers.ServoPort`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Self
+
+from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+
+from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.registers import Register
+from companion.io.protocols import DeviceError
+
+BAUDS: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
+"""Baud rate by value of register 8; 4.5 Mbps, the eighth, has no name in termios and dynamixel-sdk does not know it."""
+FACTORY_BAUD: Final = 57600
+
+ID = Register(7, 1, "id")
+BAUD = Register(8, 1, "baud rate")
+DRIVE_MODE = Register(10, 1, "drive mode")
+SHADOW_ID = Register(12, 1, "secondary id")
+HOMING_OFFSET = Register(20, 4, "homing offset", signed=True)
+PWM_LIMIT = Register(36, 2, "PWM limit")
+MAX_POSITION_LIMIT = Register(48, 4, "max position limit")
+MIN_POSITION_LIMIT = Register(52, 4, "min position limit")
+STARTUP = Register(60, 1, "startup configuration")
+SHUTDOWN = Register(63, 1, "shutdown")
+LED = Register(65, 1, "LED")
+
+PING_BYTES: Final = 14
+_WRITE_TIMEOUT_S = 1.0
+_REPLY_TIMEOUT_MS: Final = 100.0
+"""An FTDI adapter with its factory latency timer holds an answer back by 16 ms, a busy computer by more. Who is not there costs it."""
+_ERROR_NUMBER: Final = 0x7F
+
+
+class _CountingPort(dxl.ServoPort):
+    """Tells noise from silence."""
+
+    came_bytes = 0
+
+    def readPort(self, length: int) -> bytes:
+        data = super().readPort(length)
+        self.came_bytes += len(data)
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What answered a broadcast ping at one baud rate."""
+
+    baud: int
+    servos: tuple[tuple[int, int, int], ...]
+    """Id, model and firmware of each, by id."""
+    garbled: bool
+    """Something came that nobody can read: two servos with one id, or noise."""
+
+
+class ServoTalk:
+    """One port. Not thread-safe; a KeyboardInterrupt may fly out of any of its methods and leaves nothing under torque.
+
+    Args:
+        port: serial device.
+    """
+
+    def __init__(self, port: str) -> None:
+        self._name = port
+        self._port = _CountingPort(port)
+        self._protocol = PacketHandler(2.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.suppress(OSError):
+            self._port.closePort()
+
+    def open(self, baud: int) -> None:
+        """Open the port, or go on at another baud rate.
+
+        Raises:
+            DeviceError: no such port, busy, not permitted.
+        """
+        self._port.reply_timeout_ms = _REPLY_TIMEOUT_MS
+        self._port.baudrate = baud
+        if not self._port.openPort():
+            raise DeviceError(f"arm bus {self._name}: this computer's serial ports do not know baud rate {baud}")
+        self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's is that of a tick; nobody waits for one here
+        # What the wire still carries at the old rate is nobody's answer.
+        with contextlib.suppress(OSError):
+            self._port.ser.reset_input_buffer()
+
+    @property
+    def baud(self) -> int:
+        """At which the port is open."""
+        return int(self._port.baudrate)
+
+    def heard(self) -> Heard:
+        """Everybody who answers a broadcast ping; takes up to 1.5 s, for every servo answers in the time of its id.
+
+        Raises:
+            DeviceError: the port is gone.
+        """
+        before = self._port.came_bytes
+        with self._named("broadcast ping"):
+            answered, _ = self._protocol.broadcastPing(self._port)
+        servos = tuple((servo_id, model, firmware) for servo_id, (model, firmware) in sorted(answered.items()))
+        return Heard(self.baud, servos, self._port.came_bytes - before != PING_BYTES * len(servos))
+
+    def answers(self, servo_id: int) -> bool:
+        """Whether this one answers a ping.
+
+        Raises:
+            DeviceError: the port is gone.
+        """
+        with self._named(f"ping of servo {servo_id}"):
+            _, result, _ = self._protocol.ping(self._port, servo_id)
+        return bool(result == COMM_SUCCESS)
+
+    def read(self, servo_id: int, register: Register) -> int:
+        """A register's value.
+
+        Raises:
+            DeviceError: no answer, or a refusal.
+        """
+        with self._named(f"servo {servo_id}: reading {register}"):
+            data, result, error = self._protocol.readTxRx(self._port, servo_id, register.address, register.size)
+        self._check(servo_id, f"reading {register}", result, error)
+        return int.from_bytes(bytes(data), "little", signed=register.signed)
+
+    def write(self, servo_id: int, register: Register, value: int, *, read_back: bool = True) -> None:
+        """Write a register, and see that it took it.
+
+        Args:
+            servo_id: whom.
+            register: which.
+            value: what.
+            read_back: False for registers after which the servo answers elsewhere (id, baud rate): nothing is expected of it.
+
+        Raises:
+            DeviceError: no answer, a refusal, or another value is read afterwards.
+        """
+        data = list(value.to_bytes(register.size, "little", signed=register.signed))
+        with self._named(f"servo {servo_id}: writing {register}"):
+            result, error = self._protocol.writeTxRx(self._port, servo_id, register.address, register.size, data)
+        if not read_back:
+            return
+        self._check(servo_id, f"writing {register}", result, error)
+        found = self.read(servo_id, register)
+        if found != value:
+            raise self._error(
+                servo_id, f"{register} reads {found} after {value} was written; another program may be on the bus"
+            )
+
+    def _check(self, servo_id: int, doing: str, result: int, error: int) -> None:
+        if result != COMM_SUCCESS:
+            raise self._error(servo_id, f"{doing}: no answer at {self.baud} baud; look for a loose cable or supply")
+        if error & _ERROR_NUMBER:
+            text = self._protocol.getRxPacketError(error & _ERROR_NUMBER).removeprefix("[RxPacketError] ")
+            raise self._error(servo_id, f"{doing} was refused: {text}")
+
+    def _error(self, servo_id: int, text: str) -> DeviceError:
+        return DeviceError(f"arm bus {self._name}: servo {servo_id}: {text}")
+
+    @contextlib.contextmanager
+    def _named(self, doing: str) -> Iterator[None]:
+        """A port that dies raises whatever its driver likes; people want one line of it."""
+        self._port.is_using = False  # an exception in an earlier transaction leaves it set
+        try:
+            yield
+        except (OSError, TypeError, ValueError) as error:
+            text = f"{doing}: the port failed: {error}; plug the adapter in again"
+            raise DeviceError(f"arm bus {self._name}: {text}") from error

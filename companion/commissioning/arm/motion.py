@@ -1,0 +1,202 @@
+"""Slow, bounded motion of one joint at a time on the ground, and every reason to end it. Pure: joint states in, torques out.
+
+The law is that of `companion.control.arm_hold`, behind a reference that never runs faster than asked; a small integral carries what
+friction and masses leave over. Angles are the paper's; the body is taken for level.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from companion.config.vehicle import Arm, Vehicle
+from companion.control.arm_hold import hold_torque_nm
+from companion.control.manipulator import Manipulator
+from companion.io.dynamixel.registers import WATCHDOG_ERROR, hardware_error_text
+from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
+
+SPEED_MAX_DEG_S: Final = 20.0
+ACCELERATION_DEG_S2: Final = 60.0
+TORQUE_SHARE: Final = 0.6
+"""Of `torque_max_nm`: no more is asked of a servo here."""
+LOAD_NM: Final = 0.5
+"""A torque that gravity and friction do not explain by more than this for `LOAD_S`: something is in the way."""
+LOAD_S: Final = 0.15
+WALL_MARGIN_DEG: Final = 3.0
+RUNAWAY_DEG_S: Final = 90.0
+"""No joint turns so fast here unless its sign is wrong, or somebody pulls at it."""
+ASTRAY_DEG: Final = 10.0
+"""The joint that is to stay has moved by this."""
+REACHED_DEG: Final = 0.7
+_INTEGRAL_NM_RAD_S: Final = 12.0
+_INTEGRAL_MAX_NM: Final = 0.25
+_LEAD_RAD: Final = math.radians(5.0)
+"""The reference waits for a joint that does not follow."""
+
+
+def gentle(arm: Arm, share: float = TORQUE_SHARE) -> Arm:
+    """The arm with so much less torque allowed: the bus clips by it, whatever the law asks."""
+    first, second = (joint.model_copy(update={"torque_max_nm": share * joint.torque_max_nm}) for joint in arm.joints)
+    return arm.model_copy(update={"joints": (first, second)})
+
+
+def walls_deg(arm: Arm, joint: int) -> tuple[float, float]:
+    """How far a joint may be moved here."""
+    low, high = arm.joints[joint].angle_deg
+    return low + WALL_MARGIN_DEG, high - WALL_MARGIN_DEG
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """One control step."""
+
+    torque_nm: Vec2
+    reference_rad: Vec2
+    reference_rate_rad_s: Vec2
+    load_nm: Vec2
+    """Torque beside gravity."""
+    reached: bool
+    """Reference and joint are at the goal."""
+    stop: str = ""
+    """Why the motion has to end at once; empty: it need not. The torque is 0 then."""
+
+
+class Motion:
+    """Leads both joints, one of which moves.
+
+    Args:
+        vehicle: arm, tool and limits.
+        state: where the arm is now.
+    """
+
+    def __init__(self, vehicle: Vehicle, state: ArmState) -> None:
+        self._vehicle = vehicle
+        self._arm = vehicle.arm
+        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._limit_nm = tuple(TORQUE_SHARE * joint.torque_max_nm for joint in vehicle.arm.joints)
+        self._reference = list(state.angle_rad)
+        self._rate = [0.0, 0.0]
+        self._goal = list(state.angle_rad)
+        self._integral = [0.0, 0.0]
+        self._loaded_s = 0.0
+        self._speed_rad_s = math.radians(SPEED_MAX_DEG_S)
+        self.load_max_nm = [0.0, 0.0]
+        """Largest torque beside gravity so far."""
+
+    @property
+    def reference_rad(self) -> Vec2:
+        """Where the joints are led now."""
+        return (self._reference[0], self._reference[1])
+
+    def go(self, joint: int, goal_rad: float, speed_rad_s: float) -> None:
+        """Move a joint from now on; the other one stays where it is led.
+
+        Args:
+            joint: 0 or 1.
+            goal_rad: clipped to the walls, margin kept; a joint beyond them may only come back.
+            speed_rad_s: at most `SPEED_MAX_DEG_S`.
+        """
+        low, high = (math.radians(wall) for wall in walls_deg(self._arm, joint))
+        here = self._reference[joint]
+        self._goal[joint] = max(min(low, here), min(max(high, here), goal_rad))
+        self._goal[1 - joint] = self._reference[1 - joint]
+        self._speed_rad_s = min(speed_rad_s, math.radians(SPEED_MAX_DEG_S))
+
+    def halt(self) -> None:
+        """Stay here."""
+        self._goal = list(self._reference)
+        self._rate = [0.0, 0.0]
+
+    def refusal(self, poses_rad: Sequence[Vec2]) -> str:
+        """Why these poses may not be gone to; empty: they may."""
+        for pose in poses_rad:
+            gravity = self._manipulator.gravity_torque_nm(pose, IDENTITY_QUAT)
+            for joint in (0, 1):
+                if abs(gravity[joint]) > 0.9 * self._limit_nm[joint]:
+                    where = f"({math.degrees(pose[0]):.0f}, {math.degrees(pose[1]):.0f}) deg"
+                    return (
+                        f"at {where} joint {joint + 1} carries {abs(gravity[joint]):.2f} N m, more than 90 % of the "
+                        f"{self._limit_nm[joint]:.2f} N m allowed here; choose a pose nearer to hanging"
+                    )
+        return ""
+
+    def step(self, state: ArmState, dt_s: float) -> Moved:
+        """One control step.
+
+        Args:
+            state: the newest, fresh.
+            dt_s: since the last step; a late one leads no further than 20 ms.
+        """
+        dt_s = min(dt_s, 0.02)
+        for joint in (0, 1):
+            self._lead(joint, state.angle_rad[joint], dt_s)
+        reference = self.reference_rad
+        rate = (self._rate[0], self._rate[1])
+        gravity = self._manipulator.gravity_torque_nm(state.angle_rad, IDENTITY_QUAT)
+        held = hold_torque_nm(self._manipulator, state.angle_rad, state.velocity_rad_s, reference, rate, IDENTITY_QUAT)
+        torque = [self._whole(joint, held[joint], reference[joint] - state.angle_rad[joint], dt_s) for joint in (0, 1)]
+        load = (torque[0] - gravity[0], torque[1] - gravity[1])
+        self.load_max_nm = [max(most, abs(now)) for most, now in zip(self.load_max_nm, load, strict=True)]
+        self._loaded_s = self._loaded_s + dt_s if max(map(abs, load)) > LOAD_NM else 0.0
+        stop = self._stop(state, load)
+        if stop:
+            torque = [0.0, 0.0]
+        reached = all(
+            self._goal[joint] == reference[joint]
+            and abs(reference[joint] - state.angle_rad[joint]) <= math.radians(REACHED_DEG)
+            for joint in (0, 1)
+        )
+        return Moved((torque[0], torque[1]), reference, rate, load, reached, stop)
+
+    def _lead(self, joint: int, angle_rad: float, dt_s: float) -> None:
+        """Move the reference: to the goal, not faster than allowed, not away from a joint that does not follow."""
+        left = self._goal[joint] - self._reference[joint]
+        if left == 0.0:
+            self._rate[joint] = 0.0
+            return
+        way = math.copysign(1.0, left)
+        most = math.radians(ACCELERATION_DEG_S2)
+        speed = min(self._speed_rad_s, abs(self._rate[joint]) + most * dt_s, math.sqrt(2.0 * most * abs(left)))
+        if way * (self._reference[joint] - angle_rad) > _LEAD_RAD:
+            speed = 0.0
+        if speed * dt_s >= abs(left) or abs(left) < 1e-6:
+            self._reference[joint], self._rate[joint] = self._goal[joint], 0.0
+        else:
+            self._reference[joint] += way * speed * dt_s
+            self._rate[joint] = way * speed
+
+    def _whole(self, joint: int, held_nm: float, error_rad: float, dt_s: float) -> float:
+        most = self._limit_nm[joint]
+        grown = self._integral[joint] + _INTEGRAL_NM_RAD_S * error_rad * dt_s
+        self._integral[joint] = max(-_INTEGRAL_MAX_NM, min(_INTEGRAL_MAX_NM, grown))
+        return max(-most, min(most, held_nm + self._integral[joint]))
+
+    def _stop(self, state: ArmState, load: Vec2) -> str:
+        safety = self._vehicle.safety
+        for joint in (0, 1):
+            name = f"joint {joint + 1}"
+            error = state.hardware_error[joint]
+            if error & WATCHDOG_ERROR:
+                return f"{name}: the bus watchdog let go: this computer was busy elsewhere, or a cable is loose"
+            if error:
+                return f"{name}: hardware error: {hardware_error_text(error)}; remove the cause, then cycle the servos' power"
+            if state.temperature_c[joint] >= safety.servo_warn_c:
+                return f"{name}: {state.temperature_c[joint]:.0f} degC; let the arm cool down"
+            if abs(math.degrees(state.velocity_rad_s[joint])) > RUNAWAY_DEG_S:
+                return f"{name} runs away; if nobody pulled at it, its sign is wrong: companion arm zero"
+            astray_deg = math.degrees(abs(state.angle_rad[joint] - self._reference[joint]))
+            if astray_deg > ASTRAY_DEG:
+                return f"{name} is {astray_deg:.0f} deg from where it is led; look what is in its way, or pulls at it"
+            low, high = self._arm.joints[joint].angle_deg
+            angle_deg = math.degrees(state.angle_rad[joint])
+            if not low <= angle_deg <= high:
+                return f"{name} is at {angle_deg:.0f} deg, beyond its walls, {low:g} to {high:g} deg; bring it back by hand"
+        if self._loaded_s > LOAD_S:
+            joint = 0 if abs(load[0]) > abs(load[1]) else 1
+            return (
+                f"joint {joint + 1}: {load[joint]:+.2f} N m beside gravity; look what is in its way, and for masses or a torque "
+                "constant that are not the vehicle file's"
+            )
+        return ""

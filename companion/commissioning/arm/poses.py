@@ -1,0 +1,119 @@
+"""The poses in which somebody holds the arm so that its zeros, directions and plugs can be told. Pure.
+
+Angles are the paper's: joint 1 from body +x, positive turning down; joint 2 turns the lower link the other way, so that it points along
+`alpha_1 - alpha_2`. Only directions that anybody can hold are asked for exactly: level or plumb.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from companion.config.document import ConfigError
+from companion.config.vehicle import Arm, Joint
+from companion.model.types import Vec2
+
+SWING_DEG, SWING_MIN_DEG = 45.0, 25.0
+"""Of a joint that cannot be brought from one such direction to another."""
+_STRAIGHT_DEG = ((0.0, 0.0), (90.0, 0.0))
+_DIRECTIONS = {
+    0: "straight forward (towards the nose), level",
+    90: "straight down, plumb",
+    180: "straight back, level",
+    -90: "straight up, plumb",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One thing that somebody is asked to do with the arm."""
+
+    name: str
+    told: str
+    """What to do, for people."""
+    joint: int | None
+    """The one joint that moves, 0 or 1; None: both may."""
+    by_deg: float
+    """By how much it moves."""
+    exact: bool
+    """It ends in a direction that can be held exactly; else only the way it moves counts."""
+    pose_deg: Vec2
+    """Both joints at its end; of a joint that moves without being exact, about."""
+
+    @property
+    def hand_rad(self) -> Vec2:
+        """Both joints at its end."""
+        return (math.radians(self.pose_deg[0]), math.radians(self.pose_deg[1]))
+
+
+def steps_of(arm: Arm) -> tuple[Step, Step, Step]:
+    """The three steps for an arm, within its walls: straight, elbow alone, shoulder alone.
+
+    Raises:
+        ConfigError: the walls leave no straight pose, or a joint too little room.
+    """
+    first, second = arm.joints
+    straight = next((pose for pose in _STRAIGHT_DEG if _within(first, pose[0]) and _within(second, pose[1])), None)
+    if straight is None:
+        raise ConfigError(
+            [
+                "arm.joints[].angle_deg: the walls allow the arm neither straight forward (0, 0) nor straight down (90, 0), and one of "
+                "the two is needed to find the zeros; widen the walls as far as the arm can really go"
+            ]
+        )
+    elbow_deg, elbow_exact = _turn(second, straight[1], 1)
+    shoulder_deg, shoulder_exact = _turn(first, straight[0], 0)
+    bent = straight[1] + elbow_deg
+    swung = straight[0] + shoulder_deg
+    return (
+        Step("straight", f"hold the whole arm {_direction(straight[0])}, both links in one line", None, 0.0, True, straight),
+        Step("elbow", _elbow_text(straight[0], elbow_deg, elbow_exact), 1, elbow_deg, elbow_exact, (straight[0], bent)),
+        Step("shoulder", _shoulder_text(straight[0], shoulder_deg, shoulder_exact), 0, shoulder_deg, shoulder_exact, (swung, bent)),
+    )  # fmt: skip
+
+
+def _within(joint: Joint, angle_deg: float) -> bool:
+    low, high = joint.angle_deg
+    return low <= angle_deg <= high
+
+
+def _turn(joint: Joint, from_deg: float, index: int) -> tuple[float, bool]:
+    for by_deg in (90.0, -90.0):
+        if _within(joint, from_deg + by_deg):
+            return by_deg, True
+    low, high = joint.angle_deg
+    by_deg = min(SWING_DEG, high - from_deg) if high - from_deg >= from_deg - low else -min(SWING_DEG, from_deg - low)
+    if abs(by_deg) < SWING_MIN_DEG:
+        raise ConfigError(
+            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the walls leave {abs(by_deg):.0f} deg to turn, at least "
+             f"{SWING_MIN_DEG:g} are needed to tell which way the servo counts"]
+        )  # fmt: skip
+    return by_deg, False
+
+
+def _direction(angle_deg: float) -> str:
+    return _DIRECTIONS[round((angle_deg + 90.0) % 360.0 - 90.0)]
+
+
+def _elbow_text(alpha1_deg: float, by_deg: float, exact: bool) -> str:
+    # The lower link points along alpha_1 - alpha_2: what turns joint 2 forward turns the link back.
+    still = "leave the upper link as it is"
+    if exact:
+        return f"{still}, bend the elbow until the lower link points {_direction(alpha1_deg - by_deg)}"
+    return f"{still}, bend the elbow: swing the lower link {_way(alpha1_deg, -by_deg)} by about {abs(by_deg):.0f} deg"
+
+
+def _shoulder_text(alpha1_deg: float, by_deg: float, exact: bool) -> str:
+    still = "leave the elbow as it is, turn the shoulder"
+    if exact:
+        return f"{still} until the upper link points {_direction(alpha1_deg + by_deg)}"
+    return f"{still}: swing the upper link {_way(alpha1_deg, by_deg)} by about {abs(by_deg):.0f} deg"
+
+
+def _way(from_deg: float, by_deg: float) -> str:
+    """Where a link that points forward or down goes when its angle (positive down from forward) changes."""
+    middle_deg = from_deg + math.copysign(SWING_DEG, by_deg)
+    forward, down = math.cos(math.radians(middle_deg)), math.sin(math.radians(middle_deg))
+    if from_deg == 0.0:
+        return "down" if down > 0.0 else "up"
+    return "forward (towards the nose)" if forward > 0.0 else "back (towards the tail)"

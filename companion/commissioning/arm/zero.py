@@ -1,0 +1,215 @@
+"""Zeros, directions and plugs of the arm's servos, from three poses in which somebody holds it. Pure: counts in, result out."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from companion.commissioning.arm.poses import SWING_MIN_DEG, Step, steps_of
+from companion.config.base import Location
+from companion.config.document import Data
+from companion.config.vehicle import Arm
+from companion.io.dynamixel.registers import COUNTS_PER_TURN
+
+HELD_S: Final = 2.0
+"""The arm is held when it was still for so long."""
+STILL_DEG: Final = 1.5
+"""No joint moves by more than this while it is held."""
+BEGUN_DEG: Final = 5.0
+"""It was moved at all."""
+NEAR_SHARE: Final = 0.35
+"""Of a turn that is asked for exactly: nearer than this to it counts."""
+ALONE_SHARE: Final = 0.35
+"""The other joint may turn by so much of it."""
+HAND_DEG: Final = 2.0
+"""So exactly can somebody hold a link level or plumb; a zero of the vehicle file within this is left as it is."""
+DISAGREE_DEG: Final = 8.0
+"""Poses that tell a zero differently by more than this were not held as asked, or the arm slips."""
+_DEG_PER_COUNT: Final = 360.0 / COUNTS_PER_TURN
+
+Counts = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroJoint:
+    """What was found of one joint."""
+
+    servo_id: int
+    sign: int
+    zero_count: int
+    """Present position (register 132) at joint angle 0, within one turn unless the joint turns more than once."""
+    spread_deg: float | None
+    """Between the poses that tell the zero; None: one alone tells it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroResult:
+    """Both joints, shoulder first."""
+
+    joints: tuple[ZeroJoint, ZeroJoint]
+    swapped: bool
+    """The servos of the vehicle file sit in each other's joint."""
+    held_counts: tuple[Counts, Counts, Counts]
+    """Mean positions in the three poses, in the order of the vehicle file's servos."""
+
+    def changes(self, arm: Arm) -> dict[Location, Data]:
+        """What the vehicle file should say instead; empty: it is right as far as a hand can tell."""
+        wanted: dict[Location, Data] = {}
+        for index, (found, joint) in enumerate(zip(self.joints, arm.joints, strict=True)):
+            at: Location = ("arm", "joints", index)
+            if found.servo_id != joint.servo_id:
+                wanted[(*at, "servo_id")] = found.servo_id
+            if found.sign != joint.sign:
+                wanted[(*at, "sign")] = found.sign
+            if abs(self.error_deg(arm, index)) > HAND_DEG:
+                wanted[(*at, "zero_count")] = found.zero_count
+        return wanted
+
+    def error_deg(self, arm: Arm, index: int) -> float:
+        """How far the vehicle file's zero is from the one found, in turns of the servo, -180 to 180."""
+        counts = arm.joints[index].zero_count - self.joints[index].zero_count
+        return ((counts + COUNTS_PER_TURN / 2) % COUNTS_PER_TURN - COUNTS_PER_TURN / 2) * _DEG_PER_COUNT
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroView:
+    """What to show now."""
+
+    step: Step | None
+    """None: done."""
+    number: int
+    moved_deg: tuple[float, float]
+    """Since the step began, as each servo counts, in the order of the vehicle file's servos."""
+    held: float
+    """0 to 1: how long the arm has been held as asked."""
+    notice: str
+    """What is not as asked; empty: nothing."""
+    result: ZeroResult | None = None
+    failed: str = ""
+    """Why the poses cannot be understood; the guide is then at its end."""
+
+
+class ZeroGuide:
+    """Watches the arm, decides when a pose is held, and says in the end what it means.
+
+    Args:
+        arm: the vehicle file's; its walls say which poses are asked for.
+
+    Raises:
+        ConfigError: the walls leave no such poses.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+        self.steps = steps_of(arm)
+        self._held: list[Counts] = []
+        self._began: Counts | None = None
+        self._window: deque[tuple[float, Counts]] = deque()
+        self._begun = False
+
+    def update(self, t_s: float, counts: Counts, accept: bool = False) -> ZeroView:
+        """One reading.
+
+        Args:
+            t_s: any clock.
+            counts: present positions (register 132), in the order of the vehicle file's servos.
+            accept: somebody says that the arm is held now; it need not have been moved then.
+        """
+        index = len(self._held)
+        step = self.steps[index]
+        if self._began is None:
+            self._began = counts
+        moved = (_moved_deg(self._began, counts, 0), _moved_deg(self._began, counts, 1))
+        self._begun = self._begun or max(map(abs, moved)) > BEGUN_DEG
+        window = self._window
+        window.append((t_s, counts))
+        while len(window) > 1 and window[1][0] <= t_s - HELD_S:
+            window.popleft()
+        still_s = self._still_s(t_s)
+        notice = self._notice(step, moved)
+        ready = (self._begun or accept) and not notice
+        share = min(1.0, still_s / HELD_S) if ready else 0.0
+        if share < 1.0:
+            return ZeroView(step, index + 1, moved, share, notice)
+        self._held.append(_mean([one for _, one in window]))
+        self._began, self._begun = self._held[-1], False
+        window.clear()
+        if len(self._held) < len(self.steps):
+            return ZeroView(self.steps[index + 1], index + 2, (0.0, 0.0), 0.0, "")
+        return self._conclude(moved)
+
+    def _still_s(self, t_s: float) -> float:
+        """How long nothing has moved."""
+        newest = self._window[-1][1]
+        low, high = list(newest), list(newest)
+        since_s = t_s
+        for at_s, counts in reversed(self._window):
+            for servo in (0, 1):
+                low[servo], high[servo] = min(low[servo], counts[servo]), max(high[servo], counts[servo])
+            if max(high[0] - low[0], high[1] - low[1]) * _DEG_PER_COUNT > STILL_DEG:
+                break
+            since_s = at_s
+        return t_s - since_s
+
+    def _notice(self, step: Step, moved: tuple[float, float]) -> str:
+        if step.joint is None or not self._begun:
+            return ""
+        most, least = max(map(abs, moved)), min(map(abs, moved))
+        if least > ALONE_SHARE * max(most, SWING_MIN_DEG):
+            return "both joints have moved; turn only the one that is asked for, put the other one back"
+        if step.exact and abs(most - abs(step.by_deg)) > NEAR_SHARE * abs(step.by_deg):
+            return f"{abs(step.by_deg):.0f} deg are asked for, it has turned by {most:.0f}"
+        if most < SWING_MIN_DEG:
+            return f"turn it further, {SWING_MIN_DEG:.0f} deg at least; it has turned by {most:.0f}"
+        return ""
+
+    def _conclude(self, moved: tuple[float, float]) -> ZeroView:
+        first, second, third = self._held
+        elbow, shoulder = _mover(first, second), _mover(second, third)
+        view = ZeroView(None, len(self.steps), moved, 1.0, "")
+        if elbow == shoulder:
+            servo_id = self._arm.joints[elbow].servo_id
+            text = f"the servo with id {servo_id} turned in both steps, the other one never: was it the elbow first, then the shoulder?"
+            return _failed(view, text)
+        counts = (tuple(held[shoulder] for held in self._held), tuple(held[elbow] for held in self._held))
+        joints = tuple(self._joint(joint, (shoulder, elbow)[joint], counts[joint]) for joint in (0, 1))
+        for joint, found in enumerate(joints):
+            if found.spread_deg is not None and found.spread_deg > DISAGREE_DEG:
+                text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
+                return _failed(view, f"{text}; hold them more exactly, and look for a horn that slips")
+        result = ZeroResult((joints[0], joints[1]), elbow == 0, (first, second, third))
+        return ZeroView(None, view.number, moved, 1.0, "", result)
+
+    def _joint(self, joint: int, servo: int, counts: Sequence[int]) -> ZeroJoint:
+        # The elbow turns in the second step, the shoulder in the third; in the third the elbow is only left about as it is.
+        at = 1 if joint == 1 else 2
+        turns = self.steps[at]
+        sign = 1 if (counts[at] - counts[at - 1]) * turns.by_deg > 0.0 else -1
+        last = at + turns.exact
+        tells = list(zip(counts, self.steps, strict=True))[:last]
+        zeros = [count - sign * step.pose_deg[joint] / _DEG_PER_COUNT for count, step in tells]
+        zero = round(sum(zeros) / len(zeros))
+        low_deg, high_deg = self._arm.joints[joint].angle_deg
+        if high_deg - low_deg < 360.0:
+            zero %= COUNTS_PER_TURN
+        spread = (max(zeros) - min(zeros)) * _DEG_PER_COUNT if len(zeros) > 1 else None
+        return ZeroJoint(self._arm.joints[servo].servo_id, sign, zero, spread)
+
+
+def _failed(view: ZeroView, text: str) -> ZeroView:
+    return ZeroView(None, view.number, view.moved_deg, 0.0, "", None, text)
+
+
+def _moved_deg(began: Counts, counts: Counts, servo: int) -> float:
+    return (counts[servo] - began[servo]) * _DEG_PER_COUNT
+
+
+def _mover(before: Counts, after: Counts) -> int:
+    return 0 if abs(after[0] - before[0]) > abs(after[1] - before[1]) else 1
+
+
+def _mean(counts: Sequence[Counts]) -> Counts:
+    return (round(math.fsum(a for a, _ in counts) / len(counts)), round(math.fsum(b for _, b in counts) / len(counts)))

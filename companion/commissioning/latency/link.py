@@ -1,0 +1,168 @@
+"""PX4's IMU with PX4's own stamps, and PX4's clock against ours: HIGHRES_IMU and TIMESYNC beside the autopilot's edge. I/O only.
+
+HIGHRES_IMU says when its sample was taken (`time_usec`), so the way of the message does not matter. TIMESYNC with `tc1` 0 is answered
+with PX4's clock at once: half of the round trip is the way back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import statistics
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Final, Self
+
+from companion.commissioning.latency.fit import ImuSample
+from companion.config.vehicle import AutopilotDevice
+from companion.io.protocols import DeviceError
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.model.frames import flu_from_frd
+from companion.runtime.clock import Clock
+
+SYNC_PERIOD_S: Final = 0.1
+_SYNC_MIN: Final = 5
+_SYNC_DEADLINE_S: Final = 5.0
+_NEAR: Final = 30
+"""Answers around a moment that its clock offset is told from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sync:
+    """One question for PX4's clock."""
+
+    t_s: float
+    """Half way between question and answer, our clock."""
+    offset_s: float
+    """PX4's clock less ours."""
+    round_trip_s: float
+
+
+class LatencyLink(MavsdkAutopilot):
+    """The autopilot's edge, which also keeps every IMU sample and asks for PX4's clock ten times a second."""
+
+    def __init__(self, device: AutopilotDevice, clock: Clock) -> None:
+        super().__init__(device, clock)
+        self._now = clock
+        self._heard: deque[tuple[float, str, str]] = deque()
+        self._asked_ns: set[int] = set()
+        self._asking: asyncio.Task[None] | None = None
+        self.syncs: list[Sync] = []
+        self._raw: list[tuple[float, float, ImuSample]] = []
+
+    async def __aenter__(self) -> Self:
+        """Open the link as for a flight, then wait for PX4's clock.
+
+        Raises:
+            DeviceError: also if PX4 does not answer TIMESYNC.
+        """
+        await super().__aenter__()
+        try:
+            self._direct.subscribe_message("HIGHRES_IMU", self._on_message)
+            self._direct.subscribe_message("TIMESYNC", self._on_message)
+            self._asking = asyncio.create_task(self._ask_clock(), name="timesync")
+            await self._first_answers()
+        except BaseException:
+            await self.__aexit__(None, None, None)
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the questions, then as the edge does."""
+        if self._asking is not None:
+            self._asking.cancel()
+            await asyncio.wait((self._asking,))
+        await super().__aexit__(kind, error, trace)
+
+    def imu(self, last_s: float = math.inf) -> list[ImuSample]:
+        """All samples so far on our clock, or those of the last `last_s`."""
+        self._read()
+        offsets = _Offsets(self.syncs)
+        found: list[ImuSample] = []
+        from_s = self._raw[-1][1] - last_s if self._raw else 0.0
+        first = bisect_left(self._raw, from_s, key=lambda one: one[1])
+        for _, px4_s, sample in self._raw[first:]:
+            t_s = px4_s - offsets.at(px4_s)
+            if not found or t_s > found[-1].t_s:
+                found.append(sample._replace(t_s=t_s))
+        return found
+
+    def imu_age_s(self) -> float | None:
+        """Median from a sample to the arrival of its message; None: none came."""
+        self._read()
+        offsets = _Offsets(self.syncs)
+        ages = [arrived_s - (px4_s - offsets.at(px4_s)) for arrived_s, px4_s, _ in self._raw]
+        return statistics.median(ages) if ages else None
+
+    def round_trip_s(self) -> float:
+        """Median of all questions."""
+        self._read()
+        return statistics.median(sync.round_trip_s for sync in self.syncs)
+
+    async def _first_answers(self) -> None:
+        try:
+            async with asyncio.timeout(_SYNC_DEADLINE_S):
+                while len(self.syncs) < _SYNC_MIN or not self._raw:
+                    await asyncio.sleep(SYNC_PERIOD_S)
+                    self._read()
+        except TimeoutError:
+            what = "an answer to TIMESYNC" if len(self.syncs) < _SYNC_MIN else "HIGHRES_IMU"
+            raise DeviceError(
+                f"autopilot {self._device.address}: expected {what} within {_SYNC_DEADLINE_S:g} s, found none; use a link of PX4's "
+                "onboard mode (MAV_x_MODE 2) that no router filters"
+            ) from None
+
+    async def _ask_clock(self) -> None:
+        while True:
+            asked_ns = int(self._now() * 1e9)
+            self._asked_ns.add(asked_ns)
+            self._send("TIMESYNC", json.dumps({"tc1": 0, "ts1": asked_ns}))
+            await asyncio.sleep(SYNC_PERIOD_S)
+
+    def _on_message(self, message: Any, _: Any) -> None:
+        """A thread of MAVSDK's: stamped and kept."""
+        self._heard.append((self._now(), message.message_name, message.fields_json))
+
+    def _read(self) -> None:
+        while self._heard:
+            arrived_s, name, text = self._heard.popleft()
+            fields = json.loads(text)
+            if name == "TIMESYNC":
+                self._take_sync(arrived_s, int(fields["tc1"]), int(fields["ts1"]))
+            elif name == "HIGHRES_IMU":
+                force = flu_from_frd((float(fields["xacc"]), float(fields["yacc"]), float(fields["zacc"])))
+                rate = flu_from_frd((float(fields["xgyro"]), float(fields["ygyro"]), float(fields["zgyro"])))
+                px4_s = 1e-6 * int(fields["time_usec"])
+                self._raw.append((arrived_s, px4_s, ImuSample(0.0, force, rate)))
+
+    def _take_sync(self, arrived_s: float, px4_ns: int, asked_ns: int) -> None:
+        if px4_ns == 0 or asked_ns not in self._asked_ns:
+            return  # PX4's own question, or the answer to somebody else
+        self._asked_ns.discard(asked_ns)
+        asked_s = 1e-9 * asked_ns
+        middle_s = 0.5 * (asked_s + arrived_s)
+        self.syncs.append(Sync(middle_s, 1e-9 * px4_ns - middle_s, arrived_s - asked_s))
+
+
+class _Offsets:
+    """PX4's clock less ours at any time: the median of the quicker half of the questions around it."""
+
+    def __init__(self, syncs: list[Sync]) -> None:
+        self._px4_s = [sync.t_s + sync.offset_s for sync in syncs]
+        self._syncs = syncs
+        self._known: dict[int, float] = {}
+
+    def at(self, px4_s: float) -> float:
+        """By PX4's clock."""
+        key = int(2.0 * px4_s)
+        if key not in self._known:
+            order = sorted(range(len(self._syncs)), key=lambda k: abs(self._px4_s[k] - px4_s))[:_NEAR]
+            near = sorted((self._syncs[k] for k in order), key=lambda sync: sync.round_trip_s)
+            quick = near[: max(1, (len(near) + 1) // 2)]
+            self._known[key] = statistics.median(sync.offset_s for sync in quick)
+        return self._known[key]

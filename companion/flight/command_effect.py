@@ -1,0 +1,121 @@
+"""What a command did, in the words of a pilot. Pure: read off the tick in which it was judged and the tick before."""
+
+from __future__ import annotations
+
+from companion.model.flight_stage import PILOT_FLIES, Stage
+from companion.model.types import OperatorCommand, Outputs, PhaseKind, SafetyAction
+
+Effect = tuple[bool, str]
+"""Accepted (it did something, or what it asks for is done already), and what was done or why nothing was."""
+
+_RISING = frozenset({Stage.OFFBOARD.value, Stage.ARM.value, Stage.SPOOL.value})
+"""Phases between the word to take off and the take-off."""
+
+
+def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) -> Effect:
+    """What came of a command.
+
+    Args:
+        command: as it was put into `Inputs.command`, or as it would have been if a landing were not asked for already.
+        before: outputs of the tick before the command; None: there was none.
+        after: outputs of the tick with it.
+    """
+    if after.phase == PILOT_FLIES:
+        return False, "a pilot has the vehicle: nothing is sent against them"
+    stood = before is None or before.phase_kind is PhaseKind.GROUND
+    if after.phase_kind is PhaseKind.DONE and not stood:
+        return command in _DOWN, "down already" if command in _DOWN else f"{_NOTHING[command]}: the flight is over"
+    if after.phase == Stage.AUTOPILOT_LAND.value:
+        if command in _DOWN:
+            return True, "recorded; PX4 is landing on its own, it goes on"
+        return False, f"{_NOTHING[command]}: PX4 is landing on its own"
+    return _JUDGES[command](before, after)
+
+
+def _land(before: Outputs | None, after: Outputs) -> Effect:
+    if after.phase_kind is PhaseKind.DONE:
+        return True, "not taking off: standing down"
+    if before is not None and before.phase == Stage.SPOOL.value:
+        return True, "not taking off: the rotors spool down"
+    landed_already = before is not None and before.action.rank >= SafetyAction.LAND.rank
+    return True, "already landing" if landed_already else "landing"
+
+
+def _abort(before: Outputs | None, after: Outputs) -> Effect:
+    accepted, text = _land(before, after)
+    return accepted, "aborted: landing, the arm folds" if text == "landing" else text
+
+
+def _hold(before: Outputs | None, after: Outputs) -> Effect:
+    if after.phase_kind is PhaseKind.DONE:
+        return True, "not taking off: standing down"
+    if after.phase_kind is PhaseKind.GROUND:
+        return True, "it stays on the ground until start is commanded"
+    if before is not None and before.phase == Stage.SPOOL.value:
+        return True, "not taking off: the rotors spool down"
+    if "no_room_to_stay" in _events(after):
+        return True, "too low to hold: landing"
+    action = after.action
+    if action is SafetyAction.RETRACT:
+        return False, "not held: it goes back along the tether and lands"
+    if action.rank > SafetyAction.HOLD.rank or after.phase_kind is PhaseKind.LANDING:
+        return False, "not held: it is landing"
+    held_already = before is not None and before.action is SafetyAction.HOLD
+    return True, "holding already" if held_already else "holding"
+
+
+def _resume(before: Outputs | None, after: Outputs) -> Effect:
+    refused = _events(after).get("resume_refused")
+    if refused is not None:
+        return False, f"resume refused: {refused}"
+    if before is None or before.action is not SafetyAction.HOLD:
+        return False, f"nothing to resume: {_instead(after)}"
+    if after.action.rank > SafetyAction.HOLD.rank:
+        return False, f"resume refused: {_instead(after)}"
+    if after.phase_kind is PhaseKind.LANDING:
+        return True, "the landing goes on"
+    return True, "going on"
+
+
+def _start(before: Outputs | None, after: Outputs) -> Effect:
+    declined = _events(after).get("start_declined")
+    if declined is not None:
+        return False, f"start refused: {declined}"
+    if before is not None and before.phase in _RISING:
+        return (True, "taking off already") if after.phase_kind is PhaseKind.GROUND else (False, _NOT_GROUNDED)
+    if after.phase in _RISING:
+        return True, "taking off"
+    if after.phase_kind is PhaseKind.DONE:
+        return False, "start refused: it stands down"
+    return False, _NOT_GROUNDED
+
+
+def _instead(after: Outputs) -> str:
+    """What it does that is not to hold."""
+    if after.phase_kind is PhaseKind.GROUND:
+        return "on the ground"
+    if after.action is SafetyAction.RETRACT:
+        return "it goes back along the tether and lands"
+    if after.action.rank > SafetyAction.HOLD.rank or after.phase_kind is PhaseKind.LANDING:
+        return "it is landing"
+    return "not holding"
+
+
+def _events(outputs: Outputs) -> dict[str, str]:
+    return {event.id: event.text for event in outputs.events}
+
+
+_DOWN = frozenset({OperatorCommand.LAND, OperatorCommand.ABORT})
+_NOT_GROUNDED = "start refused: in the air already"
+_NOTHING = {
+    OperatorCommand.HOLD: "not held",
+    OperatorCommand.RESUME: "nothing to resume",
+    OperatorCommand.START: "start refused",
+}
+_JUDGES = {
+    OperatorCommand.LAND: _land,
+    OperatorCommand.ABORT: _abort,
+    OperatorCommand.HOLD: _hold,
+    OperatorCommand.RESUME: _resume,
+    OperatorCommand.START: _start,
+}

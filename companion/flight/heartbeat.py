@@ -1,0 +1,109 @@
+"""What the flight process reports to the guardian in each tick. Pure but for the client that sends it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from companion.guardian.client import GuardianClient
+from companion.guardian.heartbeat import Beat
+from companion.model.flight_stage import PILOT_FLIES
+from companion.model.types import AutopilotRequest, AutopilotStatus, Inputs, LinkIdentity, Outputs, PhaseKind
+from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
+
+_IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
+_REFUSALS = frozenset(rule.id for rule in (MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS))
+"""Events after which PX4 lands because motion capture is not believed."""
+
+
+class Heartbeats:
+    """The heartbeats of one flight. Pure.
+
+    Args:
+        identity: of the MAVLink link that the guardian would take over.
+        origin_s: `time.monotonic` at zero of the flight clock.
+    """
+
+    def __init__(self, identity: LinkIdentity, origin_s: float) -> None:
+        self._identity = identity
+        self._origin_s = origin_s
+        self._pilot = False
+        self._lands_without_mocap = False
+        """One of `_REFUSALS` has happened: from then on a pose that is not believed is more than a single bad one."""
+        self._pose_stamp_s = float("-inf")
+        self._position_world_m = (0.0, 0.0, 0.0)
+
+    def of(self, inputs: Inputs, outputs: Outputs) -> Beat:
+        """The heartbeat of a tick; to be called in every tick."""
+        ids = {event.id for event in outputs.events}
+        self._pilot = self._pilot or PILOT_TOOK_OVER.id in ids or outputs.phase == PILOT_FLIES
+        self._lands_without_mocap = self._lands_without_mocap or not ids.isdisjoint(_REFUSALS)
+        mocap = inputs.mocap
+        if mocap is not None and mocap.tracking_valid and outputs.mocap_trusted:
+            self._pose_stamp_s, self._position_world_m = mocap.stamp_s, mocap.position_world_m
+        armed = inputs.status is not None and inputs.status.armed
+        # PX4 reports once a second that it is armed: from the request on it may be.
+        may_lift = armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR
+        link = self._identity
+        return Beat(
+            tick=inputs.tick,
+            t_s=inputs.t_s,
+            origin_s=self._origin_s,
+            mission_t_s=outputs.mission_t_s,
+            lifting=may_lift,
+            pilot=self._pilot,
+            goodbye=False,
+            mocap_refused=self._lands_without_mocap and not outputs.mocap_trusted,
+            autopilot_system=link.autopilot_system,
+            own_system=link.own_system,
+            own_component=link.own_component,
+            local_port=link.local_port,
+            pose_stamp_s=self._pose_stamp_s,
+            position_world_m=self._position_world_m,
+            peer=link.peer,
+        )
+
+
+class FlightGuard:
+    """The flight process's connection to the guardian: sends it a heartbeat in each tick.
+
+    Args:
+        client: to the guardian.
+        identity: of the MAVLink link that the guardian would take over.
+        origin_s: `time.monotonic` at zero of the flight clock.
+    """
+
+    def __init__(self, client: GuardianClient, identity: LinkIdentity, origin_s: float) -> None:
+        self._client = client
+        self._heartbeats = Heartbeats(identity, origin_s)
+        self._last: Beat | None = None
+
+    @property
+    def ready(self) -> bool:
+        """The guardian said within the last second that it could take over."""
+        self._client.listen()
+        return self._client.ready
+
+    @property
+    def would_take_over(self) -> bool:
+        """If this process ended now, the guardian would land."""
+        return self._last is not None and self._last.lifting and self.ready
+
+    def tick(self, inputs: Inputs, outputs: Outputs) -> None:
+        """At the end of a tick: what was decided has left."""
+        self._last = self._heartbeats.of(inputs, outputs)
+        self._client.beat(self._last)
+
+    def still_here(self) -> None:
+        """Between ticks that do not come any more: this process sees to the landing itself."""
+        if self._last is not None:
+            self._client.beat(self._last)
+
+    def goodbye(self, now: AutopilotStatus | None) -> None:
+        """The flight is over. While PX4 is armed no goodbye is said: the guardian takes over once this process has ended.
+
+        Args:
+            now: PX4's newest status; None if it was never heard.
+        """
+        if self._last is not None and not (now is not None and now.armed):
+            self._last = dataclasses.replace(self._last, goodbye=True)
+            self._client.beat(self._last)

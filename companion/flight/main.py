@@ -1,0 +1,377 @@
+"""The flight process of `companion fly`: opens the edges, ticks the core, closes down in order.
+
+Started by the launcher as `python -m companion.flight.main --config FILE --out DIR --channel FD --guardian FD`. Ends with the
+outcome's exit code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import math
+import os
+import signal
+import socket
+import sys
+import time
+import traceback
+from pathlib import Path
+
+from companion.config.loader import FlightConfig
+from companion.core.flight_core import NOMINAL_DT_S, FlightCore
+from companion.flight.command_effect import effect_of
+from companion.flight.command_queue import GivenUp, Operator
+from companion.flight.fallback_landing import hand_over, unflown
+from companion.flight.heartbeat import FlightGuard
+from companion.flight.startup import Checked, Refused, check_before_flight, with_hover_thrust
+from companion.flight.ticker import Ticker
+from companion.guardian.client import GuardianClient
+from companion.io.devices import Edges, open_edges
+from companion.io.protocols import DeviceError
+from companion.model.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
+from companion.model.types import (
+    AutopilotRequest,
+    Event,
+    GroundCommand,
+    Inputs,
+    OperatorCommand,
+    Outcome,
+    Outputs,
+    SafetyAction,
+    Sent,
+    Severity,
+    Vec2,
+)
+from companion.recorder.client import RecorderProcess, epoch_offset_ns
+from companion.runtime import ipc
+from companion.runtime.clock import Clock, flight_clock
+from companion.runtime.event_loop import run
+from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.safety.rules import REATTACHED
+
+STATUS_EVERY = 20
+JOINT_READ_TIMEOUT_S = 0.002
+"""From the start of the tick; the read was begun before that."""
+JOINT_LEAD_MAX_S = 0.003
+JOINT_MARGIN_S = 0.0001
+"""The joints are read so that the answer is there when the tick starts, this much earlier, and no older than it must be."""
+
+
+class Flight:
+    """One flight over open edges."""
+
+    def __init__(
+        self,
+        config: FlightConfig,
+        edges: Edges,
+        recorder: RecorderProcess,
+        channel: socket.socket,
+        operator: Operator,
+        clock: Clock,
+        guardian: FlightGuard | None,
+    ) -> None:
+        self._mocap_rate_hz = config.vehicle.devices.mocap.rate_hz
+        self._guardian = guardian
+        self._edges = edges
+        self._recorder = recorder
+        self._channel = channel
+        self._operator = operator
+        self._clock = clock
+        self._core = FlightCore(config)
+        self._missed = 0
+        self._period_s = NOMINAL_DT_S
+        self._phase = ""
+        """As the launcher was told last."""
+        self._ground: str | None = None
+        """What the launcher was last told of the way to the ground stations."""
+
+    async def run(self) -> Outcome:
+        """Tick until the core says that it is over."""
+        ticker = Ticker(self._period_s, self._clock, self._mocap_rate_hz)
+        self._edges.vision.on_frame = ticker.frame
+        arm = self._edges.arm
+        tick = 0
+        before: Outputs | None = None
+        if self._edges.ground is not None:
+            self._tell_forwarding(self._clock(), self._edges.ground.line)
+        while True:
+            if arm is not None:
+                arm.begin_read(ticker.due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
+            now = await ticker.next()
+            turn = self._operator.next()
+            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command)
+            if turn.asked is not None:
+                self._answer(turn.asked, turn.refused, before, outputs)
+            before = outputs
+            self._missed += now.lateness_s > self._period_s
+            self._report(tick, outputs, sent)
+            if self._edges.ground is not None:
+                self._edges.ground.tell(inputs, outputs)
+            if self._guardian is not None:
+                self._guardian.tick(inputs, outputs)
+            if outputs.outcome is not None:
+                return outputs.outcome
+            if tick == 0 and self._edges.found_armed and not self._goes_on(outputs):
+                return Outcome.ABORTED
+            tick += 1
+
+    async def _tick(
+        self, tick: int, start_s: float, lateness_s: float, command: OperatorCommand
+    ) -> tuple[Inputs, Outputs, Sent]:
+        edges = self._edges
+        arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S) if edges.arm is not None else None
+        joint_read_s = self._clock()
+        inputs = Inputs(
+            tick=tick,
+            t_s=joint_read_s,
+            vehicle=edges.autopilot.vehicle(),
+            status=edges.autopilot.status(),
+            mocap=edges.mocap.latest() if edges.mocap is not None else None,
+            arm=arm_state,
+            force=edges.force.latest() if edges.force is not None else None,
+            command=command,
+            recorder_dropped=self._recorder.client.dropped,
+            guardian_ready=self._guardian.ready if self._guardian is not None else None,
+        )
+        outputs = self._core.step(inputs)
+        edges.vision.open = outputs.mocap_trusted
+        core_s = self._clock()
+        # The setpoint first: handing over the currents wakes the bus thread, which wants the interpreter for itself.
+        attitude_sent = edges.autopilot.send_attitude(outputs.attitude)
+        setpoint_s = self._clock()
+        torque_sent: Vec2 | None = None
+        if outputs.arm_torque_nm is not None and edges.arm is not None:
+            torque_sent = edges.arm.write_torque(outputs.arm_torque_nm)
+        current_s = self._clock()
+        if outputs.request is not AutopilotRequest.NONE:
+            edges.autopilot.request(outputs.request)
+        sent = Sent(
+            tick=tick,
+            attitude_sent=attitude_sent,
+            arm_torque_sent_nm=torque_sent,
+            start_s=start_s,
+            lateness_s=lateness_s,
+            joint_read_s=joint_read_s,
+            core_s=core_s,
+            setpoint_sent_s=setpoint_s,
+            current_sent_s=current_s,
+            hold=self._operator.judged(command, outputs),
+        )
+        self._recorder.client.record(inputs, outputs, sent)
+        if commands := self._recorder.client.take_commands():
+            for asked, why in self._operator.ask(commands):
+                self._tell_asker(asked, False, why, outputs)
+        return inputs, outputs, sent
+
+    def _answer(self, asked: GroundCommand, refused: str | None, before: Outputs | None, after: Outputs) -> None:
+        """Tell the one who commanded, the log and the launcher what came of it."""
+        effect = (False, refused) if refused is not None else effect_of(asked.command, before, after)
+        self._tell_asker(asked, *effect, after)
+
+    def _tell_asker(self, asked: GroundCommand, accepted: bool, text: str, after: Outputs) -> None:
+        about = (asked.nonce, asked.operator, asked.command)
+        self._recorder.client.ack(*about, accepted, text, after.t_s, after.phase, after.action)
+        message = {"operator": asked.operator, "command": asked.command.value, "accepted": accepted, "text": text}
+        ipc.send(self._channel, {"type": "command", "t_s": after.mission_t_s, **message})
+
+    def _goes_on(self, outputs: Outputs) -> bool:
+        """Whether PX4, armed when its link was opened, still is: else there is nothing to land, and no reason to fly a mission."""
+        goes_on = any(event.id == REATTACHED.id for event in outputs.events)
+        lines = [f"landing without it: {line}" for line in self._edges.failures]
+        if not goes_on:
+            lines = [
+                "PX4 was armed when the companion started, and has disarmed since; nothing was lifted: start again to fly"
+            ]
+        for text in lines:
+            self._tell(0, outputs, Event(outputs.t_s, REATTACHED.id, Severity.WARNING, SafetyAction.WARN, text))
+            self._recorder.client.text(outputs.t_s, Severity.WARNING, REATTACHED.id, text)
+        return goes_on
+
+    def _report(self, tick: int, outputs: Outputs, sent: Sent) -> None:
+        for event in outputs.events:
+            self._tell(tick, outputs, event)
+        if tick % STATUS_EVERY and outputs.outcome is None and outputs.phase == self._phase:
+            return
+        self._phase = outputs.phase
+        for text in self._edges.autopilot.take_messages():
+            self._recorder.client.text(outputs.t_s, Severity.WARNING, "px4", text)
+            ipc.send(self._channel, {"type": "px4", "text": text})
+        if self._edges.ground is not None:
+            for text in self._edges.ground.take_messages():
+                self._tell_forwarding(outputs.t_s, text)
+        self._tell_ground()
+        ipc.send(self._channel, self._status(tick, outputs, sent))
+
+    def _tell_forwarding(self, t_s: float, text: str) -> None:
+        self._recorder.client.text(t_s, Severity.INFO, "ground", text)
+        ipc.send(self._channel, {"type": "ground", "text": text})
+
+    def _tell_ground(self) -> None:
+        """How the way to the ground stations is, when that changes."""
+        client = self._recorder.client
+        gone = client.gone and client.ground is not None
+        ground = "no telemetry and no commands any more: the recorder is gone; Ctrl-C lands" if gone else client.ground
+        if ground != self._ground:
+            self._ground = ground
+            ipc.send(self._channel, {"type": "ground", "text": ground})
+
+    def _tell(self, tick: int, outputs: Outputs, event: Event) -> None:
+        message = {
+            "type": "event",
+            "tick": tick,
+            "t_s": outputs.mission_t_s,
+            "flight_t_s": event.t_s,
+            "id": event.id,
+            "severity": event.severity.value,
+            "action": event.action.value,
+            "text": event.text,
+        }
+        ipc.send(self._channel, message)
+
+    def _status(self, tick: int, outputs: Outputs, sent: Sent) -> ipc.Message:
+        error = outputs.control.error if outputs.control else None
+        reference = outputs.reference
+        return {
+            "type": "status",
+            "tick": tick,
+            "t_s": outputs.t_s,
+            "mission_t_s": outputs.mission_t_s,
+            "phase": outputs.phase,
+            "kind": outputs.phase_kind.value,
+            "progress": outputs.progress,
+            "action": outputs.action.value,
+            "error_m": math.hypot(*error[0:3]) if error else None,
+            "position_m": [r + e for r, e in zip(reference.position_world_m, error[0:3], strict=True)]
+            if reference and error
+            else None,
+            "thrust": outputs.attitude.thrust if outputs.attitude else None,
+            "lateness_ms": sent.lateness_s * 1e3,
+            "missed": self._missed,
+            "dropped": self._recorder.client.dropped,
+        }
+
+
+async def fly(
+    config: FlightConfig,
+    out: Path,
+    channel: socket.socket,
+    guardian_channel: socket.socket | None = None,
+    *,
+    sitl: bool = False,
+) -> Outcome:
+    """Open, fly, close.
+
+    Args:
+        config: checked.
+        out: folder of the flight.
+        channel: to the launcher.
+        guardian_channel: to the guardian; None: nobody stands by.
+        sitl: the devices are those of the simulated world.
+
+    Raises:
+        DeviceError: a device is not there or not as it must be; nothing was armed.
+        Refused: something is not as it must be for a flight; nothing was armed.
+        GivenUp: a landing was asked for before the first tick; nothing was armed.
+    """
+    origin_s = time.monotonic()
+    clock = flight_clock(origin_s)
+    client = GuardianClient(guardian_channel, clock) if guardian_channel is not None else None
+    operator = Operator(channel)
+    checked: Checked | None = None
+    async with contextlib.AsyncExitStack() as stack:
+        stack.enter_context(operator.attention())
+        edges = await operator.unless_land(stack.enter_async_context(open_edges(config, clock)))
+        if edges.found_armed:  # it flies, perhaps: nothing is waited for
+            config = unflown(config)
+        else:
+            checked = await operator.unless_land(check_before_flight(edges, config, clock, out, channel, sitl))
+            config = await operator.unless_land(with_hover_thrust(config, edges.autopilot))
+            if client is not None:
+                await operator.unless_land(client.wait_ready())
+        try:
+            recorder = await asyncio.to_thread(
+                RecorderProcess.start,
+                out / "flight.mcap",
+                config_json=config.model_dump_json(),
+                epoch_offset_ns=epoch_offset_ns(clock()),
+                metadata={
+                    "mission": config.mission.name,
+                    "law": config.controller.law,
+                    "preset": config.controller.preset,
+                    "simulated": str(sitl).lower(),
+                },
+                simulated=sitl,
+            )
+        except DeviceError as error:
+            if not edges.found_armed:
+                raise
+            print(error, file=sys.stderr)  # no log, but a landing
+            outcome = await hand_over(edges.autopilot, channel, clock, None)
+            ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
+            return outcome
+        try:
+            if not edges.found_armed:
+                recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
+            if checked is not None:
+                checked.tell(recorder.client)
+            guardian = FlightGuard(client, edges.autopilot.identity(), origin_s) if client is not None else None
+            if client is not None:
+                client.share_recorder(recorder.client.fileno())
+            flight = Flight(config, edges, recorder, channel, operator, clock, guardian)
+            computer = config.vehicle.computer
+            got = str(claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory))
+            recorder.client.metadata("realtime", {"got": got})
+            ipc.send(channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got})
+            try:
+                outcome = await flight.run()
+            except Exception:  # whatever broke in here, the vehicle may be in the air
+                with contextlib.suppress(
+                    OSError, ValueError
+                ):  # a full disk under flight.log costs the words, not the landing
+                    traceback.print_exc()
+                    sys.stderr.flush()
+                if guardian is not None and guardian.would_take_over:
+                    os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
+                outcome = await hand_over(edges.autopilot, channel, clock, guardian)
+            if guardian is not None and outcome is not Outcome.LOST:
+                guardian.goodbye(edges.autopilot.status())
+        finally:
+            report = await asyncio.to_thread(recorder.finish)
+        recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}
+        ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": recorded})
+    return outcome
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the flight process."""
+    parser = argparse.ArgumentParser(prog="companion.flight.main")
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--channel", type=int, required=True, help="socket to the launcher")
+    parser.add_argument("--guardian", type=int, required=True, help="socket to the guardian")
+    parser.add_argument("--sitl", action="store_true", help="the devices are those of the simulated world")
+    arguments = parser.parse_args(argv)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the launcher's: it asks for a landing
+    config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
+    channel = socket.socket(fileno=arguments.channel)
+    channel.setblocking(False)
+    try:
+        guardian = socket.socket(fileno=arguments.guardian)
+        outcome = run(fly(config, arguments.out, channel, guardian, sitl=arguments.sitl))
+    except DeviceError as error:
+        ipc.send(channel, {"type": "refused", "lines": str(error).splitlines(), "device_failed": True})
+        return EXIT_REFUSED
+    except Refused as refused:
+        ipc.send(channel, {"type": "refused", "lines": refused.lines})
+        return EXIT_REFUSED
+    except GivenUp:
+        outcome = Outcome.ABORTED
+        ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
+    return EXIT_CODES[outcome]
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    os._exit(code)  # MAVSDK's C++ threads may outlive the interpreter's teardown

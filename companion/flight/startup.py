@@ -1,0 +1,104 @@
+"""What the flight process does between open devices and the first tick: preflight, and what PX4 must be asked."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.config.loader import FlightConfig
+from companion.io.devices import Edges
+from companion.io.protocols import DeviceError
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.mission.plan import Plan
+from companion.model.observations import Observations
+from companion.model.rows import Row, refusals
+from companion.model.types import Vec3
+from companion.preflight import run as preflight
+from companion.recorder.client import RecorderClient
+from companion.runtime import ipc
+from companion.runtime.clock import Clock
+
+PATH_POINTS_MAX = 300
+_HOVER_PARAM = "MPC_THR_HOVER"
+
+
+class Refused(Exception):
+    """The preflight refuses; `lines` say why, one each."""
+
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__("; ".join(lines))
+        self.lines = lines
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What is known of the flight once it may begin."""
+
+    plan: Plan
+    """From where the mission says that the vehicle stands."""
+    rows: tuple[Row, ...]
+
+    def tell(self, recorder: RecorderClient) -> None:
+        """Planned path and preflight, for log and ground stations."""
+        path = [[round(value, 4) for value in point] for point in path_of(self.plan)]
+        recorder.metadata("plan", {"json": json.dumps(path), "mission_s": repr(self.plan.duration_s)})
+        rows = [{"id": row.id, "level": "ok" if row.ok else row.level.value, "text": row.line()} for row in self.rows]
+        recorder.metadata("preflight", {"json": json.dumps(rows)})
+
+
+def path_of(plan: Plan) -> list[Vec3]:
+    """Planned positions in the world, m, evenly in time from the first to the last moment; at most `PATH_POINTS_MAX`."""
+    steps = PATH_POINTS_MAX - 1
+    return [plan.reference(plan.duration_s * step / steps).position_world_m for step in range(PATH_POINTS_MAX)]
+
+
+async def check_before_flight(
+    edges: Edges, config: FlightConfig, clock: Clock, out: Path, channel: socket.socket, sitl: bool
+) -> Checked:
+    """The preflight, told to the launcher and written to `preflight.json`.
+
+    Raises:
+        DeviceError: `preflight.json` cannot be written.
+        Refused: a row refuses.
+    """
+
+    def tell(text: str, share: float) -> None:
+        ipc.send(channel, {"type": "preflight_progress", "text": text, "share": share})
+
+    # A path takes seconds to plan, once in a process: here, where motion capture goes on flowing meanwhile.
+    plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
+    known = Observations(0.0, 0.0, mission_s=plan.duration_s)
+    rows = await preflight.preflight(edges, config, clock, out=out, tell=tell, known=known, sitl=sitl)
+    ipc.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
+    try:
+        preflight.write(rows, out)
+    except OSError as error:
+        raise DeviceError(
+            f"{out / preflight.FILE}: cannot be written: {error.strerror}; choose another --out"
+        ) from None
+    if refused := refusals(rows):
+        raise Refused([row.line() for row in refused])
+    return Checked(plan, tuple(rows))
+
+
+async def with_hover_thrust(config: FlightConfig, autopilot: MavsdkAutopilot) -> FlightConfig:
+    """The effective configuration: hover thrust from PX4 unless the vehicle file gives it.
+
+    Raises:
+        DeviceError: the parameter cannot be read or makes no sense.
+    """
+    airframe = config.vehicle.airframe
+    if airframe.hover_thrust is not None:
+        return config
+    value = float(await autopilot.read_param(_HOVER_PARAM))
+    if not 0.1 <= value <= 0.8:
+        raise DeviceError(
+            f"autopilot: {_HOVER_PARAM} = {value:.3f} is no hover thrust of this machine, expected 0.1 to 0.8;"
+            f" set it in PX4 or give airframe.hover_thrust"
+        )
+    airframe = airframe.model_copy(update={"hover_thrust": value})
+    vehicle = config.vehicle.model_copy(update={"airframe": airframe})
+    return config.model_copy(update={"vehicle": vehicle})

@@ -1,0 +1,112 @@
+"""Ticks of the control loop: absolute deadlines that lean on the frames of motion capture."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+
+from companion.runtime.clock import Clock
+
+EARLY_S, LATE_S = 0.0015, 0.001
+"""A frame that comes so much before or after the moment that it was expected at starts the tick; without one the tick starts then."""
+MATCH = 0.02
+"""Frames are ridden on if their rate differs by no more than this share from that of the ticks."""
+_GAIN, _SLEW_S = 0.1, 0.00025
+"""Share of a frame's error by which the next tick is moved, and the most of it."""
+_PATIENCE = 3.0
+"""Periods without a frame in its place after which nothing is waited for."""
+
+
+@dataclass(frozen=True, slots=True)
+class TickTime:
+    """When a tick began."""
+
+    start_s: float
+    lateness_s: float
+    """Behind the frame that started it, or else behind its deadline."""
+
+
+class Ticker:
+    """Absolute deadlines: an error of one tick does not move the next. Deadlines that are past are skipped, not made up for.
+
+    Told of frames that come as often as it ticks, it moves its deadlines onto them, by at most `_SLEW_S` a tick, and each tick begins
+    when its frame arrives. A frame that does not come within `LATE_S` is not waited for, one that comes out of its place starts
+    nothing: whatever arrives, ticks are between about half and one and a half periods apart.
+
+    Args:
+        period_s: between ticks.
+        clock: the flight clock.
+        frame_rate_hz: of motion capture; 0, or too far from the ticks': frames are not looked at.
+    """
+
+    def __init__(self, period_s: float, clock: Clock, frame_rate_hz: float = 0.0) -> None:
+        self._period_s = period_s
+        self._clock = clock
+        self._rides = abs(frame_rate_hz * period_s - 1.0) <= MATCH
+        self._due_s = clock() + period_s
+        self._frame_s: float | None = None
+        """Newest since the last tick."""
+        self._in_place_s = -math.inf
+        """Arrival of the last frame that came about when one was expected."""
+        self._waiter: asyncio.Future[None] | None = None
+        self.skipped = 0
+
+    def frame(self, arrived_s: float) -> None:
+        """A frame of motion capture has arrived; to be called from the event loop."""
+        if not self._rides:
+            return
+        self._frame_s = arrived_s
+        if self._waiter is not None and not self._waiter.done() and self._in_place(arrived_s):
+            self._waiter.set_result(None)
+
+    @property
+    def due_s(self) -> float:
+        """When the next tick is expected to begin."""
+        return self._due_s
+
+    async def next(self) -> TickTime:
+        """Wait for the next frame or deadline."""
+        self._skip()
+        if self._frame_s is None or not self._in_place(self._frame_s):  # else the loop has just served its sockets
+            await self._frame_or_deadline()
+        start_s, frame_s = self._clock(), self._frame_s
+        behind_s = start_s - self._due_s
+        if frame_s is not None:
+            if self._in_place(frame_s):
+                behind_s = start_s - frame_s
+            # Of the due moment next to it: the frame may have come just after a tick that did not wait for it.
+            error_s = math.remainder(frame_s - self._due_s, self._period_s)
+            if -EARLY_S <= error_s <= LATE_S:
+                self._in_place_s = frame_s
+            self._due_s += max(-_SLEW_S, min(_SLEW_S, _GAIN * error_s))
+            self._frame_s = None
+        self._due_s += self._period_s
+        return TickTime(start_s, max(0.0, behind_s))
+
+    def _in_place(self, frame_s: float) -> bool:
+        return -EARLY_S <= frame_s - self._due_s <= LATE_S
+
+    def _skip(self) -> None:
+        late_periods = int((self._clock() - self._due_s) / self._period_s)
+        if late_periods > 0:
+            self.skipped += late_periods
+            self._due_s += late_periods * self._period_s
+
+    async def _frame_or_deadline(self) -> None:
+        now_s = self._clock()
+        waits = self._due_s - self._in_place_s < _PATIENCE * self._period_s
+        deadline_s = self._due_s + LATE_S if waits else self._due_s
+        loop = asyncio.get_running_loop()
+        waiter = self._waiter = loop.create_future()
+        timer = loop.call_later(max(0.0, deadline_s - now_s), _wake, waiter)
+        try:
+            await waiter
+        finally:
+            timer.cancel()
+            self._waiter = None
+
+
+def _wake(waiter: asyncio.Future[None]) -> None:
+    if not waiter.done():
+        waiter.set_result(None)

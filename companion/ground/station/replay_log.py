@@ -1,0 +1,104 @@
+"""A flight's log as the page plays it: the same records that the vehicle would have sent, 20 a second."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from companion.analysis.log import FlightLog, LogError, writer
+from companion.config.ground import topic_name
+from companion.config.loader import FlightConfig
+from companion.ground.messages import VERSION, Preflight, PreflightRow, Presence, State
+from companion.ground.scene import PATH_POINTS_MAX, scene_of
+from companion.ground.snapshot import replay
+from companion.ground.station.replayed import Replayed
+from companion.model.codec import json_text, to_jsonable
+from companion.model.types import Vec3
+
+STREAMS_MAX = 12_000
+"""Ten minutes at 20 Hz; longer logs are shown at a lower rate."""
+TICKS_MAX = 60_000
+_GZIP_LEVEL = 5
+
+
+def read_for_page(path: Path, number: int) -> Replayed:
+    """Read a log and make of it what the page plays.
+
+    Args:
+        path: the log.
+        number: of this log among those of the page.
+
+    Raises:
+        LogError: one line: not there, damaged, no flight's, of another version.
+    """
+    log = FlightLog.read(path, ticks_max=TICKS_MAX)
+    if not log.inputs:
+        raise LogError(f"{path}: holds no ticks")
+    if log.config_json is None:
+        raise LogError(
+            f"{path}: holds no configuration (metadata record 'config'); there is no room to draw the flight in"
+        )
+    try:
+        config = FlightConfig.model_validate_json(log.config_json)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise LogError(
+            f"{path}: its configuration does not fit this version ({where}: {first['msg']}); it was written by {writer(log.metadata)}"
+        ) from None
+    session = f"log-{number}"
+    streams, events = replay(log.rows(), config, session, _epoch_offset_s(log), max_records=STREAMS_MAX)
+    parts = {
+        "state": to_jsonable(_state(log, config, session)),
+        "scene": to_jsonable(scene_of(config, session, _reference_path(log), mission_s=log.outputs[-1].mission_t_s)),
+        "preflight": to_jsonable(Preflight(VERSION, session, _preflight(log))),
+        "events": to_jsonable(events),
+    }
+    texts = [f'"{name}":{json_text(part)}' for name, part in parts.items()]
+    texts.append(f'"streams":[{",".join(json_text(to_jsonable(stream)) for stream in streams)}]')
+    body = gzip.compress(f"{{{','.join(texts)}}}".encode(), _GZIP_LEVEL, mtime=0)
+    return Replayed(str(path), body)
+
+
+def _epoch_offset_s(log: FlightLog) -> float:
+    try:
+        return int(log.metadata["companion"]["epoch_offset_ns"]) / 1e9
+    except (KeyError, ValueError):
+        return 0.0  # wall time is for people only, and nothing else hangs on it
+
+
+def _reference_path(log: FlightLog) -> list[Vec3]:
+    """Where the vehicle was to be, evenly in time; what a scene takes at most of it."""
+    path = [outputs.reference.position_world_m for outputs in log.outputs if outputs.reference is not None]
+    return path[:: max(1, len(path) // PATH_POINTS_MAX)]
+
+
+def _preflight(log: FlightLog) -> tuple[PreflightRow, ...]:
+    """Empty for logs without one."""
+    try:
+        rows = json.loads(log.metadata.get("preflight", {}).get("json", "[]"))
+        return tuple(PreflightRow(str(row["id"]), str(row["level"]), str(row["text"])) for row in rows)
+    except (ValueError, KeyError, TypeError):
+        return ()
+
+
+def _state(log: FlightLog, config: FlightConfig, session: str) -> State:
+    flight = log.metadata.get("flight", {})
+    outcome = log.outputs[-1].outcome
+    return State(
+        v=VERSION,
+        vehicle=topic_name(config.vehicle.ground.topic, config.vehicle.name),
+        session=session,
+        presence=Presence.ENDED,
+        simulated=flight.get("simulated") == "true",
+        mission=config.mission.name,
+        law=config.controller.law,
+        preset=config.controller.preset,
+        wall_s=_epoch_offset_s(log) + log.inputs[-1].t_s,
+        commands=False,
+        outcome=None if outcome is None else outcome.value,
+        text=f"{log.path}, {writer(log.metadata)}" + ("" if log.closed else "; the log was not closed"),
+    )

@@ -1,0 +1,334 @@
+"""The arm edge: one thread owns the servo bus, the event loop only hands over and takes back."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Self, TypeVar
+
+from companion.config.vehicle import Arm, ArmDevice
+from companion.io.dynamixel.bus import ArmBus, Pair
+from companion.io.dynamixel.registers import WATCHDOG_ERROR, WATCHDOG_TRIPPED, Block, JointScale
+from companion.io.protocols import DeviceError
+from companion.model.observations import ServoReport
+from companion.model.types import ArmState, Vec2
+from companion.runtime.clock import Clock
+
+_OPEN_TIMEOUT_S = 8.0
+_CLOSE_TIMEOUT_S = 2.0
+_KEEPALIVES_PER_WATCHDOG = 3.0
+_FIRST_READ_S = 0.002
+_SMOOTHING, _DEVIATIONS = 0.05, 2.0
+"""Of the time that a read takes: as TCP does with round trips (RFC 6298), somewhat slower."""
+
+_T = TypeVar("_T")
+
+_WRITE = object()
+_STOP = object()
+_NOW = object()
+"""The read that was to begin later is wanted at once."""
+
+
+@dataclass(slots=True)
+class _Read:
+    """One read; the bus thread tells by assignment how far it is, and wakes the event loop only for somebody who waits."""
+
+    at_s: float
+    begun: bool = False
+    done: bool = False
+    waiter: asyncio.Future[None] | None = None
+
+
+class DynamixelArm:
+    """Two XM430-W210-T in current mode behind the `Arm` protocol.
+
+    While nobody asks for a read the thread reads on its own, often enough that the servos' bus watchdogs stay quiet; a torque that
+    is not renewed within `device.watchdog_ms` is taken back to 0. The watchdogs themselves are for the case that the whole
+    process stops. One that tripped is restarted, and shown once as `WATCHDOG_ERROR` in `ArmState.hardware_error`; a servo with a
+    hardware error of its own is left alone.
+
+    Args:
+        device: port, baud rate, watchdog.
+        arm: joints and torque constant.
+        clock: the flight clock; stamps come from it.
+    """
+
+    def __init__(self, device: ArmDevice, arm: Arm, clock: Clock) -> None:
+        self._device = device
+        self._arm = arm
+        self._clock = clock
+        self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
+        """`_Read`, or one of the marks above."""
+        self._goals: deque[Pair] = deque(maxlen=1)
+        self._goal_handed_s = 0.0
+        self._state: ArmState | None = None
+        self._failures = 0
+        self._written_s: float | None = None
+        self._problem = ""
+        self._scales: tuple[JointScale, JointScale] | None = None
+        self._servos: tuple[ServoReport, ...] = ()
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._finished: asyncio.Future[None] | None = None
+        self._reading: _Read | None = None
+        self._read_s, self._read_deviation_s = _FIRST_READ_S, 0.0
+        self._stop = threading.Event()
+
+    # --- event loop --------------------------------------------------------------------------------------------------
+
+    async def __aenter__(self) -> Self:
+        if self._thread is not None:
+            raise RuntimeError("an arm edge is entered once")
+        self._loop = asyncio.get_running_loop()
+        opened: asyncio.Future[DeviceError | None] = self._loop.create_future()
+        self._finished = self._loop.create_future()
+        self._thread = threading.Thread(target=self._run, args=(opened,), name="arm-bus", daemon=True)
+        self._thread.start()
+        try:
+            await asyncio.wait((opened,), timeout=_OPEN_TIMEOUT_S + 1.0)
+        except BaseException:
+            await self._shut_down()
+            raise
+        failure = (
+            opened.result()
+            if opened.done()
+            else DeviceError(f"arm bus {self._device.port}: the port did not open within {_OPEN_TIMEOUT_S:g} s")
+        )
+        if failure is not None:
+            await self._shut_down()
+            raise failure
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._shut_down()
+
+    def latest(self) -> ArmState | None:
+        """Newest joint state."""
+        return self._state
+
+    @property
+    def servos(self) -> tuple[ServoReport, ...]:
+        """Both servos as they were when the edge had been opened."""
+        return self._servos
+
+    @property
+    def problem(self) -> str:
+        """What the port itself said when it last failed; empty while it has not."""
+        return self._problem
+
+    @property
+    def read_takes_s(self) -> float:
+        """Time within which most reads are done."""
+        return self._read_s + _DEVIATIONS * self._read_deviation_s
+
+    def begin_read(self, at_s: float = 0.0) -> None:
+        """Have the bus thread read, without waiting for it; nothing new is begun while an earlier read is under way.
+
+        Args:
+            at_s: when, flight clock; what is past is now.
+        """
+        if self._reading is None or self._reading.done:
+            self._reading = _Read(at_s)
+            self._jobs.put(self._reading)
+
+    async def read(self, timeout_s: float) -> ArmState | None:
+        """Wait for the read that was begun, or for one that is begun now; the newest state, whose `read_failures` counts the misses up
+        to now.
+
+        A read that takes longer than `timeout_s` goes on in the bus thread and the next call waits for that one.
+        """
+        if self._reading is None:
+            self.begin_read()
+        reading = self._reading
+        assert reading is not None
+        if not reading.done:
+            if not reading.begun:
+                self._jobs.put(_NOW)
+            assert self._loop is not None, "the arm edge is not entered"
+            waiter = reading.waiter = self._loop.create_future()
+            if not reading.done:  # else the thread may have looked for a waiter before there was one
+                await asyncio.wait((waiter,), timeout=timeout_s)
+            if not reading.done:
+                return self._state
+        self._reading = None
+        return self._state
+
+    def write_torque(self, torque_nm: Vec2) -> Vec2:
+        """Hand one command to the bus thread.
+
+        Args:
+            torque_nm: joint torques, paper's signs.
+
+        Returns:
+            What will be sent, after rounding to current counts and clipping, N m.
+
+        Raises:
+            ValueError: a torque is not finite.
+        """
+        assert self._scales is not None, "the arm edge is not entered"
+        first, second = self._scales
+        counts = (first.current_counts(torque_nm[0]), second.current_counts(torque_nm[1]))
+        self._goal_handed_s = time.monotonic()
+        self._goals.append(counts)
+        self._jobs.put(_WRITE)
+        return (first.torque_nm(counts[0]), second.torque_nm(counts[1]))
+
+    async def _shut_down(self) -> None:
+        self._stop.set()
+        self._jobs.put(_STOP)
+        if self._thread is None or self._finished is None:
+            return
+        await asyncio.wait((self._finished,), timeout=_CLOSE_TIMEOUT_S)
+        if self._finished.done():
+            self._thread.join(_CLOSE_TIMEOUT_S)  # has nothing left to do but end
+
+    # --- bus thread --------------------------------------------------------------------------------------------------
+
+    def _run(self, opened: asyncio.Future[DeviceError | None]) -> None:
+        bus = ArmBus(self._device, self._arm, self._stop.is_set)
+        try:
+            failure = self._open(bus)
+            self._post(functools.partial(_resolve, opened, failure))
+            if failure is None:
+                self._serve(bus)
+        finally:
+            bus.close()
+            finished = self._finished
+            assert finished is not None
+            self._post(functools.partial(_resolve, finished, None))
+
+    def _open(self, bus: ArmBus) -> DeviceError | None:
+        try:
+            self._scales = bus.open(_OPEN_TIMEOUT_S)
+            self._servos = bus.reports
+            self._read_once(bus)
+        except DeviceError as error:
+            return error
+        except Exception as error:  # an unplugged port raises whatever its driver likes; preflight wants one line of it
+            return DeviceError(f"arm bus {self._device.port}: failed while being set up: {_describe(error)}")
+        if self._state is None:
+            return DeviceError(
+                f"arm bus {self._device.port}: the servos fell silent right after set-up; check the cables"
+            )
+        return None
+
+    def _serve(self, bus: ArmBus) -> None:
+        watchdog_s = self._device.watchdog_ms * 1e-3
+        sent: Pair = (0, 0)
+        later: _Read | None = None
+        while True:
+            wait_s = watchdog_s / _KEEPALIVES_PER_WATCHDOG
+            if later is not None:
+                wait_s = min(wait_s, later.at_s - self._clock())
+            try:
+                job = self._jobs.get(timeout=max(0.0, wait_s))
+            except queue.Empty:
+                job = None
+            if job is _STOP:
+                return
+            if job is _WRITE:
+                sent = self._write_newest(bus, sent)
+                continue
+            if isinstance(job, _Read):
+                later = job
+                if job.at_s > self._clock():
+                    continue
+            elif job is _NOW and later is None:
+                continue  # it has begun meanwhile
+            reading = later
+            if job is None and later is not None and later.at_s > self._clock():
+                reading = None  # far off: meanwhile the watchdogs are kept quiet, and an old torque is taken back
+            if reading is not None:
+                later = None
+                reading.begun = True
+            tripped = self._read_once(bus)
+            if reading is not None:
+                reading.done = True
+                if reading.waiter is not None:
+                    self._post(functools.partial(_resolve, reading.waiter, None))
+            if tripped:
+                sent = (0, 0)
+                self._try(bus.restart_watchdogs)
+            elif self._goal_handed_s > 0.0 and time.monotonic() - self._goal_handed_s > watchdog_s:
+                # Again and again: nobody answers a sync write, and our reads keep the servos' watchdogs content.
+                sent = (0, 0)
+                self._try(lambda: bus.write_currents((0, 0)))
+
+    def _write_newest(self, bus: ArmBus, sent: Pair) -> Pair:
+        try:
+            goal = self._goals.pop()
+        except IndexError:
+            return sent  # an earlier turn took the newest already
+        self._try(lambda: bus.write_currents(goal))
+        self._written_s = self._clock()
+        return goal
+
+    def _read_once(self, bus: ArmBus) -> bool:
+        """Read, publish the state; True if a bus watchdog had tripped."""
+        asked_s = self._clock()
+        try:
+            pair = bus.read()
+        except Exception as error:  # as in `_try`
+            self._problem = _describe(error)
+            pair = None
+        if pair is None:
+            self._failures += 1
+            if self._state is not None:
+                self._state = replace(self._state, read_failures=self._failures)
+            return False
+        self._failures = 0
+        self._state = state = self._to_state(pair, asked_s)
+        off_s = state.stamp_s - asked_s - self._read_s
+        self._read_s += _SMOOTHING * off_s
+        self._read_deviation_s += _SMOOTHING * (abs(off_s) - self._read_deviation_s)
+        return WATCHDOG_TRIPPED in (pair[0].bus_watchdog, pair[1].bus_watchdog)
+
+    def _to_state(self, blocks: tuple[Block, Block], asked_s: float) -> ArmState:
+        assert self._scales is not None
+        (a, b), (first, second) = blocks, self._scales
+        return ArmState(
+            stamp_s=self._clock(),
+            angle_rad=(first.angle_rad(a.position_count), second.angle_rad(b.position_count)),
+            velocity_rad_s=(first.velocity_rad_s(a.velocity_count), second.velocity_rad_s(b.velocity_count)),
+            torque_nm=(first.torque_nm(a.current_count), second.torque_nm(b.current_count)),
+            hardware_error=(_errors(a), _errors(b)),
+            temperature_c=(float(a.temperature_c), float(b.temperature_c)),
+            read_failures=0,
+            written_s=self._written_s,
+            asked_s=asked_s,
+        )
+
+    def _try(self, transaction: Callable[[], None]) -> None:
+        # A port that dies raises whatever its driver likes; the thread must outlive it to let go of the arm in the end.
+        try:
+            transaction()
+        except Exception as error:
+            self._problem = _describe(error)
+
+    def _post(self, callback: Callable[[], None]) -> None:
+        assert self._loop is not None
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            self._loop.call_soon_threadsafe(callback)
+
+
+def _errors(block: Block) -> int:
+    return block.hardware_error | (WATCHDOG_ERROR if block.bus_watchdog == WATCHDOG_TRIPPED else 0)
+
+
+def _describe(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _resolve(future: asyncio.Future[_T], result: _T) -> None:
+    if not future.done():
+        future.set_result(result)

@@ -1,0 +1,299 @@
+"""The conversation with the arm's two servos, blocking: check and set up, one read and one write per cycle, let go.
+
+Everything here runs in the one thread that owns the bus. The real dynamixel-sdk speaks on the wire.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+
+from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+
+from companion.config.vehicle import Arm, ArmDevice, Joint
+from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.registers import Block, JointScale, Register
+from companion.io.protocols import DeviceError
+from companion.model.observations import ServoReport
+
+_FLIGHT_REPLY_TIMEOUT_MS = 8.0
+"""In flight: an absent servo costs no more than this."""
+_USB_LATENCY_MAX_MS = 4
+_ERROR_NUMBER = 0x7F
+
+Pair = tuple[int, int]
+
+
+class ArmBus:
+    """Two servos on one port. Not thread-safe.
+
+    Args:
+        device: port, baud rate, watchdog.
+        arm: joints and torque constant.
+        aborted: asked between steps of `open`; True gives up.
+    """
+
+    def __init__(self, device: ArmDevice, arm: Arm, aborted: Callable[[], bool] = lambda: False) -> None:
+        self._device = device
+        self._joints = arm.joints
+        self._torque_per_amp_nm_a = arm.torque_per_amp_nm_a
+        self._aborted = aborted
+        self._ids = [joint.servo_id for joint in arm.joints]
+        self._protocol = PacketHandler(2.0)
+        self._port = dxl.ServoPort(device.port)
+        self._deadline_s = 0.0
+        self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
+        self._touched = False
+        self.reports: tuple[ServoReport, ...] = ()
+        """Identity and settings of both servos as `open` left them, read back."""
+
+    def open(self, timeout_s: float) -> tuple[JointScale, JointScale]:
+        """Open the port, check both servos, set them up and switch torque on with goal current 0.
+
+        Raises:
+            DeviceError: anything is not as it must be; one line.
+        """
+        self._deadline_s = time.monotonic() + timeout_s
+        self._open_port()
+        for joint in self._joints:
+            self._check_identity(joint)
+        self._touched = True
+        scales = tuple(self._set_up(joint) for joint in self._joints)
+        blocks = self.read()
+        if blocks is None:
+            raise self._error(
+                "servos", self._ids, "answered one by one, but not to a sync read; look for a loose cable"
+            )
+        scales = tuple(
+            self._within_walls(joint, scale, block)
+            for joint, scale, block in zip(self._joints, scales, blocks, strict=True)
+        )
+        for joint in self._joints:
+            self._verify_ready(joint)
+        self.reports = tuple(self._report(joint) for joint in self._joints)
+        for joint in self._joints:
+            self._write(joint, dxl.TORQUE_ENABLE, 1)
+        self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
+        return scales[0], scales[1]
+
+    def read(self) -> tuple[Block, Block] | None:
+        """One sync read; None if not both servos answered in time, set up as `open` left them.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        port, protocol, ids = self._port, self._protocol, self._ids
+        port.is_using = False  # an exception in an earlier transaction leaves it set
+        if protocol.syncReadTx(port, dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids, len(ids), False) != COMM_SUCCESS:
+            return None
+        blocks: list[Block] = []
+        for servo_id in ids:
+            data, result, error = protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
+            if result != COMM_SUCCESS or error & _ERROR_NUMBER or len(data) != dxl.BLOCK_SIZE:
+                return None
+            block = Block.from_bytes(bytes(data))
+            if block.bus_watchdog not in (self._watchdog, dxl.WATCHDOG_TRIPPED):
+                return None  # restarted by itself (a loose supply): its indirect addresses are gone, the block means nothing
+            blocks.append(block)
+        return blocks[0], blocks[1]
+
+    def write_currents(self, counts: Pair) -> None:
+        """One sync write of the goal currents; the protocol has no answer to it.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        self._port.is_using = False
+        parameters: list[int] = []
+        for servo_id, count in zip(self._ids, counts, strict=True):
+            parameters += (servo_id, count & 0xFF, count >> 8 & 0xFF)
+        self._protocol.syncWriteTxOnly(
+            self._port, dxl.GOAL_CURRENT.address, dxl.GOAL_CURRENT.size, parameters, len(parameters)
+        )
+
+    def restart_watchdogs(self) -> None:
+        """Clear tripped bus watchdogs and start them again, with goal current 0. Nothing is reported: the next read tells.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        for servo_id in self._ids:
+            self._try_write(servo_id, dxl.BUS_WATCHDOG, 0)
+        self.write_currents((0, 0))
+        for servo_id in self._ids:
+            self._try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
+
+    def close(self) -> None:
+        """Goal current 0, torque off, watchdog off, port closed; as much of it as the bus still allows. Never raises."""
+        self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
+        try:
+            if self._touched and self._port.is_open:
+                self.write_currents((0, 0))
+                for register in (dxl.TORQUE_ENABLE, dxl.BUS_WATCHDOG):
+                    for servo_id in self._ids:
+                        self._try_write(servo_id, register, 0)
+        except Exception:  # a dead port raises whatever its driver likes; what counts is that it gets closed
+            pass
+        finally:
+            with contextlib.suppress(OSError):
+                self._port.closePort()
+
+    # --- opening, step by step ---------------------------------------------------------------------------------------
+
+    def _open_port(self) -> None:
+        self._port.baudrate = self._device.baud
+        if not self._port.openPort():
+            raise self._error("port", None, f"dynamixel-sdk does not know baud rate {self._device.baud}")
+        # There is no such thing on a pty or a native UART; what counts is what the kernel says next.
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+            self._port.ser.set_low_latency_mode(True)
+        latency_ms = dxl.usb_latency_ms(self._device.port)
+        if latency_ms is not None and latency_ms > _USB_LATENCY_MAX_MS:
+            raise self._error(
+                "USB adapter",
+                None,
+                f"latency timer is {latency_ms} ms, expected at most {_USB_LATENCY_MAX_MS}; write 1 to "
+                f"/sys/bus/usb-serial/devices/{self._device.port.rsplit('/', 1)[-1]}/latency_timer (a udev rule keeps it)",
+            )
+
+    def _check_identity(self, joint: Joint) -> None:
+        self._check_time()
+        self._port.is_using = False
+        model, result, _ = self._protocol.ping(self._port, joint.servo_id)
+        if result != COMM_SUCCESS:
+            answered, _ = self._protocol.broadcastPing(self._port)
+            others = (
+                f"ids that answer: {', '.join(map(str, sorted(answered)))}" if answered else "no servo answers at all"
+            )
+            raise self._error(
+                "servo",
+                joint.servo_id,
+                f"does not answer at {self._device.baud} baud; {others}; check its power, cable, id and baud rate",
+            )
+        if model != dxl.MODEL_NUMBER_XM430_W210:
+            raise self._error(
+                "servo",
+                joint.servo_id,
+                f"has model number {model}, expected {dxl.MODEL_NUMBER_XM430_W210} (XM430-W210)",
+            )
+        # A servo told to answer nothing but pings would look dead; what this write itself answers does not matter.
+        self._try_write(joint.servo_id, dxl.STATUS_RETURN_LEVEL, 2)
+        errors = self._read(joint, dxl.HARDWARE_ERROR)
+        if errors:
+            raise self._error(
+                "servo",
+                joint.servo_id,
+                f"reports a hardware error: {dxl.hardware_error_text(errors)} ({dxl.HARDWARE_ERROR} = {errors}); "
+                "remove the cause, then reboot it or cycle its power",
+            )
+
+    def _set_up(self, joint: Joint) -> JointScale:
+        self._write(joint, dxl.TORQUE_ENABLE, 0)
+        self._write(joint, dxl.BUS_WATCHDOG, 0)
+        for register, value in ((dxl.RETURN_DELAY, 0), (dxl.OPERATING_MODE, dxl.MODE_CURRENT)):
+            if self._read(joint, register) != value:  # EEPROM wears
+                self._write(joint, register, value)
+        try:
+            scale = dxl.joint_scale(joint, self._torque_per_amp_nm_a, self._read(joint, dxl.CURRENT_LIMIT))
+        except ValueError as error:
+            raise self._error("servo", joint.servo_id, str(error)) from error
+        pointers = [byte for address in dxl.BLOCK_ADDRESSES for byte in (address & 0xFF, address >> 8)]
+        self._write_bytes(joint, Register(dxl.INDIRECT_ADDRESS_1, len(pointers), "indirect addresses"), pointers)
+        self._write(joint, dxl.GOAL_CURRENT, 0)
+        self._write(joint, dxl.BUS_WATCHDOG, self._watchdog)
+        return scale
+
+    def _within_walls(self, joint: Joint, scale: JointScale, block: Block) -> JointScale:
+        zero_count = joint.zero_count + dxl.turn_offset_counts(joint, block.position_count)
+        scale = JointScale(scale.sign, zero_count, scale.torque_nm_per_count, scale.current_max_counts)
+        angle_deg = scale.angle_rad(block.position_count) * 360.0 / (dxl.COUNTS_PER_TURN * dxl.RAD_PER_COUNT)
+        low_deg, high_deg = joint.angle_deg
+        if not low_deg <= angle_deg <= high_deg:
+            raise self._error(
+                "servo",
+                joint.servo_id,
+                f"stands at {angle_deg:.1f} deg ({dxl.PRESENT_POSITION} = {block.position_count}), outside its walls "
+                f"{low_deg:g} to {high_deg:g} deg; move the arm by hand or correct zero_count and sign",
+            )
+        return scale
+
+    def _verify_ready(self, joint: Joint) -> None:
+        expected = (
+            (dxl.TORQUE_ENABLE, 0),
+            (dxl.OPERATING_MODE, dxl.MODE_CURRENT),
+            (dxl.RETURN_DELAY, 0),
+            (dxl.GOAL_CURRENT, 0),
+            (dxl.BUS_WATCHDOG, self._watchdog),
+            (dxl.HARDWARE_ERROR, 0),
+        )
+        for register, value in expected:
+            found = self._read(joint, register)
+            if found != value:
+                raise self._error("servo", joint.servo_id, f"{register} reads {found} after set-up, expected {value}")
+
+    def _report(self, joint: Joint) -> ServoReport:
+        return ServoReport(
+            servo_id=joint.servo_id,
+            model=self._read(joint, dxl.MODEL),
+            firmware=self._read(joint, dxl.FIRMWARE),
+            operating_mode=self._read(joint, dxl.OPERATING_MODE),
+            return_delay_us=self._read(joint, dxl.RETURN_DELAY) * dxl.RETURN_DELAY_UNIT_US,
+            current_limit_counts=self._read(joint, dxl.CURRENT_LIMIT),
+            watchdog_ms=self._read(joint, dxl.BUS_WATCHDOG) * dxl.WATCHDOG_UNIT_MS,
+            voltage_v=round(self._read(joint, dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V, 1),
+        )
+
+    # --- registers ---------------------------------------------------------------------------------------------------
+
+    def _read(self, joint: Joint, register: Register) -> int:
+        data = self._read_bytes(joint, register)
+        return int.from_bytes(data, "little", signed=register.signed)
+
+    def _read_bytes(self, joint: Joint, register: Register) -> bytes:
+        self._check_time()
+        self._port.is_using = False
+        data, result, error = self._protocol.readTxRx(self._port, joint.servo_id, register.address, register.size)
+        self._check_answer(joint, f"reading {register}", result, error)
+        return bytes(data)
+
+    def _write(self, joint: Joint, register: Register, value: int) -> None:
+        self._write_bytes(joint, register, list(value.to_bytes(register.size, "little", signed=register.signed)))
+
+    def _write_bytes(self, joint: Joint, register: Register, data: list[int]) -> None:
+        """Write and read back."""
+        self._check_time()
+        self._port.is_using = False
+        result, error = self._protocol.writeTxRx(self._port, joint.servo_id, register.address, len(data), data)
+        self._check_answer(joint, f"writing {register}", result, error)
+        found = self._read_bytes(joint, register)
+        if found != bytes(data):
+            raise self._error(
+                "servo", joint.servo_id, f"{register} reads {found.hex()} after {bytes(data).hex()} was written"
+            )
+
+    def _try_write(self, servo_id: int, register: Register, value: int) -> None:
+        self._port.is_using = False
+        data = list(value.to_bytes(register.size, "little"))
+        self._protocol.writeTxRx(self._port, servo_id, register.address, register.size, data)
+
+    def _check_answer(self, joint: Joint, doing: str, result: int, error: int) -> None:
+        if result != COMM_SUCCESS:
+            text = self._protocol.getTxRxResult(result).removeprefix("[TxRxResult] ")
+            raise self._error("servo", joint.servo_id, f"{doing} failed: {text} Look for a loose cable.")
+        if error & _ERROR_NUMBER:
+            text = self._protocol.getRxPacketError(error & _ERROR_NUMBER).removeprefix("[RxPacketError] ")
+            raise self._error("servo", joint.servo_id, f"{doing} was refused: {text}")
+
+    def _check_time(self) -> None:
+        if self._aborted():
+            raise self._error("set-up", None, "given up")
+        if time.monotonic() > self._deadline_s:
+            raise self._error("set-up", None, "not finished in time: the servos answer too slowly; check the cables")
+
+    def _error(self, what: str, ids: int | list[int] | None, text: str) -> DeviceError:
+        if isinstance(ids, list):
+            what = f"{what} {' and '.join(map(str, ids))}"
+        elif ids is not None:
+            what = f"{what} {ids} (joint {self._ids.index(ids) + 1})"
+        return DeviceError(f"arm bus {self._device.port}: {what}: {text}")

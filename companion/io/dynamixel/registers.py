@@ -1,0 +1,276 @@
+"""XM430-W210-T: control table, units, and the SDK's serial port made fit for a control loop. No protocol logic: that is the SDK's.
+
+Source: ROBOTIS e-manual, XM430-W210 control table.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import serial
+from dynamixel_sdk import PortHandler
+from serial.tools import list_ports
+
+from companion.config.vehicle import Joint
+from companion.io.protocols import DeviceError
+
+MODEL_NUMBER_XM430_W210 = 1030
+MODE_CURRENT = 0
+WATCHDOG_UNIT_MS = 20
+RETURN_DELAY_UNIT_US = 2
+VOLTAGE_UNIT_V = 0.1
+WATCHDOG_TRIPPED = 0xFF
+"""Register 98 after the bus watchdog let go."""
+
+COUNTS_PER_TURN = 4096
+RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
+RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
+AMP_PER_COUNT = 2.69e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """One entry of the control table."""
+
+    address: int
+    size: int
+    name: str
+    signed: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.name} (register {self.address})"
+
+
+MODEL = Register(0, 2, "model number")
+FIRMWARE = Register(6, 1, "firmware version")
+RETURN_DELAY = Register(9, 1, "return delay time")
+OPERATING_MODE = Register(11, 1, "operating mode")
+CURRENT_LIMIT = Register(38, 2, "current limit")
+TORQUE_ENABLE = Register(64, 1, "torque enable")
+STATUS_RETURN_LEVEL = Register(68, 1, "status return level")
+HARDWARE_ERROR = Register(70, 1, "hardware error status")
+BUS_WATCHDOG = Register(98, 1, "bus watchdog")
+GOAL_CURRENT = Register(102, 2, "goal current", signed=True)
+PRESENT_CURRENT = Register(126, 2, "present current", signed=True)
+PRESENT_VELOCITY = Register(128, 4, "present velocity", signed=True)
+PRESENT_POSITION = Register(132, 4, "present position", signed=True)
+PRESENT_VOLTAGE = Register(144, 2, "present input voltage")
+PRESENT_TEMPERATURE = Register(146, 1, "present temperature")
+INDIRECT_ADDRESS_1 = 168
+INDIRECT_DATA_1 = 224
+
+# The one block that is read in every cycle. A small byte stands behind every signed value, so that FF FF FD never occurs in an
+# answer: once it has removed a stuffed byte, dynamixel-sdk 4.1.0 also removes one from a later FF FD FD, which is data.
+BLOCK = (PRESENT_POSITION, HARDWARE_ERROR, PRESENT_VELOCITY, PRESENT_TEMPERATURE, PRESENT_CURRENT, BUS_WATCHDOG)
+BLOCK_SIZE = sum(register.size for register in BLOCK)
+BLOCK_ADDRESSES = tuple(register.address + i for register in BLOCK for i in range(register.size))
+_BLOCK = struct.Struct("<iBiBhB")
+
+_POLL_MS = 1.0
+_NOISE_PATIENCE = 20.0
+_NOISE_BYTES = 4096
+"""More than all answers to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
+
+HARDWARE_ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
+WATCHDOG_ERROR = 0x80
+"""Set by the companion in `ArmState.hardware_error`, in a bit that register 70 does not use: the bus watchdog had let go."""
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One servo's answer to a cycle's read, in register units."""
+
+    position_count: int
+    hardware_error: int
+    velocity_count: int
+    temperature_c: int
+    current_count: int
+    bus_watchdog: int
+
+    @staticmethod
+    def from_bytes(data: bytes) -> Block:
+        """Decode `BLOCK_SIZE` bytes of indirect data."""
+        return Block(*_BLOCK.unpack(data))
+
+
+def hardware_error_text(error: int) -> str:
+    """Names of the bits of register 70 (and of `WATCHDOG_ERROR`), for people."""
+    names = [HARDWARE_ERROR_NAMES.get(bit, f"bit {bit}") for bit in range(7) if error >> bit & 1]
+    if error & WATCHDOG_ERROR:
+        names.append("bus watchdog")
+    return ", ".join(names) if names else "none"
+
+
+@dataclass(frozen=True, slots=True)
+class JointScale:
+    """Conversion between one servo's register units and the paper's joint angle."""
+
+    sign: int
+    zero_count: int
+    """Present position at joint angle 0, whole turns of the encoder included."""
+    torque_nm_per_count: float
+    current_max_counts: int
+
+    def angle_rad(self, position_count: int) -> float:
+        """Joint angle."""
+        return self.sign * (position_count - self.zero_count) * RAD_PER_COUNT
+
+    def velocity_rad_s(self, velocity_count: int) -> float:
+        """Joint velocity."""
+        return self.sign * velocity_count * RAD_S_PER_COUNT
+
+    def torque_nm(self, current_count: int) -> float:
+        """Joint torque of a current."""
+        return self.sign * current_count * self.torque_nm_per_count
+
+    def current_counts(self, torque_nm: float) -> int:
+        """Goal current for a joint torque, rounded and clipped.
+
+        Raises:
+            ValueError: torque is not finite.
+        """
+        if not math.isfinite(torque_nm):
+            raise ValueError(f"joint torque {torque_nm} is not a number that a servo could follow")
+        limit = self.current_max_counts
+        return max(-limit, min(limit, round(self.sign * torque_nm / self.torque_nm_per_count)))
+
+
+def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: int) -> JointScale:
+    """Scale of a joint whose servo has the given current limit (register 38).
+
+    Raises:
+        ValueError: the current limit is below what `torque_max_nm` needs.
+    """
+    torque_nm_per_count = torque_per_amp_nm_a * AMP_PER_COUNT
+    wanted = math.floor(joint.torque_max_nm / torque_nm_per_count + 1e-9)
+    if wanted > current_limit_counts:
+        raise ValueError(
+            f"{CURRENT_LIMIT} is {current_limit_counts}, which is {current_limit_counts * torque_nm_per_count:.2f} N m; "
+            f"torque_max_nm {joint.torque_max_nm:g} needs {wanted}: raise the register or lower torque_max_nm"
+        )
+    return JointScale(joint.sign, joint.zero_count, torque_nm_per_count, wanted)
+
+
+def turn_offset_counts(joint: Joint, position_count: int) -> int:
+    """Whole turns to add to `zero_count` so that the joint angle comes to lie within its walls.
+
+    The encoder knows the angle within one turn only; which turn it is, the servo forgets when it is switched off. A joint with
+    less than a turn between its walls is unambiguous all the same. 0 if no turn fits.
+    """
+    low_deg, high_deg = joint.angle_deg
+    if high_deg - low_deg >= 360.0:
+        return 0
+    angle_deg = joint.sign * (position_count - joint.zero_count) * 360.0 / COUNTS_PER_TURN
+    turns = math.ceil((low_deg - angle_deg) / 360.0)
+    if angle_deg + 360.0 * turns > high_deg:
+        return 0
+    return -joint.sign * turns * COUNTS_PER_TURN
+
+
+class ServoPort(PortHandler):  # type: ignore[misc]
+    """The SDK's port with a serial timeout (as it is, it busy-polls with the GIL held), a lock, and a packet timeout of its own.
+
+    An answer is overdue when the time is up and most of that time was really spent waiting at the port: a process that was not
+    scheduled for a while looks at the port again before it gives a servo up.
+    """
+
+    is_open: bool
+    _waited_ms = 0.0
+    _taken_bytes = 0
+    reply_timeout_ms = 100.0
+    """Longest wait for an answer, beside the time of its bytes."""
+
+    def setupPort(self, cflag_baud: int) -> bool:
+        """Open at `self.baudrate` (the SDK calls this).
+
+        Raises:
+            DeviceError: no such port, busy, not permitted, not a serial port.
+        """
+        if self.is_open:
+            self.closePort()
+        try:
+            # A write that cannot proceed means that nobody is there; it must not block the bus thread for ever. Not shorter:
+            # pyserial looks at the time after a write that succeeded, too, and the process may have been held up meanwhile.
+            self.ser = serial.Serial(
+                self.port_name,
+                cflag_baud,
+                timeout=_POLL_MS * 1e-3,
+                write_timeout=0.1,
+                exclusive=True,
+                bytesize=serial.EIGHTBITS,
+            )
+        except (OSError, ValueError) as error:
+            raise DeviceError(f"arm bus {self.port_name}: {_open_failure(self.port_name, error)}") from error
+        self.is_open = True
+        self.tx_time_per_byte = 10_000.0 / self.baudrate
+        return True
+
+    def closePort(self) -> None:
+        """Close; does nothing on a closed port."""
+        if self.is_open:
+            self.is_open = False
+            self.ser.close()
+
+    def getCurrentTime(self) -> float:
+        """Monotonic ms; the SDK's own follows the wall clock, which NTP may set."""
+        return time.monotonic() * 1e3
+
+    def setPacketTimeout(self, packet_length: int) -> None:
+        """Start to wait for `packet_length` bytes."""
+        self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + self.reply_timeout_ms)
+
+    def setPacketTimeoutMillis(self, msec: float) -> None:
+        """Start to wait for `msec`."""
+        self.packet_start_time = self.getCurrentTime()
+        self.packet_timeout = msec
+        self._waited_ms = 0.0
+        self._taken_bytes = 0
+
+    def readPort(self, length: int) -> bytes:
+        """Up to `length` bytes, after at most 1 ms.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        if self._taken_bytes > _NOISE_BYTES:
+            return b""  # the SDK looks at the time only when it lacks bytes: noise without end would keep it for ever
+        data: bytes = self.ser.read(length)
+        if data:
+            self._taken_bytes += len(data)
+        else:
+            self._waited_ms += _POLL_MS
+        return data
+
+    def isPacketTimeout(self) -> bool:
+        """The answer is overdue."""
+        elapsed_ms = self.getTimeSinceStart()
+        if elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > _NOISE_BYTES:
+            return True  # a line that never falls silent
+        return elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
+
+
+def _open_failure(port: str, error: Exception) -> str:
+    """Why a port did not open and what to do, in one line."""
+    number = getattr(error, "errno", None)
+    if number == errno.ENOENT or not Path(port).exists():
+        found = sorted(p.device for p in list_ports.comports())
+        there = f"serial ports here: {', '.join(found)}" if found else "this machine has no serial port at all"
+        return f"no such port; {there}; correct devices.arm.port or plug the U2D2 in"
+    if number in (errno.EACCES, errno.EPERM):
+        return "no permission to open it; add this user to the group that owns the port (usually dialout)"
+    if number in (errno.EBUSY, errno.EAGAIN):
+        return "port is busy; another program (a second companion, DYNAMIXEL Wizard) has it open: close that one"
+    return f"is not a usable serial port: {error}"
+
+
+def usb_latency_ms(port: str, sysfs: Path = Path("/sys/class/tty")) -> int | None:
+    """Latency timer of the FTDI chip behind a port, ms; None if the port has none (a pty, a native UART)."""
+    try:
+        return int((sysfs / Path(port).resolve().name / "device" / "latency_timer").read_text())
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,310 @@
+"""The force-torque edge: Robotous RFT60-HA01 on a serial port."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import math
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Final, Self
+
+import serial
+from serial.tools import list_ports
+
+from companion.config.vehicle import ForceDevice
+from companion.io.force_torque import rft
+from companion.io.force_torque.rft import Command, PacketScanner
+from companion.io.protocols import DeviceError
+from companion.model.types import ForceSample
+from companion.runtime.clock import Clock
+
+_LOG = logging.getLogger(__name__)
+
+_REPEAT_S: Final = 0.4
+_FIRST_SAMPLES: Final = 5
+_READ_BYTES: Final = 4096
+_MODEL: Final = "RFT60"
+
+
+@dataclass(frozen=True, slots=True)
+class ForceHealth:
+    """Counters since the port was opened."""
+
+    samples: int
+    skipped_bytes: int
+    """Bytes that belonged to no packet."""
+    bad_sums: int
+    lost: str | None
+    """Why the port is not read any more; None while it is."""
+
+
+class RobotousForceTorque:
+    """RFT60-HA01 in continuous output; implements `companion.io.protocols.ForceTorque`.
+
+    The port is read from the event loop: 200 packets/s of 19 bytes need no thread. Samples are as measured, in the sensor frame; bias
+    is removed by whoever uses them. When the sensor falls silent or the port vanishes `latest()` grows old; nothing is raised.
+
+    Args:
+        device: port, rate and the force beyond which a sample counts as overloaded.
+        clock: the flight clock.
+        answer_timeout_s: for each answer of the sensor, and for the first samples.
+    """
+
+    def __init__(self, device: ForceDevice, clock: Clock, *, answer_timeout_s: float = 2.0) -> None:
+        self._device = device
+        self._clock = clock
+        self._answer_timeout_s = answer_timeout_s
+        self._serial: serial.Serial | None = None
+        self._scanner = PacketScanner(rft.RESPONSE_BYTES)
+        self._answers: dict[int, asyncio.Future[bytes]] = {}
+        self._collectors: list[_Collector] = []
+        self._latest: ForceSample | None = None
+        self._samples = 0
+        self._received_bytes = 0
+        self._lost: str | None = None
+        self.product_name = ""
+        self.firmware = ""
+
+    def latest(self) -> ForceSample | None:
+        """Newest sample, as measured; never blocks."""
+        return self._latest
+
+    def health(self) -> ForceHealth:
+        """Counters, for logs and preflight."""
+        return ForceHealth(self._samples, self._scanner.skipped_bytes, self._scanner.bad_sums, self._lost)
+
+    async def tare_samples(self, duration_s: float) -> list[ForceSample]:
+        """The samples of the next `duration_s` (counted at the configured rate), for the caller to average.
+
+        Raises:
+            DeviceError: they did not come within twice the time and a second.
+        """
+        count = max(1, math.ceil(duration_s * self._device.rate_hz))
+        deadline_s = 2.0 * duration_s + 1.0
+        samples = await self._collect(count, deadline_s)
+        if len(samples) < count:
+            raise DeviceError(
+                f"{self._where}: {len(samples)} of {count} samples came within {deadline_s:g} s while taring; "
+                f"{self._lost or 'the sensor fell silent'}"
+            )
+        return samples
+
+    async def __aenter__(self) -> Self:
+        """Open the port, identify the sensor, set its rate, start continuous output, see the first samples.
+
+        Raises:
+            DeviceError: no such port, port in use, silent or other device, first samples missing.
+        """
+        self._serial = self._open()
+        try:
+            asyncio.get_running_loop().add_reader(self._serial.fileno(), self._on_readable)
+            self._send(Command.STOP)  # it may still stream from an earlier run, and then obeys nothing else
+            self.product_name = rft.decode_text(await self._ask(Command.PRODUCT_NAME, repeat_s=_REPEAT_S))
+            if _MODEL not in self.product_name:
+                raise DeviceError(
+                    f'{self._where}: a "{self.product_name}" answers, expected a {_MODEL}-HA01 (other models scale their readings '
+                    "differently); check devices.force.port"
+                )
+            self.firmware = rft.decode_text(await self._ask(Command.FIRMWARE_VERSION))
+            await self._set_rate()
+            self._send(Command.START)
+            await self._first_samples()
+        except BaseException:
+            self._shut()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop the output and close the port; never raises."""
+        self._shut()
+
+    # -- opening ---------------------------------------------------------------------------------------------------------------
+
+    @property
+    def _where(self) -> str:
+        return f"force sensor {self._device.port}"
+
+    def _open(self) -> serial.Serial:
+        try:
+            opened = serial.Serial(self._device.port, self._device.baud, timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise DeviceError(f"{self._where}: {self._why_not_open(error)}") from None
+        # USB adapters hold bytes back for up to 16 ms otherwise; ports that cannot do it (a pty) have no such delay.
+        with suppress(OSError, ValueError, NotImplementedError):
+            opened.set_low_latency_mode(True)
+        return opened
+
+    def _why_not_open(self, error: OSError | ValueError) -> str:
+        number = error.errno if isinstance(error, OSError) else None
+        if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+            found = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
+            return f"no such port; serial ports of this machine: {found}; plug the sensor in or set devices.force.port"
+        if number in (errno.EBUSY, errno.EAGAIN):
+            return "in use by another program; close it (lsof names it)"
+        if number in (errno.EACCES, errno.EPERM):
+            return "no permission; add your user to the group dialout and log in again"
+        return f"not usable as a serial port ({error}); set devices.force.port to the sensor's port"
+
+    async def _set_rate(self) -> None:
+        """Read the rate and write it only if it differs: the sensor keeps it in EEPROM."""
+        wanted_hz = self._device.rate_hz
+        if await self._read_rate() == wanted_hz:
+            return
+        code = next(code for code, rate_hz in rft.RATE_CODES.items() if rate_hz == wanted_hz)
+        answer = await self._ask(Command.SET_RATE, code)
+        rate_hz = await self._read_rate()
+        if rate_hz != wanted_hz:
+            raise DeviceError(
+                f"{self._where}: output rate {wanted_hz} Hz was refused (error {answer[2]}), it stays at {rate_hz or 'unknown'} Hz; "
+                "set devices.force.rate_hz to a rate that the sensor offers"
+            )
+
+    async def _read_rate(self) -> int | None:
+        return rft.RATE_CODES.get((await self._ask(Command.GET_RATE))[1])
+
+    async def _ask(self, command: Command, parameter: int = 0, repeat_s: float | None = None) -> bytes:
+        """One question, one answer. The first question of all is repeated: half a command of an earlier run may sit in the sensor
+        and swallow it.
+        """
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + self._answer_timeout_s
+        answer: asyncio.Future[bytes] = loop.create_future()
+        self._answers[command] = answer
+        try:
+            while (remaining_s := deadline_s - loop.time()) > 0.0 and self._lost is None:
+                self._send(command, parameter)
+                done, _ = await asyncio.wait([answer], timeout=min(repeat_s or remaining_s, remaining_s))
+                if done:
+                    return answer.result()
+        finally:
+            del self._answers[command]
+        raise DeviceError(
+            f"{self._where}: {self._why_silent(f'no answer to command {command.value} ({command.name})')}"
+        )
+
+    async def _first_samples(self) -> None:
+        samples = await self._collect(_FIRST_SAMPLES, self._answer_timeout_s)
+        if len(samples) < _FIRST_SAMPLES:
+            raise DeviceError(
+                f"{self._where}: {self._why_silent(f'{len(samples)} of {_FIRST_SAMPLES} samples after START')}"
+            )
+
+    def _why_silent(self, what: str) -> str:
+        within = f"{what} within {self._answer_timeout_s:g} s"
+        if self._lost is not None:
+            return f"{what}: {self._lost}"
+        if self._received_bytes == 0:
+            return f"{within}, nothing was received; check the sensor's power and cable"
+        if self._scanner.packets == 0:
+            return (
+                f"{within}; {self._received_bytes} bytes came but no valid packet ({self._scanner.bad_sums} wrong checksums); "
+                "check that this is the sensor's port, its baud rate (115200) and the cable"
+            )
+        return (
+            f"{within}; {self._scanner.packets} valid packets and {self._scanner.bad_sums} wrong checksums came; "
+            "check the cable and power-cycle the sensor"
+        )
+
+    # -- running ---------------------------------------------------------------------------------------------------------------
+
+    def _send(self, command: Command, parameter: int = 0) -> None:
+        if self._serial is None or self._lost is not None:
+            return
+        try:
+            os.write(self._serial.fileno(), rft.encode_command(command, parameter))
+        except BlockingIOError:
+            _LOG.warning("%s: command %s was not taken by the port", self._where, command.name)
+        except OSError as error:
+            self._lose(str(error))
+
+    def _on_readable(self) -> None:
+        if self._serial is None:
+            return
+        try:
+            received = os.read(self._serial.fileno(), _READ_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:  # a pty whose other end closed, an unplugged adapter
+            self._lose(str(error))
+            return
+        if not received:
+            self._lose("end of file")
+            return
+        arrived_s = self._clock()
+        self._received_bytes += len(received)
+        for field in self._scanner.feed(received):
+            if field[0] in (Command.START, Command.READ_ONCE):
+                self._take_sample(field, arrived_s)
+            else:
+                answer = self._answers.get(field[0])
+                if answer is not None and not answer.done():
+                    answer.set_result(field)
+
+    def _take_sample(self, field: bytes, arrived_s: float) -> None:
+        wrench = rft.decode_wrench(field)
+        beyond = max(abs(component) for component in wrench.force_n) > self._device.force_max_n
+        sample = ForceSample(
+            stamp_s=arrived_s,
+            force_sensor_n=wrench.force_n,
+            torque_sensor_nm=wrench.torque_nm,
+            overload=wrench.overload_bits != 0 or beyond,
+        )
+        self._latest = sample
+        self._samples += 1
+        for collector in self._collectors:
+            collector.add(sample)
+
+    async def _collect(self, count: int, deadline_s: float) -> list[ForceSample]:
+        """The next `count` samples, or fewer at the deadline or when the port is lost."""
+        collector = _Collector(count)
+        self._collectors.append(collector)
+        if self._lost is not None:
+            collector.full.set()
+        try:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(deadline_s):
+                    await collector.full.wait()
+        finally:
+            self._collectors.remove(collector)
+        return collector.samples
+
+    def _lose(self, reason: str) -> None:
+        """The port is gone: stop reading it (a dead descriptor is readable for ever) and wake who waits."""
+        if self._lost is not None or self._serial is None:
+            return
+        self._lost = f"the port was lost ({reason})"
+        asyncio.get_running_loop().remove_reader(self._serial.fileno())
+        _LOG.error("%s: %s", self._where, self._lost)
+        for collector in self._collectors:
+            collector.full.set()
+
+    def _shut(self) -> None:
+        opened = self._serial
+        if opened is None:
+            return
+        self._send(Command.STOP)
+        asyncio.get_running_loop().remove_reader(opened.fileno())
+        self._serial = None
+        with suppress(OSError):
+            opened.close()
+
+
+class _Collector:
+    """Takes samples until it has enough."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self.samples: list[ForceSample] = []
+        self.full = asyncio.Event()
+
+    def add(self, sample: ForceSample) -> None:
+        if len(self.samples) < self._count:
+            self.samples.append(sample)
+        if len(self.samples) == self._count:
+            self.full.set()

@@ -1,0 +1,399 @@
+"""PX4 through MAVSDK's native binding.
+
+MAVSDK's callbacks come from C++ threads and do nothing but keep the newest values; frames are converted when the flight loop asks.
+The hot path (`send_attitude`, `send_vision`) is one synchronous native call each.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Iterable
+from types import TracebackType
+from typing import Any, Self
+
+from mavsdk import ComponentType, Configuration, Mavsdk, MavsdkError
+from mavsdk.plugins.info.info import Info
+from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectResult, MavlinkMessage
+from mavsdk.plugins.mocap.mocap import AngleBody, Covariance, Mocap, PositionBody, VisionPositionEstimate
+from mavsdk.plugins.param.param import Param
+from mavsdk.plugins.telemetry.telemetry import Telemetry
+
+from companion.config.vehicle import AutopilotDevice
+from companion.io.protocols import DeviceError
+from companion.io.px4 import messages
+from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
+from companion.io.px4.claim import LinkClaim
+from companion.io.px4.inbox import Inbox, ask_for_streams
+from companion.io.px4.link import (
+    add_connection,
+    check_address,
+    device_error,
+    first_autopilot,
+    pin_new_udp,
+    quiet_native_log,
+    udp_sockets,
+)
+from companion.io.px4.origin import ensure_origin
+from companion.io.px4.params import ParamTransfer
+from companion.io.px4.requests import SENT_ONCE, RequestDesk
+from companion.io.px4.setpoints import SetpointPath, setpoint_path
+from companion.model.observations import EstimatorReport, StateCounts
+from companion.model.types import (
+    AttitudeSetpoint,
+    AutopilotRequest,
+    AutopilotStatus,
+    LinkIdentity,
+    MocapPose,
+    VehicleState,
+)
+from companion.runtime.clock import Clock
+
+_CONNECT_DEADLINE_S = 5.0
+_HEARTBEAT_DEADLINE_S = 5.0
+"""PX4 sends one a second."""
+_CLOSE_DEADLINE_S = 4.0
+# One NaN: PX4 takes EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
+_COVARIANCE_FROM_PARAMS = Covariance([float("nan")])
+
+_log = logging.getLogger(__name__)
+
+
+class MavsdkAutopilot:
+    """The `Autopilot` edge.
+
+    Attitude setpoints leave by the way that `devices.autopilot.setpoint_path` names: see `autopilot_setpoints`.
+
+    Args:
+        device: its address, and how setpoints go there.
+        clock: the flight clock.
+        forwarding: a second connection is wanted, see `forward_to`.
+    """
+
+    def __init__(self, device: AutopilotDevice, clock: Clock, *, forwarding: bool = False) -> None:
+        self._device = device
+        self._forwarding = forwarding
+        self._clock = clock
+        self._desk = RequestDesk()
+        self._inbox = Inbox(clock, self._desk, self._on_heartbeat)
+        self._calls = NativeCalls(device.address)
+        self._mavsdk: Any = None
+        self._connection: Any = None
+        self._second: Any = None
+        self._restore_log: Callable[[], None] | None = None
+        self._direct: Any = None
+        self._setpoints: SetpointPath | None = None
+        self._mocap: Any = None
+        self._info: Any = None
+        self._params: ParamTransfer | None = None
+        self._open = False
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._system_id = 0
+        self._own_ids = (0, 0)
+        self._local_port = 0
+        self._claim: LinkClaim | None = None
+
+    async def __aenter__(self) -> Self:
+        """Open the link, find PX4, ask for the streams, give PX4 a global origin if it has none and is not armed.
+
+        Raises:
+            DeviceError: one line per way of failing; nothing is left open.
+        """
+        address = self._device.address
+        check_address(address)
+        self._loop = asyncio.get_running_loop()
+        self._restore_log = quiet_native_log()
+        try:
+            configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
+            self._own_ids = (int(configuration.system_id), int(configuration.component_id))
+            self._mavsdk = Mavsdk(configuration)
+            self._claim = claim = LinkClaim(address)
+            await claim.find_px4(self._device.discovery_timeout_s)
+            self._connection = await self._calls.run(
+                *("the connection to open", _CONNECT_DEADLINE_S, add_connection),
+                *(self._mavsdk, address, self._forwarding),
+            )
+            self._local_port = claim.pin()
+            async with claim.calling(self._own_ids):
+                system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
+            self._system_id = int(system.get_system_id())
+            self._direct = MavlinkDirect(system)
+            self._setpoints = setpoint_path(self._device.setpoint_path, system, self._direct)
+            self._mocap = Mocap(system)
+            telemetry = Telemetry(system)
+            self._params = ParamTransfer(
+                address, self._clock, self._calls, self._direct, Param(system), self._system_id
+            )
+            self._info = Info(system)
+            self._inbox.subscribe(telemetry, self._direct)
+            self._direct.subscribe_message("COMMAND_ACK", self._on_ack)
+            await ask_for_streams(address, self._calls, telemetry, self._direct, self._system_id)
+            self._open = True
+            await self.ensure_origin()
+            claim.refuse_rivals()
+        except BaseException:
+            await self._close()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Cut the wire at once, then let MAVSDK's threads end. No packet leaves after this; PX4 keeps its mode."""
+        await self._close()
+
+    def identity(self) -> LinkIdentity:
+        """Who speaks to whom on the open link."""
+        peer = self._claim.peer if self._claim is not None else None
+        return LinkIdentity(self._system_id, *self._own_ids, self._local_port, peer)
+
+    async def forward_to(self, port: int) -> int:
+        """Forward between PX4 and that UDP port of 127.0.0.1; the port of 127.0.0.1 that MAVSDK speaks from to it.
+
+        MAVSDK takes what comes from there for as good as what comes from PX4: only `ground_relay` may be at the other end, and
+        nobody else is heard.
+
+        Raises:
+            DeviceError: the connection cannot be opened, or not be kept to that one partner.
+        """
+        self._require_open()
+        assert self._forwarding, "made without forwarding"
+        address = f"udpout://127.0.0.1:{port}"
+        before = frozenset(udp_sockets())
+        expected = "the connection for forwarding to open"
+        self._second = await self._calls.run(expected, _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address, True)
+        try:
+            twin, own_port = pin_new_udp(before, ("127.0.0.1", port))
+            twin.close()
+            return own_port
+        except OSError as error:
+            self._drop_second()
+            fix = "mount /proc, or fly without ground.qgroundcontrol"
+            raise device_error(address, "MAVSDK's socket in /proc", error.strerror or str(error), fix) from None
+
+    def vehicle(self) -> VehicleState | None:
+        """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
+        return self._inbox.vehicle()
+
+    def status(self) -> AutopilotStatus | None:
+        """Latest slow state; None before the first heartbeat. `heartbeat_stamp_s` is when the newest HEARTBEAT arrived."""
+        return self._inbox.status()
+
+    def estimator(self) -> EstimatorReport | None:
+        """Latest ESTIMATOR_STATUS, stamped on arrival; None before the first."""
+        return self._inbox.estimator()
+
+    def counts(self) -> StateCounts:
+        """Messages of the fast state since the link was opened."""
+        return self._inbox.counts()
+
+    def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
+        """Send SET_ATTITUDE_TARGET at once; None: from now on nothing leaves. False: nothing was sent.
+
+        Raises:
+            ValueError: a value that must never leave (not finite, not a unit quaternion, thrust outside 0 to 1).
+        """
+        if not self._open or self._setpoints is None:
+            return False
+        if setpoint is None:
+            self._setpoints.stop()
+            return False
+        return self._setpoints.send(setpoint, self._clock())
+
+    def send_vision(self, pose: MocapPose) -> bool:
+        """Send VISION_POSITION_ESTIMATE at once. False: the link is closed or refused it.
+
+        Raises:
+            ValueError: the pose is not finite.
+        """
+        position_ned_m, (roll_rad, pitch_rad, yaw_rad) = messages.vision_ned(pose)
+        if not self._open:
+            return False
+        estimate = VisionPositionEstimate(
+            # Without TIMESYNC, which PX4 1.16 does not take from MAVSDK, PX4 stamps on arrival (and subtracts EKF2_EV_DELAY);
+            # the companion's own clock is what a log reader can use. MAVSDK would replace 0.
+            time_usec=max(1, int(pose.stamp_s * 1e6)),
+            position_body=PositionBody(*position_ned_m),
+            angle_body=AngleBody(roll_rad, pitch_rad, yaw_rad),
+            pose_covariance=_COVARIANCE_FROM_PARAMS,
+        )
+        try:
+            self._mocap.set_vision_position_estimate(estimate)
+        except MavsdkError as error:
+            _log.debug("VISION_POSITION_ESTIMATE not sent: %s", error)
+            return False
+        return True
+
+    def request(self, request: AutopilotRequest) -> None:
+        """Send the request's command unless one of its kind is under way or was made a moment ago. Returns at once.
+
+        LAND never waits for a command of another kind. Refusals come out of `take_messages`.
+        """
+        if not self._open or not self._desk.claim(request, self._clock()):
+            return
+
+        def answered(result: Any, ack: Any, _: Any) -> None:
+            if result == MavlinkDirectResult.SUCCESS:
+                reason = messages.refusal(ack.fields_json)
+            else:
+                reason = f"no COMMAND_ACK ({result.name.lower().replace('_', ' ')})"
+            self._desk.answer(request, reason, self._clock())
+
+        command = MavlinkMessage("COMMAND_LONG", fields_json=messages.command_json(request, self._system_id))
+        if request in SENT_ONCE:
+            self._direct.send_message(command)
+        else:
+            self._direct.send_command_async(command, answered)
+
+    def _on_ack(self, message: Any, _: Any) -> None:
+        """COMMAND_ACK, on a thread of MAVSDK's."""
+        if messages.answers_arming(message.fields_json):
+            self._desk.answer_sent_once(messages.refusal(message.fields_json), self._clock())
+
+    def take_messages(self) -> list[str]:
+        """Refusals and STATUSTEXTs since the last call, oldest first, a second sender that claims to be PX4, a new port of PX4."""
+        texts = self._desk.take_messages(self._clock())
+        rival = self._claim.take_rival(self._inbox.silent_s()) if self._claim is not None else None
+        return texts if rival is None else [*texts, rival]
+
+    async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
+        """Values of PX4's parameters by name, int or float as PX4 stores them; a name that PX4 does not have is left out.
+
+        Raises:
+            DeviceError: a name that cannot be one, or no answer within the deadline.
+        """
+        return await self._transfer().read(names)
+
+    async def read_param(self, name: str) -> float | int:
+        """Value of one PX4 parameter, int or float as PX4 stores it.
+
+        Raises:
+            DeviceError: no such name, or no answer within the deadline.
+        """
+        values = await self._transfer().read([name])
+        if name not in values:
+            fix = "check the name against PX4's version"
+            raise device_error(self._device.address, f"PX4's parameter {name}", "no such parameter", fix)
+        return values[name]
+
+    async def write_param(self, name: str, value: float | int) -> float | int:
+        """Write one PX4 parameter and read it back; what PX4 now holds, a float in single precision.
+
+        Raises:
+            DeviceError: no such name, a value that PX4's type cannot hold, PX4 refused it, or holds another one afterwards.
+        """
+        return await self._transfer().write(name, value)
+
+    async def ensure_origin(self) -> bool:
+        """Give PX4 the global origin of `autopilot_origin` unless it has one or is armed. True: PX4 says that it has one.
+
+        PX4 says so only while its position is valid; False right after boot means nothing yet.
+
+        Raises:
+            DeviceError: PX4 does not answer, or sends no heartbeat.
+        """
+        self._require_open()
+        return await ensure_origin(self._device.address, self._calls, self._direct, self._system_id, self._armed)
+
+    async def _armed(self) -> bool:
+        try:
+            async with asyncio.timeout(_HEARTBEAT_DEADLINE_S):
+                while (status := self._inbox.status()) is None:  # noqa: ASYNC110 - written by MAVSDK's threads
+                    await asyncio.sleep(0.02)
+        except TimeoutError:
+            expected = f"a PX4 heartbeat within {_HEARTBEAT_DEADLINE_S:g} s"
+            raise device_error(self._device.address, expected, "none", "check the link") from None
+        return status.armed
+
+    async def firmware(self) -> str:
+        """PX4's version as it reports it, like `PX4 1.16.1 release (git 0123456789abcdef)`.
+
+        Raises:
+            DeviceError: no AUTOPILOT_VERSION within the deadline.
+        """
+        self._require_open()
+        try:
+            version = await self._calls.run("PX4's version", 2 * NATIVE_CALL_DEADLINE_S, _get_version, self._info)
+        except MavsdkError as error:
+            found = str(error).split(";")[0]
+            fix = "check the link"
+            raise device_error(self._device.address, "PX4's version (AUTOPILOT_VERSION)", found, fix) from None
+        number = f"{version.flight_sw_major}.{version.flight_sw_minor}.{version.flight_sw_patch}"
+        return f"PX4 {number} {version.flight_sw_version_type.name.lower()} (git {version.flight_sw_git_hash or 'unknown'})"
+
+    def _transfer(self) -> ParamTransfer:
+        self._require_open()
+        assert self._params is not None
+        return self._params
+
+    def _require_open(self) -> None:
+        if not self._open:
+            fix = "enter the edge first"
+            raise device_error(self._device.address, "an open link", "a closed one", fix)
+
+    def _on_heartbeat(self) -> None:
+        """A thread of MAVSDK's."""
+        assert self._loop is not None
+        with contextlib.suppress(RuntimeError):  # the loop is closed: MAVSDK hung and was left behind
+            self._loop.call_soon_threadsafe(self._show_ground_station)
+
+    def _show_ground_station(self) -> None:
+        """Answer the heartbeat of a PX4 that is not armed as a ground station does: PX4 says why it refuses only where it sees one.
+
+        Not while it is armed: there the loss of the real one must be noticed, whatever NAV_DLL_ACT makes of it.
+        """
+        status = self._inbox.status()
+        if self._open and status is not None and not status.armed:
+            self._send("HEARTBEAT", messages.GROUND_STATION_HEARTBEAT_JSON)
+
+    def _send(self, name: str, fields_json: str) -> bool:
+        try:
+            self._direct.send_message(MavlinkMessage(name, fields_json=fields_json))
+        except MavsdkError as error:
+            _log.debug("%s not sent: %s", name, error)
+            return False
+        return True
+
+    async def _close(self) -> None:
+        self._open = False
+        if self._connection is not None:
+            self._mavsdk.remove_connection(self._connection)  # takes 0.2 ms; from here on nothing can leave
+            self._connection = None
+        self._drop_second()
+        if self._claim is not None:
+            self._claim.close()
+        # Shielded: a second Ctrl-C must not leave MAVSDK half destroyed.
+        await asyncio.shield(asyncio.get_running_loop().run_in_executor(None, self._tear_down))
+
+    def _drop_second(self) -> None:
+        if self._second is not None:
+            self._mavsdk.remove_connection(self._second)
+            self._second = None
+
+    def _tear_down(self) -> None:
+        deadline_s = time.monotonic() + _CLOSE_DEADLINE_S
+        try:
+            # MAVSDK must not be destroyed under a call that is still inside it, nor before the last command's callback has run.
+            if not self._calls.finish(_CLOSE_DEADLINE_S):
+                _log.error(
+                    "autopilot %s: a call into MAVSDK hangs, left to the end of the process", self._device.address
+                )
+                return
+            while self._desk.pending() and time.monotonic() < deadline_s:
+                time.sleep(0.02)
+            if self._mavsdk is not None:
+                self._mavsdk.destroy()
+        except Exception as error:
+            _log.error("autopilot %s: closing failed: %s", self._device.address, error)
+        finally:
+            if self._restore_log is not None:
+                self._restore_log()
+
+
+def _get_version(info: Any) -> Any:
+    return info.get_version()
+
+
+__all__ = ["DeviceError", "MavsdkAutopilot"]

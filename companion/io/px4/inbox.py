@@ -1,0 +1,215 @@
+"""What PX4 streams: the newest of each, kept by MAVSDK's threads, made into the companion's records when the flight loop asks."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from mavsdk import MavsdkError
+from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkMessage
+from mavsdk.plugins.telemetry.telemetry import Telemetry
+
+from companion.io.px4 import messages
+from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
+from companion.io.px4.delta_velocity import DeltaVelocity
+from companion.io.px4.link import device_error
+from companion.io.px4.requests import RequestDesk
+from companion.model.frames import flu_from_frd
+from companion.model.observations import EstimatorReport, StateCounts
+from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
+from companion.runtime.clock import Clock
+from companion.runtime.native_threads import keep_interpreter_state
+
+POSITION_RATE_HZ = 200.0
+"""Asked of LOCAL_POSITION_NED; PX4 gives about 124 Hz."""
+ATTITUDE_RATE_HZ = 250.0
+"""Asked of ATTITUDE_QUATERNION, which carries the angular rates too."""
+IMU_RATE_HZ = 250.0
+"""Asked of HIGHRES_IMU."""
+LANDED_RATE_HZ = 10.0
+"""Asked of EXTENDED_SYS_STATE."""
+ESTIMATOR_RATE_HZ = 5.0
+"""Asked of ESTIMATOR_STATUS."""
+
+
+class Inbox:
+    """Written by MAVSDK's threads, one assignment each; a tuple is replaced as a whole, so a reader never sees half of it."""
+
+    def __init__(self, clock: Clock, desk: RequestDesk, after_heartbeat: Callable[[], None]) -> None:
+        self._clock = clock
+        self._desk = desk
+        self._after_heartbeat = after_heartbeat
+        self._position: tuple[float, Vec3, Vec3] | None = None
+        self._attitude: tuple[float, Quat, int] | None = None
+        self._rates: Vec3 | None = None
+        self._imu: tuple[float, Vec3, float | None, Vec3] | None = None
+        self._delta_velocity_frd = DeltaVelocity()
+        self._heartbeat: tuple[float, str] | None = None
+        self._estimator: tuple[float, str] | None = None
+        self._positions = self._attitudes = self._imus = 0
+        self._landed = 0
+        self._battery: tuple[float, float] = (float("nan"), float("nan"))
+
+        self._vehicle_key: tuple[Any, ...] | None = None
+        self._vehicle: VehicleState | None = None
+        self._heartbeat_read: tuple[float, str] | None = None
+        self._state: tuple[bool, FlightMode, int | None] = (False, FlightMode.UNKNOWN, None)
+        self._estimator_read: tuple[float, str] | None = None
+        self._estimator_report: EstimatorReport | None = None
+
+    def subscribe(self, telemetry: Telemetry, direct: MavlinkDirect) -> None:
+        """From now on everything that arrives is kept."""
+        self._telemetry = telemetry  # MAVSDK's plugin ends its subscriptions when nobody holds it any more
+        telemetry.subscribe_position_velocity_ned(self._on_position)
+        telemetry.subscribe_attitude_quaternion(self._on_attitude)
+        telemetry.subscribe_attitude_angular_velocity_body(self._on_rates)
+        telemetry.subscribe_imu(self._on_imu)
+        telemetry.subscribe_landed_state(self._on_landed)
+        telemetry.subscribe_battery(self._on_battery)
+        # System.is_connected turns false seconds late; HEARTBEAT itself is the evidence, and carries armed and mode.
+        direct.subscribe_message("HEARTBEAT", self._on_heartbeat)
+        direct.subscribe_message("ESTIMATOR_STATUS", self._on_estimator)
+        # Telemetry.status_text cuts the first long text after PX4's boot in two and keeps one of exactly 50 characters back.
+        direct.subscribe_message("STATUSTEXT", self._on_status_text)
+
+    def vehicle(self) -> VehicleState | None:
+        """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
+        position, attitude, rates, imu = self._position, self._attitude, self._rates, self._imu
+        if position is None or attitude is None or rates is None or imu is None:
+            return None
+        key = (position[0], attitude[0], rates, imu[0])
+        if key != self._vehicle_key:
+            self._vehicle_key = key
+            state = messages.vehicle_state(
+                position[0], position[1], position[2], attitude[0], attitude[1], rates, imu[0], imu[1]
+            )
+            if state is not None:
+                boot_s = attitude[2] * 1e-6 if attitude[2] else None
+                total = flu_from_frd(imu[3])
+                state = replace(state, boot_s=boot_s, imu_boot_s=imu[2], delta_velocity_body_m_s=total)
+            # Values that are not finite are as good as not arrived: the last good state stays, and its stamps grow old.
+            self._vehicle = state or self._vehicle
+        return self._vehicle
+
+    def status(self) -> AutopilotStatus | None:
+        """Latest slow state; None before the first heartbeat. `heartbeat_stamp_s` is when the newest HEARTBEAT arrived."""
+        heartbeat = self._heartbeat
+        if heartbeat is None:
+            return None
+        if heartbeat is not self._heartbeat_read:
+            self._heartbeat_read = heartbeat
+            self._state = messages.heartbeat_state(heartbeat[1])
+        armed, mode, system_status = self._state
+        voltage_v, remaining = messages.battery(*self._battery)
+        return AutopilotStatus(
+            heartbeat_stamp_s=heartbeat[0],
+            armed=armed,
+            mode=mode,
+            landed=messages.landed_state(self._landed),
+            battery_voltage_v=voltage_v,
+            battery_remaining=remaining,
+            system_status=system_status,
+        )
+
+    def estimator(self) -> EstimatorReport | None:
+        """Latest ESTIMATOR_STATUS, stamped on arrival; None before the first."""
+        newest = self._estimator
+        if newest is not None and newest is not self._estimator_read:
+            self._estimator_read = newest
+            self._estimator_report = messages.estimator_report(newest[1], newest[0])
+        return self._estimator_report
+
+    def silent_s(self) -> float:
+        """Time since the newest message of PX4; infinite before the first."""
+        newest = (self._attitude, self._imu, self._position, self._heartbeat)
+        return self._clock() - max((message[0] for message in newest if message is not None), default=-math.inf)
+
+    def counts(self) -> StateCounts:
+        """Messages of the fast state since the link was opened."""
+        return StateCounts(self._positions, self._attitudes, self._imus)
+
+    # Callbacks: C++ threads, one message type in one thread. Nothing but an assignment, and one more in a count or a sum.
+
+    def _on_position(self, value: Any, _: Any) -> None:
+        p, v = value.position, value.velocity
+        self._position = (
+            self._clock(),
+            (p.north_m, p.east_m, p.down_m),
+            (v.north_m_s, v.east_m_s, v.down_m_s),
+        )
+        self._positions += 1
+
+    def _on_attitude(self, value: Any, _: Any) -> None:
+        self._attitude = (self._clock(), (value.w, value.x, value.y, value.z), value.timestamp_us)
+        self._attitudes += 1
+
+    def _on_rates(self, value: Any, _: Any) -> None:
+        self._rates = (value.roll_rad_s, value.pitch_rad_s, value.yaw_rad_s)
+
+    def _on_imu(self, value: Any, _: Any) -> None:
+        keep_interpreter_state()
+        a = value.acceleration_frd
+        force_m_s2 = (a.forward_m_s2, a.right_m_s2, a.down_m_s2)
+        total = self._delta_velocity_frd
+        if value.timestamp_us:
+            total.add(value.timestamp_us * 1e-6, force_m_s2)
+        self._imu = (self._clock(), force_m_s2, total.boot_s, total.sum_m_s)
+        self._imus += 1
+
+    def _on_landed(self, value: Any, _: Any) -> None:
+        self._landed = int(value)
+
+    def _on_battery(self, value: Any, _: Any) -> None:
+        self._battery = (value.voltage_v, value.remaining_percent)
+
+    def _on_status_text(self, message: Any, _: Any) -> None:
+        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
+            self._desk.hear(json.loads(message.fields_json), self._clock())
+
+    def _on_heartbeat(self, message: Any, _: Any) -> None:
+        # A gimbal or camera behind the same system id has a heartbeat of its own.
+        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
+            self._heartbeat = (self._clock(), message.fields_json)
+            self._after_heartbeat()
+
+    def _on_estimator(self, message: Any, _: Any) -> None:
+        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
+            self._estimator = (self._clock(), message.fields_json)
+
+
+async def ask_for_streams(
+    address: str, calls: NativeCalls, telemetry: Telemetry, direct: MavlinkDirect, system_id: int
+) -> None:
+    """Ask PX4 for every stream that `Inbox` keeps, at its rate.
+
+    Raises:
+        DeviceError: PX4 refused one, or did not answer.
+    """
+
+    def estimator_rate(rate_hz: float) -> None:
+        fields = messages.set_message_interval_json(messages.ESTIMATOR_STATUS_ID, rate_hz, system_id)
+        ack = direct.send_command(MavlinkMessage("COMMAND_LONG", fields_json=fields))
+        reason = messages.refusal(ack.fields_json)
+        if reason is not None:
+            raise _RefusedError(reason)
+
+    for stream, rate_hz, ask in (
+        ("LOCAL_POSITION_NED", POSITION_RATE_HZ, telemetry.set_rate_position_velocity_ned),
+        ("ATTITUDE_QUATERNION", ATTITUDE_RATE_HZ, telemetry.set_rate_attitude_quaternion),
+        ("HIGHRES_IMU", IMU_RATE_HZ, telemetry.set_rate_imu),
+        ("EXTENDED_SYS_STATE", LANDED_RATE_HZ, telemetry.set_rate_landed_state),
+        ("ESTIMATOR_STATUS", ESTIMATOR_RATE_HZ, estimator_rate),
+    ):
+        expected = f"PX4 to stream {stream} at {rate_hz:g} Hz"
+        try:
+            await calls.run(expected, NATIVE_CALL_DEADLINE_S, ask, rate_hz)
+        except (MavsdkError, _RefusedError) as error:
+            fix = "check the link's bandwidth (MAV_x_RATE, baud) and that it is an onboard-mode MAVLink instance"
+            raise device_error(address, expected, str(error).split(";")[0], fix) from None
+
+
+class _RefusedError(Exception):
+    """PX4 denied a command, with its reason in words."""

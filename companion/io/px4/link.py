@@ -1,0 +1,267 @@
+"""Opening MAVSDK's connection to PX4: every way in which it can fail becomes one clear line."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import os
+import re
+import socket
+import stat
+import threading
+from collections.abc import Callable, Container
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mavsdk import Autopilot as AutopilotKind
+from mavsdk import ConnectionResult, Mavsdk, log_subscribe, log_unsubscribe
+from mavsdk.exceptions import ConnectionError as MavsdkConnectionError
+from mavsdk.mavsdk import ForwardingOption
+
+from companion.io.protocols import DeviceError
+
+_ADDRESS = re.compile(
+    r"(?P<net>udpin|udpout|tcpin|tcpout)://(?P<host>[^:/?]+):(?P<port>\d+)"
+    r"|(?P<serial>serial|serial_flowcontrol)://(?P<path>/[^:]+):(?P<baud>\d+)"
+)
+_FORMS = "udpin://0.0.0.0:14540, udpout://HOST:PORT, tcpout://HOST:PORT or serial:///dev/ttyAMA0:921600"
+
+_native_log = logging.getLogger("companion.mavsdk")
+_log_lock = threading.Lock()
+_log_users = 0
+
+
+def device_error(address: str, expected: str, found: str, fix: str) -> DeviceError:
+    """The one line that a person gets."""
+    return DeviceError(f"autopilot {address}: expected {expected}, found {found}; {fix}")
+
+
+def no_heartbeat(address: str, timeout_s: float) -> DeviceError:
+    """No autopilot is heard."""
+    fix = "power the autopilot, check cable, baud or PX4's MAVLink target address and port"
+    return device_error(address, f"a PX4 heartbeat within {timeout_s:g} s", "none", fix)
+
+
+def check_address(address: str) -> None:
+    """Look at the address before MAVSDK does: it shares a busy UDP port silently and reports bad ones without a reason.
+
+    Raises:
+        DeviceError: syntax, port range, busy or foreign local address, serial port missing or not accessible.
+    """
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
+        raise device_error(address, f"an address like {_FORMS}", "something else", "correct devices.autopilot.address")
+    if match["serial"]:
+        _check_serial(address, match["path"])
+        return
+    port = int(match["port"])
+    if not 0 < port <= 65535:
+        raise device_error(address, "a port from 1 to 65535", str(port), "correct devices.autopilot.address")
+    if match["net"] == "tcpin":
+        bind_alone(address, match["host"], port, socket.SOCK_STREAM).close()
+
+
+@dataclass(frozen=True, slots=True)
+class AddressParts:
+    """An address taken apart."""
+
+    kind: str
+    """udpin, udpout, tcpin, tcpout, serial or serial_flowcontrol."""
+    host: str
+    """Path of the device on a serial link."""
+    port: int
+    """Baud rate on a serial link."""
+
+    @property
+    def serial(self) -> bool:
+        """The link is a serial port."""
+        return self.kind in ("serial", "serial_flowcontrol")
+
+
+def parse_address(address: str) -> AddressParts:
+    """Parts of an address that `check_address` accepts.
+
+    Raises:
+        ValueError: `check_address` does not accept it.
+    """
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
+        raise ValueError(f"expected an address like {_FORMS}, got {address!r}")
+    if match["serial"]:
+        return AddressParts(match["serial"], match["path"], int(match["baud"]))
+    return AddressParts(match["net"], match["host"], int(match["port"]))
+
+
+def _check_serial(address: str, path: str) -> None:
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as error:
+        fix = "plug the autopilot in, or correct devices.autopilot.address (ls /dev/serial/by-id)"
+        raise device_error(address, f"the serial port {path}", error.strerror or str(error), fix) from None
+    if not stat.S_ISCHR(mode):
+        raise device_error(address, f"a serial port at {path}", "no device file", "correct devices.autopilot.address")
+    if not os.access(path, os.R_OK | os.W_OK):
+        fix = "add the user to the group that owns it (usually dialout) and log in again"
+        raise device_error(address, f"permission to read and write {path}", "none", fix)
+
+
+def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> socket.socket:
+    """Bind a local port that no other socket has.
+
+    Raises:
+        DeviceError: the port is busy, or the host is not this machine.
+    """
+    bound = socket.socket(socket.AF_INET, kind)
+    try:
+        bound.bind((host, port))
+    except OSError as error:
+        bound.close()
+        if error.errno == errno.EADDRINUSE:
+            fix = "stop that program (another companion, QGroundControl, a MAVLink router?) or use another port"
+            raise device_error(address, f"port {port} to be free", "another program on it", fix) from None
+        fix = "use an address of this machine, 0.0.0.0 for all"
+        raise device_error(address, f"a local address in {host}", error.strerror or str(error), fix) from None
+    return bound
+
+
+def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> Any:
+    """Open the connection; the handle that `Mavsdk.remove_connection` takes. Blocks while a TCP connection is made.
+
+    Args:
+        mavsdk: the instance.
+        address: checked.
+        forwarding: what arrives goes out on the other connections that forward, and the other way round.
+
+    Raises:
+        DeviceError: MAVSDK could not open it.
+    """
+    try:
+        option = ForwardingOption.ON if forwarding else ForwardingOption.OFF
+        return mavsdk.add_any_connection_with_handle_and_forwarding(address, option)
+    except MavsdkConnectionError as error:
+        found = str(error).removeprefix("Connection failed: ").lower().replace("_", " ")
+        if ConnectionResult.BAUDRATE_UNKNOWN.name in str(error):
+            fix = "use a baud rate that the port knows, 921600 for PX4's TELEM2"
+        else:
+            fix = "check cable, address and that no other program holds it"
+        raise device_error(address, "to open the connection", found, fix) from None
+
+
+async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any:
+    """The MAVSDK system whose heartbeat comes first, if it is PX4.
+
+    Raises:
+        DeviceError: no heartbeat within `timeout_s`, or another autopilot's.
+    """
+    loop = asyncio.get_running_loop()
+    found: asyncio.Future[Any] = loop.create_future()
+
+    def resolve(system: Any) -> None:
+        if not found.done():
+            found.set_result(system)
+
+    handle = mavsdk.first_autopilot_async(timeout_s, lambda system: loop.call_soon_threadsafe(resolve, system))
+    try:
+        # MAVSDK keeps the deadline; this one only guards against MAVSDK.
+        async with asyncio.timeout(timeout_s + 2.0):
+            system = await found
+    except TimeoutError:
+        system = None
+    finally:
+        mavsdk.cancel_first_autopilot(handle)
+    if system is None:
+        raise no_heartbeat(address, timeout_s)
+    kind = system.autopilot_type()
+    if kind != AutopilotKind.PX4:
+        raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion speaks no other's modes")
+    return system
+
+
+@dataclass(frozen=True, slots=True)
+class UdpSocket:
+    """A UDP (IPv4) socket of this process."""
+
+    descriptor: int
+    port: int
+    """Local port."""
+
+
+def udp_sockets() -> dict[int, UdpSocket]:
+    """UDP (IPv4) sockets of this process by inode; empty where /proc does not show them."""
+    try:
+        own = {link: int(name) for name in os.listdir("/proc/self/fd") if (link := _link_of(name)) is not None}
+        table = Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return {}
+    rows = (line.split() for line in table)
+    return {
+        int(row[9]): UdpSocket(own[link], int(row[1].rpartition(":")[2], 16))
+        for row in rows
+        if (link := f"socket:[{row[9]}]") in own
+    }
+
+
+def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> tuple[socket.socket, int]:
+    """Let the one UDP socket that MAVSDK has opened since hear `peer` alone: the kernel drops datagrams of every other sender.
+
+    MAVSDK itself takes messages from every sender that finds its port, on a `udpout` connection too.
+
+    Args:
+        before: inodes of `udp_sockets` before MAVSDK opened the connection.
+        peer: IPv4 address and port.
+
+    Returns:
+        A second descriptor of the socket, to connect it to another peer by, and its local port. The port is free once both are closed.
+
+    Raises:
+        OSError: the socket is not found, or cannot be connected.
+    """
+    new = [found for inode, found in udp_sockets().items() if inode not in before]
+    if len(new) != 1:
+        raise OSError(errno.ENOENT, f"{len(new)} new sockets")
+    twin = socket.socket(fileno=os.dup(new[0].descriptor))
+    try:
+        twin.connect(peer)
+    except OSError:
+        twin.close()
+        raise
+    return twin, new[0].port
+
+
+def _link_of(descriptor: str) -> str | None:
+    try:
+        return os.readlink(f"/proc/self/fd/{descriptor}")
+    except OSError:  # closed while we looked
+        return None
+
+
+def _log_native(level: Any, message: str, file: str | None, line: int) -> bool:
+    del level, file, line
+    _native_log.debug("%s", message)
+    return True  # keeps MAVSDK from printing it
+
+
+def quiet_native_log() -> Callable[[], None]:
+    """Send MAVSDK's own log to the logger `companion.mavsdk` at DEBUG instead of the terminal. Returns the undo."""
+    global _log_users
+    with _log_lock:
+        _log_users += 1
+        if _log_users == 1:
+            log_subscribe(_log_native)
+    undone = False
+
+    def undo() -> None:
+        nonlocal undone
+        global _log_users
+        with _log_lock:
+            if undone:
+                return
+            undone = True
+            _log_users -= 1
+            # After the last instance is gone no thread of MAVSDK is left to call into Python while the interpreter ends.
+            if _log_users == 0:
+                log_unsubscribe()
+
+    return undo

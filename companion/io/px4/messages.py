@@ -1,0 +1,263 @@
+"""MAVLink as PX4 speaks it, to and from the companion's records. Pure: no socket, no MAVSDK, no clock.
+
+Everything that changes frame between companion and PX4 is here: NED/FRD on the wire, world ENU / body FLU in the records.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+
+from companion.model.frames import (
+    attitude_enu_flu_from_ned_frd,
+    attitude_ned_frd_from_enu_flu,
+    enu_from_ned,
+    euler_zyx_from_quat,
+    flu_from_frd,
+    ned_from_enu,
+    quat_normalize,
+)
+from companion.model.observations import EstimatorReport
+from companion.model.types import (
+    AttitudeSetpoint,
+    AutopilotRequest,
+    FlightMode,
+    LandedState,
+    MocapPose,
+    Quat,
+    Vec3,
+    VehicleState,
+)
+
+GPS_GLOBAL_ORIGIN_ID = 49
+ESTIMATOR_STATUS_ID = 230
+_REQUEST_MESSAGE, _SET_MESSAGE_INTERVAL = 512, 511
+GROUND_STATION_HEARTBEAT_JSON = (
+    '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
+)
+"""HEARTBEAT: MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE."""
+
+MAV_COMP_ID_AUTOPILOT1 = 1
+_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1
+MAV_MODE_FLAG_SAFETY_ARMED = 128
+_PX4_MAIN_MODE_AUTO = 4
+_PX4_MAIN_MODE_OFFBOARD = 6
+# Body rates are not commanded: ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE | PITCH | YAW.
+_TYPE_MASK_IGNORE_RATES = 7
+_QUAT_NORM_TOLERANCE = 1e-2
+
+# PX4's px4_custom_mode.h. Main modes in which a pilot steers; 9 simple, 11 altitude cruise.
+_PX4_PILOT_MAIN_MODES = frozenset({1, 2, 3, 5, 7, 8, 9, 11})
+_PX4_AUTO_SUB_MODES = {
+    2: FlightMode.TAKEOFF,
+    3: FlightMode.HOLD,
+    5: FlightMode.RETURN,
+    6: FlightMode.LAND,
+    9: FlightMode.LAND,  # precision landing
+}
+_LANDED_STATES = (
+    LandedState.UNKNOWN,
+    LandedState.ON_GROUND,
+    LandedState.IN_AIR,
+    LandedState.TAKING_OFF,
+    LandedState.LANDING,
+)
+_MAV_RESULTS = {
+    0: "accepted",
+    1: "temporarily rejected",
+    2: "denied",
+    3: "unsupported",
+    4: "failed",
+    5: "in progress",
+    6: "cancelled",
+}
+_COMMANDS: dict[AutopilotRequest, tuple[int, float, float]] = {
+    AutopilotRequest.OFFBOARD: (176, float(_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(_PX4_MAIN_MODE_OFFBOARD)),
+    AutopilotRequest.ARM: (400, 1.0, 0.0),
+    AutopilotRequest.DISARM: (400, 0.0, 0.0),
+    AutopilotRequest.FORCE_DISARM: (400, 0.0, 21196.0),
+    AutopilotRequest.LAND: (21, 0.0, 0.0),
+}
+
+
+def heartbeat_state(heartbeat_json: str) -> tuple[bool, FlightMode, int]:
+    """Armed flag, flight mode and MAV_STATE of a HEARTBEAT's fields (`base_mode`, `custom_mode`, `system_status`)."""
+    fields = json.loads(heartbeat_json)
+    base_mode = int(fields["base_mode"])
+    armed = bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
+    return armed, flight_mode(base_mode, int(fields["custom_mode"])), int(fields["system_status"])
+
+
+def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
+    """PX4's mode: main mode in bits 16-23 of `custom_mode`, sub mode in bits 24-31."""
+    main, sub = (custom_mode >> 16) & 0xFF, (custom_mode >> 24) & 0xFF
+    if not base_mode & _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or main == 0:
+        return FlightMode.UNKNOWN
+    if main == _PX4_MAIN_MODE_OFFBOARD:
+        return FlightMode.OFFBOARD
+    if main == _PX4_MAIN_MODE_AUTO:
+        return _PX4_AUTO_SUB_MODES.get(sub, FlightMode.OTHER)
+    return FlightMode.MANUAL if main in _PX4_PILOT_MAIN_MODES else FlightMode.OTHER
+
+
+def landed_state(value: int) -> LandedState:
+    """EXTENDED_SYS_STATE.landed_state."""
+    return _LANDED_STATES[value] if 0 <= value < len(_LANDED_STATES) else LandedState.UNKNOWN
+
+
+def battery(voltage_v: float, remaining_percent: float) -> tuple[float | None, float | None]:
+    """Voltage in V and remaining charge, 0 to 1; None where the autopilot does not know (NaN or negative)."""
+    voltage = voltage_v if math.isfinite(voltage_v) and voltage_v > 0.0 else None
+    known = math.isfinite(remaining_percent) and remaining_percent >= 0.0
+    return voltage, min(remaining_percent / 100.0, 1.0) if known else None
+
+
+def vehicle_state(
+    position_stamp_s: float,
+    position_ned_m: Vec3,
+    velocity_ned_m_s: Vec3,
+    attitude_stamp_s: float,
+    attitude_ned_frd: Quat,
+    rates_frd_rad_s: Vec3,
+    imu_stamp_s: float,
+    specific_force_frd_m_s2: Vec3,
+) -> VehicleState | None:
+    """LOCAL_POSITION_NED, ATTITUDE_QUATERNION and HIGHRES_IMU in the companion's frames; None if anything is not finite or the
+    quaternion has no direction.
+    """
+    values = (*position_ned_m, *velocity_ned_m_s, *attitude_ned_frd, *rates_frd_rad_s, *specific_force_frd_m_s2)
+    if not all(map(math.isfinite, values)):
+        return None
+    try:
+        attitude_ned_frd = quat_normalize(attitude_ned_frd)
+    except ValueError:
+        return None
+    return VehicleState(
+        position_stamp_s=position_stamp_s,
+        attitude_stamp_s=attitude_stamp_s,
+        imu_stamp_s=imu_stamp_s,
+        position_world_m=enu_from_ned(position_ned_m),
+        velocity_world_m_s=enu_from_ned(velocity_ned_m_s),
+        attitude_wxyz=attitude_enu_flu_from_ned_frd(attitude_ned_frd),
+        angular_rate_body_rad_s=flu_from_frd(rates_frd_rad_s),
+        specific_force_body_m_s2=flu_from_frd(specific_force_frd_m_s2),
+    )
+
+
+def attitude_target_ned(setpoint: AttitudeSetpoint) -> Quat:
+    """Attitude FRD -> NED of a setpoint that may leave.
+
+    Raises:
+        ValueError: a value is not finite, the quaternion is not of unit norm, or thrust is outside 0 to 1.
+    """
+    w, x, y, z = setpoint.attitude_wxyz
+    norm_squared = w * w + x * x + y * y + z * z
+    # Written so that NaN fails both.
+    if not abs(norm_squared - 1.0) <= _QUAT_NORM_TOLERANCE:
+        raise ValueError(f"attitude setpoint {setpoint.attitude_wxyz} is not a unit quaternion")
+    if not 0.0 <= setpoint.thrust <= 1.0:
+        raise ValueError(f"thrust setpoint {setpoint.thrust} is outside 0 to 1")
+    return attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz)
+
+
+def attitude_target_deg(setpoint: AttitudeSetpoint) -> Vec3:
+    """Roll, pitch, yaw (ZYX, FRD -> NED) in degrees of a setpoint that may leave; raises as `attitude_target_ned` does."""
+    roll_rad, pitch_rad, yaw_rad = euler_zyx_from_quat(quat_normalize(attitude_target_ned(setpoint)))
+    return math.degrees(roll_rad), math.degrees(pitch_rad), math.degrees(yaw_rad)
+
+
+def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> str:
+    """SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises as `attitude_target_ned` does."""
+    q = attitude_target_ned(setpoint)
+    return (
+        f'{{"time_boot_ms":{time_boot_ms & 0xFFFFFFFF},"target_system":{target_system},'
+        f'"target_component":{MAV_COMP_ID_AUTOPILOT1},"type_mask":{_TYPE_MASK_IGNORE_RATES},'
+        f'"q":[{q[0]:.9g},{q[1]:.9g},{q[2]:.9g},{q[3]:.9g}],'
+        f'"body_roll_rate":0,"body_pitch_rate":0,"body_yaw_rate":0,"thrust":{setpoint.thrust:.9g}}}'
+    )
+
+
+def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
+    """Position NED in m and roll, pitch, yaw (ZYX, FRD -> NED) in rad, as VISION_POSITION_ESTIMATE wants them.
+
+    Raises:
+        ValueError: a value is not finite or the quaternion has no direction.
+    """
+    if not all(map(math.isfinite, (*pose.position_world_m, *pose.attitude_wxyz))):
+        raise ValueError(f"mocap pose {pose.position_world_m}, {pose.attitude_wxyz} is not finite")
+    attitude = attitude_ned_frd_from_enu_flu(quat_normalize(pose.attitude_wxyz))
+    return ned_from_enu(pose.position_world_m), euler_zyx_from_quat(attitude)
+
+
+def command(request: AutopilotRequest) -> tuple[int, float, float]:
+    """MAV_CMD and its first two parameters, the others are 0: DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND (21).
+
+    Raises:
+        KeyError: for `AutopilotRequest.NONE`, which is no command.
+    """
+    return _COMMANDS[request]
+
+
+def command_json(request: AutopilotRequest, target_system: int) -> str:
+    """COMMAND_LONG for a request, fields as `command` gives them; raises as `command` does."""
+    return _command_json(*command(request), target_system)
+
+
+def request_message_json(message_id: int, target_system: int) -> str:
+    """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE (512): send that message once."""
+    return _command_json(_REQUEST_MESSAGE, float(message_id), 0.0, target_system)
+
+
+def set_message_interval_json(message_id: int, rate_hz: float, target_system: int) -> str:
+    """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511): stream that message; PX4 takes the interval in us."""
+    return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz, target_system)
+
+
+def estimator_report(fields_json: str, stamp_s: float) -> EstimatorReport:
+    """ESTIMATOR_STATUS. PX4 says NaN for the ratio of what it does not fuse, which becomes 0, and for an accuracy that it does not
+    know, which becomes infinite.
+    """
+    fields = json.loads(fields_json)
+
+    def number(key: str, unknown: float) -> float:
+        value = fields[key]
+        return float(value) if value is not None and math.isfinite(value) else unknown
+
+    return EstimatorReport(
+        stamp_s=stamp_s,
+        flags=int(fields["flags"]),
+        velocity_ratio=number("vel_ratio", 0.0),
+        position_horizontal_ratio=number("pos_horiz_ratio", 0.0),
+        position_vertical_ratio=number("pos_vert_ratio", 0.0),
+        position_horizontal_accuracy_m=number("pos_horiz_accuracy", math.inf),
+        position_vertical_accuracy_m=number("pos_vert_accuracy", math.inf),
+    )
+
+
+def _command_json(number: int, param1: float, param2: float, target_system: int) -> str:
+    fields: dict[str, float | int] = {
+        "target_system": target_system,
+        "target_component": MAV_COMP_ID_AUTOPILOT1,
+        "command": number,
+        "confirmation": 0,
+        "param1": param1,
+        "param2": param2,
+    }
+    fields.update((f"param{i}", 0.0) for i in range(3, 8))
+    return json.dumps(fields)
+
+
+def refusal(ack_json: str) -> str | None:
+    """Why a COMMAND_ACK is not an acceptance, in words; None when it is one."""
+    result = int(json.loads(ack_json)["result"])
+    return None if result == 0 else result_text(result)
+
+
+def answers_arming(ack_json: str) -> bool:
+    """Return whether a COMMAND_ACK answers MAV_CMD_COMPONENT_ARM_DISARM (400)."""
+    return int(json.loads(ack_json)["command"]) == _COMMANDS[AutopilotRequest.ARM][0]
+
+
+def result_text(result: int) -> str:
+    """A MAV_RESULT in words."""
+    return f"{_MAV_RESULTS.get(result, 'unknown result')} (MAV_RESULT {result})"

@@ -1,0 +1,68 @@
+"""A global origin for a vehicle that has no GPS.
+
+PX4 counts its global position as valid only with an origin; HOLD, RETURN and LAND then work on motion capture alone. The origin is
+latitude 0, longitude 0, altitude 0, because that is where EKF2 without GPS has put local (0, 0, 0) by itself: nothing moves, whether
+vision is fused already or not. Any other place moves the local position, measured on PX4 1.16.1: with 47.4 deg N, 8.5 deg E and
+488 m given before the first vision, LOCAL_POSITION_NED is thousands of kilometres away until vision is fused and its z is wrong by
+488 m for ever after; given while vision is fused, the filter resets and its innovation ratio rises to 2.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from mavsdk import MavsdkError
+from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkMessage
+
+from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
+from companion.io.px4.link import device_error
+from companion.io.px4.messages import GPS_GLOBAL_ORIGIN_ID, refusal, request_message_json
+
+ORIGIN_LATITUDE_DEG = 0.0
+ORIGIN_LONGITUDE_DEG = 0.0
+ORIGIN_ALTITUDE_M = 0.0
+
+
+def set_origin_json(system_id: int) -> str:
+    """SET_GPS_GLOBAL_ORIGIN for that system. The altitude is in mm, the angles in 1e-7 deg."""
+    return json.dumps(
+        {
+            "target_system": system_id,
+            "latitude": round(ORIGIN_LATITUDE_DEG * 1e7),
+            "longitude": round(ORIGIN_LONGITUDE_DEG * 1e7),
+            "altitude": round(ORIGIN_ALTITUDE_M * 1e3),
+            "time_usec": 0,
+        }
+    )
+
+
+async def ensure_origin(
+    address: str, calls: NativeCalls, direct: MavlinkDirect, system_id: int, armed: Callable[[], Awaitable[bool]]
+) -> bool:
+    """Give PX4 an origin unless it has one or is armed. True: PX4 says that it has one.
+
+    PX4 tells of its origin only while its position is valid, so right after boot, before any vision, the answer is False though the
+    origin was taken; to send the same one again changes nothing.
+
+    Raises:
+        DeviceError: PX4 does not answer at all.
+    """
+    if await _has_origin(address, calls, direct, system_id):
+        return True
+    if await armed():
+        return False  # to move the origin under a flying estimate is worse than to have none
+    direct.send_message(MavlinkMessage("SET_GPS_GLOBAL_ORIGIN", fields_json=set_origin_json(system_id)))
+    return await _has_origin(address, calls, direct, system_id)
+
+
+async def _has_origin(address: str, calls: NativeCalls, direct: Any, system_id: int) -> bool:
+    expected = "PX4 to say whether it has a global origin"
+    command = MavlinkMessage("COMMAND_LONG", fields_json=request_message_json(GPS_GLOBAL_ORIGIN_ID, system_id))
+    try:
+        ack = await calls.run(expected, NATIVE_CALL_DEADLINE_S, direct.send_command, command)
+    except MavsdkError as error:
+        raise device_error(address, expected, str(error).split(";")[0], "check the link") from None
+    # PX4 sends the message before it accepts, and denies where it has none to send.
+    return refusal(ack.fields_json) is None

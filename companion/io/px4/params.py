@@ -1,0 +1,221 @@
+"""PX4's parameters: many names at once, in a window of requests, and one value written and read back.
+
+PARAM_REQUEST_READ by name goes out through MavlinkDirect, several under way at a time, because MAVSDK's Param plugin asks one after the
+other and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer those). That PX4 lacks a parameter is concluded
+from its silence while it answers other requests that were sent after it, not from silence alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import re
+import struct
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkMessage
+from mavsdk.plugins.param.param import Param, ParamError
+
+from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
+from companion.io.px4.link import device_error
+from companion.io.px4.messages import MAV_COMP_ID_AUTOPILOT1
+from companion.px4.params_file import single
+from companion.runtime.clock import Clock
+
+WINDOW = 8
+"""Requests under way at once: their answers fit PX4's transmit buffer beside the telemetry."""
+ANSWER_S = 0.4
+"""A request that was not answered by then is asked again."""
+ASKS = 4
+"""So often is a name asked for, while PX4 answers others, before it counts as absent."""
+READ_DEADLINE_S = 10.0
+ALWAYS_THERE = "MAV_SYS_ID"
+"""Asked along: its answer shows that PX4 has heard what was sent before."""
+
+_NAME = re.compile(r"[A-Z0-9_]{1,16}")
+_REAL32 = 9
+_INT32_MIN, _INT32_MAX = -(2**31), 2**31 - 1
+
+Value = float | int
+
+
+class ParamQueries:
+    """Which names to ask for now. Pure: the clock comes in, names come out."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.answered: set[str] = set()
+        self.absent: set[str] = set()
+        self._names = tuple(dict.fromkeys(names))
+        self._waiting = deque(self._names)
+        self._sent_s: dict[str, float] = {}
+        self._unheard = dict.fromkeys(self._names, 0)
+        self._heard_s = -math.inf
+        self._alive_sent_s = -math.inf
+
+    @property
+    def done(self) -> bool:
+        """Every name is answered or absent."""
+        return len(self.answered) + len(self.absent) == len(self._names)
+
+    def due(self, now_s: float) -> list[str]:
+        """Names to ask for at `now_s`, ALWAYS_THERE last where a sign of life is due; none: look again a little later."""
+        for name in [name for name, sent_s in self._sent_s.items() if now_s >= sent_s + ANSWER_S]:
+            # Silence says something only if PX4 spoke since.
+            self._unheard[name] += self._heard_s > self._sent_s.pop(name)
+            if self._unheard[name] >= ASKS:
+                self.absent.add(name)
+            else:
+                self._waiting.append(name)
+        asks = []
+        while self._waiting and len(self._sent_s) < WINDOW:
+            name = self._waiting.popleft()
+            self._sent_s[name] = now_s
+            asks.append(name)
+        if asks and now_s >= self._alive_sent_s + ANSWER_S:
+            self._alive_sent_s = now_s
+            asks.append(ALWAYS_THERE)
+        return asks
+
+    def heard(self, name: str, now_s: float) -> None:
+        """PARAM_VALUE of `name` arrived."""
+        self._heard_s = now_s
+        if name in self._unheard:
+            self._sent_s.pop(name, None)
+            if name in self._waiting:
+                self._waiting.remove(name)
+            self.absent.discard(name)
+            self.answered.add(name)
+
+
+def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
+    """Name and value of a PARAM_VALUE's fields, an int where PX4 stores one.
+
+    PX4 puts the bytes of an INT32 where the float is; None where those make a NaN, which JSON cannot say (negative numbers).
+    """
+    name, wire = str(fields["param_id"]), fields["param_value"]
+    if wire is None:
+        return name, None
+    if int(fields["param_type"]) == _REAL32:
+        return name, float(wire)
+    return name, int(struct.unpack("<i", struct.pack("<f", wire))[0])
+
+
+class ParamTransfer:
+    """Reads and writes over an open link."""
+
+    def __init__(
+        self, address: str, clock: Clock, calls: NativeCalls, direct: MavlinkDirect, param: Param, system_id: int
+    ) -> None:
+        self._address = address
+        self._clock = clock
+        self._calls = calls
+        self._direct = direct
+        self._param = param
+        self._system_id = system_id
+
+    async def read(self, names: Iterable[str]) -> dict[str, Value]:
+        """Values by name, int or float as PX4 stores them; names that PX4 does not have are left out.
+
+        Raises:
+            DeviceError: a name that cannot be one, or no answer within the deadline.
+        """
+        wanted = tuple(dict.fromkeys(names))
+        for name in wanted:
+            if _NAME.fullmatch(name) is None:
+                expected = "a parameter name of up to 16 of A-Z 0-9 _"
+                raise device_error(self._address, expected, repr(name), "correct the name")
+        queries, got = ParamQueries(wanted), dict[str, Value | None]()
+        loop, changed = asyncio.get_running_loop(), asyncio.Event()
+
+        def take(fields_json: str) -> None:
+            name, value = value_of(json.loads(fields_json))
+            queries.heard(name, self._clock())
+            got[name] = value
+            changed.set()
+
+        def arrived(message: Any, _: Any) -> None:
+            if message.component_id == MAV_COMP_ID_AUTOPILOT1:
+                loop.call_soon_threadsafe(take, message.fields_json)
+
+        handle = self._direct.subscribe_message("PARAM_VALUE", arrived)
+        try:
+            async with asyncio.timeout(READ_DEADLINE_S):
+                while not queries.done:
+                    for name in queries.due(self._clock()):
+                        self._ask(name)
+                    changed.clear()
+                    with contextlib.suppress(TimeoutError):  # then it is time to look what is overdue
+                        async with asyncio.timeout(ANSWER_S / 4):
+                            await changed.wait()
+        except TimeoutError:
+            expected = f"PX4's parameters ({len(wanted)} of them, first {wanted[0]})"
+            found = f"{len(queries.answered)} within {READ_DEADLINE_S:g} s"
+            raise device_error(self._address, expected, found, "check the link") from None
+        finally:
+            self._direct.unsubscribe_message(handle)
+        values: dict[str, Value] = {}
+        for name in wanted:
+            if name in queries.answered:
+                value = got[name]
+                values[name] = await self._read_int(name) if value is None else value
+        return values
+
+    async def write(self, name: str, value: Value) -> Value:
+        """Write one value and read it back; what PX4 now holds.
+
+        Raises:
+            DeviceError: no such name, a value that the type cannot hold, PX4 refused it, or holds another one afterwards.
+        """
+        before = (await self.read([name])).get(name)
+        if before is None:
+            fix = "check the name against PX4's version"
+            raise device_error(self._address, f"PX4's parameter {name}", "no such parameter", fix)
+        wanted = self._storable(name, value, integer=isinstance(before, int))
+        try:
+            setter = self._param.set_param_int if isinstance(wanted, int) else self._param.set_param_float
+            await self._calls.run(f"PX4 to take {name} = {wanted:g}", 2 * NATIVE_CALL_DEADLINE_S, setter, name, wanted)
+        except ParamError as error:
+            found = error.result.name.lower().replace("_", " ")
+            fix = "check the value's range and the link"
+            raise device_error(self._address, f"PX4 to take {name} = {wanted:g}", found, fix) from None
+        after = (await self.read([name])).get(name)
+        if after != wanted:
+            fix = "PX4 clipped or refused the value; choose one within the parameter's range"
+            raise device_error(self._address, f"{name} = {wanted:g} after writing", f"{after}", fix)
+        return after
+
+    def _storable(self, name: str, value: Value, *, integer: bool) -> Value:
+        if integer:
+            if math.isfinite(value) and value == int(value) and _INT32_MIN <= value <= _INT32_MAX:
+                return int(value)
+            raise device_error(self._address, f"a whole number for {name}, an INT32", f"{value}", "correct the value")
+        try:
+            return single(float(value))
+        except OverflowError:
+            expected = f"a number of single precision for {name}, a REAL32"
+            raise device_error(self._address, expected, f"{value}", "correct the value") from None
+
+    def _ask(self, name: str) -> None:
+        fields = {
+            "target_system": self._system_id,
+            "target_component": MAV_COMP_ID_AUTOPILOT1,
+            "param_id": name,
+            "param_index": -1,
+        }
+        # A message that the link refuses is one that is not answered: it is asked again.
+        self._direct.send_message(MavlinkMessage("PARAM_REQUEST_READ", fields_json=json.dumps(fields)))
+
+    async def _read_int(self, name: str) -> Value:
+        """An INT32 whose bytes are a NaN comes through MAVSDK's own plugin."""
+        try:
+            value: Value = await self._calls.run(
+                f"PX4's parameter {name}", 2 * NATIVE_CALL_DEADLINE_S, self._param.get_param_int, name
+            )
+        except ParamError as error:
+            found = error.result.name.lower().replace("_", " ")
+            raise device_error(self._address, f"PX4's parameter {name}", found, "check the link") from None
+        return value

@@ -1,0 +1,182 @@
+"""What a ground station may send to the vehicle, and what of it while PX4 is armed. Pure: frames in, frames out; time is an argument.
+
+While PX4 is armed an allow-list holds: what reads, and what ends or pauses the flight (LAND, HOLD, a pilot's mode, a disarm that PX4
+itself may refuse). Everything else waits until PX4 is disarmed: a forced disarm, a restart, flight termination, parameters, missions,
+files, RETURN (which climbs, on a tether), and whatever is not listed here.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.io.qgroundcontrol.frames import (
+    COMMANDS,
+    GROUND_MESSAGES,
+    GROUND_SYSTEMS_MAX,
+    REFUSED_COMMANDS,
+    REQUEST_EVENT,
+    UP_BURST,
+    UP_RATE_HZ,
+    Bucket,
+    Frame,
+    autopilot_heartbeat,
+    command_of,
+    frames,
+)
+
+HEARTBEAT_MAX_AGE_S = 3.0
+"""PX4 sends one a second. Without one PX4 counts as armed."""
+
+ARMED_MESSAGES = frozenset(
+    getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+    for name in (
+        *("HEARTBEAT", "PING", "SYSTEM_TIME", "MANUAL_CONTROL", "SET_MODE", "COMMAND_LONG", "COMMAND_INT"),
+        *("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "LOGGING_ACK"),
+        *("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_REQUEST_LIST", "MISSION_ACK"),
+    )
+) | {REQUEST_EVENT}
+
+_READING_COMMANDS = frozenset(
+    {
+        mavlink.MAV_CMD_REQUEST_MESSAGE,
+        mavlink.MAV_CMD_GET_MESSAGE_INTERVAL,
+        mavlink.MAV_CMD_GET_HOME_POSITION,
+        mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION,
+        mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    }
+)
+_ALTCTL, _POSCTL, _AUTO, _STABILIZED = 2, 3, 4, 7
+"""PX4's main modes, as px4_custom_mode.h numbers them."""
+_LOITER, _LAND = 3, 6
+"""PX4's sub-modes of AUTO."""
+_ARMED_MODES = frozenset({(_AUTO, _LOITER), (_AUTO, _LAND), (_POSCTL, 0), (_ALTCTL, 0), (_STABILIZED, 0)})
+_COMMAND_BYTES = 33
+"""Payload of COMMAND_LONG; that of COMMAND_INT is longer, with param1 to param4 at the same place."""
+_SET_MODE_BYTES = 6
+
+
+class ArmedState:
+    """Whether PX4 is armed, as the relay sees it.
+
+    Args:
+        vehicle_system: MAVLink system id of PX4.
+    """
+
+    def __init__(self, vehicle_system: int) -> None:
+        self._vehicle_system = vehicle_system
+        self._disarmed_s: float | None = None
+        self._arming_s = -math.inf
+
+    def hear(self, datagram: bytes, now_s: float) -> None:
+        """Take in what MAVSDK forwards from PX4."""
+        heard = autopilot_heartbeat(datagram)
+        if heard is not None and heard.system == self._vehicle_system:
+            self._disarmed_s = None if heard.armed else now_s
+
+    def expect_arming(self, now_s: float) -> None:
+        """The companion asks PX4 to arm; the HEARTBEAT that shows it comes up to a second later."""
+        self._arming_s = now_s
+
+    def armed(self, now_s: float) -> bool:
+        """PX4 is armed, may be, or is not heard."""
+        if self._disarmed_s is None or now_s - self._disarmed_s > HEARTBEAT_MAX_AGE_S:
+            return True
+        return now_s - self._arming_s <= HEARTBEAT_MAX_AGE_S
+
+
+class Door:
+    """What a ground station may say to the vehicle.
+
+    Args:
+        vehicle_system: MAVLink system id of PX4, which is the companion's too.
+        while_armed: pass while PX4 is armed what passes while it is not, SERIAL_CONTROL excepted.
+        console: pass SERIAL_CONTROL while PX4 is not armed.
+    """
+
+    def __init__(self, vehicle_system: int, *, while_armed: bool = False, console: bool = False) -> None:
+        self.state = ArmedState(vehicle_system)
+        """Whether PX4 is armed."""
+        self.refused: Counter[str] = Counter()
+        """How many were not let through, by the reason in words."""
+        self._vehicle_system = vehicle_system
+        self._while_armed, self._console = while_armed, console
+        self._systems: set[int] = set()
+        self._bucket = Bucket(UP_RATE_HZ, UP_BURST)
+
+    def admit(self, datagram: bytes, now_s: float) -> list[bytes]:
+        """The frames to pass on, each as one datagram."""
+        passed = []
+        for frame in frames(datagram):
+            reason = self._objection(frame, now_s)
+            if reason is None and frame is not None:
+                passed.append(frame.data)
+            else:
+                self.refused[str(reason)] += 1
+        return passed
+
+    def _objection(self, frame: Frame | None, now_s: float) -> str | None:
+        if frame is None or not frame.intact():
+            return "no MAVLink"
+        if frame.system in (0, self._vehicle_system):
+            return f"in the vehicle's name (system id {frame.system})"
+        if frame.message_id not in GROUND_MESSAGES:
+            return f"{frame.name}, which is not a ground station's to say"
+        if frame.message_id in COMMANDS and command_of(frame.payload) in REFUSED_COMMANDS:
+            return f"command {command_of(frame.payload)}, which the flight does not allow"
+        reason = self._now(frame, self.state.armed(now_s))
+        if reason is not None:
+            return reason
+        if frame.system not in self._systems:
+            if len(self._systems) >= GROUND_SYSTEMS_MAX:
+                return f"from a fifth ground station (system id {frame.system})"
+            self._systems.add(frame.system)
+        return None if self._bucket.take(now_s) else f"more than {UP_RATE_HZ:g} messages a second"
+
+    def _now(self, frame: Frame, armed: bool) -> str | None:
+        """Why the frame must wait, or never passes here."""
+        if frame.message_id == mavlink.MAVLINK_MSG_ID_SERIAL_CONTROL:
+            if not self._console:
+                return "SERIAL_CONTROL, which ground.qgroundcontrol_console does not allow"
+            return "SERIAL_CONTROL while PX4 is armed" if armed else None
+        return objection_while_armed(frame) if armed and not self._while_armed else None
+
+
+def objection_while_armed(frame: Frame) -> str | None:
+    """Why an intact frame of a ground station is refused while PX4 is armed; None if it may pass."""
+    if frame.message_id not in ARMED_MESSAGES:
+        return f"{frame.name} while PX4 is armed"
+    if frame.message_id == mavlink.MAVLINK_MSG_ID_SET_MODE:
+        custom_mode, _, base_mode = struct.unpack("<IBB", _padded(frame, _SET_MODE_BYTES))
+        allowed = _mode_allowed(float(base_mode), float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24))
+        return None if allowed else "this mode while PX4 is armed"
+    if frame.message_id in COMMANDS and not _command_allowed(frame):
+        return f"command {command_of(frame.payload)} while PX4 is armed"
+    return None
+
+
+def _command_allowed(frame: Frame) -> bool:
+    command = command_of(frame.payload)
+    params = struct.unpack_from("<7f", _padded(frame, _COMMAND_BYTES))
+    if command == mavlink.MAV_CMD_NAV_LAND or command in _READING_COMMANDS:
+        return True
+    if command == mavlink.MAV_CMD_DO_SET_MODE:
+        return _mode_allowed(*params[:3])
+    if command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
+        return params[:2] == (0.0, 0.0)  # disarm, not forced: PX4 refuses it in the air
+    if command == mavlink.MAV_CMD_DO_REPOSITION:  # QGroundControl's Pause: hold where it is
+        return frame.message_id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG and all(map(math.isnan, params[4:7]))
+    return False
+
+
+def _mode_allowed(base_mode: float, main_mode: float, sub_mode: float) -> bool:
+    custom = base_mode in range(256) and int(base_mode) & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    return bool(custom) and (main_mode, sub_mode) in _ARMED_MODES
+
+
+def _padded(frame: Frame, size: int) -> bytes:
+    """The payload's first `size` bytes; MAVLink 2 cuts zeros off the end."""
+    return frame.payload[:size].ljust(size, b"\0")

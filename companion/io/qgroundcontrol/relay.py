@@ -1,0 +1,223 @@
+"""The process between MAVSDK and a MAVLink ground station: `python -m companion.io.qgroundcontrol.relay`.
+
+It holds three sockets: one to MAVSDK's second connection (loopback), one to the ground station, both connected, so that the kernel
+throws away what comes from anywhere else, and the channel to the flight process. A flood from the ground costs this process its
+time, not the flight. It ends when the channel does.
+
+On the channel, JSON (`companion.io.qgroundcontrol.channel`): to the flight process `{"port": N}` once, or `{"error": text}`; later
+`{"text": text}`. From it `{"vehicle_port": N}` once; later `{"arming": true}` when it asks PX4 to arm,
+`{"texts": [[severity, text], ...]}`, `{"situation": text}`, `{"t_ms": N, "values": {...}}`, `{"bye": true}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections import Counter
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.io.qgroundcontrol.channel import pack, unpack
+from companion.io.qgroundcontrol.door import Door
+from companion.io.qgroundcontrol.frames import Thinner
+from companion.io.qgroundcontrol.texts import COMPONENT, Texts, heartbeat_message, value_messages
+
+NICENESS = 10
+CHANNEL_MAX_BYTES = 65_536
+GONE = "flight process gone: guardian lands, link ends"
+_DATAGRAM_MAX_BYTES = 65535
+_ROUND_DATAGRAMS = 64
+"""Of one socket before the others have their turn."""
+_HEARTBEAT_S = 1.0
+_AWAY_S = 5.0
+"""A ground station that was silent so long is told again what is going on."""
+_REPORT_S = 5.0
+"""Between two lines about what was refused."""
+
+
+class Relay:
+    """One vehicle and one ground station.
+
+    Args:
+        channel: to the flight process.
+        vehicle: UDP, bound on loopback; connected once MAVSDK's port is known.
+        ground: UDP, connected to the ground station.
+        door: what the ground station may say.
+        vehicle_system: MAVLink system id of the vehicle.
+        own: system and component id that MAVSDK speaks with; the system is the vehicle's.
+        name: the ground station's address for people.
+    """
+
+    def __init__(
+        self,
+        channel: socket.socket,
+        vehicle: socket.socket,
+        ground: socket.socket,
+        door: Door,
+        vehicle_system: int,
+        own: tuple[int, int],
+        name: str,
+    ) -> None:
+        self._channel, self._vehicle, self._ground, self._name = channel, vehicle, ground, name
+        for one in (channel, vehicle, ground):
+            one.setblocking(False)
+        self._open = False
+        """MAVSDK's port is known."""
+        self._bye = False
+        self._door, self._thinner, self._texts = door, Thinner(own), Texts()
+        self._encoder = mavlink.MAVLink(None, srcSystem=vehicle_system, srcComponent=COMPONENT)
+        self._situation: str | None = None
+        self._beat_s = self._report_s = 0.0
+        self._heard_s: float | None = None
+        self._told: Counter[str] = Counter()
+
+    def run(self) -> None:
+        """Until the flight process says goodbye or is gone."""
+        waits = select.poll()
+        for one in (self._channel, self._vehicle, self._ground):
+            waits.register(one, select.POLLIN)
+        while True:
+            now_s = time.monotonic()
+            ready = {fd for fd, _ in waits.poll(1e3 * max(0.0, min(self._beat_s - now_s, 0.1)))}
+            now_s = time.monotonic()
+            if self._channel.fileno() in ready and not self._hear():
+                break
+            if self._vehicle.fileno() in ready:
+                for datagram in _received(self._vehicle):
+                    self._door.state.hear(datagram, now_s)
+                    for frame in self._thinner.pick(datagram, now_s):
+                        self._to_ground(frame)
+            if self._ground.fileno() in ready:
+                self._take_from_ground(now_s)
+            if now_s >= self._beat_s:
+                self._beat_s = now_s + _HEARTBEAT_S
+                self._say(heartbeat_message())
+            for message in self._texts.due(now_s):
+                self._say(message)
+            self._report(now_s)
+        if not self._bye:
+            self._texts = Texts()
+            self._texts.say(int(mavlink.MAV_SEVERITY_ALERT), GONE)
+            for message in self._texts.due(time.monotonic()):
+                self._say(message)
+
+    def _hear(self) -> bool:
+        """What the flight process says; False: the channel has ended."""
+        for _ in range(_ROUND_DATAGRAMS):
+            try:
+                data = self._channel.recv(CHANNEL_MAX_BYTES)
+            except BlockingIOError:
+                return True
+            except OSError:
+                return False
+            if not data:
+                return False
+            self._take(unpack(data))
+        return True
+
+    def _take(self, said: dict[str, Any]) -> None:
+        if "vehicle_port" in said:
+            self._vehicle.connect(("127.0.0.1", said["vehicle_port"]))
+            self._open = True
+        if "arming" in said:
+            self._door.state.expect_arming(time.monotonic())
+        for severity, text in said.get("texts", ()):
+            self._texts.say(severity, text)
+        self._situation = said.get("situation", self._situation)
+        if "values" in said:
+            for message in value_messages(said["t_ms"], said["values"]):
+                self._say(message)
+        self._bye = self._bye or "bye" in said
+
+    def _take_from_ground(self, now_s: float) -> None:
+        for datagram in _received(self._ground):
+            passed = self._door.admit(datagram, now_s)
+            if not passed or not self._open:
+                continue
+            if self._heard_s is None:
+                self._tell(f"ground station {self._name} is there")
+            if self._situation is not None and (self._heard_s is None or now_s - self._heard_s > _AWAY_S):
+                self._texts.say(int(mavlink.MAV_SEVERITY_INFO), self._situation)
+            self._heard_s = now_s
+            for frame in passed:
+                with contextlib.suppress(OSError):  # MAVSDK does not keep up: as on any link
+                    self._vehicle.send(frame)
+
+    def _report(self, now_s: float) -> None:
+        """What was refused, a line for each new reason and then every so often how many."""
+        if self._door.refused == self._told or now_s < self._report_s:
+            return
+        self._report_s = now_s + _REPORT_S
+        new = self._door.refused - self._told
+        self._told = Counter(self._door.refused)
+        reasons = ", ".join(f"{count} {reason}" for reason, count in new.most_common(5))
+        self._tell(f"ground station {self._name}: messages refused: {reasons}")
+
+    def _say(self, message: Any) -> None:
+        self._to_ground(message.pack(self._encoder))
+        self._encoder.seq = (self._encoder.seq + 1) % 256
+
+    def _to_ground(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):  # nobody listens there, or no network: both may come back
+            self._ground.send(data)
+
+    def _tell(self, text: str) -> None:
+        with contextlib.suppress(OSError):
+            self._channel.send(pack({"text": text}))
+
+
+def _received(source: socket.socket) -> list[bytes]:
+    """What waits, up to a round's worth."""
+    datagrams = []
+    for _ in range(_ROUND_DATAGRAMS):
+        try:
+            datagrams.append(source.recv(_DATAGRAM_MAX_BYTES))
+        except BlockingIOError:
+            break
+        except OSError:
+            continue  # an ICMP of before: nobody listened
+    return datagrams
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    parser = argparse.ArgumentParser(prog="companion.io.qgroundcontrol.relay")
+    parser.add_argument("--fd", type=int, required=True, help="channel to the flight process")
+    parser.add_argument("--host", required=True, help="ground station, an IP address")
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--system", type=int, required=True, help="MAVLink system id of the vehicle")
+    parser.add_argument("--own", type=int, nargs=2, required=True, help="system and component id of MAVSDK")
+    parser.add_argument("--name", required=True, help="the ground station's address for people")
+    parser.add_argument("--while-armed", action="store_true", help="pass everything while PX4 is armed too")
+    parser.add_argument("--console", action="store_true", help="pass SERIAL_CONTROL while PX4 is not armed")
+    a = parser.parse_args(argv)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends with the flight process
+    os.nice(NICENESS)
+    family = socket.AF_INET6 if ":" in a.host else socket.AF_INET
+    with (
+        socket.socket(fileno=a.fd) as channel,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+        socket.socket(family, socket.SOCK_DGRAM) as ground,
+    ):
+        vehicle.bind(("127.0.0.1", 0))
+        try:
+            ground.connect((a.host, a.port))
+        except OSError as error:
+            channel.send(pack({"error": error.strerror or str(error)}))
+            return 1
+        channel.send(pack({"port": vehicle.getsockname()[1]}))
+        door = Door(a.system, while_armed=a.while_armed, console=a.console)
+        Relay(channel, vehicle, ground, door, a.system, (a.own[0], a.own[1]), a.name).run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""`companion fly` from the launcher's side: run it, show it, write down what came of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from companion.analysis.log import FlightLog, LogError
+from companion.analysis.summary import empty_summary, summarise, write_summary
+from companion.config.loader import FlightConfig
+from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
+from companion.model.types import Outcome
+from companion.runtime.console import FlightDisplay, print_result, tell
+from companion.runtime.ipc import Message
+from companion.runtime.subprocesses import LaunchError
+
+TICKS_MAX = 60_000
+"""Of a longer flight (5 minutes at 200 Hz) fewer ticks are graded and drawn: all ticks of an hour would take 6 GB."""
+
+
+def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
+    """Fly, then write summary and, if wanted, the report; returns the exit code."""
+    where = config.vehicle.name if sitl is None else "SITL" if sitl == "stub" else "a real PX4 in SITL"
+    title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
+    display = FlightDisplay(console, title)
+
+    def on_message(message: Message) -> None:
+        if message.get("type") == "progress" and message.get("source") == "sitl":
+            display.say(message["text"])
+        else:
+            display.on_message(message)
+
+    launcher = Launcher(config, out, sitl=sitl or False, on_message=on_message)
+    # A second Ctrl-C may come when a short flight is over already: it must not cost the summary.
+    with landing_signals(launcher.ask_to_land):
+        with display:
+            try:
+                result = launcher.run()
+            except LaunchError as error:
+                result = FlightResult(Outcome.REFUSED, lines=(str(error),))
+        for line in result.lines:
+            tell(line)
+        try:
+            log, summary = _summary(config, result, out)
+        except OSError as error:
+            tell(f"{out}: summary.json cannot be written: {error.strerror}")
+            return result.exit_code
+    page = None
+    if log is not None and report:
+        try:
+            with console.status("writing the report"):
+                page = report_of(log, summary, out)
+        except KeyboardInterrupt:
+            tell(f"report given up; make it with: companion report {out / 'flight.mcap'}")
+        except OSError as error:
+            tell(f"{out}: the report cannot be written: {error.strerror}")
+    print_result(console, summary, out, page)
+    return result.exit_code
+
+
+def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[FlightLog | None, dict[str, Any]]:
+    """Read the log, if the flight left one; write summary.json."""
+    log = None
+    path = out / "flight.mcap"
+    if path.exists():
+        try:
+            log = FlightLog.read(path, ticks_max=TICKS_MAX)
+        except LogError as error:
+            tell(error)
+    about: dict[str, Any] = {
+        "outcome": result.outcome.value,
+        "controller": config.controller.law,
+        "preset": config.controller.preset,
+        "payload_kg": result.world.get("payload_kg"),
+        "recorder": result.recorder,
+    }
+    summary = summarise(log, **about) if log is not None else empty_summary(**about)
+    summary["autopilot"] = autopilot_of(log, result.world)
+    logged = {event["id"] for event in summary["events"]}
+    summary["events"] += [event for event in result.events if event["id"] not in logged]
+    summary["events"] += result.guardian_events
+    write_summary(summary, out / "summary.json")
+    return log, summary
+
+
+def autopilot_of(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]:
+    """Who flew: kind (stub or px4), version, and what else the world knows; on the vehicle by what PX4 said."""
+    firmware = None if log is None else log.metadata.get("autopilot", {}).get("firmware")
+    return {"kind": "px4", "version": firmware, "firmware": firmware, **world.get("autopilot", {})}
+
+
+def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None:
+    """report.html with its plots; None without matplotlib, which a flight does not need."""
+    try:
+        from companion.analysis.report import write_report
+    except ImportError:
+        return None
+    return write_report(log, summary, out)

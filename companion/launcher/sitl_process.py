@@ -1,0 +1,169 @@
+"""The simulated world as a child process of the launcher."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from companion.config.loader import FlightConfig
+from companion.runtime.subprocesses import LaunchError, how_it_ended, last_line, terminate, write_text
+
+SITL_READY_TIMEOUT_S = 30.0
+PX4_READY_TIMEOUT_S = 700.0
+"""With a real PX4. The world keeps its own deadlines: of PX4's boot, and of a person who starts it by hand."""
+PX4_FOLDER = "px4"
+"""In the flight's folder: what a real PX4 reads and writes."""
+SITL_LEAVE_TIMEOUT_S = 5.0
+"""The world ends by itself when the launcher leaves it and its rotors stand."""
+SITL_LAST_WORDS_TIMEOUT_S = 10.0
+"""After SIGTERM; a real PX4 takes its time to end."""
+
+
+class SitlProcess:
+    """The simulated world as a child process.
+
+    Args:
+        config: of the flight.
+        out: folder of the flight.
+        px4: fly a real PX4 instead of the stub.
+    """
+
+    def __init__(self, config: FlightConfig, out: Path, *, px4: bool = False) -> None:
+        self._px4 = px4
+        self._error: str | None = None
+        path = out / "sitl_config.json"
+        write_text(path, config.model_dump_json(indent=1))
+        self.log = out / "sitl.log"
+        with open(self.log, "wb") as log:
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "sitl", "--config", str(path), "--for-launcher"),
+                    *(("--px4", str((out / PX4_FOLDER).resolve())) if px4 else ()),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                start_new_session=True,
+            )
+        self._buffer = b""
+        self.final: dict[str, Any] = {}
+        self.at_rest = False
+        self.flight_environment: dict[str, str] = {}
+        """What the flight process's environment needs for faults of its own that the world plants."""
+        self.ended = False
+        """The world closed its end of the pipe: it is gone, or about to be."""
+
+    def devices(
+        self,
+        on_message: Callable[[dict[str, Any]], None] = lambda message: None,
+        given_up: Callable[[], bool] = lambda: False,
+    ) -> dict[str, dict[str, Any]]:
+        """Addresses of the simulated devices, once they are open and the autopilot can be flown.
+
+        Args:
+            on_message: called with what the world says until then (type "progress": a line for the user).
+            given_up: asked several times a second; True ends the wait.
+
+        Raises:
+            LaunchError: the world ended, was not ready in time, or was given up.
+        """
+        timeout_s = PX4_READY_TIMEOUT_S if self._px4 else SITL_READY_TIMEOUT_S
+        deadline_s = time.monotonic() + timeout_s
+        while not self.ended and time.monotonic() < deadline_s:
+            if given_up():
+                raise LaunchError("sitl: given up while the simulated world was being prepared")
+            devices = self._ready(min(deadline_s, time.monotonic() + 0.2), on_message)
+            if devices is not None:
+                return devices
+        if self.ended:
+            raise LaunchError(self.epitaph())
+        raise LaunchError(f"sitl: the simulated world was not ready within {timeout_s:g} s; see {self.log}")
+
+    def _ready(
+        self, deadline_s: float, on_message: Callable[[dict[str, Any]], None]
+    ) -> dict[str, dict[str, Any]] | None:
+        for message in self.messages(deadline_s):
+            on_message(message)
+            if message.get("type") == "ready":
+                devices: dict[str, dict[str, Any]] = message["devices"]
+                self.flight_environment = message.get("flight_environment", {})
+                return devices
+            if message.get("type") == "error":
+                raise LaunchError(str(message["text"]))
+        return None
+
+    def epitaph(self) -> str:
+        """One line about a world that ended by itself."""
+        terminate(self.process)
+        if self._error is not None:
+            return self._error
+        return f"sitl: the simulated world {how_it_ended(self.process.returncode)}{last_line(self.log)}; see {self.log}"
+
+    def messages(self, deadline_s: float) -> Iterator[dict[str, Any]]:
+        """JSON lines until the deadline (0: only what is there) or the end of the process."""
+        if self.ended:
+            return
+        assert self.process.stdout is not None
+        fd = self.process.stdout.fileno()
+        while True:
+            while b"\n" in self._buffer:
+                line, _, self._buffer = self._buffer.partition(b"\n")
+                with contextlib.suppress(ValueError):
+                    message = json.loads(line)
+                    self._note(message)
+                    yield message
+            left_s = max(0.0, deadline_s - time.monotonic())
+            if not select.select([fd], [], [], left_s)[0]:
+                return
+            data = os.read(fd, 65536)
+            if not data:
+                self.ended = True
+                return
+            self._buffer += data
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if message.get("type") == "final":
+            self.final = message["world"]
+        if message.get("type") == "error":
+            self._error = str(message["text"])
+        if message.get("type") == "at_rest":
+            self.at_rest = bool(message["at_rest"])
+
+    def tell_flight(self, pid: int) -> None:
+        """Name the flight process to the world, which may be asked to kill or to stop it."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):  # a world that is gone is noticed elsewhere
+            os.write(self.process.stdin.fileno(), json.dumps({"type": "flight", "pid": pid}).encode() + b"\n")
+
+    def wait_at_rest(self, deadline_s: float) -> None:
+        """Until the world's rotors stand, or the deadline."""
+        for _ in self.messages(0.0):
+            pass
+        while not self.at_rest and time.monotonic() < deadline_s and not self.ended:
+            for _ in self.messages(time.monotonic() + 0.2):
+                pass
+
+    def stop(self) -> None:
+        """Ask for the end, take the last words, make sure. Does nothing after the first time."""
+        assert self.process.stdin is not None and self.process.stdout is not None
+        if self.process.stdout.closed:
+            return
+        with contextlib.suppress(OSError):
+            self.process.stdin.close()
+        self._listen(SITL_LEAVE_TIMEOUT_S)
+        if not self.ended:
+            self.process.terminate()
+            self._listen(SITL_LAST_WORDS_TIMEOUT_S)
+        terminate(self.process)
+
+    def _listen(self, timeout_s: float) -> None:
+        for _ in self.messages(time.monotonic() + timeout_s):
+            pass

@@ -1,0 +1,147 @@
+"""Frames and rotations: world ENU-like / body FLU (companion) <-> NED / FRD (PX4).
+
+The companion's world shares its origin with PX4's local frame: x_enu = y_ned, y_enu = x_ned, z_enu = -z_ned. All quaternions are
+``(w, x, y, z)``. Functions work on tuples of floats and use `math` only: they run in the control tick.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.model.types import Quat, Vec3
+
+_SQRT_HALF = math.sqrt(0.5)
+
+
+def quat_multiply(a: Quat, b: Quat) -> Quat:
+    """Hamilton product a * b."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def quat_conjugate(q: Quat) -> Quat:
+    """Inverse of a unit quaternion."""
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+def quat_normalize(q: Quat) -> Quat:
+    """Unit quaternion of the same direction.
+
+    Raises:
+        ValueError: if the norm is zero or not finite.
+    """
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if not norm > 1e-9 or not math.isfinite(norm):
+        raise ValueError(f"quaternion {q} has no direction")
+    return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+def quat_rotate(q: Quat, v: Vec3) -> Vec3:
+    """Rotate v by q (body vector into the world, if q is an attitude)."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx = 2.0 * (y * vz - z * vy)
+    ty = 2.0 * (z * vx - x * vz)
+    tz = 2.0 * (x * vy - y * vx)
+    return (
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+def body_z_component(q: Quat, v: Vec3) -> float:
+    """The last component of a world vector seen from the body: `quat_rotate(quat_conjugate(q), v)[2]`, to the last bit."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx = 2.0 * (z * vy - y * vz)
+    ty = 2.0 * (x * vz - z * vx)
+    tz = 2.0 * (y * vx - x * vy)
+    return vz + w * tz - x * ty + y * tx
+
+
+def body_x_z_axes_world(q: Quat) -> tuple[Vec3, Vec3]:
+    """The body's x and z axis in the world: first and third column of the rotation matrix."""
+    w, x, y, z = q
+    yy = y * y
+    return (
+        (1.0 - 2.0 * (yy + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+        (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + yy)),
+    )
+
+
+def quat_from_euler_zyx(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
+    """Attitude from ZYX Euler angles (the paper's q = [roll, pitch, yaw])."""
+    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def euler_zyx_from_quat(q: Quat) -> Vec3:
+    """Roll, pitch, yaw in rad; pitch in [-pi/2, pi/2]."""
+    w, x, y, z = q
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return (roll, pitch, yaw)
+
+
+def yaw_from_quat(q: Quat) -> float:
+    """The yaw of `euler_zyx_from_quat` alone, rad."""
+    w, x, y, z = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def wrap_rad(angle_rad: float) -> float:
+    """Angle in [-pi, pi)."""
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def tilt_rad(q: Quat) -> float:
+    """Angle between the body z axis and the vertical."""
+    return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))))
+
+
+def ned_from_enu(v: Vec3) -> Vec3:
+    """World vector, ENU -> NED."""
+    return (v[1], v[0], -v[2])
+
+
+def enu_from_ned(v: Vec3) -> Vec3:
+    """World vector, NED -> ENU (its own inverse)."""
+    return (v[1], v[0], -v[2])
+
+
+def frd_from_flu(v: Vec3) -> Vec3:
+    """Body vector, FLU -> FRD."""
+    return (v[0], -v[1], -v[2])
+
+
+def flu_from_frd(v: Vec3) -> Vec3:
+    """Body vector, FRD -> FLU (its own inverse)."""
+    return (v[0], -v[1], -v[2])
+
+
+def attitude_ned_frd_from_enu_flu(q: Quat) -> Quat:
+    """Attitude FLU->ENU to attitude FRD->NED, w >= 0."""
+    # (0, s, s, 0) * q * (0, 1, 0, 0) with s = sqrt(1/2), up to the sign: rotation by pi about (1, 1, 0), then by pi about x.
+    w, x, y, z = _SQRT_HALF * q[0], _SQRT_HALF * q[1], _SQRT_HALF * q[2], _SQRT_HALF * q[3]
+    w, x, y, z = w + z, x + y, x - y, w - z
+    return (w, x, y, z) if w >= 0.0 else (-w, -x, -y, -z)
+
+
+def attitude_enu_flu_from_ned_frd(q: Quat) -> Quat:
+    """Attitude FRD->NED to attitude FLU->ENU, w >= 0 (its own inverse)."""
+    return attitude_ned_frd_from_enu_flu(q)

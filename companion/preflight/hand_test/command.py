@@ -1,0 +1,201 @@
+"""The hand test at the terminal: says what to do, shows the motion, judges, keeps the record of a passed one."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+import termios
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn
+
+from companion.config.loader import FlightConfig
+from companion.io.devices import Edges, SomeEdges
+from companion.model.rows import Row, refusals
+from companion.model.types import AutopilotStatus, MocapPose, VehicleState
+from companion.preflight.checks import Check
+from companion.preflight.hand_test import judge as hand_judge
+from companion.preflight.hand_test import record as hand_record
+from companion.preflight.hand_test.run import TOLD, HandResult, HandSample, HandTest, HandView, Step
+
+LOOK_PERIOD_S: Final = 0.004
+ARM_PERIOD_S: Final = 0.02
+_ARM_TIMEOUT_S: Final = 0.003
+ENDED_BY_HAND: Final = "ended by hand"
+_STEPS: Final = tuple(step for step in Step if step is not Step.DONE)
+
+RECORD = Check(
+    "hand.record",
+    "hand test: record",
+    "a passed test is written down",
+    "the next check will ask for the test again",
+    warns=True,
+)
+
+
+async def run_hand_test(
+    edges: Edges | SomeEdges, config: FlightConfig, console: Console, json: bool = False, *, record: Path | None = None
+) -> list[Row]:
+    """Guide somebody through the test; its rows. Any key or Ctrl-C ends it.
+
+    Args:
+        edges: open; motion capture need not flow to PX4. The arm, if it is open, is read on, for the sake of its watchdogs.
+        config: the effective configuration.
+        console: for people.
+        json: standard output is kept free: people are told on standard error, wherever the console writes.
+        record: where a passed test is written down (`hand_record.record_path()`); None: nowhere, as in SITL.
+    """
+    outcome = await perform(edges, config, console, json)
+    if isinstance(outcome, str):
+        return [hand_judge.ended(outcome)]
+    rows = hand_judge.rows(outcome, config.vehicle.devices.mocap.up_axis)
+    if record is not None and edges.mocap is not None and not refusals(rows):
+        info = edges.mocap.server_info
+        setup = hand_record.Setup.of(config.vehicle, info.version if info is not None else "")
+        rows.append(_keep(record, setup, rows))
+    return rows
+
+
+async def perform(
+    edges: Edges | SomeEdges, config: FlightConfig, console: Console, json: bool = False
+) -> HandResult | str:
+    """Guide somebody through the test; what was measured, or why there is nothing. Arguments as of `run_hand_test`."""
+    mocap, autopilot, arm = edges.mocap, edges.autopilot, edges.arm
+    if mocap is None or autopilot is None:
+        missing = "motion capture" if mocap is None else "PX4"
+        return f"{missing} is not open"
+    test, clock, arm_due_s = HandTest(), _StampClock(), 0.0
+    stop = asyncio.Event()
+    with (
+        _ended_by_hand(stop),
+        _Screen(Console(stderr=True) if json and console.file is sys.stdout else console) as screen,
+    ):
+        while True:
+            pose, vehicle, status = mocap.latest(), autopilot.vehicle(), autopilot.status()
+            now_s = clock.now(pose, vehicle, status)
+            view = test.update(HandSample(now_s, pose, vehicle, _armed(status, now_s, config)))
+            screen.show(view)
+            if view.result is not None or view.ended or stop.is_set():
+                break
+            if arm is not None and now_s >= arm_due_s:
+                arm_due_s = now_s + ARM_PERIOD_S
+                await arm.read(_ARM_TIMEOUT_S)
+            await asyncio.sleep(LOOK_PERIOD_S)
+    return view.result if view.result is not None else view.ended or ENDED_BY_HAND
+
+
+def _keep(path: Path, setup: hand_record.Setup, rows: list[Row]) -> Row:
+    try:
+        tests = hand_record.load(path)
+    except hand_record.RecordError:
+        tests = []  # what cannot be understood is replaced: the test that was just passed is what counts
+    try:
+        hand_record.save(path, hand_record.with_passed(tests, setup, datetime.now(UTC), rows))
+    except hand_record.RecordError as error:
+        return RECORD.bad(str(error), "", "correct the folder's permissions and repeat the test")
+    return RECORD.good(f"written to {path}")
+
+
+def _armed(status: AutopilotStatus | None, now_s: float, config: FlightConfig) -> bool | None:
+    if status is None or now_s - status.heartbeat_stamp_s > config.vehicle.safety.heartbeat_timeout_s:
+        return None
+    return status.armed
+
+
+class _StampClock:
+    """The flight clock as the edges' stamps tell it: monotonic time from another origin. It goes on when all of them fall silent."""
+
+    def __init__(self) -> None:
+        self._ahead_s: float | None = None
+
+    def now(self, pose: MocapPose | None, vehicle: VehicleState | None, status: AutopilotStatus | None) -> float:
+        """Seconds; 0 while nothing has come yet."""
+        here_s = time.monotonic()
+        stamps = [
+            *((pose.stamp_s,) if pose is not None else ()),
+            *((vehicle.imu_stamp_s,) if vehicle is not None else ()),
+            *((status.heartbeat_stamp_s,) if status is not None else ()),
+        ]
+        if stamps:
+            newest_s = max(stamps) - here_s
+            self._ahead_s = newest_s if self._ahead_s is None else max(self._ahead_s, newest_s)
+        return here_s + (self._ahead_s or 0.0)
+
+
+@contextlib.contextmanager
+def _ended_by_hand(stop: asyncio.Event) -> Iterator[None]:
+    """Any key at a terminal, or Ctrl-C, sets the event."""
+    loop = asyncio.get_running_loop()
+    with contextlib.ExitStack() as stack:
+        if threading.current_thread() is threading.main_thread():
+            before = signal.getsignal(signal.SIGINT)
+            loop.add_signal_handler(signal.SIGINT, stop.set)
+            stack.callback(signal.signal, signal.SIGINT, before)
+            stack.callback(loop.remove_signal_handler, signal.SIGINT)
+        if sys.stdin is not None and sys.stdin.isatty():
+            descriptor = sys.stdin.fileno()
+            settings = termios.tcgetattr(descriptor)
+            stack.callback(termios.tcsetattr, descriptor, termios.TCSANOW, settings)
+            tty.setcbreak(descriptor, termios.TCSANOW)
+
+            def on_key() -> None:
+                os.read(descriptor, 64)
+                stop.set()
+
+            loop.add_reader(descriptor, on_key)
+            stack.callback(loop.remove_reader, descriptor)
+        yield
+
+
+class _Screen:
+    """One bar for the step under way; without a terminal a line per step."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._step: Step | None = None
+        self._notice = ""
+        self._progress = Progress(
+            TextColumn("  {task.description:<10}"),
+            BarColumn(bar_width=28),
+            TextColumn("{task.fields[seen]}", markup=False),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("", total=1.0, seen="")
+
+    def __enter__(self) -> _Screen:
+        self._console.print(
+            "[bold]hand test[/]  battery in, motors disarmed, propellers off; somebody carries the machine (any key ends it)"
+        )
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, view: HandView) -> None:
+        """The newest state."""
+        if view.step is not self._step:
+            self._step = view.step
+            number = f"{_STEPS.index(view.step) + 1}/{len(_STEPS)}" if view.step in _STEPS else "   "
+            self._line(f"{number}  {TOLD[view.step]}")
+        if view.notice != self._notice:
+            self._notice = view.notice
+            if view.notice:
+                self._line(f"     [yellow]{escape(view.notice)}[/]")
+        self._progress.update(self._task, description=view.step.value, completed=view.progress, seen=view.seen)
+
+    def _line(self, text: str) -> None:
+        self._progress.console.print(f"  {text}", highlight=False)

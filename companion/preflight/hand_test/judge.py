@@ -1,0 +1,206 @@
+"""What a hand test has shown: rows with what was measured, and which axis is wrong. Pure.
+
+Frames: what the IMU felt is in the machine's own body frame (x forward, y left, z up), what motion capture saw in the frame of its
+rigid body. On a sound set-up the two are one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from companion.model.frames import quat_rotate
+from companion.model.rows import Row
+from companion.model.types import Vec3
+from companion.preflight.axes import ALL, IDENTITY, Y_UP, AxisMap
+from companion.preflight.checks import Check
+from companion.preflight.hand_test.motion import Motion, angle_rad, norm
+from companion.preflight.hand_test.run import HandResult
+
+_ASTRAY = "the controller would push into wrong directions"
+DONE = Check("hand.done", "hand test", "every step of it is recognised", "nothing is known of the axes")
+TOLD = Check(
+    "hand.told",
+    "hand test: as told",
+    "the IMU felt it go up, forward and turn left",
+    "either it was moved elsewhere, or PX4's own axes are wrong",
+)
+LEVEL = Check("hand.level", "hand test: level", "gravity is vertical in the stream within 5 deg", _ASTRAY)
+LIFT = Check("hand.lift", "hand test: up", "felt and seen in the same direction within 20 deg", _ASTRAY)
+FORWARD = Check(
+    "hand.forward",
+    "hand test: forward",
+    "the same, and within 12 deg about the vertical",
+    "PX4 fuses this yaw and cannot notice: the machine would circle or fly off",
+)
+TURN = Check(
+    "hand.turn",
+    "hand test: turn",
+    "gyro and motion capture agree within 8 deg",
+    "a yaw that turns the wrong way never settles",
+)
+SCALE = Check(
+    "hand.scale",
+    "hand test: distance",
+    "0.7 to 1.4 m seen for each metre felt",
+    "every distance would be wrong by that",
+)
+CHECKS = (DONE, TOLD, LEVEL, LIFT, FORWARD, TURN, SCALE)
+
+LEVEL_MAX_DEG: Final = 5.0
+"""Between gravity by the accelerometer, turned by the streamed attitude, and the world's vertical."""
+AXIS_MAX_DEG: Final = 20.0
+YAW_MAX_DEG: Final = 12.0
+"""Between the nose of the rigid body and that of the machine."""
+TURN_MAX_DEG: Final = 8.0
+"""Between gyro and motion capture, of some 45 deg."""
+TOLD_MAX_DEG: Final = 40.0
+"""Between where it was to be moved and where the IMU felt it move."""
+SCALE_SPAN: Final = (0.7, 1.4)
+
+_UP: Vec3 = (0.0, 0.0, 1.0)
+_AHEAD: Vec3 = (1.0, 0.0, 0.0)
+_RESET = "in Motive, with the machine level and its nose along the stream's +x, reset the rigid body's orientation"
+_BOARD = "correct PX4's SENS_BOARD_ROT and calibrate its accelerometer: its axes are not the machine's"
+
+
+def rows(result: HandResult, up_axis: str) -> list[Row]:
+    """One row per thing that the test shows.
+
+    Args:
+        result: of a finished test.
+        up_axis: devices.mocap.up_axis, "y" or "z".
+    """
+    lift, forward, turn = result.lift, result.forward, result.turn
+    up_body = result.stood.force_m_s2
+    told = _told(lift, forward, turn, up_body)
+    fix = _BOARD if not told.ok and _seen_as_told(result) else _explain(result, up_axis)
+    level_deg = math.degrees(angle_rad(quat_rotate(result.stood.attitude, up_body), _UP))
+    lift_deg = math.degrees(angle_rad(lift.response, lift.felt_m))
+    yaw_deg = yaw_offset_deg(forward)
+    slant_deg = math.degrees(angle_rad(forward.response, forward.felt_m))
+    felt_deg, seen_deg = (math.degrees(value) for value in (turn.felt_turn_rad[2], turn.seen_turn_rad[2]))
+    axis_deg = math.degrees(angle_rad(turn.seen_turn_rad, turn.felt_turn_rad))
+    scales = (norm(lift.response), norm(forward.response))
+
+    def row(check: Check, ok: bool, read: str, wanted: str, wrong: str = fix) -> Row:
+        return check.good(read, wanted) if ok else check.bad(read, wanted, wrong)
+
+    far = "calibrate the motion-capture volume anew (wand length), or the accelerometer if it reads wrong at rest"
+    return [
+        DONE.good("lift, forward and turn were recognised"),
+        told,
+        row(
+            LEVEL,
+            level_deg <= LEVEL_MAX_DEG,
+            f"gravity points {level_deg:.1f} deg from the stream's vertical",
+            f"within {LEVEL_MAX_DEG:g} deg",
+        ),
+        row(
+            LIFT,
+            lift_deg <= AXIS_MAX_DEG,
+            f"felt {_way(lift.felt_m)}, seen {_way(lift.seen_m)}, {lift_deg:.0f} deg apart",
+            f"within {AXIS_MAX_DEG:g} deg",
+        ),
+        row(
+            FORWARD,
+            abs(yaw_deg) <= YAW_MAX_DEG and slant_deg <= AXIS_MAX_DEG,
+            f"felt {_way(forward.felt_m)}, seen {_way(forward.seen_m)}, the body's yaw is off by {yaw_deg:+.0f} deg",
+            f"within {YAW_MAX_DEG:g} deg",
+        ),
+        row(
+            TURN,
+            abs(seen_deg - felt_deg) <= TURN_MAX_DEG and axis_deg <= AXIS_MAX_DEG,
+            f"felt {felt_deg:+.0f} deg about its vertical, seen {seen_deg:+.0f} deg",
+            f"within {TURN_MAX_DEG:g} deg",
+        ),
+        row(
+            SCALE,
+            all(SCALE_SPAN[0] <= scale <= SCALE_SPAN[1] for scale in scales),
+            f"seen {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre felt",
+            f"{SCALE_SPAN[0]:g} to {SCALE_SPAN[1]:g} m",
+            far,
+        ),
+    ]
+
+
+def ended(cause: str, again: str = "companion check --hand") -> Row:
+    """A test that has no result; `again` is the command that it was part of."""
+    return DONE.bad(cause, "lift, forward and a turn to the left, each recognised", f"do it again: {again}")
+
+
+def yaw_offset_deg(forward: Motion) -> float:
+    """By how much the streamed yaw is too large, in (-180, 180]."""
+    (fx, fy, _), (sx, sy, _) = forward.felt_m, forward.response
+    return math.degrees(math.atan2(sx * fy - sy * fx, fx * sx + fy * sy))
+
+
+def _told(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) -> Row:
+    """Was it moved as it was told, by what the IMU felt alone? If yes, the IMU's own axes are right, too."""
+    up_deg = math.degrees(angle_rad(lift.felt_m, up_body))
+    standing_deg = math.degrees(angle_rad(up_body, _UP))
+    ahead_deg = math.degrees(angle_rad(forward.felt_m, _AHEAD))
+    left_deg = math.degrees(turn.felt_turn_rad[2])
+    read = f"the IMU felt {_way(lift.felt_m)}, then {_way(forward.felt_m)}, then a turn by {left_deg:+.0f} deg"
+    if max(up_deg, standing_deg, ahead_deg) <= TOLD_MAX_DEG and left_deg > 0.0:
+        return TOLD.good(read, "up, forward, left")
+    return TOLD.bad(read, "up, forward, left", f"repeat the test; if it was moved as told, {_BOARD}")
+
+
+def _seen_as_told(result: HandResult) -> bool:
+    """By motion capture alone: up, forward, left."""
+    most = math.radians(TOLD_MAX_DEG)
+    straight = angle_rad(result.lift.seen_m, _UP) <= most and angle_rad(result.forward.seen_m, _AHEAD) <= most
+    return straight and result.turn.seen_turn_rad[2] > 0.0
+
+
+def best_axes(result: HandResult) -> AxisMap:
+    """What the rigid body's streamed axes truly are, of the 48 possibilities: the nearest to all that was measured."""
+    polar = [(m.felt_m, m.response) for m in (result.lift, result.forward)]
+    axial = (result.turn.felt_turn_rad, result.turn.seen_turn_rad)
+
+    def misfit(axes: AxisMap) -> float:
+        total = sum(angle_rad(axes.vector(felt), seen) ** 2 for felt, seen in polar)
+        x, y, z = axes.vector(axial[0])
+        d = axes.determinant
+        return total + angle_rad((d * x, d * y, d * z), axial[1]) ** 2
+
+    return min(ALL, key=misfit)
+
+
+def _explain(result: HandResult, up_axis: str) -> str:
+    """The one line that says what to do."""
+    axes = best_axes(result)
+    yaw_deg = yaw_offset_deg(result.forward)
+    if axes.determinant < 0:
+        return (
+            f"the stream is left-handed (its x, y, z look like the true {', '.join(axes.names)}): "
+            "take Motive's right-handed axes, and no axis conversion on the way"
+        )
+    # A whole stream in other axes is level in itself; a body alone is not.
+    level = angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP) <= math.radians(LEVEL_MAX_DEG)
+    if level and axes == Y_UP and up_axis == "z":
+        return "the stream looks y-up: set devices.mocap.up_axis: y"
+    if level and axes == Y_UP.inverse and up_axis == "y":
+        return "the stream looks z-up: set devices.mocap.up_axis: z"
+    if axes.vector(_UP) == _UP and (axes != IDENTITY or abs(yaw_deg) > YAW_MAX_DEG):
+        side = "left" if yaw_deg > 0.0 else "right"
+        return f"the rigid body's zero is turned: its x axis points {abs(yaw_deg):.0f} deg to the {side} of the nose; {_RESET}"
+    if axes == IDENTITY:
+        return f"the rigid body's zero was set while the machine was tilted, or the ground plane is not level; {_RESET}"
+    exchanged = f"axes are exchanged (its x, y, z look like the machine's {', '.join(axes.names)})"
+    if level:
+        return f"the stream's {exchanged}: set devices.mocap.up_axis as Motive streams, and Motive's ground plane with z up"
+    return f"the rigid body's {exchanged}; {_RESET}"
+
+
+def _way(v: Vec3) -> str:
+    """A displacement in words: 0.29 m forward."""
+    words = (("forward", "back"), ("left", "right"), ("up", "down"))
+    size = norm(v)
+    parts = [
+        f"{abs(part):.2f} m {pair[part < 0.0]}"
+        for part, pair in zip(v, words, strict=True)
+        if abs(part) >= max(0.05, 0.25 * size)
+    ]
+    return " and ".join(parts) if parts else f"{100.0 * size:.0f} cm"

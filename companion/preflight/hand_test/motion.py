@@ -1,0 +1,245 @@
+"""One carried move as PX4's IMU felt it beside what motion capture saw of it. Pure.
+
+PX4's attitude is made of motion capture and says nothing new; accelerometer and gyro do. Gravity and the accelerometer's bias are
+nearly constant while the machine is carried for two seconds, so both velocities are compared without their mean and their slope: no
+rest need be perfect for that, and a hand's never is.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from companion.model.frames import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
+from companion.model.types import IDENTITY_QUAT, Quat, Vec3
+
+GRID_S: Final = 0.02
+GAP_MAX_S: Final = 0.3
+"""Longer without a sample, and the move is not judged."""
+
+
+class PoseAt(NamedTuple):
+    """A tracked motion-capture pose, as configured and streamed."""
+
+    t_s: float
+    position_m: Vec3
+    attitude: Quat
+
+
+class ImuAt(NamedTuple):
+    """PX4's accelerometer and gyro, body FLU."""
+
+    t_s: float
+    force_m_s2: Vec3
+    rate_rad_s: Vec3
+
+
+class GapError(ValueError):
+    """Samples are missing within a move; the text says of what, for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """One move from rest to rest."""
+
+    duration_s: float
+    felt_m: Vec3
+    """Displacement by the IMU, body frame at the move's start."""
+    seen_m: Vec3
+    """The same by motion capture, in the frame of its rigid body at the start."""
+    seen_world_m: Vec3
+    """The same in the stream's world."""
+    response: Vec3
+    """What motion capture saw, in its body's frame, of one metre that the IMU felt in the direction of `felt_m`: its length is the
+    ratio of their scales, its direction is to be that of `felt_m`."""
+    felt_turn_rad: Vec3
+    """Rotation vector by the gyro, body frame at the start."""
+    seen_turn_rad: Vec3
+    """The same by motion capture, in the frame of its rigid body at the start."""
+
+
+def measure(
+    poses: Sequence[PoseAt], imu: Sequence[ImuAt], start_s: float, end_s: float, gyro_bias_rad_s: Vec3
+) -> Motion:
+    """Compare a move that begins and ends at rest.
+
+    Args:
+        poses: in order of time, beyond both ends.
+        imu: in order of time, beyond both ends.
+        start_s: a moment of rest before.
+        end_s: a moment of rest after.
+        gyro_bias_rad_s: read on the floor.
+
+    Raises:
+        GapError: samples are missing.
+    """
+    count = int((end_s - start_s) / GRID_S)
+    _no_gaps([pose.t_s for pose in poses], start_s, end_s, "motion capture lost the rigid body (markers covered?)")
+    _no_gaps([sample.t_s for sample in imu], start_s, end_s, "PX4's IMU was not heard")
+    times = [start_s + GRID_S * k for k in range(count + 1)]
+    velocity, turned = _felt(imu, times, gyro_bias_rad_s)
+    places = _places(poses, times)
+    first, last = _nearest(poses, start_s), _nearest(poses, times[-1])
+    back = quat_conjugate(first.attitude)
+    seen_world = _minus(places[-1], places[0])
+    paces = [quat_rotate(back, _scaled(_minus(b, a), 1.0 / GRID_S)) for a, b in pairwise(places)]
+    felt_paces = [_scaled(_plus(a, b), 0.5) for a, b in pairwise(velocity)]
+    felt = _travel(velocity)
+    length = norm(felt)
+    response = (0.0, 0.0, 0.0)
+    if length > 1e-6:
+        direction = _scaled(felt, 1.0 / length)
+        response = _response([dot(v, direction) for v in _detrended(felt_paces)], _detrended(paces))
+    return Motion(
+        duration_s=end_s - start_s,
+        felt_m=felt,
+        seen_m=quat_rotate(back, seen_world),
+        seen_world_m=seen_world,
+        response=response,
+        felt_turn_rad=rotation_vector(turned),
+        seen_turn_rad=rotation_vector(quat_multiply(back, last.attitude)),
+    )
+
+
+def _felt(imu: Sequence[ImuAt], times: Sequence[float], bias: Vec3) -> tuple[list[Vec3], Quat]:
+    """Specific force integrated in the body frame of the first time, on the grid; and the rotation until the last."""
+    index = max(0, bisect_left(imu, times[0], key=lambda sample: sample.t_s) - 1)
+    now_s, q = times[0], IDENTITY_QUAT
+    velocity: list[Vec3] = [(0.0, 0.0, 0.0)]
+    v: Vec3 = (0.0, 0.0, 0.0)
+    for until_s in times[1:]:
+        while now_s < until_s - 1e-9:
+            # A sample holds until the next one.
+            while index + 1 < len(imu) and imu[index + 1].t_s <= now_s + 1e-9:
+                index += 1
+            next_s = imu[index + 1].t_s if index + 1 < len(imu) else math.inf
+            step_s = min(until_s, next_s) - now_s
+            rate = _minus(imu[index].rate_rad_s, bias)
+            half = _turned(q, rate, 0.5 * step_s)
+            v = _plus(v, _scaled(quat_rotate(half, imu[index].force_m_s2), step_s))
+            q = _turned(q, rate, step_s)
+            now_s += step_s
+        velocity.append(v)
+    return velocity, q
+
+
+def _turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
+    angle = norm(rate_rad_s) * dt_s
+    if angle < 1e-12:
+        return q
+    x, y, z = _scaled(rate_rad_s, math.sin(0.5 * angle) / angle * dt_s)
+    return quat_normalize(quat_multiply(q, (math.cos(0.5 * angle), x, y, z)))
+
+
+def _places(poses: Sequence[PoseAt], times: Sequence[float]) -> list[Vec3]:
+    """Positions on the grid, between frames linear."""
+    stamps = [pose.t_s for pose in poses]
+    places = []
+    for t_s in times:
+        after = min(max(1, bisect_left(stamps, t_s)), len(poses) - 1)
+        a, b = poses[after - 1], poses[after]
+        share = (t_s - a.t_s) / (b.t_s - a.t_s) if b.t_s > a.t_s else 0.0
+        places.append(_plus(a.position_m, _scaled(_minus(b.position_m, a.position_m), min(1.0, max(0.0, share)))))
+    return places
+
+
+def _nearest(poses: Sequence[PoseAt], t_s: float) -> PoseAt:
+    return min(poses, key=lambda pose: abs(pose.t_s - t_s))
+
+
+def _travel(velocity: Sequence[Vec3]) -> Vec3:
+    """Distance of a velocity that is zero at both ends: what grows evenly in between is gravity and bias."""
+    count = len(velocity) - 1
+    drift = _scaled(velocity[-1], 1.0 / count)
+    total: Vec3 = (0.0, 0.0, 0.0)
+    for k, v in enumerate(velocity):
+        total = _plus(total, _minus(v, _scaled(drift, k)))
+    return _scaled(total, GRID_S)
+
+
+def _detrended(values: Sequence[Vec3]) -> list[Vec3]:
+    """Without mean and slope, each axis by least squares."""
+    count = len(values)
+    middle = 0.5 * (count - 1)
+    spread = sum((k - middle) ** 2 for k in range(count))
+    columns = []
+    for axis in range(3):
+        column = [value[axis] for value in values]
+        mean = sum(column) / count
+        slope = sum((k - middle) * value for k, value in enumerate(column)) / spread
+        columns.append([value - mean - slope * (k - middle) for k, value in enumerate(column)])
+    return list(zip(*columns, strict=True))
+
+
+def _response(along: Sequence[float], seen: Sequence[Vec3]) -> Vec3:
+    power = sum(a * a for a in along)
+    if power < 1e-9:
+        return (0.0, 0.0, 0.0)
+    x, y, z = (sum(a * value[axis] for a, value in zip(along, seen, strict=True)) / power for axis in range(3))
+    return (x, y, z)
+
+
+def _no_gaps(stamps: Sequence[float], start_s: float, end_s: float, what: str) -> None:
+    inside = [start_s, *(stamp for stamp in stamps if start_s <= stamp <= end_s), end_s]
+    gap_s = max(b - a for a, b in pairwise(inside))
+    if gap_s > GAP_MAX_S:
+        raise GapError(f"{what} for {gap_s:.1f} s of the move")
+
+
+def rotation_vector(q: Quat) -> Vec3:
+    """Axis times angle (rad, at most pi) of a unit quaternion."""
+    w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
+    sine = math.sqrt(x * x + y * y + z * z)
+    k = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
+    return (k * x, k * y, k * z)
+
+
+def mean_vector(values: Sequence[Vec3]) -> Vec3:
+    """Component by component."""
+    count = len(values)
+    return (sum(v[0] for v in values) / count, sum(v[1] for v in values) / count, sum(v[2] for v in values) / count)
+
+
+def mean_attitude(values: Sequence[Quat]) -> Quat:
+    """Of attitudes near to each other."""
+    first = values[0]
+    signs = [1.0 if sum(a * b for a, b in zip(first, q, strict=True)) >= 0.0 else -1.0 for q in values]
+    w, x, y, z = (sum(s * q[k] for s, q in zip(signs, values, strict=True)) for k in range(4))
+    return quat_normalize((w, x, y, z))
+
+
+def turned_rad(a: Quat, b: Quat) -> float:
+    """Angle between two attitudes."""
+    return norm(rotation_vector(quat_multiply(quat_conjugate(a), b)))
+
+
+def angle_rad(a: Vec3, b: Vec3) -> float:
+    """Between two vectors; pi if one of them is nothing."""
+    size = norm(a) * norm(b)
+    return math.acos(max(-1.0, min(1.0, dot(a, b) / size))) if size > 1e-12 else math.pi
+
+
+def dot(a: Vec3, b: Vec3) -> float:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def norm(v: Vec3) -> float:
+    """Length."""
+    return math.sqrt(dot(v, v))
+
+
+def _plus(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def _minus(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+def _scaled(v: Vec3, k: float) -> Vec3:
+    return (k * v[0], k * v[1], k * v[2])

@@ -1,0 +1,126 @@
+"""The record of passed hand tests: which set-ups of motion capture have been held against an IMU once.
+
+`$XDG_STATE_HOME/companion/hand-tests.json`, else `~/.local/state/companion/hand-tests.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from companion.config.vehicle import Vehicle
+from companion.model.rows import Row
+
+SCHEMA_VERSION = 1
+FILE = "companion/hand-tests.json"
+
+
+class RecordError(Exception):
+    """The record cannot be read or written: one line for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What a passed test holds for; when one of these changes, it holds no more."""
+
+    vehicle: str
+    """Its name."""
+    server: str
+    """devices.mocap.server."""
+    rigid_body_id: int
+    up_axis: str
+    natnet_version: str
+    """As the server said it."""
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, natnet_version: str) -> Setup:
+        """Of a vehicle file and the server's own word."""
+        device = vehicle.devices.mocap
+        return cls(vehicle.name, device.server, device.rigid_body_id, device.up_axis, natnet_version)
+
+
+@dataclass(frozen=True, slots=True)
+class Passed:
+    """One passed test."""
+
+    setup: Setup
+    at: str
+    """UTC, ISO 8601."""
+    measured: Mapping[str, str]
+    """Of each row, by its id: what was read."""
+
+
+def record_path(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where the record lies."""
+    state = environment.get("XDG_STATE_HOME", "")
+    # The XDG specification has a relative path ignored.
+    folder = Path(state) if state and Path(state).is_absolute() else Path.home() / ".local/state"
+    return folder / FILE
+
+
+def on_record(setup: Setup, tests: Sequence[Passed]) -> tuple[str, str]:
+    """`Observations.hand_test` and `hand_test_changed`: when it was passed with this set-up; else what has changed since it was."""
+    for test in reversed(tests):
+        if test.setup == setup:
+            return f"passed on {test.at}", ""
+    for test in reversed(tests):
+        if test.setup.vehicle == setup.vehicle:
+            then, now = asdict(test.setup), asdict(setup)
+            changes = [f"{key} was {then[key]}, is {now[key]}" for key in now if then[key] != now[key]]
+            return "", f"passed on {test.at}, but since then {', '.join(changes)}"
+    return "", ""
+
+
+def with_passed(tests: Sequence[Passed], setup: Setup, at: datetime, rows: Sequence[Row]) -> list[Passed]:
+    """The tests with a newly passed one, which takes the place of an older one of the same set-up."""
+    measured = {row.id: row.read for row in rows}
+    return [*(test for test in tests if test.setup != setup), Passed(setup, at.isoformat(timespec="seconds"), measured)]
+
+
+def load(path: Path) -> list[Passed]:
+    """All passed tests; none if there is no record.
+
+    Raises:
+        RecordError: there is one, but it cannot be understood.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if document["schema_version"] != SCHEMA_VERSION:
+            raise RecordError(
+                f"{path}: schema_version {document['schema_version']}, expected {SCHEMA_VERSION}; remove the file"
+            )
+        return [Passed(_setup(test["setup"]), str(test["at"]), dict(test["measured"])) for test in document["passed"]]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read ({error.strerror}); correct its permissions") from None
+    except (ValueError, TypeError, KeyError) as error:
+        raise RecordError(f"{path}: is no record of hand tests ({error!r}); remove the file") from None
+
+
+def save(path: Path, tests: Sequence[Passed]) -> None:
+    """Replace the record as a whole.
+
+    Raises:
+        RecordError: it cannot be written.
+    """
+    document = {"schema_version": SCHEMA_VERSION, "passed": [asdict(test) for test in tests]}
+    part = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(json.dumps(document, indent=1), encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be written ({error.strerror}); correct its permissions") from None
+
+
+def _setup(values: Mapping[str, Any]) -> Setup:
+    known = {field.name for field in fields(Setup)}
+    if set(values) != known:
+        raise ValueError(f"setup has {sorted(values)}")
+    return Setup(**values)

@@ -1,0 +1,129 @@
+"""Packets of the flight process as messages of one MCAP file.
+
+Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; ``/events``, a message each. For viewers, typed and
+thinned out: those of `companion.recorder.viewer_channels`, and ``/log``. Every message is stamped with the wall clock of its tick: log
+time, publish time and the header's are one.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import foxglove
+from foxglove.channels import LogChannel
+from foxglove.mcap import MCAPWriteOptions
+from foxglove.messages import Log, LogLevel
+
+from companion.ground.messages import EventLine
+from companion.model.codec import json_schema, json_text, jsonable_from_plain
+from companion.model.types import Inputs, Outputs, Sent
+from companion.recorder.disk import Disk
+from companion.recorder.viewer_channels import ViewerChannels, timestamp
+
+_LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}
+_STAMP_MAX_NS = 2**32 * 1_000_000_000 - 1
+"""Seconds of a header's time stamp have 32 bits."""
+
+
+class LogWriter:
+    """Turns packets into messages of one MCAP file.
+
+    Attributes:
+        viewer_error: why the viewers' messages of a tick were left out, for the first such tick; None: they never were.
+    """
+
+    def __init__(self, disk: Disk, epoch_offset_ns: int, *, chunk_bytes: int) -> None:
+        self._epoch_offset_ns = epoch_offset_ns
+        self._context = foxglove.Context()
+        # Chunks are closed by `flush`, between ticks and not within one.
+        options = MCAPWriteOptions(profile="companion", chunk_size=None, disable_seeking=True, compression_threads=0)
+        self._chunk_bytes = chunk_bytes
+        self._mcap = foxglove.open_mcap(disk, context=self._context, writer_options=options)
+        self._inputs = self._json_channel("/inputs", Inputs)
+        self._outputs = self._json_channel("/outputs", Outputs)
+        self._sent = self._json_channel("/sent", Sent)
+        self._events = self._json_channel("/events", EventLine)
+        self._log = LogChannel("/log", context=self._context)
+        self._viewers = ViewerChannels(self._context)
+        self._unflushed_bytes = 0
+        self.viewer_error: str | None = None
+
+    @property
+    def chunk_is_full(self) -> bool:
+        """Time to flush."""
+        return self._unflushed_bytes >= self._chunk_bytes
+
+    def tick(self, inputs_plain: Any, outputs_plain: Any, sent_plain: Any) -> None:
+        """One tick: three full-rate messages, its events, and now and then the viewers' messages."""
+        inputs = jsonable_from_plain(Inputs, inputs_plain)
+        outputs = jsonable_from_plain(Outputs, outputs_plain)
+        sent = jsonable_from_plain(Sent, sent_plain)
+        # All texts first: a record that cannot be written leaves no half tick behind.
+        texts = [json_text(record).encode() for record in (inputs, outputs, sent)]
+        stamp_ns = self._stamp_ns(inputs["t_s"])
+        for channel, text in zip((self._inputs, self._outputs, self._sent), texts, strict=True):
+            channel.log(text, log_time=stamp_ns)
+            self._unflushed_bytes += len(text)
+        # The tick is recorded; whatever may be wrong with it, it is not to count as lost because of its pictures.
+        try:
+            for event in outputs["events"]:
+                self._event(stamp_ns, outputs["mission_t_s"], event)
+            self._viewers.tick(inputs["t_s"], stamp_ns, inputs, outputs)
+        except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
+            if self.viewer_error is None:
+                self.viewer_error = f"tick {inputs['tick']}: {type(error).__name__}: {error}"
+                self._line(stamp_ns, "warning", "recorder", f"no viewer messages of {self.viewer_error}")
+
+    def text(self, t_s: float, severity: str, source: str, text: str) -> None:
+        """One line of the `/log` channel."""
+        self._line(self._stamp_ns(t_s), severity, source, text)
+
+    def metadata(self, name: str, values: dict[str, str]) -> None:
+        """One metadata record. Of `config` and `plan` the viewers' picture is made, as far as it can be."""
+        self._mcap.write_metadata(name, values)
+        if name in ("config", "plan"):
+            try:
+                content = json.loads(values.get("json", "null"))
+            except (ValueError, RecursionError):
+                content = None
+            if name == "config":
+                self._viewers.configure(content)
+            else:
+                self._viewers.plan(content)
+
+    def flush(self) -> None:
+        """Write the open chunk, if it holds anything."""
+        if self._unflushed_bytes:
+            self._unflushed_bytes = 0
+            self._mcap.flush()
+
+    def close(self) -> None:
+        """Write the summary; the file is complete."""
+        self._mcap.close()
+
+    def _json_channel(self, topic: str, cls: type) -> foxglove.Channel:
+        return foxglove.Channel(topic, schema=json_schema(cls), context=self._context)
+
+    def _event(self, stamp_ns: int, mission_t_s: float, event: dict[str, Any]) -> None:
+        line = {"t_s": event["t_s"], "mission_t_s": mission_t_s, **event}
+        self._events.log(json_text(line).encode(), log_time=stamp_ns)
+        self._line(stamp_ns, event["severity"], event["id"], event["text"])
+
+    def _line(self, stamp_ns: int, severity: str, source: str, text: str) -> None:
+        level = _LEVELS.get(severity, LogLevel.Unknown)
+        line = Log(timestamp=timestamp(stamp_ns), level=level, message=_clean(text), name=_clean(source))
+        self._log.log(line, log_time=stamp_ns)
+        self._unflushed_bytes += len(text) + 1
+
+    def _stamp_ns(self, t_s: float) -> int:
+        try:
+            stamp_ns = self._epoch_offset_ns + round(t_s * 1e9)
+        except (ValueError, OverflowError):  # not finite: a sick tick is worth recording too
+            stamp_ns = self._epoch_offset_ns
+        return min(max(0, stamp_ns), _STAMP_MAX_NS)
+
+
+def _clean(text: str) -> str:
+    """Text that UTF-8 can hold: what came over a wire may have half characters in it."""
+    return text.encode("utf-8", "replace").decode()

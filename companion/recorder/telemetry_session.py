@@ -1,0 +1,330 @@
+"""What the ground is told, and what becomes of what it says: packets of the flight to messages, payloads to commands. No I/O.
+
+Times are those of CLOCK_MONOTONIC, which is the same in all processes: the flight clock is found from it by the ticks themselves.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+from companion.config.ground import topic_name
+from companion.config.loader import FlightConfig
+from companion.ground.commands import Accepted, Verifier
+from companion.ground.messages import (
+    VERSION,
+    Ack,
+    Command,
+    CommandName,
+    Preflight,
+    PreflightRow,
+    Presence,
+    State,
+    Topic,
+    encode,
+)
+from companion.ground.proof import with_proof, with_proofs
+from companion.ground.scene import scene_of
+from companion.ground.snapshot import StreamMaker, shortened
+from companion.model.codec import restore, unpack_plain
+from companion.model.types import Inputs, Outcome, Outputs, Sent
+from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK
+
+SILENT_S = 0.5
+"""No tick for so long while the flight is not over: it is told."""
+STATE_PERIOD_S = 2.0
+"""The state is said again so often: what another client or an old last will has put there does not stay."""
+TELL_PERIOD_S = 1.0
+"""Refused commands of one kind are one line in so long."""
+WARNING, INFO = "warning", "info"
+_SILENT = "the flight process says nothing; the guardian lands what flies"
+_LOST = "the flight process, or its recorder, ended without a word; the guardian lands what flies"
+
+
+@dataclass(slots=True)
+class _Refusals:
+    """Of one reason."""
+
+    count: int = 0
+    """Not told yet."""
+    text: str = ""
+    told_s: float = -math.inf
+
+
+@dataclass(slots=True)
+class Outgoing:
+    """What is to be sent now."""
+
+    retained: dict[Topic, bytes] = field(default_factory=dict)
+    """Newest of each, of those that changed."""
+    acks: list[bytes] = field(default_factory=list)
+    stream: bytes | None = None
+    log: list[tuple[float, str, str]] = field(default_factory=list)
+    """Flight clock, severity, text: lines for the log's `/log` channel."""
+
+
+class GroundDesk:
+    """One flight's.
+
+    Args:
+        config: effective configuration.
+        session: drawn at random for this flight.
+        simulated: the devices are those of the simulated world.
+        verifier: judges commands; None: none are heard.
+        no_commands: then why, for people.
+    """
+
+    def __init__(
+        self,
+        config: FlightConfig,
+        session: str,
+        *,
+        simulated: bool,
+        verifier: Verifier | None,
+        no_commands: str | None = None,
+    ) -> None:
+        self.vehicle = topic_name(config.vehicle.ground.topic, config.vehicle.name)
+        self._config = config
+        self._verifier = verifier
+        self._maker = StreamMaker(config, session)
+        self._clock_s = math.inf
+        """CLOCK_MONOTONIC less the flight clock: the least that was seen, of the packet that came the fastest."""
+        self._tick_s: float | None = None
+        """CLOCK_MONOTONIC of the newest tick."""
+        self._new_ticks = False
+        self._outcome: Outcome | None = None
+        self._over = False
+        self._broken: str | None = None
+        """A packet that could not be read: a fault of the program, told once."""
+        self._refusals: dict[str, _Refusals] = {}
+        self._acks: deque[Ack] = deque(maxlen=200)
+        self._log: deque[tuple[float, str, str]] = deque(maxlen=200)
+        self._state = State(
+            v=VERSION,
+            vehicle=self.vehicle,
+            session=session,
+            presence=Presence.FLYING,
+            simulated=simulated,
+            mission=config.mission.name,
+            law=config.controller.law,
+            preset=config.controller.preset,
+            wall_s=0.0,
+            commands=False,
+            text=no_commands,
+        )
+        self._no_commands = no_commands
+        self._state_said_s = -math.inf
+        self._scene = scene_of(config, session)
+        self._preflight = Preflight(VERSION, session, ())
+        self._events_said = -1
+        self._changed = {Topic.SCENE, Topic.PREFLIGHT}
+        self.refused = 0
+        """Commands, of all reasons."""
+
+    @property
+    def session(self) -> str:
+        """Of this flight."""
+        return self._state.session
+
+    @property
+    def hears_commands(self) -> bool:
+        """Somebody is there to judge them."""
+        return self._verifier is not None
+
+    @property
+    def over(self) -> bool:
+        """The flight has ended, one way or another."""
+        return self._over
+
+    def flight_s(self, now_s: float) -> float | None:
+        """The flight clock at a time of CLOCK_MONOTONIC; None before the first tick."""
+        return None if self._clock_s == math.inf else now_s - self._clock_s
+
+    def last_will(self) -> bytes:
+        """What the broker says when this process is gone without a word."""
+        text = "the connection to the vehicle broke without a word"
+        return encode(replace(self._state, presence=Presence.LOST, wall_s=0.0, commands=False, text=text))
+
+    def take(self, received_s: float, packet: bytes) -> None:
+        """One packet of the flight's channel, or of the guardian's. Never raises: the log has it in any case."""
+        try:
+            kind, _, *rest = unpack_plain(packet)
+            if kind == TICK:
+                self._tick(received_s, *rest)
+            elif kind == TEXT:
+                t_s, severity, source, text = rest
+                self._maker.tell(t_s, severity, source, text)
+            elif kind == ACK:
+                self._ack(*rest)
+            elif kind == METADATA:
+                self._metadata(*rest)
+            elif kind == CLOSE:
+                self.end(in_order=True)
+        except (ValueError, TypeError, LookupError, AttributeError, EOFError, OverflowError) as error:
+            self._broken = self._broken or f"telemetry: a packet could not be read: {type(error).__name__}: {error}"
+
+    def tell(self, now_s: float, severity: str, text: str, *, event: bool = True) -> None:
+        """A line about the telemetry itself, for the log and, if `event`, for the list of events."""
+        t_s = self.flight_s(now_s) or 0.0
+        self._log.append((t_s, severity, text))
+        if event:
+            self._maker.tell(t_s, severity, "ground", text)
+
+    def commands_heard(self, heard: bool, why_not: str | None = None) -> None:
+        """Whether the broker delivers commands."""
+        if self._verifier is not None:
+            self._no_commands = None if heard else why_not
+            self._set_state(commands=heard)
+
+    def hear(self, payload: bytes, retained: bool, now_s: float) -> Command | None:
+        """Judge what came on the command topic; the command if it is to be followed."""
+        if self._verifier is None or self._over:
+            return None
+        verdict = self._verifier.check(payload, retained, self.flight_s(now_s))
+        if isinstance(verdict, Accepted):
+            return verdict.command
+        self._refused(verdict.reason.value, verdict.text)
+        if verdict.command is not None:
+            self.answer(verdict.command, f"refused: {verdict.text}", now_s)
+        return None
+
+    def answer(self, command: Command, text: str, now_s: float) -> None:
+        """Tell the sender of a well-signed command that nothing was done."""
+        newest = self._maker.newest_outputs
+        self._acks.append(
+            Ack(
+                v=VERSION,
+                session=self.session,
+                nonce=command.nonce,
+                operator=command.operator,
+                command=command.command,
+                accepted=False,
+                text=text,
+                t_s=self.flight_s(now_s) or 0.0,
+                phase=newest.phase if newest is not None else "",
+                action=newest.action.value if newest is not None else "nominal",
+            )
+        )
+
+    def end(self, *, in_order: bool) -> None:
+        """No more ticks come.
+
+        Args:
+            in_order: the flight said so; else its process died.
+        """
+        if self._over:
+            return
+        self._over = True
+        outcome = self._outcome.value if self._outcome is not None else None
+        if in_order:
+            self._set_state(presence=Presence.ENDED, commands=False, outcome=outcome, text=None)
+        else:
+            self._set_state(presence=Presence.LOST, commands=False, outcome=outcome, text=_LOST)
+
+    def collect(self, now_s: float, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Outgoing:
+        """What is new since the last call.
+
+        Args:
+            now_s: CLOCK_MONOTONIC.
+            wall_s: seconds since 1970.
+            dropped: records that the recorder lost.
+            recorder_error: why it records no more.
+        """
+        self._presence(now_s)
+        self._tell_refusals(now_s)
+        if self._broken:
+            self.tell(now_s, WARNING, self._broken)
+            self._broken = ""  # not None: told
+        out = Outgoing()
+        if now_s - self._state_said_s >= STATE_PERIOD_S:
+            self._state_said_s = now_s
+            self._state = replace(self._state, wall_s=round(wall_s, 3))
+            out.retained[Topic.STATE] = encode(self._state)
+        for topic, record in ((Topic.SCENE, self._scene), (Topic.PREFLIGHT, self._preflight)):
+            if topic in self._changed:
+                out.retained[topic] = encode(record)
+        self._changed.clear()
+        if self._events_said != self._maker.count:
+            self._events_said = self._maker.count
+            out.retained[Topic.EVENTS] = encode(self._maker.events_record())
+        if self._new_ticks:
+            self._new_ticks = False
+            stream = self._maker.make(wall_s, dropped=dropped, recorder_error=recorder_error)
+            keys = self._verifier.operators.keys if self._verifier is not None else ()
+            out.stream = encode(with_proofs(stream, self.vehicle, keys))
+        out.acks = [encode(self._proven(ack)) for ack in self._acks]
+        self._acks.clear()
+        out.log = list(self._log)
+        self._log.clear()
+        return out
+
+    def _tick(self, received_s: float, inputs_plain: object, outputs_plain: object, sent_plain: object) -> None:
+        inputs = restore(Inputs, inputs_plain)  # type: ignore[arg-type]
+        outputs = restore(Outputs, outputs_plain)  # type: ignore[arg-type]
+        self._maker.take(inputs, outputs, restore(Sent, sent_plain))  # type: ignore[arg-type]
+        self._new_ticks = True
+        self._tick_s = received_s
+        if math.isfinite(inputs.t_s):
+            self._clock_s = min(self._clock_s, received_s - inputs.t_s)
+        if outputs.outcome is not None:
+            self._outcome = outputs.outcome
+
+    def _ack(
+        self, nonce: str, operator: str, command: str, accepted: bool, text: str, t_s: float, phase: str, action: str
+    ) -> None:
+        self._acks.append(
+            Ack(VERSION, self.session, nonce, operator, CommandName(command), accepted, text, t_s, phase, action)
+        )
+
+    def _proven(self, ack: Ack) -> Ack:
+        """With the proof for the operator who commanded."""
+        key = self._verifier.operators.find(ack.operator) if self._verifier is not None else None
+        return ack if key is None else with_proof(ack, self.vehicle, key)
+
+    def _metadata(self, name: str, values: dict[str, str]) -> None:
+        if name == "plan":
+            path = [(float(x), float(y), float(z)) for x, y, z in json.loads(values["json"])]
+            self._scene = scene_of(self._config, self.session, path, mission_s=float(values["mission_s"]))
+            self._changed.add(Topic.SCENE)
+        elif name == "preflight":
+            rows = [
+                PreflightRow(str(row["id"]), str(row["level"]), shortened(str(row["text"])))
+                for row in json.loads(values["json"])
+            ]
+            self._preflight = Preflight(VERSION, self.session, tuple(rows))
+            self._changed.add(Topic.PREFLIGHT)
+
+    def _presence(self, now_s: float) -> None:
+        if self._over:
+            return
+        if self._tick_s is None:
+            self._tick_s = now_s  # the first look: from now on a tick is awaited
+        silent = now_s - self._tick_s > SILENT_S
+        text = _SILENT if silent else self._no_commands
+        self._set_state(presence=Presence.SILENT if silent else Presence.FLYING, text=text)
+
+    def _set_state(self, **values: object) -> None:
+        state = replace(self._state, **values)  # type: ignore[arg-type]
+        if state != self._state:
+            self._state = state
+            self._state_said_s = -math.inf
+
+    def _refused(self, reason: str, text: str) -> None:
+        refusals = self._refusals.setdefault(reason, _Refusals())
+        self.refused += 1
+        refusals.count += 1
+        refusals.text = text
+
+    def _tell_refusals(self, now_s: float) -> None:
+        """The first at once, the others counted: people see an attack, the log does not drown in it, no event is pushed out."""
+        for reason, refusals in self._refusals.items():
+            if not refusals.count or now_s - refusals.told_s < TELL_PERIOD_S:
+                continue
+            commands = "a command" if refusals.count == 1 else f"{refusals.count} commands in the last second"
+            text = f"refused {commands}: {reason}: {refusals.text}"
+            refusals.count, refusals.told_s = 0, now_s
+            t_s = self.flight_s(now_s) or 0.0
+            self._log.append((t_s, WARNING, text))
+            self._maker.tell(t_s, WARNING, f"command_refused_{reason}", text, instead=True)

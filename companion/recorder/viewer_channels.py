@@ -1,0 +1,290 @@
+"""Typed, thinned-out channels of the log, for people's viewers (Foxglove, PlotJuggler); no reader of the companion needs them.
+
+================  ==========================  =========================================================================
+``/tf``           foxglove.FrameTransform     world -> body, 50 Hz
+``/tf_arm``       foxglove.FrameTransforms    body -> link1 -> link2 -> net, 50 Hz
+``/pose``         foxglove.PoseInFrame        motion capture, as it came, 50 Hz
+``/reference``    foxglove.PoseInFrame        where the vehicle should be, 50 Hz
+``/scene``        foxglove.SceneUpdate        the tether, 20 Hz
+``/scene_path``   foxglove.SceneUpdate        flown and reference path so far, every 2 s
+``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and when the plan is known
+================  ==========================  =========================================================================
+
+A viewer that jumps in time asks for the newest message of each topic and no more: what is said once, and what is said at another
+rate, has a topic of its own. Vehicle, arm and net are drawn once, locked to their frames; the frames move.
+Values that are not finite are never passed on: their message is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import foxglove
+from foxglove.channels import (
+    FrameTransformChannel,
+    FrameTransformsChannel,
+    PoseInFrameChannel,
+    SceneUpdateChannel,
+)
+from foxglove.messages import (
+    Color,
+    Duration,
+    FrameTransform,
+    FrameTransforms,
+    Point3,
+    Pose,
+    PoseInFrame,
+    Quaternion,
+    SceneEntity,
+    SceneUpdate,
+    Timestamp,
+    Vector3,
+)
+
+from companion.model.frames import quat_rotate
+from companion.model.types import Quat, Vec3
+from companion.recorder.viewer_scene import (
+    Machine,
+    hanging_line_m,
+    machine_of,
+    path_of,
+    point3,
+    standing_entities,
+    tether_colour,
+    trail,
+)
+
+PERIOD_S = 0.02
+SCENE_PERIOD_S = 0.05
+PATH_PERIOD_S = 2.0
+_EARLY_S = 0.0025
+"""A message that is due within half a tick is sent in this one."""
+_LIFETIME = Duration(0, 500_000_000)
+"""Of what moves: gone from the picture half a second after the last word of it."""
+_FRESH_S = 0.1
+"""An older pose of motion capture is not where the vehicle is."""
+_FLOWN = Color(r=0.12, g=0.44, b=0.71, a=1.0)
+_REFERENCE = Color(r=0.88, g=0.48, b=0.13, a=0.9)
+_TRAIL_POINTS = 256
+_TRAIL_PERIOD_S = 0.1
+_STRAIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
+
+
+class ViewerChannels:
+    """Makes the viewers' messages of a tick, each at its own rate."""
+
+    def __init__(self, context: foxglove.Context) -> None:
+        self._tf = FrameTransformChannel("/tf", context=context)
+        self._arm = FrameTransformsChannel("/tf_arm", context=context)
+        self._pose = PoseInFrameChannel("/pose", context=context)
+        self._reference = PoseInFrameChannel("/reference", context=context)
+        self._scene = SceneUpdateChannel("/scene", context=context)
+        self._path = SceneUpdateChannel("/scene_path", context=context)
+        self._static = SceneUpdateChannel("/scene_static", context=context)
+        self._machine = machine_of(None)
+        self._joints = _Joints(self._machine)
+        self._planned: tuple[Vec3, ...] = ()
+        self._static_due = False
+        self._due_s = self._scene_due_s = self._path_due_s = -math.inf
+        self._flown, self._wanted = _Trail(), _Trail()
+
+    def configure(self, config: Any) -> None:
+        """The effective configuration as nested dicts; of anything else the picture is empty."""
+        self._machine = machine_of(config)
+        self._joints = _Joints(self._machine)
+        self._static_due = True
+
+    def plan(self, path: Any) -> None:
+        """The planned path, [[x, y, z], ...] in the world."""
+        self._planned = path_of(path)
+        self._static_due = True
+
+    def tick(self, t_s: float, stamp_ns: int, inputs: dict[str, Any], outputs: dict[str, Any]) -> None:
+        """What is due of one tick.
+
+        Args:
+            t_s: flight clock; a clock that went back starts anew.
+            stamp_ns: wall clock of the tick, for every message and its header.
+            inputs, outputs: the tick's records in their jsonable form.
+        """
+        frames_due, scene_due = _due(t_s, self._due_s, PERIOD_S), _due(t_s, self._scene_due_s, SCENE_PERIOD_S)
+        if not (frames_due or scene_due) or not math.isfinite(t_s):
+            return
+        stamp = timestamp(stamp_ns)
+        if self._static_due:
+            self._static_due = False
+            entities = standing_entities(self._machine, self._planned, stamp)
+            self._static.log(SceneUpdate(entities=entities), log_time=stamp_ns)
+        where = _whereabouts(t_s, inputs)
+        if frames_due:
+            self._due_s = t_s
+            self._frames(stamp, stamp_ns, where, inputs, outputs)
+        if scene_due:
+            self._scene_due_s = t_s
+            if where is not None:
+                self._tether(stamp, stamp_ns, where, outputs.get("tether"))
+            self._paths(t_s, stamp, stamp_ns, where, outputs.get("reference"))
+
+    def _frames(
+        self,
+        stamp: Timestamp,
+        stamp_ns: int,
+        where: tuple[Vec3, Quat] | None,
+        inputs: dict[str, Any],
+        outputs: dict[str, Any],
+    ) -> None:
+        mocap, arm, reference = inputs.get("mocap"), inputs.get("arm"), outputs.get("reference")
+        if where is not None:
+            (x, y, z), (w, i, j, k) = where
+            message = FrameTransform(
+                timestamp=stamp,
+                parent_frame_id="world",
+                child_frame_id="body",
+                translation=Vector3(x=x, y=y, z=z),
+                rotation=Quaternion(w=w, x=i, y=j, z=k),
+            )
+            self._tf.log(message, log_time=stamp_ns)
+        if arm is not None:
+            self._joints.log(self._arm, stamp, stamp_ns, arm["angle_rad"])
+        if mocap is not None and mocap["tracking_valid"]:
+            _log_pose(self._pose, stamp, stamp_ns, mocap["position_world_m"], mocap["attitude_wxyz"])
+        if reference is not None:
+            half = 0.5 * reference["yaw_rad"]
+            turned = (math.cos(half), 0.0, 0.0, math.sin(half)) if math.isfinite(half) else (math.nan,) * 4
+            _log_pose(self._reference, stamp, stamp_ns, reference["position_world_m"], turned)
+
+    def _tether(
+        self, stamp: Timestamp, stamp_ns: int, where: tuple[Vec3, Quat], watched: dict[str, Any] | None
+    ) -> None:
+        tether = self._machine.tether
+        if tether is None:
+            return
+        (px, py, pz), attitude = where
+        bx, by, bz = quat_rotate(attitude, tether.attachment_body_m)
+        end = (px + bx, py + by, pz + bz)
+        slack_m = tether.length_m - math.dist(tether.anchor_world_m, end)
+        held = watched is not None and (watched["taut"] or watched["snagged"])
+        points = hanging_line_m(tether.anchor_world_m, end, tether.length_m, self._machine.floor_m)
+        line = trail([point3(p) for p in points], tether_colour(tether, slack_m, held=held), 4.0)
+        entity = SceneEntity(timestamp=stamp, frame_id="world", id="tether", lifetime=_LIFETIME, lines=[line])
+        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+
+    def _paths(
+        self,
+        t_s: float,
+        stamp: Timestamp,
+        stamp_ns: int,
+        where: tuple[Vec3, Quat] | None,
+        reference: dict[str, Any] | None,
+    ) -> None:
+        if where is not None:
+            self._flown.add(t_s, where[0])
+        if reference is not None:
+            self._wanted.add(t_s, reference["position_world_m"])
+        if not _due(t_s, self._path_due_s, PATH_PERIOD_S):
+            return
+        self._path_due_s = t_s
+        entities = [
+            SceneEntity(timestamp=stamp, frame_id="world", id=name, lines=[trail(one.points, colour)])
+            for name, one, colour in (("flown", self._flown, _FLOWN), ("reference", self._wanted, _REFERENCE))
+            if len(one.points) > 1
+        ]
+        if entities:
+            self._path.log(SceneUpdate(entities=entities), log_time=stamp_ns)
+
+
+class _Joints:
+    """The arm's frames: what is constant of them is made once."""
+
+    def __init__(self, machine: Machine) -> None:
+        arm = machine.arm
+        self._known = arm is not None
+        if arm is None:
+            return
+        x, y, z = arm.shoulder_body_m
+        self._shoulder = Vector3(x=x, y=y, z=z)
+        self._elbow, self._tip = (Vector3(x=length, y=0.0, z=0.0) for length in arm.link_lengths_m)
+
+    def log(self, channel: FrameTransformsChannel, stamp: Timestamp, stamp_ns: int, angle_rad: Sequence[float]) -> None:
+        """All frames in one message: alpha_1 turns link 1 down about the body's y, alpha_2 turns link 2 the other way."""
+        half_1, half_2 = 0.5 * angle_rad[0], -0.5 * angle_rad[1]
+        if not self._known or not math.isfinite(half_1) or not math.isfinite(half_2):
+            return
+        turn_1 = Quaternion(w=math.cos(half_1), x=0.0, y=math.sin(half_1), z=0.0)
+        turn_2 = Quaternion(w=math.cos(half_2), x=0.0, y=math.sin(half_2), z=0.0)
+        frames = [
+            FrameTransform(
+                timestamp=stamp, parent_frame_id=parent, child_frame_id=child, translation=offset, rotation=turn
+            )
+            for parent, child, offset, turn in (
+                ("body", "link1", self._shoulder, turn_1),
+                ("link1", "link2", self._elbow, turn_2),
+                ("link2", "net", self._tip, _STRAIGHT),
+            )
+        ]
+        channel.log(FrameTransforms(transforms=frames), log_time=stamp_ns)
+
+
+class _Trail:
+    """A path so far, with at most so many points: when there are more, every second one goes and fewer come."""
+
+    def __init__(self) -> None:
+        self.points: list[Point3] = []
+        self._period_s = _TRAIL_PERIOD_S
+        self._last_s = -math.inf
+
+    def add(self, t_s: float, position: Sequence[float]) -> None:
+        """Where it is now."""
+        if 0.0 <= t_s - self._last_s < self._period_s or not all(map(math.isfinite, position)):
+            return
+        self._last_s = t_s
+        self.points.append(Point3(x=position[0], y=position[1], z=position[2]))
+        if len(self.points) > _TRAIL_POINTS:
+            self.points = self.points[::2]
+            self._period_s *= 2.0
+
+
+def _log_pose(
+    channel: PoseInFrameChannel,
+    stamp: Timestamp,
+    stamp_ns: int,
+    position: Sequence[float],
+    attitude: Sequence[float],
+) -> None:
+    if not _usable(position, attitude):
+        return
+    pose = Pose(
+        position=Vector3(x=position[0], y=position[1], z=position[2]),
+        orientation=Quaternion(w=attitude[0], x=attitude[1], y=attitude[2], z=attitude[3]),
+    )
+    channel.log(PoseInFrame(timestamp=stamp, frame_id="world", pose=pose), log_time=stamp_ns)
+
+
+def _due(t_s: float, last_s: float, period_s: float) -> bool:
+    """True too if the clock went back, or was not finite."""
+    return not 0.0 <= t_s - last_s < period_s - _EARLY_S
+
+
+def timestamp(stamp_ns: int) -> Timestamp:
+    """The header's form of a wall clock in ns."""
+    return Timestamp(stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
+
+
+def _whereabouts(t_s: float, inputs: dict[str, Any]) -> tuple[Vec3, Quat] | None:
+    """Position and attitude by motion capture, by PX4 where that is old, invalid or not finite; None: not known."""
+    mocap, vehicle = inputs.get("mocap"), inputs.get("vehicle")
+    if mocap is not None and mocap["tracking_valid"] and t_s - mocap["stamp_s"] <= _FRESH_S:
+        if _usable(mocap["position_world_m"], mocap["attitude_wxyz"]):
+            return mocap["position_world_m"], mocap["attitude_wxyz"]
+    if vehicle is not None and _usable(vehicle["position_world_m"], vehicle["attitude_wxyz"]):
+        return vehicle["position_world_m"], vehicle["attitude_wxyz"]
+    return None
+
+
+def _usable(position: Sequence[float], attitude: Sequence[float]) -> bool:
+    """Finite, and the attitude is a rotation."""
+    x, y, z = position
+    w, i, j, k = attitude
+    return math.isfinite(x + y + z) and abs(w * w + i * i + j * j + k * k - 1.0) < 0.01

@@ -1,0 +1,301 @@
+"""What a 3D viewer draws of the machine and its room: geometry from the configuration, shapes, the hanging tether. No I/O.
+
+World ENU, body FLU, metres. The arm's frames are those of `companion.control.manipulator`: x of ``link1`` points from the shoulder to
+the elbow, x of ``link2`` from the elbow to the net's centre, y of both is the body's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from foxglove.messages import (
+    Color,
+    CubePrimitive,
+    CylinderPrimitive,
+    LinePrimitive,
+    LinePrimitiveLineType,
+    Point3,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SpherePrimitive,
+    Timestamp,
+    Vector3,
+)
+
+from companion.model.types import Vec2, Vec3
+
+_GREY = Color(r=0.55, g=0.60, b=0.65, a=0.8)
+_DARK = Color(r=0.20, g=0.24, b=0.28, a=1.0)
+_ROTOR = Color(r=0.15, g=0.45, b=0.70, a=0.35)
+_NOSE = Color(r=0.85, g=0.25, b=0.20, a=1.0)
+_LINK = Color(r=0.90, g=0.55, b=0.15, a=1.0)
+_NET = Color(r=0.95, g=0.85, b=0.45, a=0.45)
+_PLANNED = Color(r=0.45, g=0.45, b=0.75, a=0.9)
+SLACK = Color(r=0.18, g=0.62, b=0.42, a=1.0)
+NEARLY_TAUT = Color(r=0.93, g=0.62, b=0.10, a=1.0)
+TAUT = Color(r=0.85, g=0.15, b=0.15, a=1.0)
+
+_LINE_POINTS = 13
+_SAG_STEPS = 12
+"""Halvings of the interval that the sag lies in: to a 4000th of the tether's length."""
+_STEEP_M = 0.02
+"""A line whose ends are nearer to each other than this, seen from above, is drawn as if they were so far apart."""
+_ROTOR_PITCH = 1.0 + 1.05 * math.sqrt(2.0)
+"""Reach over radius of four disks in a square that nearly touch."""
+_ALONG_X = Quaternion(w=math.sqrt(0.5), x=0.0, y=math.sqrt(0.5), z=0.0)
+_UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmShape:
+    """The 2R arm and its net."""
+
+    shoulder_body_m: Vec3
+    link_lengths_m: Vec2
+    net_radius_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class TetherShape:
+    """The tether, and when it is shown as short."""
+
+    anchor_world_m: Vec3
+    attachment_body_m: Vec3
+    length_m: float
+    margin_m: float
+    taut_slack_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Geometry for a picture; None where the configuration does not tell."""
+
+    arm: ArmShape | None
+    tether: TetherShape | None
+    radius_m: float | None
+    """Horizontal reach, rotor disks included."""
+    ground_clearance_m: float | None
+    room_min_world_m: Vec3 | None
+    room_max_world_m: Vec3 | None
+
+    @property
+    def floor_m(self) -> float | None:
+        """Height of the room's floor."""
+        return self.room_min_world_m[2] if self.room_min_world_m is not None else None
+
+
+def machine_of(config: Any) -> Machine:
+    """Geometry from an effective configuration (nested dicts); what is missing or no number is None."""
+    shoulder = _numbers(config, 3, "vehicle", "arm", "shoulder_body_m")
+    links = _numbers(config, 2, "vehicle", "arm", "link_lengths_m")
+    arm = None
+    if shoulder is not None and links is not None:
+        arm = ArmShape(_vec3(shoulder), (links[0], links[1]), _number(config, "vehicle", "tool", "net_radius_m"))
+    anchor = _numbers(config, 3, "vehicle", "tether", "anchor_world_m")
+    length_m = _number(config, "vehicle", "tether", "length_m")
+    tether = None
+    if anchor is not None and length_m is not None and length_m > 0.0:
+        tether = TetherShape(
+            _vec3(anchor),
+            _vec3(_numbers(config, 3, "vehicle", "tether", "attachment_body_m") or (0.0, 0.0, 0.0)),
+            length_m,
+            _number(config, "vehicle", "tether", "margin_m") or 0.0,
+            _number(config, "vehicle", "tether", "taut_slack_m") or 0.0,
+        )
+    spans = [_numbers(config, 2, "vehicle", "room", axis) for axis in ("x_m", "y_m", "z_m")]
+    known = [span for span in spans if span is not None]
+    whole = len(known) == len(spans)
+    return Machine(
+        arm=arm,
+        tether=tether,
+        radius_m=_number(config, "vehicle", "airframe", "radius_m"),
+        ground_clearance_m=_number(config, "vehicle", "airframe", "ground_clearance_m"),
+        room_min_world_m=_vec3([span[0] for span in known]) if whole else None,
+        room_max_world_m=_vec3([span[1] for span in known]) if whole else None,
+    )
+
+
+def path_of(data: Any, most: int = 1000) -> tuple[Vec3, ...]:
+    """Points of a path, [[x, y, z], ...]; empty if it is anything else."""
+    if not isinstance(data, list) or len(data) > most:
+        return ()
+    points = [_numbers(point, 3) for point in data]
+    return tuple(_vec3(point) for point in points if point is not None) if None not in points else ()
+
+
+def standing_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestamp: Timestamp) -> list[SceneEntity]:
+    """Everything that keeps its shape, each in the frame that it is rigid in; it lasts until it is replaced."""
+    entities: list[SceneEntity] = []
+
+    def add(name: str, frame: str, **shapes: Any) -> None:
+        entities.append(SceneEntity(timestamp=timestamp, frame_id=frame, id=name, frame_locked=True, **shapes))
+
+    if machine.room_min_world_m is not None and machine.room_max_world_m is not None:
+        add("room", "world", lines=[_box(machine.room_min_world_m, machine.room_max_world_m)])
+    if machine.tether is not None:
+        add("anchor", "world", spheres=[_ball(machine.tether.anchor_world_m, 0.05, _DARK)])
+    if len(path_world_m) > 1:
+        add("planned path", "world", lines=[trail([point3(p) for p in path_world_m], _PLANNED)])
+    if machine.radius_m is not None:
+        add("vehicle", "body", **_airframe(machine.radius_m, machine.ground_clearance_m))
+    if machine.arm is not None:
+        for frame, length_m in zip(("link1", "link2"), machine.arm.link_lengths_m, strict=True):
+            add(frame, frame, cylinders=[_rod(length_m)])
+        if machine.arm.net_radius_m is not None:
+            add("net", "net", spheres=[_ball((0.0, 0.0, 0.0), machine.arm.net_radius_m, _NET)])
+    return entities
+
+
+def hanging_line_m(anchor: Vec3, end: Vec3, length_m: float, floor_m: float | None = None) -> list[Vec3]:
+    """Points of a line of this length that hangs between two points: a parabola of that length.
+
+    What would hang through the floor lies on it. A line that is too short is straight.
+    """
+    ax, ay, az = anchor
+    dx, dy, dz = end[0] - ax, end[1] - ay, end[2] - az
+    sag_m = _sag_m(math.hypot(dx, dy), dz, length_m)
+    points: list[Vec3] = []
+    for k in range(_LINE_POINTS):
+        u = k / (_LINE_POINTS - 1)
+        z = az + u * (dz - 4.0 * sag_m * (1.0 - u))
+        if floor_m is not None and z < floor_m:
+            z = floor_m
+        points.append((ax + u * dx, ay + u * dy, z))
+    return points
+
+
+def tether_colour(tether: TetherShape, slack_m: float, *, held: bool) -> Color:
+    """Green: more slack than the margin; amber: less; red: taut, or `held` (taut or snagged by the watch)."""
+    if held or slack_m <= tether.taut_slack_m:
+        return TAUT
+    return NEARLY_TAUT if slack_m < tether.margin_m else SLACK
+
+
+def trail(points: list[Point3], colour: Color, thickness_px: float = 2.0) -> LinePrimitive:
+    """A line through points, as thick on the screen whatever the distance."""
+    return LinePrimitive(
+        type=LinePrimitiveLineType.LineStrip, thickness=thickness_px, scale_invariant=True, points=points, color=colour
+    )
+
+
+def point3(p: Vec3) -> Point3:
+    """The message of a point."""
+    return Point3(x=p[0], y=p[1], z=p[2])
+
+
+def _sag_m(level_m: float, rise_m: float, length_m: float) -> float:
+    """Vertical distance of the parabola's middle below that of its chord, for its arc to have the length given.
+
+    z(u) = rise u - 4 sag u (1 - u) over the level distance h has the slopes (rise -+ 4 sag) / h at its ends, and between the slopes
+    m0 and m1 the arc h^2 / (8 sag) (F(m1) - F(m0)), F(m) = (m sqrt(1 + m^2) + asinh m) / 2.
+    """
+    h = max(level_m, _STEEP_M)
+    if length_m * length_m <= h * h + rise_m * rise_m:
+        return 0.0
+    low, high = 0.0, length_m
+    for _ in range(_SAG_STEPS):
+        sag = 0.5 * (low + high)
+        m0, m1 = (rise_m - 4.0 * sag) / h, (rise_m + 4.0 * sag) / h
+        arc = (
+            h * h / (16.0 * sag)
+            * (m1 * math.sqrt(1.0 + m1 * m1) + math.asinh(m1) - m0 * math.sqrt(1.0 + m0 * m0) - math.asinh(m0))
+        )  # fmt: skip
+        if arc < length_m:
+            low = sag
+        else:
+            high = sag
+    return 0.5 * (low + high)
+
+
+def _airframe(radius_m: float, clearance_m: float | None) -> dict[str, Any]:
+    """Hub, booms, four rotor disks within the reach, and the feet."""
+    rotor_m = radius_m / _ROTOR_PITCH
+    out = (radius_m - rotor_m) * math.sqrt(0.5)
+    corners = [(out, out), (-out, out), (-out, -out), (out, -out)]
+    flat = Vector3(x=2.0 * rotor_m, y=2.0 * rotor_m, z=0.01)
+    disks = [
+        CylinderPrimitive(
+            pose=Pose(position=Vector3(x=x, y=y, z=0.03), orientation=_UPRIGHT),
+            size=flat,
+            bottom_scale=1.0,
+            top_scale=1.0,
+            color=_ROTOR,
+        )
+        for x, y in corners
+    ]
+    hub = CubePrimitive(
+        pose=Pose(position=Vector3(x=0.0, y=0.0, z=0.0), orientation=_UPRIGHT),
+        size=Vector3(x=0.16, y=0.12, z=0.06),
+        color=_DARK,
+    )
+    booms = [end for x, y in corners for end in ((0.0, 0.0, 0.02), (x, y, 0.02))]
+    if clearance_m is not None:
+        booms += [end for x, y in corners for end in ((x / 2, y / 2, 0.0), (x / 2, y / 2, -clearance_m))]
+    nose = _segments([(0.08, 0.0, 0.0), (radius_m, 0.0, 0.0)], _NOSE, 4.0)
+    return {"cubes": [hub], "cylinders": disks, "lines": [_segments(booms, _DARK, 3.0), nose]}
+
+
+def _box(low: Vec3, high: Vec3) -> LinePrimitive:
+    x, y, z = zip(low, high, strict=True)
+    along_x = [(x[i], y[j], z[k]) for j in (0, 1) for k in (0, 1) for i in (0, 1)]
+    along_y = [(x[i], y[j], z[k]) for i in (0, 1) for k in (0, 1) for j in (0, 1)]
+    along_z = [(x[i], y[j], z[k]) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    return _segments([*along_x, *along_y, *along_z], _GREY, 1.0)
+
+
+def _segments(ends: list[Vec3], colour: Color, thickness_px: float) -> LinePrimitive:
+    return LinePrimitive(
+        type=LinePrimitiveLineType.LineList,
+        thickness=thickness_px,
+        scale_invariant=True,
+        points=[point3(end) for end in ends],
+        color=colour,
+    )
+
+
+def _rod(length_m: float) -> CylinderPrimitive:
+    """From the frame's origin along its x."""
+    return CylinderPrimitive(
+        pose=Pose(position=Vector3(x=length_m / 2, y=0.0, z=0.0), orientation=_ALONG_X),
+        size=Vector3(x=0.025, y=0.025, z=length_m),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=_LINK,
+    )
+
+
+def _ball(centre: Vec3, radius_m: float, colour: Color) -> SpherePrimitive:
+    wide = 2.0 * radius_m
+    return SpherePrimitive(
+        pose=Pose(position=Vector3(x=centre[0], y=centre[1], z=centre[2]), orientation=_UPRIGHT),
+        size=Vector3(x=wide, y=wide, z=wide),
+        color=colour,
+    )
+
+
+def _at(config: Any, path: tuple[str, ...]) -> Any:
+    for key in path:
+        if not isinstance(config, dict):
+            return None
+        config = config.get(key)
+    return config
+
+
+def _number(config: Any, *path: str) -> float | None:
+    value = _at(config, path)
+    return float(value) if type(value) in (int, float) and math.isfinite(value) else None
+
+
+def _numbers(config: Any, size: int, *path: str) -> tuple[float, ...] | None:
+    values = _at(config, path)
+    if not isinstance(values, (list, tuple)) or len(values) != size:
+        return None
+    numbers = [_number(value) for value in values]
+    return tuple(n for n in numbers if n is not None) if None not in numbers else None
+
+
+def _vec3(values: Any) -> Vec3:
+    return (values[0], values[1], values[2])

@@ -1,0 +1,244 @@
+"""What a person sees in the terminal while a flight runs and when it is over."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+from typing import IO, Any, TextIO, cast
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.table import Table
+from rich.text import Text
+
+from companion.model.flight_stage import Stage
+from companion.model.negative_zero import without_negative_zero
+from companion.model.rows import Level, Row
+from companion.runtime.ipc import Message
+
+
+class SteadyStream:
+    """A text stream whose reader may go away (a pipe that closes, a terminal that hangs up): then it takes everything and shows
+    nothing. A flight must not care.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write what still can be written."""
+        try:
+            return self._stream.write(text)
+        except OSError:
+            self._let_go()
+            return len(text)
+
+    def flush(self) -> None:
+        """Flush what still can be flushed."""
+        try:
+            self._stream.flush()
+        except OSError:
+            self._let_go()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _let_go(self) -> None:
+        # The interpreter flushes once more at its end, and would change the exit code if that failed.
+        with contextlib.suppress(OSError), open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), self._stream.fileno())
+
+
+class _PlainNumbers(SteadyStream):
+    """A steady stream for people: it prints no negative zero."""
+
+    def write(self, text: str) -> int:
+        """Write the text without negative zeros."""
+        return super().write(without_negative_zero(text))
+
+
+def console_on(stream: TextIO) -> Console:
+    """Return a console for people on a stream whose reader may go away."""
+    return Console(file=cast("IO[str]", _PlainNumbers(stream)))
+
+
+def terminal_console() -> Console:
+    """The console on standard output."""
+    return console_on(sys.stdout)
+
+
+def tell(text: object) -> None:
+    """One line on standard error."""
+    stream = SteadyStream(sys.stderr)
+    stream.write(f"{text}\n")
+    stream.flush()
+
+
+_SEVERITY_STYLE = {"info": "cyan", "warning": "yellow", "critical": "bold red"}
+_OUTCOME_STYLE = {"completed": "bold green", "aborted": "bold yellow", "refused": "bold yellow"}
+
+
+class _Numbers(ProgressColumn):
+    """The few figures that tell whether all is well."""
+
+    def render(self, task: Task) -> Text:
+        m: Message = task.fields.get("status") or {}
+        if not m:
+            return Text(task.fields.get("note") or "", no_wrap=True, overflow="ellipsis")
+        error = m.get("error_m")
+        parts = [f"t {m['mission_t_s']:5.1f} s"]
+        if error is not None:
+            parts.append(f"|e_p| {error * 100:4.1f} cm")
+        if m.get("position_m"):
+            x, y, z = m["position_m"]
+            parts.append(f"({x:+.2f} {y:+.2f} {z:.2f}) m")
+        parts.append(f"late {m['lateness_ms']:.1f} ms")
+        text = "  ".join(parts)
+        return Text(text, style="red" if m.get("action") not in ("nominal", "warn") else "")
+
+
+class FlightDisplay:
+    """Live progress of one flight; without a terminal it prints a line per phase."""
+
+    def __init__(self, console: Console, title: str) -> None:
+        self._console = console
+        self._title = title
+        self._phase = ""
+        self._event = ""
+        """Text of the newest event: a phase that begins with an event of the same name has its line."""
+        self._progress = Progress(
+            TextColumn("[bold]{task.description:<22}"),
+            BarColumn(bar_width=28),
+            TextColumn("{task.percentage:>3.0f} %"),
+            _Numbers(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task("starting", total=1.0, status=None)
+
+    def __enter__(self) -> FlightDisplay:
+        self._console.print(f"[bold]{escape(self._title)}[/]  (Ctrl-C lands)")
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def on_message(self, message: Message) -> None:
+        """Show one message of the flight or of the world."""
+        kind = message.get("type")
+        if kind == "status":
+            self._progress.update(
+                self._task, description=message["phase"], completed=message["progress"], status=message
+            )
+            if message["phase"] != self._phase:
+                self._phase = message["phase"]
+                if not self._console.is_terminal and self._phase != self._event:
+                    self._console.print(f"  t {message['mission_t_s']:6.2f} s  {escape(self._phase)}")
+                self._event = ""
+                if self._phase == Stage.READY.value:
+                    self.say("everything is ready; take off with: companion command start (Ctrl-C stands down)")
+        elif kind == "event" and message.get("source") == "sitl":
+            if message["kind"] in ("missed", "crashed"):
+                self._line(
+                    "", f"the payload was {message['kind']}" if message["kind"] == "missed" else "crashed", "red"
+                )
+        elif kind == "event":
+            self._event = message["text"]
+            self._line(f"t {message['t_s']:6.2f} s", message["text"], _SEVERITY_STYLE[message["severity"]])
+        elif kind == "preflight_progress":
+            if not self._console.is_terminal and self._phase != "preflight":
+                self._line("preflight", message["text"], "cyan")
+            self._phase = "preflight"
+            self._progress.update(self._task, description="preflight", completed=message["share"], note=message["text"])
+        elif kind == "preflight":
+            self._preflight(message["rows"])
+        elif kind == "started":
+            self._line("real time", message["realtime"], "dim")
+        elif kind == "px4":
+            self._line("PX4", message["text"], "yellow")
+        elif kind == "command":
+            style = "cyan" if message["accepted"] else "yellow"
+            words = f"{message['operator']} commanded {message['command']}: {message['text']}"
+            self._line(f"t {message['t_s']:6.2f} s", words, style)
+        elif kind == "busy":
+            self._line("computer", message["text"], "yellow")
+        elif kind == "ground":
+            self._line("ground", message["text"], "cyan")
+
+    def _preflight(self, rows: list[Message]) -> None:
+        """Rows that refuse are told at the end, as the reason of the refusal."""
+        self._progress.update(self._task, description="starting", completed=0.0, note="")
+        bad = [row for row in rows if not row["ok"]]
+        warned = [row for row in bad if row["level"] == Level.WARN.value]
+        refused = len(bad) - len(warned)
+        told = f"{len(rows)} checks: " + (f"{refused} refused" if refused else "ok")
+        self._line("preflight", told + (f", {len(warned)} to look at" if warned else ""), "red" if refused else "green")
+        for row in warned:
+            self._line("", Row(**{**row, "level": Level.WARN}).line(), "yellow")
+
+    def say(self, text: str) -> None:
+        """One line of the launcher's own."""
+        self._line("", text, "yellow")
+
+    def _line(self, head: str, text: str, style: str) -> None:
+        self._progress.console.print(
+            f"  [dim]{escape(head):<11}[/] [{style}]{escape(text)}[/]", highlight=False, soft_wrap=True
+        )
+
+
+def print_result(console: Console, summary: dict[str, Any], out: Path, report: Path | None) -> None:
+    """The result table, and where everything lies."""
+    outcome = summary["outcome"]
+    table = Table(title=None, show_header=True, header_style="bold", box=None, pad_edge=False)
+    table.add_column("")
+    table.add_column("before the catch", justify="right")
+    table.add_column("after the catch", justify="right")
+    rms = summary["rms"]
+
+    def cell(part: str, key: str, unit: str, scale: float = 1.0, digits: int = 3) -> str:
+        values = rms.get(part)
+        value = values.get(key) if values else None
+        return "-" if value is None else f"{value * scale:.{digits}f} {unit}"
+
+    for label, key, unit, digits in (
+        ("position error, RMS", "e_p_m", "m", 4),
+        ("attitude error, RMS", "e_q_deg", "deg", 2),
+        ("arm error, RMS", "e_alpha_deg", "deg", 2),
+    ):
+        table.add_row(label, cell("pre", key, unit, digits=digits), cell("post", key, unit, digits=digits))
+    facts = Table.grid(padding=(0, 2))
+    style = _OUTCOME_STYLE.get(outcome, "bold red")
+    facts.add_row("outcome", f"[{style}]{outcome}[/]")
+    facts.add_row("controller", f"{summary['controller']} ({summary['preset']})")
+    if summary.get("payload_kg") is not None:
+        facts.add_row("payload", f"{summary['payload_kg']:g} kg (known to the simulated world only)")
+    catch = summary.get("catch_t_s")
+    doubt = "" if summary.get("catch_confirmed") is not False else ", not confirmed: the flight ended too soon after it"
+    facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
+    loop = summary.get("loop") or {}
+    if loop.get("ticks"):
+        late = loop["lateness_ms"]
+        text = (
+            f"{loop['rate_hz']:.0f} Hz, {loop['ticks']} ticks, {loop['missed']} missed, late p99 {late['p99']:.1f} ms"
+        )
+        facts.add_row("control loop", text)
+    recorder = summary.get("recorder") or {}
+    if recorder.get("samples") is not None:
+        facts.add_row("recorder", f"{recorder['samples']} ticks, {recorder['dropped']} dropped")
+    slack = (summary.get("tether") or {}).get("min_slack_m")
+    if slack is not None:
+        facts.add_row("tether", f"least slack {slack:.2f} m")
+    every = summary.get("graded_every", 1)
+    if every > 1:
+        facts.add_row("graded", f"every {every}th tick of a long flight; loop and latencies: every tick")
+    facts.add_row("report", str(report) if report else f"none; what there is lies in {out}")
+    console.print()
+    console.print(facts, highlight=False, soft_wrap=True)
+    if outcome != "refused":
+        console.print()
+        console.print(table, highlight=False)

@@ -1,0 +1,176 @@
+"""When rotors may be stopped: the one rule for every request to disarm, in the flight process and in the guardian. Pure.
+
+Three cases, and no fourth:
+
+* **It stands.** PX4 is in OFFBOARD or LAND, so no pilot flies; every fresh height is near standing height; and the vehicle has
+  not moved. All of it without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses in the air, and for
+  `FORCE_DISARM_S` by motion capture before FORCE_DISARM, which PX4 does not refuse.
+* **It is flipped.** Beyond `FLIPPED_TILT_RAD` by PX4's attitude, confirmed by motion capture, or by the accelerometer where
+  motion capture does not see the body, for `FLIPPED_HOLD_S`. Then PX4's LAND drives it into the floor, so FORCE_DISARM follows
+  at once and at any height, unless a pilot flies.
+* **It is tipped over.** For `TIPPED_HOLD_S`, in OFFBOARD or LAND: tilted by more than `safety.tilt_abort_deg` by PX4's attitude and
+  by motion capture, and less than `LOW_WITHIN_M` above standing height by motion capture. It lies on its rotors, and PX4's LAND
+  goes on driving them. Without a fresh pose there is no judgement.
+
+No sound flight is taken for a vehicle that is tipped over. The law's setpoints stay within `airframe.tilt_max_deg`, PX4's own landing
+within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by more than
+8 m/s^2, and PX4, told to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. One other way to stay so
+tilted so low is a tether that pulls the vehicle over; it then falls by `LOW_WITHIN_M` at most.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.model.flight_stage import HEARTBEAT_FRESH_S, people_fly
+from companion.model.frames import tilt_rad
+from companion.model.types import FlightMode, Inputs, MocapPose, Vec3
+from companion.safety.touchdown import MOCAP_FRESH_S, STILL_M_S, Sinking
+
+LOW_WITHIN_M = 0.25
+"""Margin over standing height: higher than this nothing counts as standing."""
+STILL_WITHIN_M = 0.05
+"""A vehicle that has moved further than this since its rest began has not stood still."""
+DISARM_STILL_S = 0.35
+FORCE_DISARM_S = 4.0
+"""At rest for this long without PX4's land detector noticing, the vehicle is disarmed against it."""
+ESTIMATE_TRUSTED_S = 4.2
+"""After the last motion-capture pose: PX4's dead-reckoned height still counts. PX4 gives it up after 4.5 s."""
+STATE_FRESH_S = 0.3
+FLIPPED_TILT_RAD = math.radians(70.0)
+FLIPPED_HOLD_S = 0.3
+TIPPED_HOLD_S = 0.5
+_UPRIGHT_MIN_M_S2 = 9.81 * math.cos(FLIPPED_TILT_RAD)
+"""Specific force along body z; anything that stands or hovers less tilted feels more."""
+Places = dict[str, Vec3]
+"""Position in the world by each source, "mocap" and "PX4"."""
+OWN_MODES = frozenset({FlightMode.OFFBOARD, FlightMode.LAND})
+"""PX4's modes in which the companion or its guardian has the vehicle; a stop of rotors is requested in no other."""
+
+
+def fresh_pose(i: Inputs) -> MocapPose | None:
+    """The motion-capture pose, if the body is in view and the pose is at most `MOCAP_FRESH_S` old."""
+    pose = i.mocap
+    return pose if pose is not None and pose.tracking_valid and i.t_s - pose.stamp_s < MOCAP_FRESH_S else None
+
+
+def hears_px4(i: Inputs) -> bool:
+    """A heartbeat of PX4 has arrived within `HEARTBEAT_FRESH_S`."""
+    return i.status is not None and i.t_s - i.status.heartbeat_stamp_s < HEARTBEAT_FRESH_S
+
+
+def is_ours(i: Inputs) -> bool:
+    """PX4 is heard, armed, and in a mode of `OWN_MODES`."""
+    return hears_px4(i) and i.status is not None and i.status.armed and i.status.mode in OWN_MODES
+
+
+def seems_flipped(i: Inputs) -> bool:
+    """Two sources say in this tick that the vehicle is tilted by more than `FLIPPED_TILT_RAD`.
+
+    PX4's attitude must say so. Motion capture decides whether that is true; without a fresh pose the accelerometer does, which
+    confirms a vehicle that lies on its side or back or falls freely, not one whose rotors still push against gravity.
+    """
+    if not _tilted_by_px4(i, FLIPPED_TILT_RAD):
+        return False
+    pose = fresh_pose(i)
+    if pose is not None:
+        return tilt_rad(pose.attitude_wxyz) > FLIPPED_TILT_RAD
+    vehicle = i.vehicle
+    fresh = vehicle is not None and i.t_s - vehicle.imu_stamp_s < STATE_FRESH_S
+    return fresh and vehicle is not None and vehicle.specific_force_body_m_s2[2] < _UPRIGHT_MIN_M_S2
+
+
+def _tilted_by_px4(i: Inputs, limit_rad: float) -> bool:
+    """PX4's attitude is fresh and tilted by more than `limit_rad`."""
+    vehicle = i.vehicle
+    if vehicle is None or i.t_s - vehicle.attitude_stamp_s >= STATE_FRESH_S:
+        return False
+    return tilt_rad(vehicle.attitude_wxyz) > limit_rad
+
+
+class RotorStop:
+    """Judges tick by tick whether the rotors may be stopped.
+
+    Args:
+        clearance_m: height of the body's origin when the vehicle stands.
+        tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
+        pose_s: flight time of the newest pose that PX4 has had; -inf if that is not known.
+        flipped: it is known to be flipped, and has been for long enough.
+    """
+
+    def __init__(
+        self, clearance_m: float, tilt_max_rad: float, pose_s: float = -math.inf, *, flipped: bool = False
+    ) -> None:
+        self._low_m = clearance_m + LOW_WITHIN_M
+        self._tilt_max_rad = tilt_max_rad
+        self._sinking = Sinking()
+        self._pose_s = pose_s
+        self._rest: tuple[float, Places] | None = None
+        """Since when it stands still, and where; None if it does not."""
+        self._flipped_since_s = -math.inf if flipped else None
+        self._tipped_since_s: float | None = None
+        self.may_disarm = self.may_force = self.flipped = self.tipped = False
+        """Whether DISARM may be requested now, and FORCE_DISARM of a vehicle that stands, is flipped, or is tipped over."""
+
+    def update(self, i: Inputs) -> None:
+        """Judge one tick. Call it in every tick of the stage, or what held before counts for nothing."""
+        self._judge_rest(i)
+        rest_s = i.t_s - self._rest[0] if self._rest is not None else -math.inf
+        self.may_disarm = rest_s >= DISARM_STILL_S
+        self.may_force = rest_s >= FORCE_DISARM_S and self._rest is not None and "mocap" in self._rest[1]
+        if not seems_flipped(i) or people_fly(i.status):
+            self._flipped_since_s = None
+        elif self._flipped_since_s is None:
+            self._flipped_since_s = i.t_s
+        self.flipped = self._flipped_since_s is not None and i.t_s - self._flipped_since_s >= FLIPPED_HOLD_S
+        if not self._lies_tilted(i):
+            self._tipped_since_s = None
+        elif self._tipped_since_s is None:
+            self._tipped_since_s = i.t_s
+        self.tipped = self._tipped_since_s is not None and i.t_s - self._tipped_since_s >= TIPPED_HOLD_S
+
+    @property
+    def overturned(self) -> bool:
+        """The vehicle is flipped or tipped over: FORCE_DISARM may be requested now."""
+        return self.flipped or self.tipped
+
+    def _lies_tilted(self, i: Inputs) -> bool:
+        """In our mode, low by motion capture, and tilted beyond the limit by motion capture and by PX4, in this tick."""
+        pose = fresh_pose(i)
+        if pose is None or pose.position_world_m[2] >= self._low_m or not is_ours(i):
+            return False
+        return tilt_rad(pose.attitude_wxyz) > self._tilt_max_rad and _tilted_by_px4(i, self._tilt_max_rad)
+
+    def _judge_rest(self, i: Inputs) -> None:
+        pose = fresh_pose(i)
+        places = self._low_and_still(i, pose)
+        rest = self._rest
+        if not places or not is_ours(i):
+            self._rest = None
+        elif rest is None or rest[1].keys() != places.keys() or _moved_m(rest[1], places) > STILL_WITHIN_M:
+            self._rest = (i.t_s, places)
+
+    def _low_and_still(self, i: Inputs, pose: MocapPose | None) -> Places:
+        """Where every source that can be trusted sees the vehicle; empty unless all say low and the best one says still."""
+        sink_m_s = self._sinking.update(i.t_s, pose)
+        if i.mocap is not None and i.mocap.tracking_valid:
+            self._pose_s = max(self._pose_s, i.mocap.stamp_s)
+        places: Places = {}
+        vehicle = i.vehicle
+        if vehicle is not None and i.t_s - vehicle.position_stamp_s < STATE_FRESH_S:
+            places["PX4"] = vehicle.position_world_m
+            speed_m_s: float | None = vehicle.velocity_world_m_s[2]
+        else:
+            speed_m_s = None
+        if pose is not None:
+            places["mocap"] = pose.position_world_m
+            speed_m_s = sink_m_s
+        elif i.t_s - self._pose_s > ESTIMATE_TRUSTED_S:
+            return {}
+        still = speed_m_s is not None and abs(speed_m_s) < STILL_M_S
+        return places if still and all(place[2] < self._low_m for place in places.values()) else {}
+
+
+def _moved_m(before: Places, now: Places) -> float:
+    """The furthest that one of the sources, the same in both, says that it has moved."""
+    return max(math.dist(before[source], now[source]) for source in now)

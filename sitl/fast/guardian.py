@@ -1,0 +1,177 @@
+"""The guardian in the fast closed loop: its own watch and its own landing, on simulated time, over a wire that is only memory.
+
+What its process does beside that (kill, take the port) is told here by how long it takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.config.vehicle import Vehicle
+from companion.flight.heartbeat import Heartbeats
+from companion.guardian.heartbeat import Beat
+from companion.guardian.link import Link
+from companion.guardian.process import PERIOD_S
+from companion.guardian.takeover_landing import Charge, Tell, Told
+from companion.guardian.watch import StallWatch
+from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Outputs, SafetyAction, Severity
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.receive import Receiver
+from sitl.autopilot.streams import STREAMS, Schedule
+
+TAKE_OVER_S = 0.03
+"""From the decision to the first message: the flight process is killed, its port opened."""
+_OWN = (1, 191)
+
+
+class MemoryWire:
+    """The guardian's wire to the stub."""
+
+    lost = False
+
+    def __init__(self, px4: Px4Stub) -> None:
+        self.schedule = Schedule(False)
+        self._px4 = px4
+        self._receiver = Receiver(px4)
+        self._end = _StubEnd(self)
+        self._decoder = mavlink.MAVLink(None)
+        self._encoder = mavlink.MAVLink(
+            None, srcSystem=px4.params.integer("MAV_SYS_ID"), srcComponent=px4.params.integer("MAV_COMP_ID")
+        )
+        self._waiting: deque[bytes] = deque()
+
+    # -- the guardian's end ----------------------------------------------------------------------------------------
+
+    def fileno(self) -> int:
+        """Nothing to wait on."""
+        return -1
+
+    @property
+    def ready(self) -> bool:
+        """There is nobody to look for."""
+        return True
+
+    def send(self, data: bytes) -> None:
+        """Handled at once."""
+        for message in self._decoder.parse_buffer(data) or ():
+            self._receiver.handle(self._end, message)
+
+    def receive(self) -> list[bytes]:
+        """What the stub has sent."""
+        waiting = list(self._waiting)
+        self._waiting.clear()
+        return waiting
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    # -- the stub's end --------------------------------------------------------------------------------------------
+
+    def pump(self, t_s: float) -> None:
+        """Streams that are due."""
+        for message_id in self.schedule.due(t_s):
+            message = STREAMS[message_id].build(self._px4)
+            if message is not None:
+                self.post(message)
+
+    def post(self, message: Any) -> None:
+        """One message of the stub."""
+        self._waiting.append(message.pack(self._encoder))
+
+
+class _StubEnd:
+    """What the receiver answers through."""
+
+    def __init__(self, wire: MemoryWire) -> None:
+        self._wire = wire
+        self.schedule = wire.schedule
+
+    def send(self, message: Any) -> None:
+        self._wire.post(message)
+
+    def send_all_params(self) -> None:
+        """Nobody here asks for them."""
+
+    def saw_ground_station(self) -> None:
+        """There is none."""
+
+    def status_text(self, severity: int, text: str) -> None:
+        """Nobody reads it."""
+
+
+class StandIn:
+    """The guardian of one fast flight.
+
+    Args:
+        vehicle: for the timeout and the height of a vehicle that stands.
+        px4: the other end of its wire.
+    """
+
+    def __init__(self, vehicle: Vehicle, px4: Px4Stub) -> None:
+        self._vehicle = vehicle
+        self._px4 = px4
+        self._watch = StallWatch(vehicle.safety.guardian_timeout_s)
+        self._beat: Beat | None = None
+        system = px4.params.integer("MAV_SYS_ID")
+        self._heartbeats = Heartbeats(LinkIdentity(system, *_OWN, local_port=0), origin_s=0.0)
+        self._round_s = 0.0
+        self.events: list[Event] = []
+        self.alive = True
+
+    def beat(self, inputs: Inputs, outputs: Outputs) -> None:
+        """A control tick of the flight process."""
+        self._beat = self._heartbeats.of(inputs, outputs)
+
+    def must_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
+        """One look at the flight process; to be asked in every tick."""
+        if not self.alive or self._beat is None or not self._beat.lifting or t_s - self._round_s < PERIOD_S - 1e-9:
+            return False
+        self._round_s = t_s
+        hangs = self._watch.update(t_s, heard)
+        if not (hangs or dead):
+            return False
+        reason = (
+            "the flight process died"
+            if dead
+            else f"the flight process hangs (silent for {self._watch.silent_s * 1e3:.0f} ms)"
+        )
+        text = f"{reason}; the guardian has taken over"
+        self._tell(Told(t_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+        return True
+
+    def take_over(self, t_s: float) -> Landing:
+        """In charge from now on."""
+        assert self._beat is not None
+        return Landing(self._beat, self._vehicle, self._px4, t_s, self._tell)
+
+    def _tell(self, told: Told) -> None:
+        self.events.append(Event(told.t_s, told.id, told.severity, told.action, told.text))
+
+
+class Landing:
+    """The guardian in charge."""
+
+    def __init__(self, beat: Beat, vehicle: Vehicle, px4: Px4Stub, t_s: float, tell: Tell) -> None:
+        self._wire = MemoryWire(px4)
+        self._link = Link(self._wire, _OWN, beat.autopilot_system)
+        clearance_m, tilt_max_rad = vehicle.airframe.ground_clearance_m, math.radians(vehicle.safety.tilt_abort_deg)
+        self._charge = Charge(beat, clearance_m, tilt_max_rad, self._link, t_s, tell)
+        self._round_s = float("-inf")
+
+    @property
+    def landed(self) -> bool | None:
+        """As `Charge.landed`."""
+        return self._charge.landed
+
+    def step(self, t_s: float, poses: list[MocapPose]) -> None:
+        """To be called in every step of the physics."""
+        self._charge.take_poses(poses)
+        if t_s - self._round_s >= PERIOD_S - 1e-9:
+            self._round_s = t_s
+            self._wire.pump(t_s)
+            self._charge.take_messages(t_s, self._link.receive())
+            self._charge.step(t_s)

@@ -1,0 +1,439 @@
+"""The fast closed loop: the same flight core, PX4 stub, servos and world, without sockets and on simulated time.
+
+What a wire would do is kept: sensor rates, quantisation, noise, delays; what is left out is only the bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from companion.config.faults import FaultKind
+from companion.config.loader import FlightConfig
+from companion.core.flight_core import FlightCore
+from companion.io.dynamixel.registers import WATCHDOG_ERROR
+from companion.io.px4.delta_velocity import DeltaVelocity
+from companion.model.frames import (
+    attitude_enu_flu_from_ned_frd,
+    attitude_ned_frd_from_enu_flu,
+    enu_from_ned,
+    flu_from_frd,
+    ned_from_enu,
+)
+from companion.model.types import (
+    ArmState,
+    AutopilotRequest,
+    AutopilotStatus,
+    Event,
+    FlightMode,
+    ForceSample,
+    Inputs,
+    LandedState,
+    MocapPose,
+    OperatorCommand,
+    Outputs,
+    Quat,
+    Vec3,
+    Vec4,
+    VehicleState,
+)
+from sitl.autopilot.autopilot import Command7, Px4Stub
+from sitl.autopilot.commander import FORCE_MAGIC, Command
+from sitl.autopilot.modes import NavState
+from sitl.autopilot.telemetry import system_status
+from sitl.autopilot.types import AttitudeTarget, ImuSample
+from sitl.ends import set_hover_thrust, stub_of
+from sitl.fast.bus import scales_of
+from sitl.fast.guardian import TAKE_OVER_S, Landing, StandIn
+from sitl.fast.link import FastLink
+from sitl.faults import COOL_C, Faults, in_time
+from sitl.server import start_of
+from sitl.servo.drive import MODE_CURRENT
+from sitl.servo.knobs import plugged_in, servos_of
+from sitl.world.plant import MocapFrame, Plant, battery_voltage_v
+from sitl.world.world import Layout, Snapshot, Truth
+
+TICK_S = 0.005
+LINK_DELAY_S = 0.002
+"""Time that a setpoint takes on the wire."""
+POSITION_PERIOD_S = 1.0 / 124.0
+"""As PX4 streams at most; attitude and IMU come with every tick."""
+_NO_COMMAND, _LAND = OperatorCommand.NONE, OperatorCommand.LAND
+_ON_GROUND, _IN_AIR = LandedState.ON_GROUND, LandedState.IN_AIR
+_NO_REQUEST = AutopilotRequest.NONE
+_HEALTHY = (0, 0)
+_COOL = (COOL_C, COOL_C)
+SETTLE_S = 30.0
+"""So long the world goes on after a flight that ends with rotors that turn."""
+HOLD_UP: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
+"""Faults of the flight process itself."""
+_MODES = {NavState.OFFBOARD: FlightMode.OFFBOARD, NavState.LAND: FlightMode.LAND, NavState.LOITER: FlightMode.HOLD}
+_OFFBOARD_MODE: Command7 = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_NOTHING: Command7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass
+class FastResult:
+    """One flight."""
+
+    inputs: list[Inputs] = field(default_factory=list)
+    outputs: list[Outputs] = field(default_factory=list)
+    crashed: bool = False
+    caught: bool = False
+    snapshots: list[Snapshot] = field(default_factory=list)
+    """The world after each tick, as it is."""
+    layout: Layout | None = None
+    after: list[Snapshot] = field(default_factory=list)
+    """The world after the last tick, while the guardian lands; every 5 ms."""
+    guardian_events: list[Event] = field(default_factory=list)
+    """What the guardian did; empty: it was not needed."""
+    guardian_landed: bool | None = None
+    """None: it was not needed, or has not come to an end."""
+    armed: bool = False
+    """The rotors still turn at the end."""
+
+    @cached_property
+    def truth(self) -> list[Truth]:
+        """The world after each tick; made when somebody looks."""
+        layout = self.layout
+        return [] if layout is None else [layout.truth(snapshot) for snapshot in self.snapshots]
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """A flight makes many records and no cycles: the collector would go through all of them again and again, for nothing."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            # Not young any more: else the collector would at once go through all that the flight has made.
+            gc.freeze()
+            gc.unfreeze()
+            gc.enable()
+
+
+class _Heard:
+    """PX4, and every IMU sample that it sends on."""
+
+    def __init__(self, px4: Px4Stub) -> None:
+        self._px4 = px4
+        self.total = DeltaVelocity()
+
+    def step(self, imu: ImuSample) -> Vec4:
+        """One sample; PX4's clock starts anew with PX4."""
+        boot_s = imu.t_s - self._px4.booted_at_s
+        if boot_s >= 0.0:
+            self.total.add(boot_s, imu.accel_frd_m_s2)
+        return self._px4.step(imu)
+
+
+class FastFlight:
+    """One flight in the fast closed loop.
+
+    Args:
+        config: effective configuration; hover thrust is taken from the stub's MPC_THR_HOVER if absent.
+        command: what the operator asks for at a flight time, for tests.
+    """
+
+    def __init__(self, config: FlightConfig, land_at_s: float | None = None) -> None:
+        config = in_time(config)
+        vehicle, world, start = config.vehicle, config.world, config.mission.start
+        self._land_at_s = land_at_s
+        self.px4 = stub_of(world, LINK_DELAY_S)
+        servos = servos_of(vehicle, world)
+        self._drives = [servo.drive for servo in servos]
+        pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
+        self._heard = _Heard(self.px4)
+        self.plant = Plant(vehicle, world, self._heard, self._drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
+        self.faults = Faults(world, self.plant.world, self.px4, self._drives, vehicle.tether.anchor_world_m)
+        if world.faults:
+            self.plant.faults = self.faults
+        self._guardian = StandIn(vehicle, self.px4) if world.faults else None
+        self._link = FastLink(self.faults, self.plant.world, self.px4, TICK_S)
+        self._goal_s = 0.0
+        hover = set_hover_thrust(self.px4, world, self.plant.world)
+        if vehicle.airframe.hover_thrust is None:
+            airframe = vehicle.airframe.model_copy(update={"hover_thrust": hover})
+            vehicle = vehicle.model_copy(update={"airframe": airframe})
+            config = config.model_copy(update={"vehicle": vehicle})
+        self.config = config
+        self.core = FlightCore(config)
+        self._watchdog_s = vehicle.devices.arm.watchdog_ms * 1e-3
+        for drive in self._drives:
+            drive.mode, drive.torque_on = MODE_CURRENT, True
+            drive.set_goal_current(0, at_once=True)
+            drive.start_watchdog(self._watchdog_s)
+        self._scales = scales_of(vehicle, plugged_in(servos, world))
+        """None if the set-up of the servo bus failed: the arm never answers."""
+        self._mocap: MocapPose | None = None
+        self._force: ForceSample | None = None
+        self._arm: ArmState | None = None
+        self._position = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+        self._trusted = True
+        """What the core said of motion capture: only what it believes is passed on to PX4."""
+        self._dropped = 0
+
+    def run(self, limit_s: float = 90.0) -> FastResult:
+        """Fly to the end."""
+        world = self.plant.world
+        result = FastResult(layout=world.layout)
+        with _no_collection():
+            self._run(result, limit_s)
+        result.crashed = world.crashed
+        result.caught = world.caught_t_s is not None
+        return result
+
+    def _run(self, result: FastResult, limit_s: float) -> None:
+        plant, core, px4 = self.plant, self.core, self.px4
+        world, guardian = plant.world, self._guardian
+        period = tick = 0
+        while world.t_s < limit_s:
+            period += 1
+            due_s = period * TICK_S - 1e-9
+            while world.t_s < due_s:
+                plant.step(px4.armed)
+                for frame in plant.take_mocap():
+                    self._deliver(frame)
+            if guardian is not None and self._held_up(guardian):
+                if guardian.must_take_over(world.t_s, False, plant.fault("kill_flight") is not None):
+                    self._guardian_lands(guardian, result, limit_s)
+                    break
+                result.after.append(world.snapshot())
+                if world.crashed:
+                    break
+                continue
+            inputs = self._inputs(tick)
+            outputs = core.step(inputs)
+            self._trusted = outputs.mocap_trusted
+            self._carry_out(outputs)
+            if guardian is not None:
+                guardian.beat(inputs, outputs)
+                guardian.must_take_over(world.t_s, True, False)
+            result.inputs.append(inputs)
+            result.outputs.append(outputs)
+            result.snapshots.append(world.snapshot())
+            tick += 1
+            if outputs.outcome is not None or world.crashed:
+                break
+        if guardian is not None:
+            result.guardian_events = guardian.events
+            self._settle(result)
+        result.armed = px4.armed
+
+    def _settle(self, result: FastResult) -> None:
+        """A flight that was given up while PX4 still lands: what becomes of the vehicle."""
+        world, px4 = self.plant.world, self.px4
+        end_s = world.t_s + SETTLE_S
+        period_s = world.t_s
+        while px4.armed and not world.crashed and world.t_s < end_s:
+            self.plant.step(px4.armed)
+            if world.t_s >= period_s + TICK_S - 1e-9:
+                period_s += TICK_S
+                result.after.append(world.snapshot())
+
+    def _held_up(self, guardian: StandIn) -> bool:
+        """A fault keeps the flight process from its tick; what then goes on is what other threads do."""
+        active, t_s = self.faults.active, self.plant.world.t_s
+        guardian.alive = "kill_guardian" not in active
+        if "stall_loop" in active:  # the bus thread lives: it feeds the watchdogs, and takes old currents back
+            for drive in self._drives:
+                drive.heard_instruction()
+                if t_s - self._goal_s > self._watchdog_s:
+                    drive.set_goal_current(0)
+        return not active.keys().isdisjoint(HOLD_UP)
+
+    def _guardian_lands(self, guardian: StandIn, result: FastResult, limit_s: float) -> None:
+        plant, px4 = self.plant, self.px4
+        world = plant.world
+        open_s = world.t_s + TAKE_OVER_S
+        landing: Landing | None = None
+        period_s = world.t_s
+        while world.t_s < limit_s and not world.crashed and (landing is None or landing.landed is None):
+            plant.step(px4.armed)
+            poses = [self._pose(frame) for frame in plant.take_mocap()]
+            if landing is None and world.t_s >= open_s:
+                landing = guardian.take_over(world.t_s)
+            if landing is not None:
+                landing.step(world.t_s, poses)
+            if world.t_s >= period_s + TICK_S - 1e-9:
+                period_s += TICK_S
+                result.after.append(world.snapshot())
+        result.guardian_landed = landing.landed if landing is not None else False
+
+    def _deliver(self, frame: MocapFrame) -> None:
+        self._mocap = pose = self._pose(frame)
+        if self._trusted and pose.tracking_valid:
+            position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
+            if self.plant.faults is None:
+                self.px4.on_vision(pose.stamp_s, position, attitude)
+            elif self.faults.active.keys().isdisjoint(HOLD_UP):
+                self._link.send(lambda: self._see(position, attitude))
+
+    def _see(self, position_ned_m: Vec3, attitude_ned_frd: Quat) -> None:
+        self.px4.on_vision(self.plant.world.t_s, position_ned_m, attitude_ned_frd)
+
+    def _pose(self, frame: MocapFrame) -> MocapPose:
+        t_s = self.plant.world.t_s
+        number, exposure_s, position, attitude, valid = frame
+        latency_s, exposure_server_s = t_s - exposure_s, exposure_s
+        if self.plant.faults is not None:
+            exposure_server_s = self.faults.server_clock_s(exposure_s)
+            latency_s = self.faults.server_clock_s(t_s) - exposure_server_s
+        return MocapPose(t_s, latency_s, number, position, attitude, valid, 0.0002, exposure_server_s)
+
+    def _inputs(self, tick: int) -> Inputs:
+        plant, t_s = self.plant, self.plant.world.t_s
+        dropped, guardian_ready = 0, None
+        if plant.faults is None:
+            vehicle, status = self._vehicle(t_s), self._status(t_s)
+        else:
+            self._link.deliver_late()
+            vehicle, status = self._link.hear(self._vehicle(t_s), self._status(t_s))
+            active = self.faults.active
+            guardian_ready = "kill_guardian" not in active
+            if "kill_recorder" in active or "disk_full" in active:
+                self._dropped += 1
+            dropped = self._dropped
+        if plant.fault("force_loss") is None:
+            force, torque = plant.force_torque()
+            self._force = ForceSample(t_s, force, torque, False)
+        if self._arm is None or plant.faults is None or not self._bus_fails():
+            self._arm = self._read_arm(t_s)
+        else:
+            self._arm = replace(self._arm, read_failures=self._arm.read_failures + 1)
+        land = self._land_at_s is not None and t_s >= self._land_at_s
+        return Inputs(
+            tick,
+            t_s,
+            vehicle,
+            status,
+            self._mocap,
+            self._arm,
+            self._force,
+            _LAND if land else _NO_COMMAND,
+            dropped,
+            guardian_ready,
+        )
+
+    def _bus_fails(self) -> bool:
+        """A read that brings nothing; the servos that are not lost have heard it all the same, unless it was damaged."""
+        lost = self.faults.active.get("servo_loss")
+        damaged = self.faults.packet_lost()
+        if lost is None:
+            return damaged
+        if not damaged:
+            self._drives[2 - lost.servo].heard_instruction()
+        return True
+
+    def _vehicle(self, t_s: float) -> VehicleState | None:
+        estimate = self.px4.estimate
+        if estimate is None or (not estimate.vision_fused and self._mocap is None):
+            return None
+        if t_s - self._position[2] >= POSITION_PERIOD_S - 1e-9:
+            self._position = (enu_from_ned(estimate.position_ned_m), enu_from_ned(estimate.velocity_ned_m_s), t_s)
+        position, velocity, stamp_s = self._position
+        return VehicleState(
+            stamp_s,
+            t_s,
+            t_s,
+            position,
+            velocity,
+            attitude_enu_flu_from_ned_frd(estimate.attitude_ned_frd),
+            flu_from_frd(estimate.rates_frd_rad_s),
+            flu_from_frd(estimate.accel_frd_m_s2),
+            None if self.plant.faults is None else t_s - self.px4.booted_at_s,
+            self._heard.total.boot_s,
+            flu_from_frd(self._heard.total.sum_m_s),
+        )
+
+    def _status(self, t_s: float) -> AutopilotStatus:
+        commander = self.px4.commander
+        remaining = self.plant.battery_remaining()
+        return AutopilotStatus(
+            t_s,
+            commander.armed,
+            _MODES.get(commander.nav_state, FlightMode.OTHER),
+            _ON_GROUND if self.px4.land.landed else _IN_AIR,
+            battery_voltage_v(remaining) - self.plant.battery_sag_v(),
+            remaining,
+            system_status(self.px4),
+        )
+
+    def _read_arm(self, t_s: float) -> ArmState | None:
+        if self._scales is None:
+            return None
+        (drive1, drive2), (scale1, scale2) = self._drives, self._scales
+        current1, speed1, position1 = drive1.present()
+        current2, speed2, position2 = drive2.present()
+        errors, temperatures_c = _HEALTHY, _COOL
+        if self.plant.faults is not None:
+            (e1, e2), (c1, c2) = self.faults.errors, self.faults.temperatures_c
+            errors, temperatures_c = (e1, e2), (c1, c2)
+        if drive1.watchdog_tripped or drive2.watchdog_tripped:
+            # As the edge does: told in one state, and started again with no current.
+            tripped = (drive1.watchdog_tripped * WATCHDOG_ERROR, drive2.watchdog_tripped * WATCHDOG_ERROR)
+            errors = (errors[0] | tripped[0], errors[1] | tripped[1])
+            drive1.start_watchdog(self._watchdog_s)
+            drive2.start_watchdog(self._watchdog_s)
+        drive1.heard_instruction()
+        drive2.heard_instruction()
+        return ArmState(
+            t_s,
+            (scale1.angle_rad(position1), scale2.angle_rad(position2)),
+            (scale1.velocity_rad_s(speed1), scale2.velocity_rad_s(speed2)),
+            (scale1.torque_nm(current1), scale2.torque_nm(current2)),
+            errors,
+            temperatures_c,
+            0,
+        )
+
+    def _carry_out(self, outputs: Outputs) -> None:
+        torque_nm, setpoint, request = outputs.arm_torque_nm, outputs.attitude, outputs.request
+        faulty = self.plant.faults is not None
+        if setpoint is not None:
+            target = AttitudeTarget(attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz), setpoint.thrust)
+            if faulty:
+                self._link.send(lambda: self.px4.on_setpoint(self.plant.world.t_s, target))
+            else:
+                self.px4.on_setpoint(self.plant.world.t_s, target)
+        if torque_nm is not None and self._scales is not None:
+            self._goal_s = self.plant.world.t_s
+            (drive1, drive2), (scale1, scale2) = self._drives, self._scales
+            counts = (scale1.current_counts(torque_nm[0]), scale2.current_counts(torque_nm[1]))
+            if not faulty:
+                drive1.set_goal_current(counts[0])
+                drive2.set_goal_current(counts[1])
+            elif not self.faults.packet_lost():
+                lost = self.faults.active.get("servo_loss")
+                for number, (drive, goal) in enumerate(zip(self._drives, counts, strict=True), start=1):
+                    if lost is None or lost.servo != number:
+                        drive.set_goal_current(goal)
+        elif faulty and self.plant.world.t_s - self._goal_s > self._watchdog_s and not self.faults.packet_lost():
+            # As the bus thread does with a goal that nobody renews; a servo that is lost has its own watchdog.
+            lost = self.faults.active.get("servo_loss")
+            for number, drive in enumerate(self._drives, start=1):
+                if lost is None or lost.servo != number:
+                    drive.set_goal_current(0)
+        if request is not _NO_REQUEST:
+            if faulty:
+                self._link.send(lambda: self._request(request))
+            else:
+                self._request(request)
+
+    def _request(self, request: AutopilotRequest) -> None:
+        t_s = self.plant.t_s
+        if request is AutopilotRequest.OFFBOARD:
+            self.px4.on_command(t_s, Command.DO_SET_MODE, _OFFBOARD_MODE)
+        elif request is AutopilotRequest.ARM:
+            self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, (1.0, *_NOTHING[1:]))
+        elif request is AutopilotRequest.LAND and self.px4.nav_state is not NavState.LAND:
+            self.px4.on_command(t_s, Command.NAV_LAND, _NOTHING)
+        elif request is AutopilotRequest.DISARM:
+            self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, _NOTHING)
+        elif request is AutopilotRequest.FORCE_DISARM:
+            self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, (0.0, float(FORCE_MAGIC), *_NOTHING[2:]))

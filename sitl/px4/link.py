@@ -1,0 +1,295 @@
+"""The world as PX4's external simulator: MAVLink 2 over TCP, HIL_SENSOR out, HIL_ACTUATOR_CONTROLS in, in lockstep.
+
+PX4 is the client. Its clock is the `time_usec` of the last HIL_SENSOR and nothing else, so that it computes exactly as long as the
+world lets it: a sample, then its answer, then the next sample. The clock begins anew with each PX4 that connects. Motion capture does
+not go this way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import random
+import socket
+from types import TracebackType
+from typing import Any, Self, cast
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.model.frames import quat_conjugate, quat_rotate
+from companion.model.types import Quat, Vec3
+from sitl.autopilot.types import ImuSample, RotorCommands
+
+CLOCK_ORIGIN_S = 1.0
+"""PX4's clock at its first sample, however old the world is: it must not begin at zero, and one that begins at some minutes keeps EKF2
+from its first estimate (PX4 1.16.1: at 300 s for some 10 s, at 1000 s for longer than the preflight waits)."""
+ANSWER_PATIENCE_S = 2.0
+"""One sample without an answer: the next one is sent all the same."""
+ANSWER_DEADLINE_S = 10.0
+"""No answer at all for so long: PX4 has stopped."""
+FIELD_EVERY, BARO_OFFSET = 5, 2
+"""Samples between two of the magnetometer, and of the barometer: 50 Hz each, in turns."""
+
+_STOPPED: RotorCommands = (0.0, 0.0, 0.0, 0.0)
+_ACCEL_AND_GYRO, _MAG, _BARO = 0x07 | 0x38, 0x1C0, 0x200 | 0x800 | 0x1000
+_GROUND_ALTITUDE_M = 488.0
+_FIELD_NED_GAUSS: Vec3 = (0.21, 0.01, 0.43)
+_FIELD_NOISE_GAUSS, _PRESSURE_NOISE_HPA = 0.001, 0.01
+_TEMPERATURE_C = 25.0
+
+
+class Px4Error(Exception):
+    """PX4 is not there, has ended, or has stopped answering; one line."""
+
+
+def pressure_hpa(altitude_m: float) -> float:
+    """Of the standard atmosphere, at a height above the sea."""
+    return 1013.25 * math.pow(1.0 - 2.25577e-5 * altitude_m, 5.25588)
+
+
+def field_frd_gauss(attitude_wxyz: Quat) -> Vec3:
+    """Magnetic field in the body (FRD) of a vehicle with this attitude (body FLU, world ENU)."""
+    north, east, down = _FIELD_NED_GAUSS
+    forward, left, up = quat_rotate(quat_conjugate(attitude_wxyz), (east, north, -down))
+    return (forward, -left, -up)
+
+
+class HilSensors:
+    """HIL_SENSOR messages of one flight.
+
+    PX4 does not boot without magnetometer and barometer, whether it fuses them or not: their values are plausible and noisy.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+        self._number = 0
+
+    def message(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> Any:
+        """HIL_SENSOR; the sample's time counts from PX4's first one, height above the floor and attitude (world ENU, body FLU) are
+        the true ones.
+        """
+        gauss = self._random.gauss
+        fields = _ACCEL_AND_GYRO
+        field: Vec3 = (0.0, 0.0, 0.0)
+        pressure = altitude_m = 0.0
+        if self._number % FIELD_EVERY == 0:
+            fields |= _MAG
+            x, y, z = field_frd_gauss(attitude_wxyz)
+            field = (
+                x + gauss(0.0, _FIELD_NOISE_GAUSS),
+                y + gauss(0.0, _FIELD_NOISE_GAUSS),
+                z + gauss(0.0, _FIELD_NOISE_GAUSS),
+            )
+        elif self._number % FIELD_EVERY == BARO_OFFSET:
+            fields |= _BARO
+            altitude_m = _GROUND_ALTITUDE_M + height_m
+            pressure = pressure_hpa(altitude_m) + gauss(0.0, _PRESSURE_NOISE_HPA)
+        self._number += 1
+        return mavlink.MAVLink_hil_sensor_message(
+            clock_us(imu.t_s), *imu.accel_frd_m_s2, *imu.gyro_frd_rad_s, *field, pressure, 0.0, altitude_m, _TEMPERATURE_C, fields
+        )  # fmt: skip
+
+
+def clock_us(t_s: float) -> int:
+    """PX4's clock, by the world time since its first sample."""
+    return round((t_s + CLOCK_ORIGIN_S) * 1e6)
+
+
+class SimulatorLink:
+    """The simulator's end of the TCP link; PX4 may connect, go, and connect again. An async context manager.
+
+    Args:
+        listener: bound to where PX4 connects, 127.0.0.1:4560 plus its instance; closed with the link.
+        sensors: what PX4 senses.
+    """
+
+    def __init__(self, listener: socket.socket, sensors: HilSensors) -> None:
+        self.rotors: RotorCommands = _STOPPED
+        """Rotor commands of the last answer, 0 to 1, PX4's quad-x order; 0 while disarmed."""
+        self.armed = False
+        self.answers = 0
+        """HIL_ACTUATOR_CONTROLS since PX4 connected."""
+        self.unanswered = 0
+        """Samples that PX4 left without an answer, in all."""
+        self.connections = 0
+        self.clock_begun_s: float | None = None
+        """World time of the first sample of the PX4 that is there; None before it. PX4's clock counts from it, at `CLOCK_ORIGIN_S`."""
+        self._listener = listener
+        self._sensors = sensors
+        self._server: asyncio.Server | None = None
+        self._peer: _Peer | None = None
+        self._encoder = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_SYSTEM_CONTROL)
+        self._waits_for_us: int | None = None
+        self._answer = asyncio.Event()
+        self._change = asyncio.Event()
+        self._silent_s = 0.0
+        self._rests = False
+        """Disarmed and without an answer: in OFFBOARD without setpoints, as after a flight, PX4 computes no controls."""
+
+    async def __aenter__(self) -> Self:
+        self._server = await asyncio.get_running_loop().create_server(lambda: _Peer(self), sock=self._listener)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._server is not None:
+            self._server.close()
+        if self._peer is not None:
+            self._peer.close()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(1.0):
+                    await self._peer.closed.wait()
+
+    @property
+    def port(self) -> int:
+        """TCP port that PX4 connects to."""
+        return int(self._listener.getsockname()[1])
+
+    @property
+    def connected(self) -> bool:
+        """A PX4 is there."""
+        return self._peer is not None
+
+    @property
+    def in_step(self) -> bool:
+        """It answers: its modules run."""
+        return self._peer is not None and self.answers > 0
+
+    async def until_in_step(self, deadline_s: float) -> bool:
+        """Wait for PX4's first answer, while somebody goes on sending samples; False: none came in time."""
+        return await self._until(lambda: self.in_step, deadline_s)
+
+    async def until_gone(self, deadline_s: float) -> bool:
+        """Wait until PX4 has closed its end; False: it has not in time."""
+        return await self._until(lambda: not self.connected, deadline_s)
+
+    async def _until(self, reached: Any, deadline_s: float) -> bool:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(deadline_s):
+                while not reached():
+                    self._change.clear()
+                    await self._change.wait()
+        return bool(reached())
+
+    def send(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> None:
+        """One sample to PX4; nothing happens while there is none. `answered` waits for what it makes of it."""
+        if self._peer is None:
+            return
+        if self.clock_begun_s is None:
+            self.clock_begun_s = imu.t_s
+        message = self._sensors.message(imu._replace(t_s=imu.t_s - self.clock_begun_s), height_m, attitude_wxyz)
+        # A PX4 that boots does not answer yet; one that rests does not answer for a while.
+        self._waits_for_us = int(message.time_usec) if self.answers and not self._rests else None
+        self._peer.write(message.pack(self._encoder))
+        self._encoder.seq = (self._encoder.seq + 1) % 256
+
+    @property
+    def pending(self) -> bool:
+        """The last sample has not been answered."""
+        return self._waits_for_us is not None
+
+    async def answered(self) -> None:
+        """Until PX4 has answered the last sample, or is gone. After `ANSWER_PATIENCE_S` the sample is given up; a PX4 that is not armed
+        is then not waited for any more until it answers again.
+
+        Raises:
+            Px4Error: an armed PX4 has answered nothing for `ANSWER_DEADLINE_S`.
+        """
+        while self._waits_for_us is not None:
+            self._answer.clear()
+            try:
+                async with asyncio.timeout(ANSWER_PATIENCE_S):
+                    await self._answer.wait()
+            except TimeoutError:
+                self.unanswered += 1
+                self._silent_s += ANSWER_PATIENCE_S
+                self._waits_for_us = None
+                self._rests = not self.armed
+                if self._silent_s >= ANSWER_DEADLINE_S:
+                    raise Px4Error(
+                        f"PX4: expected an answer to every HIL_SENSOR (lockstep), found none for {ANSWER_DEADLINE_S:g} s; "
+                        "PX4 hangs, or the machine is far too slow for it"
+                    ) from None
+
+    # -- called by the peer --------------------------------------------------------------------------------------
+
+    def attach(self, peer: _Peer) -> bool:
+        """PX4 connects; False: there is one already."""
+        if self._peer is not None:
+            return False
+        self._peer = peer
+        self.connections += 1
+        self.clock_begun_s = None
+        self.answers = 0
+        self._silent_s = 0.0
+        self._rests = False
+        self._change.set()
+        return True
+
+    def detach(self, peer: _Peer) -> None:
+        """PX4 is gone: its rotors stand."""
+        if self._peer is not peer:
+            return
+        self._peer = None
+        self.rotors, self.armed, self.answers = _STOPPED, False, 0
+        self._waits_for_us = None
+        self._answer.set()
+        self._change.set()
+
+    def take(self, message: Any) -> None:
+        """One message of PX4's."""
+        if message.get_type() != "HIL_ACTUATOR_CONTROLS":
+            return
+        self.answers += 1
+        self._rests = False
+        if self.answers == 1:
+            self._change.set()
+        self.armed = bool(message.mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        a, b, c, d = (min(1.0, max(0.0, value)) for value in message.controls[0:4])
+        self.rotors = (a, b, c, d)
+        if self._waits_for_us is not None and message.time_usec >= self._waits_for_us:
+            self._waits_for_us = None
+            self._silent_s = 0.0
+            self._answer.set()
+
+
+class _Peer(asyncio.Protocol):
+    """One TCP connection."""
+
+    def __init__(self, link: SimulatorLink) -> None:
+        self.closed = asyncio.Event()
+        self._link = link
+        self._transport: asyncio.Transport | None = None
+        self._decoder = mavlink.MAVLink(None)
+        self._decoder.robust_parsing = True
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Somebody connects."""
+        self._transport = cast(asyncio.Transport, transport)
+        connection = transport.get_extra_info("socket")
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if not self._link.attach(self):
+            self._transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It is gone."""
+        self._transport = None
+        self._link.detach(self)
+        self.closed.set()
+
+    def data_received(self, data: bytes) -> None:
+        """Messages, whole or in parts."""
+        for message in self._decoder.parse_buffer(data) or ():
+            self._link.take(message)
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        if self._transport is not None:
+            self._transport.write(data)
+
+    def close(self) -> None:
+        """Close."""
+        if self._transport is not None:
+            self._transport.abort()

@@ -1,0 +1,267 @@
+"""A real `px4` (SITL) as a child process: found, given an instance number that nobody uses, started in a folder of its own, ended.
+
+Everything that PX4 writes stays in that folder: parameters, logs (`log/*.ulg`), and what it says (`px4.log`). Outside of it PX4
+keeps `/tmp/px4_lock-N` and `/tmp/px4-sock-N` only.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import errno
+import os
+import shutil
+import signal
+import socket
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from companion.runtime.subprocesses import how_it_ended
+from sitl.px4.link import Px4Error
+
+VARIABLE = "PX4_SITL"
+"""Of the environment: the px4 binary, or the folder that a build leaves (build/px4_sitl_default)."""
+MODEL = "none_iris"
+"""A quad-x whose simulator is somebody else; everything that matters is set by parameters."""
+INSTANCES = range(10)
+"""From 10 on PX4 sends to UDP 14549 whatever its number is."""
+HOST = "127.0.0.1"
+HOW_TO_GET_IT = (
+    "set PX4_SITL to its build folder (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
+)
+HOW_TO_START_IT = (
+    "start one by hand, which waits for the world, and then this again: PX4_SIM_MODEL={model} px4 -i {number}, always in the same "
+    "folder, where it keeps its parameters, or PX4_SIM_MODEL={model} make px4_sitl_default none"
+)
+_SIMULATOR, _ONBOARD, _ONBOARD_OWN, _GROUND_OWN = 4560, 14540, 14580, 18570
+_CAMERA, _CAMERA_OWN, _GIMBAL_OWN = 14030, 14280, 13030
+_LOG = "px4.log"
+_TAIL_BYTES = 20000
+_libc = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Installation:
+    """A px4 that can be started."""
+
+    binary: Path
+    etc: Path
+    """Its start scripts (ROMFS)."""
+
+
+def find(environment: Mapping[str, str] | None = None) -> Installation | None:
+    """The px4 that PX4_SITL names, else the one on PATH; None: there is none.
+
+    Raises:
+        Px4Error: PX4_SITL names something that is none, or a px4 without its start scripts.
+    """
+    environment = os.environ if environment is None else environment
+    named = environment.get(VARIABLE, "")
+    if named:
+        given = Path(named).expanduser()
+        binary = given / "bin" / "px4" if given.is_dir() else given
+        if not (binary.is_file() and os.access(binary, os.X_OK)):
+            raise Px4Error(
+                f"{VARIABLE}={named}: expected the px4 binary or the folder of its build, found no program at {binary}; "
+                f"{HOW_TO_GET_IT}"
+            )
+        return _with_etc(binary, f"{VARIABLE}={named}")
+    on_path = shutil.which("px4", path=environment.get("PATH"))
+    return None if on_path is None else _with_etc(Path(on_path), f"px4 on PATH ({on_path})")
+
+
+def _with_etc(binary: Path, origin: str) -> Installation:
+    real = binary.resolve()
+    for root in dict.fromkeys((binary.parent.parent, real.parent.parent, real.parent)):
+        for etc in (root / "etc", root / "share" / "px4" / "etc", root / "ROMFS" / "px4fmu_common"):
+            if (etc / "init.d-posix" / "rcS").is_file():
+                return Installation(real, etc.resolve())
+    raise Px4Error(
+        f"{origin}: expected PX4's start scripts (etc/init.d-posix/rcS) beside the binary, found none; {HOW_TO_GET_IT}"
+    )
+
+
+class Instance:
+    """An instance number nobody else uses, and the sockets that keep it so. Closed with `close`, or as a context manager.
+
+    The simulator's TCP port is the claim: whoever listens there owns the number.
+    """
+
+    def __init__(self, number: int, simulator: socket.socket, witness: socket.socket) -> None:
+        self.number = number
+        self.simulator = simulator
+        """TCP, listening; PX4 connects to it."""
+        self.witness = witness
+        """UDP; what PX4 sends to its camera link arrives here."""
+
+    @property
+    def onboard_port(self) -> int:
+        """UDP port that PX4 sends its onboard link to: 14540 of instance 0."""
+        return _ONBOARD + self.number
+
+    @property
+    def ground_port(self) -> int:
+        """UDP port that PX4 sends its ground link from; it goes to 14550, whatever the instance."""
+        return _GROUND_OWN + self.number
+
+    @property
+    def onboard_address(self) -> tuple[str, int]:
+        """Where PX4's onboard link listens."""
+        return (HOST, _ONBOARD_OWN + self.number)
+
+    @property
+    def witness_address(self) -> tuple[str, int]:
+        """Where PX4's camera link listens."""
+        return (HOST, _CAMERA_OWN + self.number)
+
+    @classmethod
+    def claim(cls, numbers: range = INSTANCES) -> Instance:
+        """The first free one.
+
+        Raises:
+            Px4Error: all are taken.
+        """
+        for number in numbers:
+            instance = cls._try(number)
+            if instance is not None:
+                return instance
+        raise Px4Error(
+            f"PX4: expected one of the instances {numbers.start} to {numbers.stop - 1} to be free, found their ports in use "
+            f"(TCP {_SIMULATOR}+N, UDP {_ONBOARD}+N, {_ONBOARD_OWN}+N, ...); end other simulators"
+        )
+
+    @classmethod
+    def _try(cls, number: int) -> Instance | None:
+        with contextlib.ExitStack() as stack:
+            simulator = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+            simulator.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # only past connections keep a port busy
+            witness = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            try:
+                simulator.bind((HOST, _SIMULATOR + number))
+                simulator.listen(1)
+                witness.bind((HOST, _CAMERA + number))
+                for port in (_ONBOARD, _ONBOARD_OWN, _GROUND_OWN, _CAMERA_OWN, _GIMBAL_OWN):
+                    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                        probe.bind((HOST, port + number))
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    return None
+                raise
+            stack.pop_all()
+        simulator.setblocking(False)
+        witness.setblocking(False)
+        return cls(number, simulator, witness)
+
+    def close(self) -> None:
+        """Give the number back."""
+        self.simulator.close()
+        self.witness.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Px4Process:
+    """One PX4, running.
+
+    Args:
+        installation: what to start.
+        instance: its number, claimed.
+        folder: PX4's working folder; made if it is not there. Parameters of an earlier start in the same folder are still set.
+        settings: parameters that must hold before anything of PX4 starts (PX4_PARAM_* of its start script).
+
+    Raises:
+        Px4Error: it cannot be started.
+    """
+
+    def __init__(
+        self, installation: Installation, instance: Instance, folder: Path, settings: Mapping[str, int | float]
+    ) -> None:
+        self.log = folder / _LOG
+        self._number = instance.number
+        command = [str(installation.binary), "-i", str(instance.number), "-d", str(installation.etc)]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(("PX4_", "MAVLINK"))}
+        environment["PX4_SIM_MODEL"] = MODEL
+        environment |= {f"PX4_PARAM_{name}": str(value) for name, value in settings.items()}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with open(self.log, "ab") as log:
+                self._process = subprocess.Popen(
+                    [*command, "-s", "etc/init.d-posix/rcS"],
+                    cwd=folder,
+                    env=environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    start_new_session=True,
+                    preexec_fn=_before_exec,
+                )
+        except OSError as error:
+            raise Px4Error(f"PX4: {installation.binary} cannot be started in {folder}: {error.strerror}") from None
+
+    @property
+    def pid(self) -> int:
+        """Of PX4."""
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """It has not ended."""
+        return self._process.poll() is None
+
+    def epitaph(self) -> str:
+        """One line on a PX4 that ended by itself."""
+        code = self._process.poll()
+        how = "is running" if code is None else how_it_ended(code)
+        return f"PX4: px4 -i {self._number} {how}{self._last_complaint()}; see {self.log}"
+
+    async def until_ended(self, deadline_s: float) -> bool:
+        """Wait for its end; False: it has not come in time."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            await asyncio.to_thread(self._process.wait, deadline_s)
+        return not self.running
+
+    def ask_to_end(self) -> None:
+        """SIGTERM. In lockstep PX4's clock must go on until it is gone, or it cannot end."""
+        if self.running:
+            self._process.terminate()
+
+    def kill(self) -> None:
+        """End it at once, and what it left behind in /tmp."""
+        if self.running:
+            self._process.kill()
+        self._process.wait()
+        if self._process.returncode != 0:
+            for name in (f"/tmp/px4_lock-{self._number}", f"/tmp/px4-sock-{self._number}"):
+                with contextlib.suppress(OSError):
+                    os.unlink(name)
+
+    def _last_complaint(self) -> str:
+        said = _tail(self.log)
+        complaints = [line.strip() for line in said if "ERROR" in line or "PANIC" in line or "No such" in line]
+        # Of one that a signal ended the last words are not the cause.
+        return f" ({complaints[-1][:160]})" if complaints and self._process.returncode > 0 else ""
+
+
+def _before_exec() -> None:
+    """In the child: without a simulator PX4 would wait for ever, so it ends with the world; and it asks for its own priorities."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def _tail(path: Path) -> list[str]:
+    with contextlib.suppress(OSError), open(path, "rb") as log:
+        log.seek(max(0, log.seek(0, os.SEEK_END) - _TAIL_BYTES))
+        return log.read().decode(errors="replace").splitlines()
+    return []

@@ -1,0 +1,294 @@
+"""The simulator's own MAVLink link to a real PX4, beside the companion's: parameters, version, mode.
+
+It is PX4's link to a camera (UDP 14280 plus instance). The onboard link stays untouched, because PX4 keeps the first partner that
+speaks to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self, cast
+
+from pymavlink.dialects.v20 import development as mavlink  # common, and CURRENT_MODE
+
+from sitl.autopilot.modes import NavState, nav_state_from_custom
+from sitl.autopilot.params import MAV_PARAM_TYPE_INT32, Value, decode_bytewise, encode_bytewise
+from sitl.px4.link import Px4Error
+from sitl.px4.process import Instance
+
+ASK_AGAIN_S = 0.25
+PARAMS_DEADLINE_S = 20.0
+COMMAND_DEADLINE_S = 5.0
+HEARTBEAT_DEADLINE_S = 20.0
+MODE_PERIOD_S = 0.02
+"""Between two CURRENT_MODE on this link, so that a change of mode is seen at once; the companion hears one heartbeat a second."""
+_AT_ONCE = 20
+"""Parameters asked for together: PX4's receive buffer is finite."""
+_OWN_SYSTEM, _OWN_COMPONENT = 254, mavlink.MAV_COMP_ID_SYSTEM_CONTROL
+_AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
+_FORCE_DISARM = 21196.0
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """What flies."""
+
+    release: str
+    """1.16.1"""
+    build: str
+    """The first eight digits of its commit; empty if it does not tell."""
+
+    def __str__(self) -> str:
+        return f"{self.release} ({self.build})" if self.build else self.release
+
+
+class Witness(asyncio.DatagramProtocol):
+    """The link. An async context manager on the instance's own socket."""
+
+    def __init__(self, instance: Instance) -> None:
+        self.nav_state: NavState | None = None
+        """By the last HEARTBEAT or CURRENT_MODE."""
+        self._instance = instance
+        self._system = instance.number + 1
+        self._transport: asyncio.DatagramTransport | None = None
+        self._encoder = mavlink.MAVLink(None, srcSystem=_OWN_SYSTEM, srcComponent=_OWN_COMPONENT)
+        self._decoder = mavlink.MAVLink(None)
+        self._decoder.robust_parsing = True
+        self._handlers: list[Callable[[Any], None]] = []
+        self._closed = asyncio.Event()
+
+    async def __aenter__(self) -> Self:
+        await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self._instance.witness)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._transport is not None:
+            self._transport.close()
+            await self._closed.wait()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The socket is ready."""
+        self._transport = cast(asyncio.DatagramTransport, transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The socket is closed."""
+        self._transport = None
+        self._closed.set()
+
+    def error_received(self, exc: Exception) -> None:
+        """PX4 is not there: UDP does not care."""
+
+    def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
+        """PX4's messages."""
+        for message in self._decoder.parse_buffer(data) or ():
+            if message.get_srcSystem() != self._system or message.get_srcComponent() != _AUTOPILOT:
+                continue
+            if message.get_type() in ("HEARTBEAT", "CURRENT_MODE"):
+                main, sub = (message.custom_mode >> 16) & 0xFF, (message.custom_mode >> 24) & 0xFF
+                self.nav_state = nav_state_from_custom(main, sub)
+            for handler in tuple(self._handlers):
+                handler(message)
+
+    async def until_heard(self) -> None:
+        """Until PX4's heartbeat has come.
+
+        Raises:
+            Px4Error: not in time.
+        """
+        self.nav_state = None
+        heard = await self._ask(
+            lambda: self._send(mavlink.MAVLink_ping_message(0, 0, self._system, _AUTOPILOT)),
+            lambda message: message if message.get_type() == "HEARTBEAT" else None,
+            HEARTBEAT_DEADLINE_S,
+        )
+        if heard is None:
+            raise Px4Error(
+                f"PX4: expected a heartbeat on UDP {self._instance.witness.getsockname()[1]} within "
+                f"{HEARTBEAT_DEADLINE_S:g} s, found none; is it PX4 SITL with its standard links?"
+            )
+
+    async def version(self) -> Version:
+        """AUTOPILOT_VERSION.
+
+        Raises:
+            Px4Error: PX4 does not tell.
+        """
+        message = await self._ask(
+            lambda: self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION),
+            lambda message: message if message.get_type() == "AUTOPILOT_VERSION" else None,
+            COMMAND_DEADLINE_S,
+        )
+        if message is None:
+            raise Px4Error(f"PX4: expected AUTOPILOT_VERSION within {COMMAND_DEADLINE_S:g} s, found none")
+        number = int(message.flight_sw_version)
+        build = bytes(message.flight_custom_version)[::-1].hex()[:8].strip("0")
+        return Version(".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8)), build)
+
+    async def read(self, names: Iterable[str]) -> dict[str, Value]:
+        """Values of parameters; what PX4 does not have is left out.
+
+        Raises:
+            Px4Error: PX4 stopped answering.
+        """
+        wanted = list(dict.fromkeys(names))
+        found: dict[str, Value] = {}
+        # A name that PX4 does not have is answered by nothing: asked for often enough it is absent.
+        for _ in range(4):
+            missing = [name for name in wanted if name not in found]
+            for i in range(0, len(missing), _AT_ONCE):
+                found |= await self._read_some(missing[i : i + _AT_ONCE])
+        if wanted and not found:
+            raise Px4Error(f"PX4: expected values of {len(wanted)} parameters, found no answer at all")
+        return found
+
+    async def _read_some(self, names: list[str]) -> dict[str, Value]:
+        found: dict[str, Value] = {}
+
+        def note(message: Any) -> dict[str, Value] | None:
+            name, value = _parameter(message)
+            if name in names and value is not None:
+                found[name] = value
+            return found if len(found) == len(names) else None
+
+        def send() -> None:
+            for name in names:
+                if name not in found:
+                    self._send(mavlink.MAVLink_param_request_read_message(self._system, _AUTOPILOT, name.encode(), -1))
+
+        await self._ask(send, note, 2.5 * ASK_AGAIN_S)
+        return found
+
+    async def write(self, values: Mapping[str, Value]) -> None:
+        """Set parameters, each confirmed by what PX4 reads back.
+
+        Args:
+            values: int for INT32, float for REAL32: PX4 ignores the other type.
+
+        Raises:
+            Px4Error: PX4 did not take one.
+        """
+        left = dict(values)
+
+        def note(message: Any) -> bool | None:
+            name, value = _parameter(message)
+            if name in left and value is not None and same(value, left[name]):
+                del left[name]
+            return True if not left else None
+
+        def send() -> None:
+            for name, value in list(left.items())[:_AT_ONCE]:
+                kind = MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
+                self._send(
+                    mavlink.MAVLink_param_set_message(
+                        self._system, _AUTOPILOT, name.encode(), encode_bytewise(value), kind
+                    )
+                )
+
+        if left:
+            await self._ask(send, note, PARAMS_DEADLINE_S)
+        if left:
+            name, value = next(iter(left.items()))
+            found = (await self.read([name])).get(name)
+            raise Px4Error(
+                f"PX4: expected {name} to become {value:g}, found {'no such parameter' if found is None else found}"
+            )
+
+    async def save(self) -> None:
+        """Have PX4 store its parameters now instead of some seconds later.
+
+        Raises:
+            Px4Error: it did not.
+        """
+        await self.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1.0)
+
+    async def show_modes(self) -> None:
+        """Have CURRENT_MODE come so often that it tells when a mode changed. PX4 forgets it when it restarts.
+
+        Raises:
+            Px4Error: PX4 refused.
+        """
+        await self.command(
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_CURRENT_MODE, MODE_PERIOD_S * 1e6
+        )
+
+    def choose_mode(self, state: NavState) -> None:
+        """Ask for a mode as a ground station does; what comes of it, the heartbeats tell."""
+        main, sub = state.value[0:2]
+        self._command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main, sub)
+
+    def force_disarm(self) -> None:
+        """Stop the rotors, wherever the vehicle is."""
+        self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, _FORCE_DISARM)
+
+    async def command(self, command: int, *params: float) -> None:
+        """One MAV_CMD, accepted.
+
+        Raises:
+            Px4Error: it was refused, or not answered.
+        """
+
+        def result(message: Any) -> Any:
+            return message if message.get_type() == "COMMAND_ACK" and message.command == command else None
+
+        message = await self._ask(lambda: self._command(command, *params), result, COMMAND_DEADLINE_S)
+        name = mavlink.enums["MAV_CMD"][command].name
+        if message is None:
+            raise Px4Error(f"PX4: expected an answer to {name} within {COMMAND_DEADLINE_S:g} s, found none")
+        if message.result != mavlink.MAV_RESULT_ACCEPTED:
+            found = mavlink.enums["MAV_RESULT"][message.result].name
+            raise Px4Error(f"PX4: expected {name} to be accepted, found {found}")
+
+    def _command(self, command: int, *params: float) -> None:
+        numbers = [*params, *[0.0] * (7 - len(params))]
+        self._send(mavlink.MAVLink_command_long_message(self._system, _AUTOPILOT, command, 0, *numbers))
+
+    async def _ask(self, send: Callable[[], None], answer: Callable[[Any], Any], deadline_s: float) -> Any:
+        """Send, and again as long as `answer` makes None of every message that comes; None: the deadline has passed."""
+        answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+
+        def handle(message: Any) -> None:
+            found = answer(message)
+            if found is not None and not answered.done():
+                answered.set_result(found)
+
+        self._handlers.append(handle)
+        try:
+            end_s = asyncio.get_running_loop().time() + deadline_s
+            while (left_s := end_s - asyncio.get_running_loop().time()) > 0.0:
+                send()
+                done, _ = await asyncio.wait((answered,), timeout=min(ASK_AGAIN_S, left_s))
+                if done:
+                    return answered.result()
+            return None
+        finally:
+            self._handlers.remove(handle)
+
+    def _send(self, message: Any) -> None:
+        if self._transport is not None:
+            self._transport.sendto(message.pack(self._encoder), self._instance.witness_address)
+            self._encoder.seq = (self._encoder.seq + 1) % 256
+
+
+def _parameter(message: Any) -> tuple[str, Value | None]:
+    """Name and value of a PARAM_VALUE; ("", None) of anything else."""
+    if message.get_type() != "PARAM_VALUE":
+        return "", None
+    return message.param_id, decode_bytewise(message.param_value, message.param_type)
+
+
+def same(a: Value, b: Value) -> bool:
+    """Both are the same to PX4, which keeps REAL32."""
+    if isinstance(a, int) != isinstance(b, int):
+        return False
+    return a == b or math.isclose(_single(a), _single(b), rel_tol=1e-6, abs_tol=1e-9)
+
+
+def _single(value: Value) -> float:
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])

@@ -1,0 +1,321 @@
+"""A real PX4 as the autopilot of the simulated world: started, set up through MAVLink, restarted once, flown in lockstep, ended."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from companion.config.faults import FaultKind
+from companion.config.vehicle import Airframe
+from companion.config.world import World as WorldConfig
+from companion.model.types import Vec4
+from sitl.autopilot.autopilot import Battery
+from sitl.autopilot.modes import NavState
+from sitl.autopilot.params import Value
+from sitl.autopilot.types import ImuSample
+from sitl.ends import Noticed
+from sitl.faults import Autopilot as FaultyAutopilot
+from sitl.px4.link import HilSensors, Px4Error, SimulatorLink
+from sitl.px4.process import HOW_TO_GET_IT, HOW_TO_START_IT, MODEL, Installation, Instance, Px4Process, find
+from sitl.px4.relay import Relay
+from sitl.px4.store import restore, stored
+from sitl.px4.vehicle import BEFORE_BOOT, NOT_EVERYWHERE, parameters
+from sitl.px4.witness import Version, Witness, same
+from sitl.world.world import World
+
+BOOT_DEADLINE_S = 30.0
+END_DEADLINE_S = 6.0
+BY_HAND_DEADLINE_S = 10.0
+"""For a PX4 that somebody has started by hand: it asks for the world twice in a millisecond."""
+USER_DEADLINE_S = 300.0
+"""For somebody who is asked to start it once more."""
+SAMPLE_S = 0.004
+OF_THE_STUB: Mapping[FaultKind, str] = {
+    "autopilot_reboot": "restarts PX4 in the middle of a step",
+    "offboard_refused": "makes PX4 refuse a mode",
+    "arming_refused": "makes PX4 refuse to arm",
+    "battery_sag": "changes what PX4's power module measures",
+}
+"""Faults that need an inside that a real PX4 does not show."""
+_LINK_FAULTS: frozenset[FaultKind] = frozenset({"link_loss", "link_delay"})
+
+Tell = Callable[[str], None]
+
+
+def refuse_what_needs_the_stub(config: WorldConfig) -> None:
+    """Look at a world before a real PX4 is started for it.
+
+    Raises:
+        Px4Error: it has something that only the stub can do.
+    """
+    for fault in config.faults:
+        if fault.kind in OF_THE_STUB:
+            raise Px4Error(
+                f"world.faults: {fault.kind} {OF_THE_STUB[fault.kind]}, which needs the stub's inside; fly it with --sitl"
+            )
+    if config.battery_start != 1.0:
+        raise Px4Error(
+            "world.battery_start: PX4's own battery simulator starts full, expected 1.0 with a real PX4; fly it with --sitl"
+        )
+
+
+class RealPx4:
+    """One PX4 for one flight.
+
+    Args:
+        airframe: of the vehicle file.
+        config: of the world.
+        folder: of PX4: parameters, logs, what it says.
+        tell: takes one line for the user.
+
+    Raises:
+        Px4Error: the world needs the stub, PX4_SITL names nothing that can be started, or no instance is free.
+    """
+
+    lockstep = True
+
+    def __init__(self, airframe: Airframe, config: WorldConfig, folder: Path, tell: Tell) -> None:
+        refuse_what_needs_the_stub(config)
+        self._airframe = airframe
+        self._config = config
+        self._folder = folder
+        self._tell = tell
+        self._installation: Installation | None = find()
+        self._instance = Instance.claim()
+        self._link = SimulatorLink(self._instance.simulator, HilSensors(config.seed))
+        self._witness = Witness(self._instance)
+        self._relay = Relay(self._instance) if any(f.kind in _LINK_FAULTS for f in config.faults) else None
+        self._process: Px4Process | None = None
+        self._version: Version | None = None
+        self._imu: ImuSample | None = None
+        self._flies = False
+        """From now on a PX4 that goes is an error."""
+
+    @property
+    def number(self) -> int:
+        """Of PX4's instance."""
+        return self._instance.number
+
+    @property
+    def armed(self) -> bool:
+        """As every HIL_ACTUATOR_CONTROLS says."""
+        return self._link.armed
+
+    @property
+    def down(self) -> bool:
+        """It never is, in flight."""
+        return False
+
+    @property
+    def faulty(self) -> FaultyAutopilot:
+        """Those faults that a real PX4 can have."""
+        return _Faulty(self._witness)
+
+    def attach(self, world: World) -> None:
+        """The world that PX4's sensors sense."""
+        self._world = world
+
+    @contextlib.asynccontextmanager
+    async def wires(self) -> AsyncIterator[str]:
+        """TCP to PX4 and the world's own MAVLink link; PX4 itself, if there is one to be started, is ended at the end."""
+        async with contextlib.AsyncExitStack() as stack:
+            stack.callback(self._instance.close)
+            await stack.enter_async_context(self._link)
+            await stack.enter_async_context(self._witness)
+            address = f"udpin://127.0.0.1:{self._instance.onboard_port}"
+            if self._relay is not None:
+                address = await stack.enter_async_context(self._relay.opened())
+            stack.push_async_callback(self._end)
+            if self._installation is not None:
+                self._start(BEFORE_BOOT)
+            yield address
+
+    def _start(self, settings: Mapping[str, Value]) -> None:
+        assert self._installation is not None
+        self._process = Px4Process(self._installation, self._instance, self._folder, settings)
+
+    async def prepare(self) -> None:
+        """Boot, set the vehicle's parameters, restart for those that want it, look again.
+
+        Raises:
+            Px4Error: PX4 is not to be had, or does not become what it must be.
+        """
+        if self._process is None:
+            self._tell(
+                f"px4 was not found: looking for {BY_HAND_DEADLINE_S:g} s for one that was started by hand, on TCP "
+                f"{self._link.port}"
+            )
+        await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
+        self._version = await self._witness.version()
+        self._tell(f"PX4 {self._version}, instance {self.number}: setting its parameters")
+        wanted = parameters(self._airframe, self._config, self._world.hover_command)
+        changed = await self._settle(wanted)
+        if changed:
+            await self._restart(changed)
+            left = await self._settle(wanted)
+            if left:
+                fix = f"see {self._folder}" if self._process is not None else "start it both times in the same folder"
+                raise Px4Error(
+                    f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; {fix}"
+                )
+        await self._witness.write(self._config.spoiled_px4_params())
+        await self._witness.show_modes()
+        self._flies = True
+
+    async def _boot(self, deadline_s: float) -> None:
+        """Until PX4 computes; `deadline_s` is for its coming, `BOOT_DEADLINE_S` for its boot.
+
+        Raises:
+            Px4Error: it has ended, or one of the two has passed.
+        """
+        found, end_s = "nobody there", time.monotonic() + deadline_s
+        while not await self._link.until_in_step(0.2):
+            if self._process is not None and not self._process.running:
+                raise Px4Error(self._process.epitaph())
+            if self._link.connected and found == "nobody there":
+                found, deadline_s = "no answer to the world's sensors", BOOT_DEADLINE_S
+                end_s = time.monotonic() + deadline_s
+            if time.monotonic() > end_s:
+                how = f"see {self._process.log}" if self._process is not None else self._how()
+                raise Px4Error(
+                    f"PX4: expected it on TCP {self._link.port} within {deadline_s:g} s, found {found}; {how}"
+                )
+        await self._witness.until_heard()
+
+    def _how(self) -> str:
+        return f"{HOW_TO_GET_IT}; or {HOW_TO_START_IT.format(model=MODEL, number=self.number)}"
+
+    async def _settle(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
+        """Write what differs; what did, in PX4's types."""
+        have = await self._witness.read(wanted)
+        absent = [name for name in wanted if name not in have and name not in NOT_EVERYWHERE]
+        if absent:
+            raise Px4Error(
+                f"PX4 {self._version}: expected the parameter {absent[0]}, found that it has none of this name"
+                + (f" (nor {', '.join(absent[1:])})" if absent[1:] else "")
+            )
+        typed = {name: _as_type_of(have[name], value) for name, value in wanted.items() if name in have}
+        different = {name: value for name, value in typed.items() if not same(value, have[name])}
+        if different:
+            await self._witness.write(different)
+            await self._witness.save()
+        return different
+
+    async def _restart(self, changed: Mapping[str, Value]) -> None:
+        """The same PX4 in the same folder, or somebody who starts it again."""
+        if self._process is None:
+            self._tell(
+                "the vehicle's parameters are set; PX4 must start again for them: end it and start it once more, in the same folder, "
+                "where it keeps them"
+            )
+            if not await self._link.until_gone(USER_DEADLINE_S):
+                raise Px4Error(f"PX4: expected it to be restarted within {USER_DEADLINE_S:g} s, found it still running")
+        else:
+            store = await stored(self._folder, changed)
+            self._process.ask_to_end()
+            await self._process.until_ended(END_DEADLINE_S)  # meanwhile the world is stepped, and PX4's clock with it
+            self._process.kill()
+            restore(self._folder, store)
+            await self._link.until_gone(1.0)
+            self._start({})
+        await self._boot(BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S)
+
+    def sense(self, imu: ImuSample) -> None:
+        """HIL_SENSOR, with the truth of this moment behind it."""
+        self._imu = imu
+        q = self._world.q
+        self._link.send(imu, q[2], (q[3], q[4], q[5], q[6]))
+
+    async def answered(self) -> None:
+        """HIL_ACTUATOR_CONTROLS.
+
+        Raises:
+            Px4Error: PX4 has ended, or has stopped answering.
+        """
+        if self._link.pending:
+            await self._link.answered()
+        if self._flies and not self._link.connected:
+            raise Px4Error(await self._epitaph())
+
+    async def _epitaph(self) -> str:
+        if self._process is None:
+            return "PX4: expected it to stay until the flight is over, found that it has closed its simulator link"
+        await self._process.until_ended(1.0)
+        return self._process.epitaph()
+
+    def step(self, imu: ImuSample) -> Vec4:
+        """What PX4 answered."""
+        del imu
+        return self._link.rotors
+
+    def pump(self, t_s: float, battery: Battery) -> None:
+        """PX4 has a battery of its own, and streams by itself."""
+
+    def set_link(self, down: bool, delay_s: float) -> None:
+        """By way of the relay."""
+        if self._relay is not None:
+            self._relay.down, self._relay.delay_s = down, delay_s
+
+    def skip(self, paused_s: float) -> None:
+        """It has no clock but the world's, and a gap in its samples would throw its estimate off: it falls behind, and is seen to."""
+
+    def noticed(self) -> Noticed:
+        """What arrives at PX4 only its own log shows."""
+        return Noticed(None, None, self._witness.nav_state)
+
+    def about(self) -> dict[str, Any]:
+        """PX4, and which one."""
+        version = self._version
+        return {
+            "kind": "px4",
+            "version": None if version is None else version.release,
+            "build": None if version is None else version.build,
+            "instance": self.number,
+            "unanswered": self._link.unanswered,
+            "clock_begun_s": self._link.clock_begun_s,
+        }
+
+    async def _end(self) -> None:
+        """End our own PX4. Its clock runs by our samples, and it needs the clock to end."""
+        self._flies = False
+        process, imu = self._process, self._imu
+        if process is None:
+            return
+        if imu is None:
+            process.kill()
+            return
+        if self._link.armed:
+            self._witness.force_disarm()
+        t_s, end_s = imu.t_s, time.monotonic() + END_DEADLINE_S
+        process.ask_to_end()
+        while process.running and time.monotonic() < end_s:
+            t_s += SAMPLE_S
+            self.sense(imu._replace(t_s=t_s))
+            await asyncio.sleep(SAMPLE_S)
+        process.kill()
+
+
+class _Faulty:
+    """Faults of a real PX4: a pilot who chooses a mode."""
+
+    refuses_offboard = False
+    refuses_arming = False
+
+    def __init__(self, witness: Witness) -> None:
+        self._witness = witness
+
+    def reboot(self, for_s: float) -> None:
+        """Was refused before the flight."""
+        raise Px4Error("world.faults: autopilot_reboot needs the stub; fly it with --sitl")
+
+    def pilot_chooses(self, state: NavState) -> None:
+        """As a ground station does."""
+        self._witness.choose_mode(state)
+
+
+def _as_type_of(known: Value, value: Value) -> Value:
+    return int(value) if isinstance(known, int) else float(value)

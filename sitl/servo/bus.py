@@ -1,0 +1,365 @@
+"""A half-duplex bus of emulated XM430 servos: `ServoLine` is the pure protocol, `ServoBus` puts it behind a pty.
+
+Source: ROBOTIS e-manual, "DYNAMIXEL Protocol 2.0".
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import termios
+import tty
+from collections.abc import Callable, Iterable
+from types import TracebackType
+from typing import Self
+
+from sitl.servo.model import ServoModel, ServoRefusal
+from sitl.servo.protocol import (
+    BROADCAST_ID,
+    MAX_ID,
+    MAX_LENGTH,
+    Instruction,
+    Packet,
+    PacketParser,
+    StatusError,
+    fast_status,
+    status,
+)
+from sitl.servo.registers import BAUDS
+
+_BITS_PER_BYTE = 10
+_CLEAR_TURNS = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
+_PARTIAL_TIMEOUT_S = 0.02
+"""The servo's own byte-to-byte timeout is 1.5 ms; a pty under load may be slower."""
+_BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in BAUDS if hasattr(termios, f"B{baud}")}
+
+
+class ServoLine:
+    """What the servos on one wire answer. Two of them with the same id answer at the same time: nobody can read that."""
+
+    def __init__(self, servos: Iterable[ServoModel]) -> None:
+        self.servos = tuple(servos)
+        self._parser = PacketParser()
+        self._listening: list[ServoModel] = []
+        self._delay_s = 0.0
+
+    @property
+    def packet_pending(self) -> bool:
+        """A packet has begun and is not complete."""
+        return self._parser.pending
+
+    def drop_partial(self) -> None:
+        """The line was idle in the middle of a packet."""
+        self._parser.drop_partial()
+
+    def feed(self, data: bytes, baud_bps: int | None = None) -> bytes:
+        """Take bytes from the master, return the bytes that the servos answer. Never raises.
+
+        Args:
+            data: any bytes.
+            baud_bps: rate at which they were sent; None: the rate of every servo.
+        """
+        return self.exchange(data, baud_bps)[0]
+
+    def exchange(self, data: bytes, baud_bps: int | None = None) -> tuple[bytes, float]:
+        """As `feed`, with the return delay time in s that the answers add to the time of their bytes."""
+        self._delay_s = 0.0
+        packets = self._parser.feed(data)
+        if not packets:
+            return b"", 0.0
+        self._listening = [s for s in self.servos if not s.silent and baud_bps in (None, s.baud_bps)]
+        return b"".join(self._answer(packet) for packet in packets), self._delay_s
+
+    def _answer(self, packet: Packet) -> bytes:
+        if not packet.crc_ok:
+            if packet.instruction == Instruction.STATUS:
+                return b""
+            return _together([self._status(servo, StatusError.CRC) for servo in self._having(packet.packet_id)])
+        if packet.instruction == Instruction.STATUS:
+            return b""
+        for servo in self._listening:
+            servo.heard_instruction()
+        handler = {
+            Instruction.SYNC_READ: self._sync_read,
+            Instruction.SYNC_WRITE: self._sync_write,
+            Instruction.FAST_SYNC_READ: self._fast_sync_read,
+            Instruction.BULK_READ: self._bulk_read,
+            Instruction.BULK_WRITE: self._bulk_write,
+            Instruction.FAST_BULK_READ: self._fast_bulk_read,
+        }.get(packet.instruction)  # type: ignore[call-overload]
+        if packet.packet_id == BROADCAST_ID:
+            if handler is not None:
+                answer: bytes = handler(packet.parameters)
+                return answer
+            return self._broadcast(packet)
+        return self._unicast(packet)
+
+    # --- one servo or all --------------------------------------------------------------------------------------------
+
+    def _broadcast(self, packet: Packet) -> bytes:
+        if packet.instruction == Instruction.PING:
+            ids = sorted({servo.servo_id for servo in self._listening})
+            return b"".join(_together([self._ping(servo) for servo in self._having(servo_id)]) for servo_id in ids)
+        for servo in self._listening:
+            self._carry_out(servo, packet)
+        return b""
+
+    def _unicast(self, packet: Packet) -> bytes:
+        having = self._having(packet.packet_id)
+        for other in self._listening:
+            if other not in having and other.secondary_id == packet.packet_id:
+                self._carry_out(other, packet)
+        return _together([self._answer_of(servo, packet) for servo in having])
+
+    def _answer_of(self, servo: ServoModel, packet: Packet) -> bytes:
+        if packet.instruction == Instruction.PING:
+            return self._ping(servo)
+        # A write to register 68 or 7 counts from the next packet on.
+        level, servo_id = servo.status_return_level, servo.servo_id
+        error, data = self._carry_out(servo, packet)
+        if level == 0 or (level == 1 and packet.instruction != Instruction.READ):
+            return b""
+        return self._status(servo, error, data, servo_id)
+
+    def _carry_out(self, servo: ServoModel, packet: Packet) -> tuple[StatusError, bytes]:
+        parameters = packet.parameters
+        data = b""
+        try:
+            match packet.instruction:
+                case Instruction.READ:
+                    if len(parameters) != 4:
+                        raise ServoRefusal(StatusError.DATA_LENGTH)
+                    data = servo.read(_word(parameters, 0), _word(parameters, 2))
+                case Instruction.WRITE | Instruction.REG_WRITE:
+                    if len(parameters) < 3:
+                        raise ServoRefusal(StatusError.DATA_LENGTH)
+                    write = servo.write if packet.instruction == Instruction.WRITE else servo.register_write
+                    write(_word(parameters, 0), parameters[2:])
+                case Instruction.ACTION:
+                    servo.action()
+                case Instruction.REBOOT:
+                    servo.reboot()
+                case Instruction.CLEAR:
+                    if parameters != _CLEAR_TURNS:
+                        raise ServoRefusal(StatusError.DATA_RANGE)
+                    servo.clear_turns()
+                case Instruction.FACTORY_RESET:
+                    # It would change ids and baud rates under a world that addresses the servos by them.
+                    raise ServoRefusal(StatusError.RESULT_FAIL)
+                case _:
+                    raise ServoRefusal(StatusError.INSTRUCTION)
+        except ServoRefusal as refusal:
+            return refusal.error, b""
+        return StatusError.NONE, data
+
+    def _ping(self, servo: ServoModel) -> bytes:
+        return self._status(servo, StatusError.NONE, servo.model.to_bytes(2, "little") + bytes((servo.firmware,)))
+
+    # --- several servos ----------------------------------------------------------------------------------------------
+
+    def _sync_read(self, parameters: bytes) -> bytes:
+        return self._read_chain(_sync_read_items(parameters))
+
+    def _bulk_read(self, parameters: bytes) -> bytes:
+        return self._read_chain(_bulk_read_items(parameters))
+
+    def _fast_sync_read(self, parameters: bytes) -> bytes:
+        return self._fast_read(_sync_read_items(parameters))
+
+    def _fast_bulk_read(self, parameters: bytes) -> bytes:
+        return self._fast_read(_bulk_read_items(parameters))
+
+    def _read_chain(self, items: list[tuple[int, int, int]]) -> bytes:
+        out = bytearray()
+        for servo_id, address, length in items:
+            having = self._having(servo_id)
+            if not having or having[0].status_return_level == 0:
+                break  # each servo waits for the status packet of the one before it
+            out += _together([self._status(servo, *_try_read(servo, address, length)) for servo in having])
+        return bytes(out)
+
+    def _fast_read(self, items: list[tuple[int, int, int]]) -> bytes:
+        blocks: list[tuple[int, int, bytes]] = []
+        size = sum(length + 4 for _, _, length in items)
+        if size > MAX_LENGTH:
+            return b""
+        for servo_id, address, length in items:
+            having = self._having(servo_id)
+            if len(having) != 1 or having[0].status_return_level == 0:
+                break
+            servo = having[0]
+            error, data = _try_read(servo, address, length)
+            self._delay_s += servo.return_delay_s
+            blocks.append((servo_id, error | servo.alert, data or bytes(length)))
+        if not blocks:
+            return b""
+        return fast_status(blocks, size)
+
+    def _sync_write(self, parameters: bytes) -> bytes:
+        if len(parameters) >= 4:
+            address, length = _word(parameters, 0), _word(parameters, 2)
+            for i in range(4, len(parameters) - length, 1 + length):
+                self._quiet_write(parameters[i], address, parameters[i + 1 : i + 1 + length])
+        return b""
+
+    def _bulk_write(self, parameters: bytes) -> bytes:
+        i = 0
+        while i + 5 <= len(parameters):
+            length = _word(parameters, i + 3)
+            data = parameters[i + 5 : i + 5 + length]
+            if len(data) == length:
+                self._quiet_write(parameters[i], _word(parameters, i + 1), data)
+            i += 5 + length
+        return b""
+
+    def _quiet_write(self, servo_id: int, address: int, data: bytes) -> None:
+        for servo in self._having(servo_id):
+            with contextlib.suppress(ServoRefusal):  # writes to several servos have no status packet that could tell
+                servo.write(address, data)
+
+    # --- helpers -----------------------------------------------------------------------------------------------------
+
+    def _having(self, servo_id: int) -> list[ServoModel]:
+        return [servo for servo in self._listening if servo.servo_id == servo_id]
+
+    def _status(self, servo: ServoModel, error: int, data: bytes = b"", servo_id: int | None = None) -> bytes:
+        self._delay_s += servo.return_delay_s
+        return status(servo.servo_id if servo_id is None else servo_id, error | servo.alert, data)
+
+
+def _together(answers: list[bytes]) -> bytes:
+    """What is read when several drive the line at once, a moment apart: low wins."""
+    line = answers[0] if answers else b""
+    for late in answers[1:]:
+        late = b"\xff" + late
+        size = max(len(line), len(late))
+        line = bytes(a & b for a, b in zip(line.ljust(size, b"\xff"), late.ljust(size, b"\xff"), strict=True))
+    return line
+
+
+def _word(data: bytes, offset: int) -> int:
+    return data[offset] | data[offset + 1] << 8
+
+
+def _sync_read_items(parameters: bytes) -> list[tuple[int, int, int]]:
+    """(id, address, length) of each servo asked; empty if malformed."""
+    if len(parameters) < 5:
+        return []
+    address, length = _word(parameters, 0), _word(parameters, 2)
+    return [(servo_id, address, length) for servo_id in parameters[4:] if servo_id <= MAX_ID]
+
+
+def _bulk_read_items(parameters: bytes) -> list[tuple[int, int, int]]:
+    if len(parameters) % 5:
+        return []
+    return [(parameters[i], _word(parameters, i + 1), _word(parameters, i + 3)) for i in range(0, len(parameters), 5)]
+
+
+def _try_read(servo: ServoModel, address: int, length: int) -> tuple[StatusError, bytes]:
+    try:
+        return StatusError.NONE, servo.read(address, length)
+    except ServoRefusal as refusal:
+        return refusal.error, b""
+
+
+class ServoBus:
+    """The servos behind a pty, served by the running event loop.
+
+    Args:
+        servos: the servos on the wire.
+        wire_time: hold every answer back for the time of its bytes at the line's baud rate and the return delays. The event
+            loop's own granularity of 1 ms stands for the latency timer of the USB adapter.
+
+    The master's baud rate is read from the pty's line settings: servos at another rate stay silent, as on a real wire.
+    """
+
+    def __init__(self, servos: Iterable[ServoModel], *, wire_time: bool = True) -> None:
+        self.line = ServoLine(servos)
+        self.dropped_bytes = 0
+        """Bytes of answers that nobody took off the line in time."""
+        self.damaged: Callable[[], bool] = lambda: False
+        """Fault: asked at every instruction whether noise damages it."""
+        self._wire_time = wire_time
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._master_fd = -1
+        self._slave_fd = -1
+        self._path = ""
+        self._last_byte_s = 0.0
+        self._line_free_s = 0.0
+        self._timers: set[asyncio.TimerHandle] = set()
+
+    @property
+    def path(self) -> str:
+        """Device that the master opens; valid while the bus is entered."""
+        return self._path
+
+    async def __aenter__(self) -> Self:
+        self._master_fd, self._slave_fd = os.openpty()
+        try:
+            tty.setraw(self._slave_fd)
+            os.set_blocking(self._master_fd, False)
+            self._path = os.ttyname(self._slave_fd)
+            self._loop = asyncio.get_running_loop()
+            self._loop.add_reader(self._master_fd, self._on_bytes)
+        except BaseException:
+            self._close()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        for timer in self._timers:
+            timer.cancel()
+        self._timers.clear()
+        if self._loop is not None:
+            self._loop.remove_reader(self._master_fd)
+            self._loop = None
+        for fd in (self._master_fd, self._slave_fd):
+            if fd >= 0:
+                os.close(fd)
+        self._master_fd = self._slave_fd = -1
+
+    def _on_bytes(self) -> None:
+        assert self._loop is not None
+        try:
+            data = os.read(self._master_fd, 4096)
+        except BlockingIOError:
+            return
+        now_s = self._loop.time()
+        if self.line.packet_pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
+            self.line.drop_partial()
+        self._last_byte_s = now_s
+        speed = termios.tcgetattr(self._slave_fd)[5]
+        # 0: a rate without a name in termios, which is none of the servos'.
+        baud_bps = _BAUD_OF_SPEED.get(speed, 0)
+        answer, delay_s = self.answer_to(data, baud_bps)
+        if not answer:
+            return
+        if not self._wire_time:
+            self._send(answer)
+            return
+        on_wire_s = (len(data) + len(answer)) * _BITS_PER_BYTE / baud_bps
+        self._line_free_s = max(now_s, self._line_free_s) + on_wire_s + delay_s
+        self._timers = {timer for timer in self._timers if not timer.cancelled() and timer.when() > now_s}
+        self._timers.add(self._loop.call_at(self._line_free_s, self._send, answer))
+
+    def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
+        """Return what the servos answer to bytes sent at a baud rate, and their return delay in s; noise may damage the bytes."""
+        if self.damaged():
+            middle = len(data) // 2
+            data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]
+        return self.line.exchange(data, baud_bps)
+
+    def _send(self, answer: bytes) -> None:
+        if self._loop is None:
+            return  # was due in the very turn of the event loop in which the bus was left
+        try:
+            sent = os.write(self._master_fd, answer)
+        except BlockingIOError:
+            sent = 0
+        self.dropped_bytes += len(answer) - sent

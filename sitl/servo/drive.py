@@ -1,0 +1,170 @@
+"""Motor and encoder of one XM430: the physics behind the control table. No I/O, no registers.
+
+`sitl.servo.model.ServoModel` puts the control table in front of it, for the bus; the fast closed loop uses it as it is. Time is the
+world's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+COUNTS_PER_TURN = 4096
+RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
+AMP_PER_COUNT = 2.69e-3
+RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
+
+MODE_CURRENT, MODE_POSITION, MODE_CURRENT_POSITION = 0, 3, 5
+
+# Position loop of modes 3 and 5 at the default P gain: about 23 N m/rad and 1.3 N m s/rad at 1.3 N m/A.
+_AMP_PER_RAD = 17.5
+_AMP_PER_RAD_S = 1.0
+_INT32 = 1 << 31
+_TIME_EPSILON_S = 1e-9
+
+
+class ServoDrive:
+    """What flows in the motor at every step of the world, and what the servo would report of the last one.
+
+    Args:
+        shaft_angle_rad: where the shaft is before the first `update`.
+    """
+
+    def __init__(self, shaft_angle_rad: float = 0.0) -> None:
+        self.torque_on = False
+        """Register 64."""
+        self.mode = MODE_POSITION
+        """Register 11."""
+        self.direction = 1
+        """-1 in reverse mode (register 10)."""
+        self.current_limit_counts = 1193
+        """Register 38."""
+        self.homing_counts = 0
+        """Register 20."""
+        self.goal_position_counts = 0
+        """Register 116."""
+        self.position_gain = 1.0
+        """Register 84 as a share of its default."""
+        self.watchdog_tripped = False
+        """It let go, and stays so until `start_watchdog`."""
+        self.goal_delay_s = 0.0
+        """Goal currents take effect that much later than they were set."""
+        self.now_s = 0.0
+        """Time of the last `update`."""
+        self.angle_rad = shaft_angle_rad
+        self.velocity_rad_s = 0.0
+        self.slip_counts = 0
+        """Fault: the horn has slipped, the encoder shows so much more."""
+        self.turn_counts = 0
+        """What the encoder does not know: whole turns, see `forget_turns`."""
+        self._goal_current_counts = 0
+        self._goals_on_their_way: deque[tuple[float, int]] = deque()
+        self._watchdog_s = math.inf
+        self._heard_s = 0.0
+        self._silent_until_s = math.inf
+        """The watchdog trips when nothing was heard until then."""
+        self._updated = False
+        self._current_counts = 0
+        self.forget_turns()
+
+    def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
+        """Note what the encoder sees and return the motor's current.
+
+        Args:
+            t_s: the world's time; must not run backwards.
+            shaft_angle_rad: continuous shaft angle in the servo's own convention (counts = angle / 2 pi * 4096).
+            shaft_velocity_rad_s: shaft velocity, same convention.
+
+        Returns:
+            Current in A that flows now, positive towards positive angle; 0 whenever the motor lets go.
+        """
+        self.now_s = t_s
+        self.angle_rad = shaft_angle_rad
+        self.velocity_rad_s = shaft_velocity_rad_s
+        if not self._updated:
+            self._updated = True
+            self.heard_instruction()
+            self.forget_turns()
+        if t_s > self._silent_until_s and self.torque_on:
+            self.watchdog_tripped = True
+            self.set_goal_current(0, at_once=True)
+        if self._goals_on_their_way:
+            self._receive(t_s)
+        if not self.torque_on or self.watchdog_tripped:
+            counts = 0
+        elif self.mode == MODE_CURRENT:
+            limit, goal = self.current_limit_counts, self._goal_current_counts
+            counts = limit if goal > limit else -limit if goal < -limit else goal
+        else:
+            counts = self._position_loop_counts()
+        self._current_counts = counts
+        return counts * AMP_PER_COUNT * self.direction
+
+    def set_goal_current(self, counts: int, *, at_once: bool = False) -> None:
+        """Goal current (register 102), in the servo's own direction; takes effect `goal_delay_s` later.
+
+        Args:
+            counts: the goal.
+            at_once: no delay, and what is on its way is forgotten.
+        """
+        if at_once or self.goal_delay_s == 0.0:
+            self._goals_on_their_way.clear()
+            self._goal_current_counts = counts
+        else:
+            self._goals_on_their_way.append((math.inf, counts))
+
+    def heard_instruction(self) -> None:
+        """A valid instruction packet was on the bus: feeds the watchdog."""
+        self._heard_s = self.now_s
+        self._silent_until_s = self.now_s + self._watchdog_s
+
+    def start_watchdog(self, period_s: float | None) -> None:
+        """Register 98: without an instruction for `period_s` the motor lets go and the goal current is 0; None: never.
+
+        One that has tripped is cleared; what was heard last still counts.
+        """
+        self.watchdog_tripped = False
+        self._watchdog_s = math.inf if period_s is None else period_s
+        self._silent_until_s = self._heard_s + self._watchdog_s
+
+    def present(self) -> tuple[int, int, int]:
+        """Current, velocity and position at the last `update`: registers 126, 128 and 132, of one and the same instant."""
+        direction = self.direction
+        position = (
+            direction * round(self.angle_rad / RAD_PER_COUNT) - self.turn_counts + self.homing_counts + self.slip_counts
+        )
+        velocity = direction * round(self.velocity_rad_s / RAD_S_PER_COUNT)
+        if not -_INT32 <= position < _INT32:
+            position = (position + _INT32) % (2 * _INT32) - _INT32
+        if not -_INT32 <= velocity < _INT32:
+            velocity = max(-_INT32, min(_INT32 - 1, velocity))
+        return self._current_counts, velocity, position
+
+    def forget_turns(self) -> None:
+        """The encoder is absolute within one turn only; which turn it was is lost here."""
+        counts = self.direction * round(self.angle_rad / RAD_PER_COUNT)
+        self.turn_counts = counts - counts % COUNTS_PER_TURN
+        self.show_no_current()
+
+    def show_no_current(self) -> None:
+        """The present current is 0 until the next `update`."""
+        self._current_counts = 0
+
+    def _receive(self, t_s: float) -> None:
+        """Goals come into force; those set since the last step were set just now, which is when their delay begins."""
+        goals = self._goals_on_their_way
+        for i, (due_s, counts) in enumerate(goals):
+            if due_s == math.inf:
+                goals[i] = (t_s + self.goal_delay_s, counts)
+        while goals and goals[0][0] <= t_s + _TIME_EPSILON_S:
+            self._goal_current_counts = goals.popleft()[1]
+
+    def _position_loop_counts(self) -> int:
+        limit = self.current_limit_counts
+        if self.mode == MODE_CURRENT_POSITION:
+            limit = min(limit, abs(self._goal_current_counts))
+        goal_rad = (self.goal_position_counts + self.turn_counts - self.homing_counts) * RAD_PER_COUNT
+        error_rad = goal_rad - self.direction * self.angle_rad
+        damping_a = _AMP_PER_RAD_S * self.direction * self.velocity_rad_s
+        current_a = self.position_gain * _AMP_PER_RAD * error_rad - damping_a
+        return max(-limit, min(limit, round(current_a / AMP_PER_COUNT)))

@@ -1,0 +1,398 @@
+"""One emulated XM430-W210-T: its control table on the side of the bus, its motor on the side of the world. No I/O.
+
+The motor is a `ServoDrive`; writes are carried over to it, and what it measures is carried into the table before somebody looks.
+Time is the world's: the watchdog runs on the `t_s` of `update`.
+"""
+
+from __future__ import annotations
+
+import struct
+
+from sitl.servo import registers as reg
+from sitl.servo.drive import (
+    AMP_PER_COUNT,
+    MODE_CURRENT,
+    MODE_CURRENT_POSITION,
+    MODE_POSITION,
+    RAD_PER_COUNT,
+    RAD_S_PER_COUNT,
+    ServoDrive,
+)
+from sitl.servo.protocol import ALERT, StatusError
+from sitl.servo.registers import Register
+
+__all__ = ["AMP_PER_COUNT", "RAD_PER_COUNT", "RAD_S_PER_COUNT", "ServoModel", "ServoRefusal"]
+
+WATCHDOG_UNIT_S = 0.020
+WATCHDOG_TRIPPED = 0xFF
+
+ERROR_VOLTAGE = 0x01
+ERROR_OVERHEATING = 0x04
+ERROR_OVERLOAD = 0x20
+
+MODES = (MODE_CURRENT, MODE_POSITION, MODE_CURRENT_POSITION)
+
+_PRESENT = struct.Struct("<hii")
+
+
+class ServoRefusal(Exception):
+    """An instruction that the servo answers with an error number."""
+
+    def __init__(self, error: StatusError) -> None:
+        super().__init__(error.name)
+        self.error = error
+
+
+class ServoModel:
+    """A servo with factory settings except for id and baud rate.
+
+    Args:
+        servo_id: register 7.
+        baud_bps: register 8 as a rate; the servo hears only packets sent at it.
+        firmware: register 6.
+        model: register 0; another number makes it a servo of another kind to whom asks.
+        shaft_angle_rad: where the shaft is before the first `update`.
+
+    Raises:
+        ValueError: baud rate or id that the servo does not have.
+    """
+
+    def __init__(
+        self,
+        servo_id: int,
+        *,
+        baud_bps: int = 3_000_000,
+        firmware: int = 48,
+        model: int = reg.MODEL,
+        shaft_angle_rad: float = 0.0,
+    ) -> None:
+        if baud_bps not in reg.BAUDS:
+            raise ValueError(f"an XM430 has no baud rate {baud_bps}; it has {reg.BAUDS}")
+        if not reg.ID.low <= servo_id <= reg.ID.high:
+            raise ValueError(f"servo id {servo_id} is not in 0..252")
+        self._memory = bytearray(reg.TABLE_SIZE)
+        for register in reg.REGISTERS:
+            self._set(register, register.initial)
+        self._set(reg.MODEL_NUMBER, model)
+        self._set(reg.ID, servo_id)
+        self._set(reg.BAUD, reg.BAUDS.index(baud_bps))
+        self._set(reg.FIRMWARE, firmware)
+        self.drive = ServoDrive(shaft_angle_rad)
+        """The motor."""
+        self.lights = 0
+        """How often its light went on."""
+        self._shutdown = False
+        self._silent = False
+        self._registered: tuple[int, bytes] | None = None
+        self._power_on()
+
+    # --- side of the world -------------------------------------------------------------------------------------------
+
+    def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
+        """Latch what the encoder sees and return the motor's current.
+
+        Args:
+            t_s: the world's time; must not run backwards.
+            shaft_angle_rad: continuous shaft angle in the servo's own convention (counts = angle / 2 pi * 4096).
+            shaft_velocity_rad_s: shaft velocity, same convention.
+
+        Returns:
+            Current in A that flows now, positive towards positive angle; 0 whenever the motor lets go.
+        """
+        drive, memory = self.drive, self._memory
+        current_a = drive.update(t_s, shaft_angle_rad, shaft_velocity_rad_s)
+        if drive.watchdog_tripped and memory[98] != WATCHDOG_TRIPPED:
+            memory[98] = WATCHDOG_TRIPPED
+            for goal in (reg.GOAL_CURRENT, reg.GOAL_VELOCITY):
+                self._set(goal, 0)
+        return current_a
+
+    @property
+    def goal_delay_s(self) -> float:
+        """Goal currents take effect that much later than they were written."""
+        return self.drive.goal_delay_s
+
+    @goal_delay_s.setter
+    def goal_delay_s(self, delay_s: float) -> None:
+        self.drive.goal_delay_s = delay_s
+
+    def fail_silent(self, silent: bool) -> None:
+        """Break (or mend) the data wire: the servo neither hears nor answers, its motor goes on until its watchdog trips."""
+        self._silent = silent
+
+    def trip_overload(self) -> None:
+        """Overload error, as after holding more than the motor can."""
+        self._raise_error(ERROR_OVERLOAD)
+
+    def set_temperature_c(self, temperature_c: float) -> None:
+        """Motor temperature; above register 31 it is an overheating error."""
+        self._set(reg.PRESENT_TEMPERATURE, max(0, min(255, round(temperature_c))))
+        self._check_environment()
+
+    def set_voltage_v(self, voltage_v: float) -> None:
+        """Supply voltage; outside registers 34 to 32 it is an input voltage error."""
+        self._set(reg.PRESENT_VOLTAGE, max(0, round(voltage_v * 10.0)))
+        self._check_environment()
+
+    # --- side of the bus ---------------------------------------------------------------------------------------------
+
+    @property
+    def servo_id(self) -> int:
+        """Register 7."""
+        return self._memory[7]
+
+    @property
+    def secondary_id(self) -> int:
+        """Register 12; above 252 it is off."""
+        return self._memory[12]
+
+    @property
+    def baud_bps(self) -> int:
+        """Register 8 as a rate."""
+        return reg.BAUDS[self._memory[8]]
+
+    @property
+    def model(self) -> int:
+        """Register 0."""
+        return self._get(reg.MODEL_NUMBER)
+
+    @property
+    def firmware(self) -> int:
+        """Register 6."""
+        return self._memory[6]
+
+    @property
+    def return_delay_s(self) -> float:
+        """Register 9, 2 us each."""
+        return self._memory[9] * 2e-6
+
+    @property
+    def lit(self) -> bool:
+        """Register 65."""
+        return bool(self._memory[65])
+
+    @property
+    def status_return_level(self) -> int:
+        """Register 68: 0 answers pings, 1 also reads, 2 everything."""
+        return self._memory[68]
+
+    @property
+    def silent(self) -> bool:
+        """The data wire is broken."""
+        return self._silent
+
+    @property
+    def alert(self) -> int:
+        """Bit 7 of every status packet's error byte."""
+        return ALERT if self._memory[70] else 0
+
+    def heard_instruction(self) -> None:
+        """A valid instruction packet for whomever was on the bus: feeds the watchdog."""
+        self.drive.heard_instruction()
+
+    def read(self, address: int, length: int) -> bytes:
+        """Bytes of the control table.
+
+        Raises:
+            ServoRefusal: DATA_LENGTH for nothing, ACCESS for bytes that are not defined.
+        """
+        if length == 0:
+            raise ServoRefusal(StatusError.DATA_LENGTH)
+        self._show_present()
+        return bytes(self._memory[self._resolve(a, StatusError.ACCESS)] for a in range(address, address + length))
+
+    def write(self, address: int, data: bytes) -> None:
+        """Write whole registers; all of them or, on a refusal, none.
+
+        Raises:
+            ServoRefusal: as the servo's status packet says.
+        """
+        for register, value in self._checked(address, data):
+            self._apply(register, value)
+
+    def register_write(self, address: int, data: bytes) -> None:
+        """Keep a write for `action`.
+
+        Raises:
+            ServoRefusal: as `write`.
+        """
+        self._checked(address, data)
+        self._registered = (address, data)
+        self._set(reg.REGISTERED_INSTRUCTION, 1)
+
+    def action(self) -> None:
+        """Carry out the registered write.
+
+        Raises:
+            ServoRefusal: INSTRUCTION if there is none, else as `write`.
+        """
+        if self._registered is None:
+            raise ServoRefusal(StatusError.INSTRUCTION)
+        address, data = self._registered
+        self._registered = None
+        self._set(reg.REGISTERED_INSTRUCTION, 0)
+        self.write(address, data)
+
+    def reboot(self) -> None:
+        """Restart: RAM as new, EEPROM kept, errors cleared unless their cause is still there."""
+        memory = self._memory
+        environment = {r: self._get(r) for r in (reg.PRESENT_TEMPERATURE, reg.PRESENT_VOLTAGE)}
+        for register in reg.REGISTERS:
+            if not register.eeprom:
+                self._set(register, register.initial)
+        for register, value in environment.items():
+            self._set(register, value)
+        for _, data, count in reg.INDIRECT_BLOCKS:
+            memory[data : data + count] = bytes(count)
+        self._shutdown = False
+        self._registered = None
+        self._power_on()
+
+    def clear_turns(self) -> None:
+        """CLEAR 0x01: present position back into one turn.
+
+        Raises:
+            ServoRefusal: RESULT_FAIL while the shaft moves.
+        """
+        self._show_present()
+        if self._memory[122]:
+            raise ServoRefusal(StatusError.RESULT_FAIL)
+        self.drive.forget_turns()
+
+    # --- registers ---------------------------------------------------------------------------------------------------
+
+    def _get(self, register: Register) -> int:
+        return register.decode(self._memory[register.address : register.address + register.size])
+
+    def _set(self, register: Register, value: int) -> None:
+        self._memory[register.address : register.address + register.size] = register.encode(value)
+
+    def _resolve(self, address: int, refusal: StatusError) -> int:
+        """Address behind a window of indirect data; itself for everything else."""
+        pointer = reg.INDIRECT_POINTER.get(address)
+        if pointer is not None:
+            address = self._memory[pointer] | self._memory[pointer + 1] << 8
+            if address in reg.INDIRECT_POINTER:
+                return address  # points at a window, by default its own: plain memory
+        if address not in reg.REGISTER_AT:
+            raise ServoRefusal(refusal)
+        return address
+
+    def _checked(self, address: int, data: bytes) -> list[tuple[Register, int]]:
+        """The register writes that `data` means, every one of them allowed."""
+        if not data:
+            raise ServoRefusal(StatusError.DATA_LENGTH)
+        targets = [self._resolve(address + i, StatusError.ACCESS) for i in range(len(data))]
+        writes: list[tuple[Register, int]] = []
+        i = 0
+        while i < len(data):
+            target = targets[i]
+            register = reg.REGISTER_AT.get(target) or Register(target, 1, "indirect data", True, 0, 0, 255)
+            end = i + register.size
+            if targets[i:end] != list(range(register.address, register.address + register.size)):
+                raise ServoRefusal(StatusError.DATA_LENGTH)
+            value = register.decode(data[i:end])
+            self._check(register, value)
+            writes.append((register, value))
+            i = end
+        return writes
+
+    def _check(self, register: Register, value: int) -> None:
+        memory = self._memory
+        if not register.writable or (register.eeprom and memory[64]):
+            raise ServoRefusal(StatusError.ACCESS)
+        if memory[98] == WATCHDOG_TRIPPED and (register in reg.GOALS or (register is reg.BUS_WATCHDOG and value != 0)):
+            raise ServoRefusal(StatusError.DATA_RANGE)
+        if not register.low <= value <= register.high:
+            raise ServoRefusal(StatusError.DATA_RANGE)
+        if register is reg.OPERATING_MODE and value not in MODES:
+            raise ServoRefusal(StatusError.DATA_RANGE)
+        if register is reg.TORQUE_ENABLE and value == 1 and self._shutdown:
+            raise ServoRefusal(StatusError.RESULT_FAIL)
+        limit = {
+            reg.GOAL_CURRENT: reg.CURRENT_LIMIT,
+            reg.GOAL_PWM: reg.PWM_LIMIT,
+            reg.GOAL_VELOCITY: reg.VELOCITY_LIMIT,
+        }.get(register)
+        if limit is not None and abs(value) > self._get(limit):
+            raise ServoRefusal(StatusError.DATA_LIMIT)
+        if (
+            register is reg.GOAL_POSITION
+            and memory[11] == MODE_POSITION
+            and not self._get(reg.MIN_POSITION_LIMIT) <= value <= self._get(reg.MAX_POSITION_LIMIT)
+        ):
+            raise ServoRefusal(StatusError.DATA_LIMIT)
+
+    def _apply(self, register: Register, value: int) -> None:
+        if register is reg.LED and value > self._get(reg.LED):
+            self.lights += 1
+        self._set(register, value)
+        drive, memory = self.drive, self._memory
+        if register is reg.TORQUE_ENABLE and value == 1:
+            if memory[11] == MODE_POSITION:
+                drive.forget_turns()
+            if memory[11] != MODE_CURRENT:
+                self._set(reg.GOAL_POSITION, drive.present()[2])
+        elif register is reg.OPERATING_MODE:
+            self._reset_goals()
+            if value == MODE_POSITION:
+                drive.forget_turns()
+        elif register in (reg.HOMING_OFFSET, reg.DRIVE_MODE):
+            drive.show_no_current()
+        elif register in (reg.TEMPERATURE_LIMIT, reg.MIN_VOLTAGE_LIMIT, reg.MAX_VOLTAGE_LIMIT):
+            self._check_environment()
+        if register is reg.GOAL_CURRENT:
+            drive.set_goal_current(value)
+        self._settings_to_drive()
+
+    # --- inside ------------------------------------------------------------------------------------------------------
+
+    def _power_on(self) -> None:
+        self._reset_goals()
+        self._settings_to_drive()
+        self.drive.forget_turns()
+        self._check_environment()
+
+    def _reset_goals(self) -> None:
+        goal = 0 if self._memory[11] == MODE_CURRENT else self._get(reg.CURRENT_LIMIT)
+        self._set(reg.GOAL_CURRENT, goal)
+        self.drive.set_goal_current(goal, at_once=True)
+        self._set(reg.GOAL_PWM, self._get(reg.PWM_LIMIT))
+        self._set(reg.GOAL_VELOCITY, 0)
+
+    def _settings_to_drive(self) -> None:
+        """Everything but the goal current, which takes its time."""
+        drive, memory = self.drive, self._memory
+        watchdog = memory[98]
+        drive.torque_on = bool(memory[64])
+        drive.mode = memory[11]
+        drive.direction = -1 if memory[10] & 1 else 1
+        drive.current_limit_counts = self._get(reg.CURRENT_LIMIT)
+        drive.homing_counts = self._get(reg.HOMING_OFFSET)
+        drive.goal_position_counts = self._get(reg.GOAL_POSITION)
+        drive.position_gain = self._get(reg.POSITION_P_GAIN) / reg.POSITION_P_GAIN.initial
+        if watchdog != WATCHDOG_TRIPPED:
+            drive.start_watchdog(watchdog * WATCHDOG_UNIT_S if watchdog else None)
+
+    def _show_present(self) -> None:
+        """Carry what the drive measured at its last update into the table."""
+        memory = self._memory
+        # One slice assignment of one instant's values: a reader never sees a position of one with a velocity of another.
+        current, velocity, position = self.drive.present()
+        memory[126:136] = _PRESENT.pack(current, velocity, position)
+        memory[120:122] = (int(self.drive.now_s * 1e3) % 32768).to_bytes(2, "little")
+        memory[122] = abs(velocity) > self._get(reg.MOVING_THRESHOLD)
+
+    def _check_environment(self) -> None:
+        if self._get(reg.PRESENT_TEMPERATURE) > self._get(reg.TEMPERATURE_LIMIT):
+            self._raise_error(ERROR_OVERHEATING)
+        voltage = self._get(reg.PRESENT_VOLTAGE)
+        if not self._get(reg.MIN_VOLTAGE_LIMIT) <= voltage <= self._get(reg.MAX_VOLTAGE_LIMIT):
+            self._raise_error(ERROR_VOLTAGE)
+
+    def _raise_error(self, bit: int) -> None:
+        self._memory[70] |= bit
+        if self._memory[63] & bit:
+            self._shutdown = True
+            self._memory[64] = 0
+            self.drive.torque_on = False

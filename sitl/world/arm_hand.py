@@ -1,0 +1,59 @@
+"""A hand that holds the arm whenever it is limp, and moves it through the poses that `companion arm zero` asks for."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from companion.commissioning.arm.poses import steps_of
+from companion.config.vehicle import Arm
+from companion.model.types import Vec2
+
+MOVE_S: Final = 2.0
+FORGET_S: Final = 1.5
+"""The lights dark for so long: whoever asked has gone, the next one begins anew."""
+
+
+class ArmHand:
+    """Where both joints are held.
+
+    Args:
+        arm: of the vehicle file; its walls say which poses there are.
+        angle_rad: of the joints at first.
+    """
+
+    def __init__(self, arm: Arm, angle_rad: Vec2) -> None:
+        self._poses = [step.hand_rad for step in steps_of(arm)]
+        self._from = self._to = self._at = angle_rad
+        self._moved_s = -MOVE_S
+        self._lit_s = -FORGET_S
+        self._seen = self._next = 0
+        self._limp = True
+
+    def angles_rad(self, t_s: float, limp: bool, angle_rad: Vec2, lights: int, lit: bool) -> Vec2 | None:
+        """Joint angles to hold now; None: the servos do.
+
+        Args:
+            t_s: world time.
+            limp: no servo has torque on.
+            angle_rad: where the joints are.
+            lights: how often the lights went on so far; each time the arm is moved to the next pose.
+            lit: they are on.
+        """
+        if limp and not self._limp:
+            self._from = self._to = self._at = angle_rad
+        self._limp = limp
+        if not limp:
+            return None
+        if lights != self._seen:
+            if t_s - self._lit_s > FORGET_S:
+                self._next = 0
+            self._seen = lights
+            self._from, self._to, self._moved_s = self._at, self._poses[self._next], t_s
+            self._next = (self._next + 1) % len(self._poses)
+        if lit:
+            self._lit_s = t_s
+        s = min(1.0, (t_s - self._moved_s) / MOVE_S)
+        s = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
+        (a1, a2), (b1, b2) = self._from, self._to
+        self._at = (a1 + s * (b1 - a1), a2 + s * (b2 - a2))
+        return self._at

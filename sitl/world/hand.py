@@ -1,0 +1,204 @@
+"""What people do to the machine with its rotors off: carry it through the guided frame test, tap it, hang a weight on its net.
+
+A hand is a spring and a damper on the base. Lift, forward, turn left, and back onto its place, again and again with a rest between:
+whoever starts to watch finds a whole round. Or it lifts and holds the machine, and another hand taps it. It sways as a hand does, and
+knows where the machine stood at first. Nothing of it is there while the rotors are armed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.config.world import World as WorldConfig
+from companion.model.frames import (
+    quat_conjugate,
+    quat_from_euler_zyx,
+    quat_multiply,
+    quat_rotate,
+    yaw_from_quat,
+)
+from companion.model.types import Quat, Vec3
+
+STIFFNESS_N_M, DAMPING_NS_M = 900.0, 95.0
+TURN_STIFFNESS_NM, TURN_DAMPING_NMS = 40.0, 4.0
+LIFT_M, FORWARD_M, TURN_DEG = 0.30, 0.30, 45.0
+REST_S = 6.0
+"""On the floor between two rounds."""
+_GRIP_S = 0.4
+"""To take the weight, and to give it back."""
+SWAY_DEG, SWAY_M = 2.0, 0.004
+
+
+class _Leg(NamedTuple):
+    duration_s: float
+    forward_m: float
+    up_m: float
+    turn_deg: float
+    """Of the goal, from where the round began."""
+
+
+_LEGS: Final = (
+    _Leg(_GRIP_S, 0.0, 0.0, 0.0),
+    _Leg(1.6, 0.0, LIFT_M, 0.0),
+    _Leg(1.5, 0.0, LIFT_M, 0.0),
+    _Leg(1.6, FORWARD_M, LIFT_M, 0.0),
+    _Leg(1.5, FORWARD_M, LIFT_M, 0.0),
+    _Leg(1.6, FORWARD_M, LIFT_M, TURN_DEG),
+    _Leg(1.5, FORWARD_M, LIFT_M, TURN_DEG),
+    _Leg(1.6, FORWARD_M, LIFT_M, 0.0),
+    _Leg(1.6, 0.0, LIFT_M, 0.0),
+    _Leg(2.0, 0.0, 0.0, 0.0),
+    _Leg(_GRIP_S, 0.0, 0.0, 0.0),
+)
+ROUND_S: Final = sum(leg.duration_s for leg in _LEGS)
+TAP_S: Final = 0.024
+"""A knock with the flat of the hand: half a period of a sine."""
+TAP_EVERY_S: Final = 1.1
+_HELD_S: Final = _GRIP_S + 1.6
+"""From the grip until the machine is held still enough to be tapped."""
+_TAP_LEVER_BODY_M: Final[Vec3] = (0.06, 0.04, 0.02)
+_TAPS_WORLD: Final[tuple[Vec3, ...]] = (
+    (1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (-0.8, 0.6, 0.0),
+    (0.0, -0.8, 0.6),
+    (-0.6, -0.6, 0.5),
+)
+"""Directions, in turn."""
+GRAVITY_M_S2: Final = 9.81
+
+
+class Wrench(NamedTuple):
+    """On the base's centre of mass, world frame."""
+
+    force_n: Vec3
+    torque_nm: Vec3
+
+
+class Hand:
+    """When it holds the machine, and with which force.
+
+    Args:
+        config: `hand`, `hand_t_s`, `hand_taps`, `hand_tap_n` and the seed of its sway.
+        weight_n: of the whole machine.
+    """
+
+    def __init__(self, config: WorldConfig, weight_n: float) -> None:
+        self._weight_n = weight_n
+        self._from_s = config.hand_t_s
+        self._taps, self._tap_n = config.hand_taps, config.hand_tap_n
+        self._legs = _LEGS if not self._taps else _holding(self._taps * TAP_EVERY_S)
+        self._round_s = sum(leg.duration_s for leg in self._legs)
+        self._origin: tuple[Vec3, float] | None = None
+        self._phases: list[float] = np.random.default_rng((config.seed, 17)).uniform(0.0, 2.0 * math.pi, 5).tolist()
+
+    def wrench(self, t_s: float, q: list[float], v: list[float]) -> Wrench | None:
+        """What the hand does now; None: nothing.
+
+        Args:
+            t_s: world time.
+            q: position, quaternion of the base (world), then whatever.
+            v: velocity (world), angular rate (body).
+        """
+        t_s -= self._from_s
+        if t_s < 0.0:
+            return None
+        t_s %= self._round_s + REST_S
+        if t_s >= self._round_s:
+            return None
+        attitude: Quat = (q[3], q[4], q[5], q[6])
+        if self._origin is None:
+            self._origin = ((q[0], q[1], q[2]), yaw_from_quat(attitude))
+        (x, y, z), yaw = self._origin
+        forward, up, turn = self._goal(t_s)
+        grip = min(1.0, t_s / _GRIP_S, (self._round_s - t_s) / _GRIP_S)
+        # As far as it is lifted: on the floor nobody's hand sways.
+        loose = min(1.0, up / LIFT_M)
+        sway = [loose * math.sin(2.0 * math.pi * (0.35 + 0.07 * k) * t_s + p) for k, p in enumerate(self._phases)]
+        goal = (
+            x + forward * math.cos(yaw) + SWAY_M * sway[0],
+            y + forward * math.sin(yaw) + SWAY_M * sway[1],
+            z + up + SWAY_M * sway[2],
+        )
+        tilt_rad = math.radians(SWAY_DEG)
+        want = quat_from_euler_zyx(tilt_rad * sway[3], tilt_rad * sway[4], yaw + turn)
+        fx, fy, fz = (
+            grip * (STIFFNESS_N_M * (to - at) - DAMPING_NS_M * speed)
+            for to, at, speed in zip(goal, q[0:3], v[0:3], strict=True)
+        )
+        w, ex, ey, ez = quat_multiply(quat_conjugate(attitude), want)
+        k = 2.0 * TURN_STIFFNESS_NM * grip * (1.0 if w >= 0.0 else -1.0)
+        d = TURN_DAMPING_NMS * grip
+        torque = quat_rotate(attitude, (k * ex - d * v[3], k * ey - d * v[4], k * ez - d * v[5]))
+        if self._taps:
+            (tx, ty, tz), lever = self._tap(t_s), quat_rotate(attitude, _TAP_LEVER_BODY_M)
+            fx, fy, fz = fx + tx, fy + ty, fz + tz
+            torque = _plus(torque, _cross(lever, (tx, ty, tz)))
+        return Wrench((fx, fy, fz + grip * self._weight_n), torque)
+
+    def _tap(self, t_s: float) -> Vec3:
+        """Force of the other hand, world frame."""
+        count, since_s = divmod(t_s - _HELD_S - 0.5 * TAP_EVERY_S, TAP_EVERY_S)
+        # Nobody taps to a clock.
+        since_s -= 0.13 * (1.0 + math.sin(5.1 * count + self._phases[0]))
+        if not 0.0 <= count < self._taps or not 0.0 <= since_s < TAP_S:
+            return (0.0, 0.0, 0.0)
+        x, y, z = _TAPS_WORLD[int(count) % len(_TAPS_WORLD)]
+        size_n = self._tap_n * math.sin(math.pi * since_s / TAP_S)
+        return (x * size_n, y * size_n, z * size_n)
+
+    def _goal(self, t_s: float) -> tuple[float, float, float]:
+        """Forward and up in m, turned in rad."""
+        before = _Leg(0.0, 0.0, 0.0, 0.0)
+        for leg in self._legs:
+            if t_s < leg.duration_s:
+                s = t_s / leg.duration_s
+                s = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
+                forward, up, turn = (a + s * (b - a) for a, b in zip(before[1:], leg[1:], strict=True))
+                return forward, up, math.radians(turn)
+            t_s -= leg.duration_s
+            before = leg
+        return 0.0, 0.0, 0.0
+
+
+class HungWeight:
+    """A known weight that somebody hangs on the net while the force sensor is being read.
+
+    Args:
+        config: `net_weight_kg`, `net_weight_t_s`.
+    """
+
+    def __init__(self, config: WorldConfig) -> None:
+        self._weight_n, self._after_s = GRAVITY_M_S2 * config.net_weight_kg, config.net_weight_t_s
+        self._read_since_s: float | None = None
+
+    def pull_n(self, t_s: float, read: bool) -> float:
+        """Force on the net's centre now, N, downwards.
+
+        Args:
+            t_s: world time.
+            read: somebody reads the force sensor.
+        """
+        if not read:
+            self._read_since_s = None
+        elif self._read_since_s is None:
+            self._read_since_s = t_s
+        since_s = self._read_since_s
+        return self._weight_n if since_s is not None and t_s - since_s >= self._after_s else 0.0
+
+
+def _holding(held_s: float) -> tuple[_Leg, ...]:
+    """Lift, hold it for so long, put it back."""
+    up, held = _Leg(1.6, 0.0, LIFT_M, 0.0), _Leg(held_s, 0.0, LIFT_M, 0.0)
+    return (_Leg(_GRIP_S, 0.0, 0.0, 0.0), up, held, _Leg(2.0, 0.0, 0.0, 0.0), _Leg(_GRIP_S, 0.0, 0.0, 0.0))
+
+
+def _plus(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def _cross(a: Vec3, b: Vec3) -> Vec3:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

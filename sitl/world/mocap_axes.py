@@ -1,0 +1,52 @@
+"""What a wrongly set-up motion-capture server streams of a pose.
+
+A rigid body's rotation is counted from how the machine stood when somebody made the body, and is told in the axes of the stream. Who
+makes the body turns the machine's nose along the stream's x axis, if that one is level; else along the true one.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.world import World
+from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply
+from companion.model.types import Quat, Vec3
+
+_PLACE = {"x": 0, "y": 1, "z": 2}
+
+
+class SpoiledFrame:
+    """True poses to streamed ones: `p' = A p`, `R' = A R Z A'` with A of `world.mocap_axes` and Z the body's wrong zero."""
+
+    def __init__(self, config: World) -> None:
+        names = config.mocap_axes
+        self._index = tuple(_PLACE[name[-1]] for name in names)
+        self._sign = tuple(-1.0 if name[0] == "-" else 1.0 for name in names)
+        rows = [
+            [s if column == i else 0.0 for column in range(3)] for i, s in zip(self._index, self._sign, strict=True)
+        ]
+        (a, b, c), (d, e, f), (g, h, i) = rows
+        self._mirror = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        nose_yaw_rad = math.atan2(b, a) if c == 0.0 else 0.0
+        roll_deg, pitch_deg = config.mocap_body_tilt_deg
+        off = quat_from_euler_zyx(
+            math.radians(roll_deg), math.radians(pitch_deg), math.radians(config.mocap_body_yaw_deg)
+        )
+        self._zero = quat_multiply(off, quat_conjugate(quat_from_euler_zyx(0.0, 0.0, nose_yaw_rad)))
+
+    @classmethod
+    def of(cls, config: World) -> SpoiledFrame | None:
+        """None: the server is set up as it should be."""
+        upright = (config.mocap_axes, config.mocap_body_yaw_deg, config.mocap_body_tilt_deg)
+        return None if upright == (("x", "y", "z"), 0.0, (0.0, 0.0)) else cls(config)
+
+    def pose(self, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat]:
+        """Position and attitude as streamed."""
+        w, x, y, z = quat_multiply(attitude_wxyz, self._zero)
+        x, y, z = self._axes((x, y, z))
+        m = self._mirror
+        return self._axes(position_world_m), (w, m * x, m * y, m * z)
+
+    def _axes(self, v: Vec3) -> Vec3:
+        (i, j, k), (a, b, c) = self._index, self._sign
+        return (a * v[i], b * v[j], c * v[k])

@@ -1,0 +1,315 @@
+"""The machine as its devices see it: the world behind noisy sensors, motors and an autopilot, without any wire.
+
+`Plant.step` advances everything by one physics step. The server puts real wires around it; the fast closed loop uses it as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from companion.config.faults import Fault, FaultKind
+from companion.config.vehicle import Joint, Vehicle
+from companion.config.world import Push, Servo
+from companion.config.world import World as WorldConfig
+from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
+from companion.model.types import Quat, Vec2, Vec3, Vec4
+from sitl.autopilot.autopilot import Battery
+from sitl.autopilot.types import ImuSample
+from sitl.faults import Faults
+from sitl.world.hand import Hand, HungWeight
+from sitl.world.mocap_axes import SpoiledFrame
+from sitl.world.world import PHYSICS_DT_S, Truth, World
+
+IMU_EVERY = 2
+"""Physics steps per IMU sample: 250 Hz, as PX4's rate loop is stepped."""
+BATTERY_FULL_V, BATTERY_EMPTY_V = 16.6, 14.0
+_COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
+
+
+class Px4(Protocol):
+    """The autopilot, stepped by its IMU."""
+
+    def step(self, imu: ImuSample) -> Vec4:
+        """One IMU sample in, rotor commands out."""
+
+
+class JointDrive(Protocol):
+    """One servo's motor, in the servo's own angle convention."""
+
+    goal_delay_s: float
+    """Goal currents take effect that much later than they were written."""
+
+    def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
+        """Latch what the servo measures; the current (A) that the motor gives now."""
+
+
+class MocapFrame(NamedTuple):
+    """One motion-capture frame, delivered `mocap_latency_s` after its exposure."""
+
+    number: int
+    exposure_t_s: float
+    position_world_m: Vec3
+    attitude_wxyz: Quat
+    valid: bool
+
+
+def _zero_rad(joint: Joint, servo: Servo) -> float:
+    """Shaft angle at joint angle 0."""
+    return joint.zero_count / _COUNTS_PER_RAD + joint.sign * math.radians(servo.zero_error_deg)
+
+
+def battery_voltage_v(remaining: float) -> float:
+    """Voltage at a charge of 0 to 1."""
+    return BATTERY_EMPTY_V + (BATTERY_FULL_V - BATTERY_EMPTY_V) * remaining
+
+
+_NOISE_BLOCK = 4096
+
+
+_MOCAP, _IMU, _FORCE = range(3)
+_PHASES = (0.0, math.tau / 3.0, 2.0 * math.tau / 3.0)
+
+
+def noise(seed: int, sensor: int) -> Iterator[Vec3]:
+    """Standard normal numbers by threes, drawn in blocks: three cost well under a microsecond."""
+    rng = np.random.default_rng((seed, sensor))
+    while True:
+        values = iter(rng.standard_normal(_NOISE_BLOCK).tolist()[::-1])
+        yield from zip(values, values, values, strict=False)
+
+
+class Plant:
+    """World, sensors and motors.
+
+    Args:
+        vehicle: the machine.
+        config: of the world.
+        px4: what flies it.
+        drives: of the joints.
+        start: position, yaw and joint angles, m and rad.
+        between_steps: cameras expose when they are due, as they do, and not at the end of the physics step that they are due in.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        config: WorldConfig,
+        px4: Px4,
+        drives: Sequence[JointDrive],
+        start: tuple[Vec2, float, Vec2],
+        *,
+        between_steps: bool = False,
+    ) -> None:
+        self._between_steps = between_steps
+        position_m, yaw_rad, arm_rad = start
+        self._config = config
+        self._px4 = px4
+        self._drives = (drives[0], drives[1])
+        for drive in drives:
+            drive.goal_delay_s = config.arm_delay_s
+        first, second = vehicle.arm.joints
+        servo1, servo2 = config.servo(0), config.servo(1)
+        self._joint_signs = (
+            -first.sign if servo1.reversed else first.sign,
+            -second.sign if servo2.reversed else second.sign,
+        )
+        self._servo_zeros_rad = (_zero_rad(first, servo1), _zero_rad(second, servo2))
+        k = vehicle.arm.torque_per_amp_nm_a
+        self._torque_per_amp_nm_a = (k / (1.0 + servo1.torque_per_amp_error), k / (1.0 + servo2.torque_per_amp_error))
+        self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
+        self._seed_noise()
+        self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
+        self._spoiled = SpoiledFrame.of(config)
+        self._hand = Hand(config, self.world.weight_n) if config.hand else None
+        self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
+        self.force_is_read = True
+        """Whether the force sensor streams; the fast closed loop reads it from the start."""
+        self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
+        self._tick = 0
+        self._imu_sample: ImuSample | None = None
+        self._mocap_queue: deque[tuple[float, MocapFrame]] = deque()
+        self._mocap_next_s = 0.0
+        self._mocap_number = 0
+        self.armed_t_s: float | None = None
+        self.faults: Faults | None = None
+        """Set by whoever has faults; None: nothing goes wrong."""
+
+    def _seed_noise(self) -> None:
+        """A stream per sensor, from the start again at arming: one seed is the same noise in flight, however long the machine stood
+        before and however often each sensor is asked, over wires as in the fast loop."""
+        self._mocap_noise, self._imu_noise, self._force_noise = (
+            noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
+        )
+
+    @property
+    def t_s(self) -> float:
+        """World time."""
+        return self.world.t_s
+
+    @property
+    def truth(self) -> Truth:
+        """The world's state after the last step."""
+        return self.world.truth()
+
+    def mission_t_s(self) -> float | None:
+        """Seconds since the rotors were armed."""
+        return None if self.armed_t_s is None else self.t_s - self.armed_t_s
+
+    def fault(self, kind: FaultKind) -> Fault | None:
+        """The fault of that kind that is active now."""
+        return None if self.faults is None else self.faults.active.get(kind)
+
+    def _load_on_net(self, push: Push | None, weight: HungWeight | None) -> Vec3:
+        """Force on the net's centre of the push and of the hung weight, N, world frame."""
+        now, force = self.mission_t_s(), (0.0, 0.0, 0.0)
+        if push is not None and now is not None and push.t_s <= now < push.t_s + push.duration_s:
+            force = push.force_world_n
+        if weight is None:
+            return force
+        x, y, z = force
+        return (x, y, z - weight.pull_n(self.world.t_s, self.force_is_read))
+
+    def step(self, armed: bool) -> None:
+        """Advance by one physics step."""
+        world, config = self.world, self._config
+        t_s = world.t_s
+        if armed and self.armed_t_s is None:
+            self.armed_t_s = t_s
+            self._seed_noise()
+        if self.faults is not None:
+            self.faults.step(t_s, self.armed_t_s)
+        q, v, layout = world.q, world.v, world.layout
+        (q1, q2), (v1, v2) = layout.joint_q, layout.joint_v
+        (sign1, sign2), (zero1, zero2) = self._joint_signs, self._servo_zeros_rad
+        drive1, drive2 = self._drives
+        k1, k2 = self._torque_per_amp_nm_a
+        torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * q[q1], sign1 * v[v1]) * k1
+        torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * q[q2], sign2 * v[v2]) * k2
+        if self._tick % IMU_EVERY == 0:
+            self._rotors = self._px4.step(self._imu_sample or self._imu())
+            self._imu_sample = None
+        self._tick += 1
+        if config.push is not None or self._weight is not None:
+            world.push(self._load_on_net(config.push, self._weight))
+        if self._hand is not None:
+            world.hold(None if armed else self._hand.wrench(t_s, q, v))
+        world.step(self._rotors, (torque1, torque2), armed)
+        if world.t_s >= self._mocap_next_s - 1e-9:
+            self._expose_mocap(min(world.t_s, self._mocap_next_s) if self._between_steps else world.t_s)
+
+    @property
+    def imu_due(self) -> bool:
+        """The next step begins with an IMU sample."""
+        return self._tick % IMU_EVERY == 0
+
+    def sample_imu(self) -> ImuSample:
+        """That sample, before the step: for an autopilot that needs time to answer."""
+        if self._imu_sample is None:
+            self._imu_sample = self._imu()
+        return self._imu_sample
+
+    def _imu(self) -> ImuSample:
+        world, config = self.world, self._config
+        s, a, g = world.sensors(), world.layout.accel, world.layout.gyro
+        gyro, accel = config.gyro_noise_rad_s, config.accel_noise_m_s2
+        nx, ny, nz = next(self._imu_noise)
+        mx, my, mz = next(self._imu_noise)
+        ax, ay, az = s[a] + accel * mx, s[a + 1] + accel * my, s[a + 2] + accel * mz
+        if config.accel_vibration_m_s2 and self.armed_t_s is not None:
+            vx, vy, vz = self._vibration(world.t_s)
+            ax, ay, az = ax + vx, ay + vy, az + vz
+        return ImuSample(
+            world.t_s, (s[g] + gyro * nx, -(s[g + 1] + gyro * ny), -(s[g + 2] + gyro * nz)), (ax, -ay, -az)
+        )
+
+    def _vibration(self, t_s: float) -> Vec3:
+        """Mean of the vibration over the sample's interval, as PX4 integrates its raw samples; a third of a turn apart on the axes."""
+        interval_s = IMU_EVERY * PHYSICS_DT_S
+        turns = math.tau * self._config.accel_vibration_hz
+        k = self._config.accel_vibration_m_s2 / (turns * interval_s)
+        x, y, z = (
+            k * (math.cos(turns * (t_s - interval_s) + phase) - math.cos(turns * t_s + phase)) for phase in _PHASES
+        )
+        return (x, y, z)
+
+    def _expose_mocap(self, t_s: float) -> None:
+        config, world = self._config, self.world
+        faults, period_s, latency_s, valid = self.faults, 1.0 / config.mocap_rate_hz, config.mocap_latency_s, True
+        if faults is not None:
+            period_s = faults.mocap_period_s(period_s)
+            latency_s += faults.size("mocap_latency")
+        self._mocap_next_s += period_s
+        self._mocap_number += 1
+        x, y, z, qw, qx, qy, qz = world.q[0:7]
+        since_s = world.t_s - t_s
+        if since_s > 0.0:  # at most a step
+            vx, vy, vz, wx, wy, wz = world.v[0:6]
+            x, y, z = x - since_s * vx, y - since_s * vy, z - since_s * vz
+            back = (1.0, -0.5 * since_s * wx, -0.5 * since_s * wy, -0.5 * since_s * wz)
+            qw, qx, qy, qz = quat_normalize(quat_multiply((qw, qx, qy, qz), back))
+        noise_m, noise_rad = config.mocap_noise_m, self._mocap_noise_rad
+        nx, ny, nz = next(self._mocap_noise)
+        roll, pitch, yaw = next(self._mocap_noise)
+        turned = quat_from_euler_zyx(noise_rad * roll, noise_rad * pitch, noise_rad * yaw)
+        position: Vec3 = (x + noise_m * nx, y + noise_m * ny, z + noise_m * nz)
+        attitude = quat_multiply((qw, qx, qy, qz), turned)
+        if faults is not None:
+            position, attitude, valid = faults.pose(position, attitude)
+        if self._spoiled is not None:
+            position, attitude = self._spoiled.pose(position, attitude)
+        self._mocap_queue.append((t_s + latency_s, MocapFrame(self._mocap_number, t_s, position, attitude, valid)))
+
+    def take_mocap(self) -> list[MocapFrame]:
+        """Frames that leave the motion-capture machine now."""
+        return [frame for _, frame in self.mocap_until(self.world.t_s)]
+
+    def mocap_until(self, until_s: float) -> list[tuple[float, MocapFrame]]:
+        """Frames that leave the motion-capture machine up to `until_s`, and when each does."""
+        queue, until_s = self._mocap_queue, until_s + 1e-9
+        if not queue or queue[0][0] > until_s:
+            return []
+        frames = []
+        while queue and queue[0][0] <= until_s:
+            frames.append(queue.popleft())
+        return [] if self.fault("mocap_loss") else frames
+
+    def battery(self) -> Battery:
+        """What the power module measures: emptied by time in the air."""
+        remaining = self.battery_remaining()
+        return Battery(voltage_v=battery_voltage_v(remaining) - self.battery_sag_v(), remaining=remaining)
+
+    def battery_sag_v(self) -> float:
+        """Voltage lost to a fault."""
+        return 0.0 if self.faults is None else self.faults.sag_v
+
+    def battery_remaining(self) -> float:
+        """Charge, 0 to 1."""
+        flown_s = 0.0 if self.armed_t_s is None else self.world.t_s - self.armed_t_s
+        remaining = self._config.battery_start - flown_s / self._config.battery_life_s
+        return remaining if remaining > 0.0 else 0.0
+
+    def force_torque(self) -> tuple[Vec3, Vec3]:
+        """Reading of the force-torque sensor in N and N m, sensor frame: noise, bias, faults and scale error included."""
+        s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
+        bx, by, bz = self._config.force_bias_n
+        noise_n = self._config.force_noise_n
+        noise_nm = noise_n * 0.02
+        nx, ny, nz = next(self._force_noise)
+        mx, my, mz = next(self._force_noise)
+        wrench = (
+            (-s[f] + bx + noise_n * nx, -s[f + 1] + by + noise_n * ny, -s[f + 2] + bz + noise_n * nz),
+            (-s[tq] + noise_nm * mx, -s[tq + 1] + noise_nm * my, -s[tq + 2] + noise_nm * mz),
+        )
+        if self.faults is not None:
+            wrench = self.faults.wrench(*wrench)
+        scale = self._config.force_scale
+        return wrench if scale == 1.0 else (_scaled(wrench[0], scale), _scaled(wrench[1], scale))
+
+
+def _scaled(v: Vec3, k: float) -> Vec3:
+    return (k * v[0], k * v[1], k * v[2])

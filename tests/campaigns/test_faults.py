@@ -1,0 +1,268 @@
+"""How a flight with a fault is judged, on flights made up for it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from companion.campaigns.faults import (
+    COLUMNS,
+    VARIANTS,
+    WIRES,
+    Flown,
+    Point,
+    Tick,
+    Variant,
+    good,
+    outcomes,
+    row_of,
+    summary,
+    variants_of,
+    write_csv,
+)
+from companion.campaigns.faults_over_wires import _offset_s
+from companion.campaigns.faults_over_wires import flown as flown_over_wires
+from companion.campaigns.faults_table import outcomes_markdown, write_html
+from companion.cli.main import main
+from companion.config.faults import IN_FLIGHT, KINDS, PHASES, FaultKind
+from companion.config.loader import load_flight
+from companion.launcher.launcher import FlightResult
+from companion.launcher.run import _summary
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.model.types import (
+    Event,
+    Inputs,
+    MocapPose,
+    OperatorCommand,
+    Outcome,
+    PhaseKind,
+    SafetyAction,
+    Severity,
+    Vec3,
+)
+from companion.safety.rules import RULES
+from tests.support import CATCH, HOVER
+
+VEHICLE = load_flight(CATCH).vehicle
+STANDING_M = VEHICLE.airframe.ground_clearance_m
+LOST = Variant("mocap_loss")
+
+
+def event(t_s: float, event_id: str, action: SafetyAction) -> Event:
+    return Event(t_s, event_id, Severity.CRITICAL, action, event_id)
+
+
+def flight(
+    *,
+    outcome: str = "aborted",
+    stands: bool = True,
+    at: Vec3 = (0.0, 0.0, 1.0),
+    drift_m: float = 0.0,
+    sink_m_s: float = 0.5,
+    tension_n: float = 0.0,
+    slack_m: float = 1.2,
+    events: tuple[Event, ...] = (event(10.12, "mocap_lost", SafetyAction.AUTOPILOT_LAND),),
+    begun_s: float | None = 10.0,
+    error: str | None = None,
+) -> Flown:
+    """A fault at 10 s; 1 s later it sinks, and drifts sideways while it does."""
+    x, y, z = at
+    course = []
+    for k in range(900):
+        t_s = 8.0 + 0.01 * k
+        sunk_m = min(z - STANDING_M, max(0.0, t_s - 11.0) * sink_m_s)
+        sideways = drift_m * min(1.0, max(0.0, t_s - 10.5))
+        course.append(Point(t_s, (x + sideways, y, z - sunk_m), 0.1, slack_m, tension_n if t_s > 12.0 else 0.0))
+    ticks = [
+        Tick(p.t_s, PhaseKind.FLIGHT, SafetyAction.NOMINAL if p.t_s < 10.12 else SafetyAction.AUTOPILOT_LAND, at)
+        for p in course
+    ]
+    return Flown(outcome, begun_s, course, ticks, events, stands, False, error)
+
+
+def test_a_flight_that_was_given_up_and_stands_has_landed() -> None:
+    row = row_of(LOST, "line", flight(drift_m=0.25), VEHICLE)
+    assert row["outcome"] == "landed"
+    assert row["detected_s"] == pytest.approx(0.12)
+    assert row["reacted_s"] == pytest.approx(0.12)
+    assert row["event"] == "mocap_lost"
+    assert row["action"] == "autopilot_land"
+    assert row["drift_m"] == pytest.approx(0.25, abs=0.01)
+    assert row["min_height_m"] == 1.0
+    assert row["worst_tilt_deg"] == pytest.approx(5.73, abs=0.01)
+    assert row["min_slack_m"] == 1.2
+    assert set(row) == set(COLUMNS)
+    assert good(row)
+
+
+@pytest.mark.parametrize(
+    ("made", "problem"),
+    [
+        (flight(stands=False), "aborted"),
+        (flight(outcome="lost"), "lost"),
+        (flight(outcome="refused"), "refused"),
+        (flight(sink_m_s=2.5), "crashed"),
+        (flight(tension_n=20.0), "tether taut by its own motion"),
+        (flight(at=(1.9, 0.0, 1.0)), "left the geofence"),
+        (flight(at=(0.0, 0.0, 2.3)), "left the geofence"),
+        (flight(begun_s=None), "the fault never began"),
+        (flight(outcome="lost", error="ZeroDivisionError: x"), "error of its own"),
+    ],
+)
+def test_what_must_not_be_is_a_problem(made: Flown, problem: str) -> None:
+    row = row_of(LOST, "line", made, VEHICLE)
+    assert problem in row["problems"]
+    assert not good(row)
+
+
+def test_refused_on_the_ground_is_well() -> None:
+    row = row_of(Variant("arming_refused"), "ground", flight(outcome="refused", events=()), VEHICLE)
+    assert good(row)
+    assert row["drift_m"] is None
+
+
+def test_a_tether_that_was_made_taut_may_be_so_but_not_be_followed_outward() -> None:
+    taut = event(10.5, "tether_taut", SafetyAction.RETRACT)
+    assert good(row_of(Variant("tether_taut", 0.1), "line", flight(tension_n=20.0, events=(taut,)), VEHICLE))
+    made = flight(tension_n=20.0, events=(taut,))
+    outward = [
+        Point(p.t_s, p.position_world_m, p.tilt_rad, p.slack_m - (0.3 if p.t_s > 12.5 else 0.0), p.tension_n)
+        for p in made.course
+    ]
+    row = row_of(
+        Variant("tether_taut", 0.1),
+        "line",
+        Flown("aborted", 10.0, outward, made.ticks, made.events, True, False),
+        VEHICLE,
+    )
+    assert row["problems"] == ["outward on a taut tether"]
+
+
+def test_what_is_told_after_the_landing_is_no_answer() -> None:
+    made = flight(outcome="completed", events=(event(16.5, "force_lost", SafetyAction.LAND),))
+    ticks = [Tick(t.t_s, t.kind if t.t_s < 16.0 else PhaseKind.DONE, SafetyAction.NOMINAL, None) for t in made.ticks]
+    row = row_of(
+        Variant("force_loss"), "line", Flown("completed", 10.0, made.course, ticks, made.events, True, True), VEHICLE
+    )
+    assert (row["action"], row["event"], row["reacted_s"]) == ("nominal", None, None)
+
+
+def test_the_table_of_kinds_is_the_literal_and_names_events_that_exist() -> None:
+    assert tuple(KINDS) == get_args(FaultKind)
+    known = {rule.id for rule in RULES} | {"guardian_took_over", "offboard_refused", "arming_refused"}
+    known |= {"inputs_missing", "vision_not_fused", "gate", "catch"}
+    assert {name for kind in KINDS.values() for name in kind.named_by} - known == set()
+
+
+def test_the_campaign_is_as_large_as_it_should_be() -> None:
+    everywhere = [variant for variant in VARIANTS if set(IN_FLIGHT) <= set(variant.phases)]
+    assert len(everywhere) >= 45
+    assert len(set(VARIANTS)) == len(VARIANTS)
+    assert {variant.kind for variant in VARIANTS} == set(KINDS)
+    assert len(WIRES) >= 15
+    for variant in VARIANTS:
+        assert (variant.size is not None) == (KINDS[variant.kind].size is not None), variant
+
+
+def test_what_is_named_is_flown() -> None:
+    assert {variant.kind for variant, _ in variants_of(["gust"], [])} == {"gust"}
+    assert {phase for _, phase in variants_of([], ["line"])} == {"line"}
+    assert variants_of(["autopilot_reboot"], []) == [(Variant("autopilot_reboot", 2.0), "ground")]
+    assert variants_of(["autopilot_reboot"], ["line"]) == [(Variant("autopilot_reboot", 2.0), "line")]
+    assert {phase for _, phase in variants_of([], [])} == set(PHASES)
+
+
+def test_tables_and_files(tmp_path: Path) -> None:
+    rows = [row_of(LOST, "line", flight(), VEHICLE), row_of(LOST, "return", flight(stands=False), VEHICLE)]
+    assert outcomes(rows) == {"landed": 1, "aborted": 1}
+    assert summary(rows)["bad"] == 1
+    write_csv(rows, tmp_path / "faults.csv")
+    with open(tmp_path / "faults.csv", encoding="utf-8") as file:
+        assert [line["outcome"] for line in csv.DictReader(file)] == ["landed", "aborted"]
+    write_html(rows, {"mission": "m<1>", "where": "here"}, {}, ["a note"], tmp_path / "faults.html")
+    page = (tmp_path / "faults.html").read_text()
+    assert "m&lt;1&gt;" in page and "a note" in page and "1 flights that must not be" in page
+    assert outcomes_markdown(rows).splitlines()[-1].startswith("| `mocap_loss` |  | landed 0.12 | **aborted** 0.12 |")
+
+
+# -- over wires --------------------------------------------------------------------------------------------------------
+
+
+def test_a_flight_that_left_nothing_behind_is_lost_and_says_why(tmp_path: Path) -> None:
+    found = flown_over_wires(tmp_path, load_flight(CATCH))
+    assert found.outcome == "lost"
+    assert "summary.json" in str(found.error)
+
+
+def pose(frame: int, stamp_s: float) -> Inputs:
+    seen = MocapPose(stamp_s, 0.005, frame, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), True, 0.0)
+    return Inputs(frame, stamp_s, None, None, seen, None, None, OperatorCommand.NONE, 0)
+
+
+def test_the_clocks_are_compared_by_the_frame_nearest_to_the_fault_that_both_know() -> None:
+    inputs = [pose(n, 100.0 + 0.005 * n) for n in range(400, 1000) if n % 7]
+    frames = [(200, 1.0), (600, 3.0), (903, 4.5), (1100, 5.5)]
+    assert _offset_s(inputs, frames, 5.4) == pytest.approx(100.0 + 0.005 * 904 - 4.5), (
+        "903 is not in the log, the next one is"
+    )
+    assert _offset_s(inputs, frames, 2.0) == pytest.approx(100.0)
+    assert _offset_s([], frames, 2.0) == 0.0
+
+
+def test_what_a_dead_recorder_did_not_log_is_in_the_summary_all_the_same(tmp_path: Path) -> None:
+    told = {
+        "t_s": 9.1,
+        "mission_t_s": 4.1,
+        "id": "recorder_drops",
+        "severity": "warning",
+        "action": "warn",
+        "text": "x",
+    }
+    _, made = _summary(load_flight(CATCH), FlightResult(Outcome.COMPLETED, events=(told,)), tmp_path)
+    assert made["events"] == [told]
+
+
+# -- command line ------------------------------------------------------------------------------------------------------
+
+
+def test_the_list_names_every_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["faults", "--list", "--json"]) == EXIT_OK
+    listed: list[dict[str, Any]] = json.loads(capsys.readouterr().out)
+    assert [kind["kind"] for kind in listed] == list(KINDS)
+    assert main(["faults", "--list"]) == EXIT_OK
+    shown = capsys.readouterr().out
+    assert all(kind in shown for kind in KINDS)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--kinds", "mocap_los"), "there is no kind of fault 'mocap_los'; did you mean 'mocap_loss'?"),
+        (("--phases", "lunch"), "there is no phase 'lunch'"),
+        (("--set", "world.faults=[]"), "the campaign sets it; use --kinds and --phases"),
+        (("--wires", "--kinds", "gust"), "with --wires there is no gust in phase any to be flown"),
+        (("--out", ""), "expected the name of a folder, got an empty one"),
+    ],
+)
+def test_what_cannot_be_flown_is_refused_in_one_line(
+    words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main(["faults", str(CATCH), *words])
+    except SystemExit as ended:
+        code = int(str(ended.code))
+    captured = capsys.readouterr()
+    assert code == EXIT_BAD_INPUT
+    assert told in captured.err
+    assert len(captured.err.strip().splitlines()) == 1
+
+
+def test_a_mission_without_the_phase_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["faults", str(HOVER), "--kinds", "gust", "--phases", "return", "--out", str(tmp_path / "out")]
+    assert main(words) == EXIT_BAD_INPUT
+    assert "mission 'hover' has no return" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

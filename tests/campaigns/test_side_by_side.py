@@ -1,0 +1,638 @@
+"""`companion report a.mcap b.mcap`: what it says of two and more flights, and what it must never do to their folders."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+from companion.analysis import plots
+from companion.analysis.log import FlightLog
+from companion.analysis.metrics import min_slack_m
+from companion.analysis.summary import summarise
+from companion.campaigns import side_by_side_plots
+from companion.campaigns.side_by_side import Comparison, Figure, NotAlignable, compare, jsonable
+from companion.campaigns.side_by_side_course import Flight, flight_of, slack_m
+from companion.campaigns.side_by_side_html import write_html
+from companion.campaigns.side_by_side_plots import LINES, write_pictures
+from companion.cli.main import main
+from companion.cli.report import names_of
+from companion.launcher import run as flight_module
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.model.types import Event, Inputs, Outputs, SafetyAction, Sent, Severity
+from tests.analysis.synthetic_flight import CATCH_S, CONFIG, GROUND_S, LANDED_S, record_flight, synthetic_flight
+
+Row = tuple[Inputs, Outputs, Sent]
+ROWS = list(synthetic_flight(rate_hz=100.0))
+IN_WORLD = CONFIG | {"vehicle": CONFIG["vehicle"] | {"devices": {"arm": {"port": "/dev/pts/4"}}}}
+VERSIONS = {"version_companion": "0.1.0", "version_git": "abc", "version_numpy": "2"}
+
+
+def made(
+    letter: str,
+    *,
+    change: Callable[[Inputs, Outputs, Sent], Row] | None = None,
+    rows: list[Row] = ROWS,
+    config: dict[str, Any] = IN_WORLD,
+    about: dict[str, str] | None = None,
+    outcome: str = "completed",
+    payload_kg: float | None = 0.2,
+    digest: str | None = None,
+    stride: int = 1,
+) -> Flight:
+    """A flight of a comparison, from ticks in memory."""
+    rows = [change(*row) for row in rows] if change is not None else rows
+    inputs, outputs, sent = zip(*rows, strict=True)
+    metadata = {
+        "companion": {**VERSIONS, "epoch_offset_ns": "1700000000000000000", **(about or {})},
+        "config": {"json": json.dumps(config)},
+    }
+    log = FlightLog(Path(f"{letter}.mcap"), inputs, outputs, sent, metadata, closed=True, stride=stride)
+    law = config["controller"]
+    summary = summarise(log, outcome=outcome, controller=law["law"], preset=law["preset"], payload_kg=payload_kg)
+    return flight_of(letter, f"flight {letter}", f"{letter}.mcap", digest or letter, log, summary)
+
+
+def configured(**changes: Any) -> dict[str, Any]:
+    """The configuration with dotted keys changed; `__` for the dot."""
+    config = copy.deepcopy(IN_WORLD)
+    for key, value in changes.items():
+        *path, last = key.split("__")
+        part = config
+        for name in path:
+            part = part.setdefault(name, {})
+        part[last] = value
+    return config
+
+
+def further_off(factor: float) -> Callable[[Inputs, Outputs, Sent], Row]:
+    def change(i: Inputs, o: Outputs, s: Sent) -> Row:
+        assert i.mocap is not None
+        if o.reference is None:
+            return i, o, s
+        pairs = zip(i.mocap.position_world_m, o.reference.position_world_m, strict=True)
+        x, y, z = (wanted + factor * (flown - wanted) for flown, wanted in pairs)
+        return replace(i, mocap=replace(i.mocap, position_world_m=(x, y, z))), o, s
+
+    return change
+
+
+def without_events(i: Inputs, o: Outputs, s: Sent) -> Row:
+    return i, replace(o, events=()), s
+
+
+def figure(comparison: Comparison, key: str) -> Figure:
+    return next(figure for figure in comparison.figures if figure.key == key)
+
+
+def keys(comparison: Comparison) -> set[str]:
+    return {setting.key for setting in comparison.settings}
+
+
+# What it says
+
+
+def test_the_same_recording_twice_shows_no_difference_at_all() -> None:
+    comparison = compare([made("A", digest="same"), made("B", digest="same")])
+    assert len(comparison.figures) > 25
+    assert {difference for figure in comparison.figures for difference in figure.differences} == {0}
+    assert {verdict for figure in comparison.figures for verdict in figure.verdicts} == {None}
+    assert (comparison.settings, comparison.addresses, comparison.cautions) == ((), (), ())
+    assert comparison.fair == "The same recording 2 times: nothing differs."
+
+
+def test_one_recording_among_others_is_told_even_if_its_copy_has_another_name() -> None:
+    comparison = compare([made("A", digest="x"), made("B"), made("C", digest="x")])
+    assert "C is the same recording as A." in comparison.cautions
+
+
+def test_a_larger_error_is_worse_by_as_much_as_it_is_larger() -> None:
+    comparison = compare([made("A"), made("B", change=further_off(3.0)), made("C", change=further_off(0.5))])
+    rms = figure(comparison, "rms.post.e_p_m")
+    first, second, third = (value or 0.0 for value in rms.values)
+    assert second == pytest.approx(3.0 * first)
+    assert list(rms.differences) == pytest.approx([0.0, 2.0 * first, third - first])
+    assert rms.verdicts == (None, "worse", "better")
+    attitude = figure(comparison, "rms.post.e_q_deg")
+    assert attitude.differences == (0.0, 0.0, 0.0)
+    assert attitude.verdicts == (None, None, None)
+
+
+def test_a_difference_of_a_few_percent_is_told_but_marked_neither_better_nor_worse() -> None:
+    rms = figure(compare([made("A"), made("B", change=further_off(1.04))]), "rms.post.e_p_m")
+    assert (rms.differences[1] or 0.0) > 0.0
+    assert rms.verdicts[1] is None
+
+
+def test_only_what_is_plainly_better_smaller_is_marked() -> None:
+    """Giving way after the catch, being held to other gains, more slack, a later catch: none of it is better or worse."""
+
+    def all_different(i: Inputs, o: Outputs, s: Sent) -> Row:
+        i, o, s = further_off(3.0)(i, o, s)
+        assert i.arm is not None
+        angle = (i.arm.angle_rad[0] + 0.2, i.arm.angle_rad[1])
+        return replace(i, arm=replace(i.arm, angle_rad=angle)), o, replace(s, lateness_s=s.lateness_s + 0.002)
+
+    other = made("B", change=all_different, config=configured(controller__phi=[3.0] * 8))
+    comparison = compare([made("A"), other])
+    marked = {figure.key for figure in comparison.figures if any(figure.verdicts)}
+    assert marked == {"rms.pre.e_p_m", "rms.pre.e_alpha_deg", "rms.post.e_p_m"} | {
+        f"loop.lateness_ms.{part}" for part in ("p50", "p99", "max")
+    }
+    arm = figure(comparison, "rms.post.e_alpha_deg")
+    assert (arm.differences[1] or 0.0) > 5.0
+
+
+def test_every_number_of_a_summary_is_in_the_table_also_one_that_came_later() -> None:
+    flights = [made("A"), made("B")]
+    for n, flight in enumerate(flights):
+        flight.summary["news"] = {"depth_m": 1.5 * n, "name": "text", "flag": True}
+    comparison = compare(flights)
+    told = {figure.key for figure in comparison.figures}
+
+    def numbers(tree: dict[str, Any], prefix: str = "") -> set[str]:
+        out: set[str] = set()
+        for key, value in tree.items():
+            if isinstance(value, dict):
+                out |= numbers(value, f"{prefix}{key}.")
+            elif isinstance(value, int | float) and not isinstance(value, bool):
+                out.add(prefix + key)
+        return out
+
+    assert numbers(flights[0].summary) <= told
+    assert figure(comparison, "news.depth_m").differences == (0.0, 1.5)
+    assert {"news.name", "news.flag"}.isdisjoint(told)
+
+
+def test_what_one_flight_did_not_measure_has_no_difference() -> None:
+    rms = figure(compare([made("A"), made("B", change=without_events)]), "rms.post.e_p_m")
+    assert rms.values[0] is not None
+    assert (rms.values[1], rms.differences[1], rms.verdicts[1]) == (None, None, None)
+
+
+def test_a_flight_that_was_not_completed_is_never_better_for_having_ended_early() -> None:
+    late = [row for row in ROWS if row[1].mission_t_s < 5.0]
+    comparison = compare([made("A", change=further_off(3.0)), made("B", rows=late, outcome="aborted")])
+    assert (figure(comparison, "rms.pre.e_p_m").differences[1] or 0.0) < 0.0
+    assert figure(comparison, "rms.pre.e_p_m").verdicts == (None, None)
+    assert any("Not completed: B (aborted)" in caution for caution in comparison.cautions)
+
+
+# The configurations
+
+
+def test_keys_that_differ_are_listed_and_no_others() -> None:
+    phases: list[dict[str, Any]] = [{"type": "takeoff", "height_m": 1.0}, {"type": "land"}]
+    one = configured(mission__phases=phases, controller__phi=[1.0, 2.0], vehicle__tether=None, world__wind=[0, 0])
+    other = configured(
+        mission__phases=[phases[0] | {"height_m": 1.2}], controller__phi=[1.0, 3.0], controller__rho_max=6.0, world__wind=[0.0, 0.0]
+    )  # fmt: skip
+    comparison = compare([made("A", config=one), made("B", config=other)])
+    settings = {setting.key: setting for setting in comparison.settings}
+    assert set(settings) == {
+        "mission.phases[0].height_m",
+        "mission.phases[1].type",
+        "controller.phi",
+        "controller.rho_max",
+        "vehicle.tether.anchor_world_m",
+        "vehicle.tether.length_m",
+        "vehicle.tether.attachment_body_m",
+    }
+    assert settings["controller.phi"].values == ([1.0, 2.0], [1.0, 3.0])
+    assert settings["controller.rho_max"].present == (False, True)
+    assert settings["mission.phases[1].type"].present == (True, False)
+    rows = {row["key"]: row for row in jsonable(comparison)["configuration"]}
+    assert rows["controller.rho_max"] == {"key": "controller.rho_max", "values": [None, 6.0], "absent": ["A"]}
+
+
+def test_a_value_that_turns_from_true_to_one_differs() -> None:
+    one, other = (made(n, config=configured(controller__flag=value)) for n, value in (("A", True), ("B", 1)))
+    assert keys(compare([one, other])) == {"controller.flag"}
+
+
+def test_addresses_of_the_simulated_world_are_told_apart_from_settings_but_not_those_of_a_vehicle() -> None:
+    def arm_on(port: str) -> dict[str, Any]:
+        return configured(vehicle__devices={"arm": {"port": port}, "mocap": {"rate_hz": 200.0}})
+
+    simulated = compare([made(n, config=arm_on(f"/dev/pts/{n}")) for n in "AB"])
+    assert (keys(simulated), [s.key for s in simulated.addresses]) == (set(), ["vehicle.devices.arm.port"])
+    assert simulated.cautions == ()
+    real = compare([made(n, config=arm_on(f"/dev/ttyUSB{n}")) for n in "AB"])
+    assert (keys(real), real.addresses) == ({"vehicle.devices.arm.port"}, ())
+
+
+def test_the_world_of_a_flight_on_the_vehicle_says_nothing() -> None:
+    flights = [
+        made(n, config=configured(vehicle__devices={"arm": {"port": "/dev/ttyUSB0"}}, world__seed=k), payload_kg=None)
+        for k, n in enumerate("AB")
+    ]
+    comparison = compare(flights)
+    assert keys(comparison) == set()
+    assert dict(comparison.about)["seed"] == ("–", "–")
+    assert comparison.cautions == ("The payload of A, B is not known: nobody can say whether it was the same.",)
+
+
+# Whether it is a fair comparison
+
+
+def test_flights_of_different_laws_alone_are_said_to_be_comparable() -> None:
+    other = configured(controller={"law": "csc", "preset": "tuned", "gain": 1.0})
+    other["sources"] = {"controller": "elsewhere.yaml"}
+    comparison = compare([made("A"), made("B", config=other)])
+    assert re.fullmatch(r"Only the law or its gains differ \(\d+ keys\)\.", comparison.fair)
+    assert comparison.cautions == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "caution"),
+    [
+        ({"config": configured(world__payload_kg=0.3), "payload_kg": 0.3}, "Different payload: A 0.2 kg, B 0.3 kg."),
+        ({"payload_kg": 0.3}, "Different payload: A 0.2 kg, B 0.3 kg."),
+        ({"config": configured(world__seed=7)}, "Different seed: A –, B 7."),
+        ({"config": configured(mission__repeat=2)}, "Different mission (1 key): mission.repeat."),
+        ({"config": configured(vehicle__airframe__mass_kg=3.2)}, "Different vehicle (1 key): vehicle.airframe.mass_kg."),
+        ({"config": configured(world__faults=[{"kind": "push"}])}, "Different world (1 key): world.faults[0].kind."),
+        ({"about": {"version_git": "def"}}, "Different versions of companion: A 0.1.0 abc, B 0.1.0 def."),
+        ({"about": {"version_numpy": "3"}}, "Different versions of numpy."),
+        (
+            {"config": configured(vehicle__devices={"arm": {"port": "/dev/ttyUSB0"}})},
+            "Flown in different places: A in the simulated world, B on the vehicle.",
+        ),
+        ({"rows": ROWS[::2]}, "Different rates of the control loop: A 100 Hz, B 50 Hz."),
+    ],
+)  # fmt: skip
+def test_whatever_else_differs_is_said_on_top(changes: dict[str, Any], caution: str) -> None:
+    config = copy.deepcopy(changes.pop("config", IN_WORLD))
+    config["controller"] = {**config["controller"], "preset": "paper"}
+    if "rows" in changes:
+        changes["rows"] = [
+            (replace(i, tick=k), replace(o, tick=k), replace(s, tick=k)) for k, (i, o, s) in enumerate(changes["rows"])
+        ]
+    comparison = compare([made("A"), made("B", config=config, **changes)])
+    assert caution in comparison.cautions
+    assert "and not they alone" in comparison.fair
+
+
+def test_different_missions_are_not_marked_better_or_worse_but_their_timing_is() -> None:
+    def slower(i: Inputs, o: Outputs, s: Sent) -> Row:
+        return further_off(3.0)(i, o, replace(s, lateness_s=3.0 * s.lateness_s))
+
+    comparison = compare([made("A"), made("B", change=slower, config=configured(mission__name="hover"))])
+    assert figure(comparison, "rms.pre.e_p_m").verdicts == (None, None)
+    assert figure(comparison, "loop.lateness_ms.p99").verdicts == (None, "worse")
+
+
+# The common time axis
+
+
+def test_flights_are_aligned_at_the_catch_each_at_its_own() -> None:
+    shifted = [(replace(i, t_s=i.t_s + 40.0), o, s) for i, o, s in ROWS]
+    shifted = [(i, replace(o, events=tuple(replace(e, t_s=e.t_s + 40.0) for e in o.events)), s) for i, o, s in shifted]
+    comparison = compare([made("A"), made("B", rows=shifted)])
+    assert comparison.align == "catch"
+    assert list(comparison.zeros_s) == pytest.approx([GROUND_S + CATCH_S, GROUND_S + CATCH_S + 40.0])
+
+
+def test_without_a_catch_in_one_of_them_they_are_aligned_at_the_take_off_and_it_says_so() -> None:
+    flights = [made("A"), made("B", change=without_events)]
+    comparison = compare(flights)
+    assert comparison.align == "takeoff"
+    assert list(comparison.zeros_s) == pytest.approx([GROUND_S, GROUND_S])
+    assert "No catch in B." in comparison.notes
+    with pytest.raises(NotAlignable, match=r"^B\.mcap: --align catch: there is no catch in this flight$"):
+        compare(flights, "catch")
+
+
+def test_a_flight_that_never_took_off_is_aligned_at_its_start() -> None:
+    comparison = compare([made("A"), made("B", rows=ROWS[:100], outcome="refused")])
+    assert (comparison.align, comparison.zeros_s) == ("start", (0.0, 0.0))
+    assert "No take-off in B." in comparison.notes
+    with pytest.raises(NotAlignable, match="no take-off"):
+        compare(comparison.flights, "takeoff")
+
+
+def test_the_user_may_choose_another_moment() -> None:
+    flights = [made("A"), made("B")]
+    assert list(compare(flights, "takeoff").zeros_s) == pytest.approx([GROUND_S, GROUND_S])
+    assert compare(flights, "start").zeros_s == (0.0, 0.0)
+
+
+def test_the_drawn_slack_has_the_least_value_that_the_summary_tells() -> None:
+    inputs, outputs, sent = zip(*ROWS, strict=True)
+    log = FlightLog(Path("a"), inputs, outputs, sent, {"config": {"json": json.dumps(CONFIG)}}, closed=True)
+    assert np.nanmin(slack_m(log)) == min_slack_m(log)
+
+
+# The pictures
+
+
+def linear(colour: str) -> Any:
+    rgb = np.array(to_rgb(colour))
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def lab(linear_rgb: Any) -> Any:
+    """CIE L*a*b* under D65."""
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = to_xyz @ np.clip(linear_rgb, 0.0, 1.0) / np.array([0.9505, 1.0, 1.089])
+    f = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+# Machado, Oliveira, Fernandes: "A Physiologically-based Model for Simulation of Color Vision Deficiency" (2009), severity 1.
+SIGHTS = {
+    "full": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_six_flights_are_told_apart_with_any_sight(sight: str) -> None:
+    seen = [lab(np.array(SIGHTS[sight]) @ linear(line.colour)) for line in LINES]
+    apart = [float(np.linalg.norm(a - b)) for n, a in enumerate(seen) for b in seen[:n]]
+    assert min(apart) > 12.0  # 2.3 is what can just be noticed
+
+
+def test_six_flights_are_told_apart_in_black_and_white() -> None:
+    assert len({line.dashes for line in LINES}) == len(LINES) == 6
+
+
+def test_pictures_of_flights_that_hardly_began_are_drawn_all_the_same(tmp_path: Path) -> None:
+    bare = [(replace(i, mocap=None, arm=None), replace(o, control=None, reference=None), s) for i, o, s in ROWS[:3]]
+    for flights in (
+        [made("A"), made("B", rows=bare, outcome="aborted")],
+        [made("A", rows=bare, outcome="aborted"), made("B", rows=bare[:1], outcome="lost")],
+    ):
+        comparison = compare(flights)
+        pictures = write_pictures(comparison, tmp_path)
+        write_html(comparison, pictures, tmp_path / "page.html")
+        assert "side_by_side_lateness" in {picture.path.stem for picture in pictures}
+
+
+def test_a_law_without_a_switching_gain_has_no_line_of_it_and_two_have_no_pane() -> None:
+    """Such a law logs 0."""
+
+    def no_rho(i: Inputs, o: Outputs, s: Sent) -> Row:
+        return i, replace(o, control=replace(o.control, rho=0.0) if o.control else None), s
+
+    def panes(*flights: Flight) -> list[str]:
+        figure = side_by_side_plots._actuation(compare(flights))
+        assert figure is not None
+        return [ax.get_ylabel() for ax in figure.axes]
+
+    bare = made("A", change=no_rho)
+    assert np.isnan(bare.course.rho).all()
+    assert panes(bare, made("B")) == ["thrust [%]", r"switching gain $\rho$", "tether slack [m]", "events"]
+    assert panes(bare, made("B", change=no_rho)) == ["thrust [%]", "tether slack [m]", "events"]
+
+
+# The page
+
+
+def test_whatever_a_log_holds_is_text_on_the_page(tmp_path: Path) -> None:
+    evil = "<script>alert('$x$')</script>"
+
+    def shout(i: Inputs, o: Outputs, s: Sent) -> Row:
+        event = Event(i.t_s, evil, Severity.WARNING, SafetyAction.HOLD, evil)
+        return i, replace(o, events=(*o.events, event) if i.tick == 750 else o.events), s
+
+    config = configured(mission__name=evil, controller__preset=evil, controller__note=evil, sources__overrides=[evil])
+    config[evil] = {evil: evil}
+    bad = replace(
+        made("B", change=shout, config=config, about={"version_git": evil, "version_companion": evil}),
+        name=evil,
+        path=evil,
+    )
+    bad.summary["outcome"] = evil
+    bad.summary["autopilot"] = {"kind": evil, "firmware": evil}
+    bad.summary[evil] = 1.0
+    comparison = compare([made("A"), bad])
+    write_html(comparison, write_pictures(comparison, tmp_path), tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;") > 15
+    assert not re.search(r"""(?:src|href)=['"](?!data:)""", page)
+
+
+def test_the_page_tells_the_figures_the_settings_and_the_events(tmp_path: Path) -> None:
+    other = made("B", change=further_off(3.0), config=configured(controller__rho_max=7.25))
+    comparison = compare([made("A"), other])
+    write_html(comparison, write_pictures(comparison, tmp_path), tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    for flight in comparison.flights:
+        assert f"{flight.summary['rms']['post']['e_p_m']:.4f}" in page
+    for told in (
+        "Only the law or its gains differ (1 key).",
+        "controller.rho_max",
+        "7.25",
+        "(+200\u00a0%)",
+        ">worse<",
+        "payload in the net",
+    ):
+        assert told in page, told
+    assert page.count("data:image/png;base64,") == 4
+    assert "nan" not in re.sub(r"base64,[^']*", "", page)
+
+
+# The command
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three flights as the recorder writes them, in folders of their own: a whole one with its report, the same with other gains,
+    and one that ended before its catch. At 50 Hz: what is tested is what becomes of files, not of figures.
+    """
+    root = tmp_path_factory.mktemp("reported")
+    configs = {"whole": IN_WORLD, "gains": configured(controller__preset="paper"), "short": IN_WORLD}
+    for name, config in configs.items():
+        (root / name).mkdir()
+        log = root / name / "flight.mcap"
+        end_s = 5.0 if name == "short" else LANDED_S
+        assert record_flight(log, config=config, end_s=end_s, rate_hz=50.0).error is None
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+        assert main(["report", str(root / "whole/flight.mcap")]) == EXIT_OK
+    return root
+
+
+@pytest.fixture
+def flights(tmp_path: Path, reported: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with them; every path is relative to it."""
+    shutil.copytree(reported, tmp_path / "flights")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures without a stroke: for tests that are about files and figures."""
+    monkeypatch.setattr(side_by_side_plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+WHOLE, GAINS, SHORT = (f"flights/{name}/flight.mcap" for name in ("whole", "gains", "short"))
+
+
+def test_two_logs_get_a_folder_of_their_own_and_keep_their_reports(
+    flights: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
+) -> None:
+    before = contents(flights / "flights")
+    assert before.keys() >= {"whole/report.html", "whole/tracking.png", "whole/summary.json"}
+    capsys.readouterr()
+    assert main(["report", WHOLE, GAINS]) == EXIT_OK
+    assert capsys.readouterr() == ("reports/whole-vs-gains/side_by_side.html\n", "")
+    assert contents(flights / "flights") == before
+    written = {path.name for path in (flights / "reports/whole-vs-gains").iterdir()}
+    pictures = {f"side_by_side_{name}.png" for name in ("errors", "actuation", "path", "lateness")}
+    assert written == pictures | {"side_by_side.html", "side_by_side.json"}
+    # Even into a flight's own folder.
+    request.getfixturevalue("undrawn")
+    assert main(["report", WHOLE, GAINS, "--out", "flights/whole"]) == EXIT_OK
+    assert {name: contents(flights / "flights")[name] for name in before} == before
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_comparison_of_other_flights_is_never_overwritten(flights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", WHOLE, GAINS, "--out", "x"]) == EXIT_OK
+    held = contents(flights / "x")
+    capsys.readouterr()
+    assert main(["report", WHOLE, SHORT, "--out", "x"]) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err == (
+        "companion report: --out x: there is a side_by_side.json of other flights already; choose another folder\n"
+    )
+    assert contents(flights / "x") == held
+    assert main(["report", WHOLE, GAINS, "--out", "x"]) == EXIT_OK
+    # Flights of the same name, in another place.
+    (flights / "other/whole").mkdir(parents=True)
+    (flights / "other/whole/flight.mcap").write_bytes((flights / SHORT).read_bytes())
+    assert main(["report", WHOLE, GAINS]) == EXIT_OK
+    capsys.readouterr()
+    assert main(["report", "other/whole/flight.mcap", GAINS]) == EXIT_OK
+    assert capsys.readouterr().out == "reports/whole-vs-gains-2/side_by_side.html\n"
+
+
+def test_json_is_printed_alone_and_nothing_is_written(flights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(flights)
+    capsys.readouterr()
+    assert main(["report", WHOLE, GAINS, WHOLE, "--json"]) == EXIT_OK
+    told = json.loads(capsys.readouterr().out)
+    assert [flight["letter"] for flight in told["flights"]] == ["A", "B", "C"]
+    assert told["flights"][0]["sha256"] == told["flights"][2]["sha256"] != told["flights"][1]["sha256"]
+    assert [row["key"] for row in told["configuration"]] == ["controller.preset"]
+    assert told["align"] == "catch"
+    assert {row["key"] for row in told["figures"]} >= {"rms.pre.e_p_m", "loop.lateness_ms.p99", "tether.min_slack_m"}
+    assert all(row["differences"][2] == 0 for row in told["figures"])
+    assert main(["report", WHOLE, "--json"]) == EXIT_OK
+    assert json.loads(capsys.readouterr().out) == json.loads((flights / "flights/whole/summary.json").read_text())
+    assert contents(flights) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ((WHOLE, "nofile.mcap"), r"nofile\.mcap: cannot be read: No such file or directory"),
+        (("flights/whole/summary.json", WHOLE), r"flights/whole/summary\.json: is no MCAP file; .*"),
+        ((WHOLE, "damaged.mcap"), r"damaged\.mcap: damaged: .*"),
+        ((WHOLE, "flights"), r"flights: cannot be read: Is a directory"),
+        ((WHOLE,) * 7, r"companion report: 7 logs: expected at most 6, .*"),
+        ((WHOLE, SHORT, "--align", "catch"), rf"{SHORT}: --align catch: there is no catch in this flight"),
+        ((WHOLE, "--align", "catch"), r"companion report: --align: there is one log; it is for two and more"),
+        ((WHOLE, GAINS, "--out", ""), r"companion report: --out: expected the name of a folder, got an empty one"),
+        ((WHOLE, GAINS, "--out", WHOLE), r"companion report: flights/whole/flight\.mcap: cannot be written: .*--out"),
+        ((WHOLE, "--out", WHOLE), r"companion report: flights/whole/flight\.mcap: cannot be written: .*--out"),
+    ],
+)  # fmt: skip
+@pytest.mark.usefixtures("undrawn")
+def test_a_mistake_is_one_line_and_leaves_nothing(
+    flights: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], line: str
+) -> None:
+    data = bytearray((flights / WHOLE).read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 64] = bytes(64)
+    (flights / "damaged.mcap").write_bytes(data)
+    before = contents(flights)
+    capsys.readouterr()
+    assert main(["report", *words]) == EXIT_BAD_INPUT
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert re.fullmatch(line, err.strip()), err
+    assert contents(flights) == before
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_log_without_a_catch_beside_one_with_a_catch_works_and_says_so(
+    flights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", WHOLE, SHORT, "--json", "--out", "x"]) == EXIT_OK
+    told = json.loads(capsys.readouterr().out)
+    assert told["align"] == "takeoff"
+    assert "No catch in B." in told["notes"]
+    assert "No catch in B." in (flights / "x/side_by_side.html").read_text(encoding="utf-8")
+
+
+def test_a_summary_beside_the_log_that_is_of_another_flight_is_not_believed(
+    flights: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Logs that were copied into one folder: its one summary is that of one flight, if of any."""
+    for name in ("whole", "short"):
+        shutil.copy(flights / f"flights/{name}/flight.mcap", flights / f"{name}.mcap")
+    known = json.loads((flights / "flights/whole/summary.json").read_text())
+    (flights / "summary.json").write_text(json.dumps(known | {"outcome": "crashed", "payload_kg": 0.25}))
+    capsys.readouterr()
+    assert main(["report", "whole.mcap", "short.mcap", "--json"]) == EXIT_OK
+    out, err = capsys.readouterr()
+    one, other = (flight["summary"] for flight in json.loads(out)["flights"])
+    assert (one["outcome"], one["payload_kg"]) == ("crashed", 0.25)
+    assert (other["outcome"], other["payload_kg"]) == ("lost", None)
+    assert err == "summary.json: is the summary of another flight; outcome and payload are told without it\n"
+
+
+@pytest.mark.parametrize("text", ["{", '{"loop": 3, "events": []}'])
+def test_a_damaged_summary_beside_the_log_costs_one_line_and_no_more(
+    flights: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    (flights / "flights/whole/summary.json").write_text(text)
+    capsys.readouterr()
+    assert main(["report", WHOLE, GAINS, "--json"]) == EXIT_OK
+    out, err = capsys.readouterr()
+    assert re.fullmatch(r"flights/whole/summary\.json: .*; outcome and payload are told without it\n", err)
+    assert (
+        json.loads(out)["flights"][0]["summary"]["loop"]["ticks"]
+        == json.loads(out)["flights"][1]["summary"]["loop"]["ticks"]
+    )
+
+
+def test_long_logs_are_thinned_and_it_says_so(
+    flights: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(flight_module, "TICKS_MAX", 500)
+    capsys.readouterr()
+    assert main(["report", WHOLE, WHOLE, "--json"]) == EXIT_OK
+    told = json.loads(capsys.readouterr().out)
+    stride = told["flights"][0]["summary"]["graded_every"]
+    assert stride > 1
+    assert any(f"A every {stride}th tick" in note for note in told["notes"])
+
+
+def test_flights_have_names_of_their_own() -> None:
+    def named(*paths: str) -> list[str]:
+        return names_of([Path(path) for path in paths])
+
+    assert named("flights/x/flight.mcap", "flights/y/flight.mcap") == ["x", "y"]
+    assert named("a.mcap", "b.mcap") == ["a", "b"]
+    assert named("p/x/flight.mcap", "q/x/flight.mcap") == ["p/x", "q/x"]
+    assert named("p/x.mcap", "q/x.mcap") == ["p/x", "q/x"]
+    assert named("x/flight.mcap", "x/flight.mcap") == ["x (1)", "x (2)"]

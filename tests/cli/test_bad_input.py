@@ -1,0 +1,247 @@
+"""Bad command lines and bad files: exit 2, one useful line per problem, nothing started, nothing left.
+
+Through the command's entry point, in this process; a few of each sort as a user's shell starts it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from companion.cli.main import main
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from tests.support import CATCH, ROOT, Ended, Sandbox, sandbox_in
+
+VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
+FLY = ("fly", "mission.yaml", "--sitl", "--out", "out")
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    """The catch and its vehicle as files that a test may spoil."""
+    with sandbox_in(tmp_path) as sandbox:
+        mission = CATCH.read_text(encoding="utf-8").replace("../vehicles/tarot650_2r.yaml", "vehicle.yaml")
+        (sandbox.cwd / "mission.yaml").write_text(mission, encoding="utf-8")
+        (sandbox.cwd / "vehicle.yaml").write_text(VEHICLE.read_text(encoding="utf-8"), encoding="utf-8")
+        yield sandbox
+
+
+def files_in(folder: Path) -> dict[str, bytes | None]:
+    return {str(path.relative_to(folder)): None if path.is_dir() else path.read_bytes() for path in folder.rglob("*")}
+
+
+Command = Callable[..., Ended]
+
+
+@pytest.fixture
+def companion(sandbox: Sandbox, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """The command in this process, at home in the sandbox; what it would start carries the sandbox's mark."""
+    monkeypatch.chdir(sandbox.cwd)
+    for name, value in sandbox.environment.items():
+        monkeypatch.setenv(name, value)
+
+    def run(*arguments: str) -> Ended:
+        capfd.readouterr()
+        try:
+            code = main(arguments)
+        except SystemExit as left:
+            code = left.code if isinstance(left.code, int) else -1
+        out, err = capfd.readouterr()
+        return Ended(code, out, err)
+
+    return run
+
+
+def assert_refused(sandbox: Sandbox, run: Command, arguments: tuple[str, ...], patterns: tuple[str, ...]) -> None:
+    """Exit 2 with exactly these lines; the sandbox holds the same files as before and no process."""
+    before = files_in(sandbox.cwd)
+    ended = run(*arguments)
+    sandbox.assert_nobody_left()
+    assert_lines(ended, patterns)
+    assert files_in(sandbox.cwd) == before
+
+
+def assert_lines(ended: Ended, patterns: tuple[str, ...]) -> None:
+    assert "Traceback" not in ended.err
+    assert len(ended.err_lines) == len(patterns), ended.err
+    for line, pattern in zip(ended.err_lines, patterns, strict=True):
+        assert re.search(pattern, line), (pattern, line)
+    assert ended.out == ""
+    assert ended.code == EXIT_BAD_INPUT
+
+
+COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "no command": ((), (r"^companion: .*COMMAND.*see companion --help",)),
+    "unknown command": (("flyy",), (r"^companion: .*'flyy'.*'fly'",)),
+    "no mission": (("fly",), (r"^companion fly: .*mission.*see companion fly --help",)),
+    "empty mission name": (("fly", ""), (r"^companion fly: MISSION: .*empty",)),
+    "empty vehicle name": ((*FLY, "--vehicle", ""), (r"^companion fly: --vehicle: .*empty",)),
+    "unknown option": ((*FLY, "--bogus"), (r"^companion fly: .*--bogus.*see companion fly --help",)),
+    "abbreviated option": ((*FLY, "--pres", "paper"), (r"^companion fly: .*--pres",)),
+    "two missions": ((*FLY, "other.yaml"), (r"^companion fly: .*other\.yaml",)),
+    "missing mission": (("fly", "nofile.yaml", "--sitl"), (r"^nofile\.yaml: no such file$",)),
+    "mission is a directory": (("fly", ".", "--sitl"), (r"^\.: is a directory, expected a YAML file",)),
+    "mission is binary": (("fly", "/bin/sh", "--sitl"), (r"^/bin/sh:1: not UTF-8",)),
+    "missing vehicle": ((*FLY, "--vehicle", "nofile.yaml"), (r"^nofile\.yaml: no such file$",)),
+    "unknown world": (("fly", "mission.yaml", "--sitl=moon"), (r"^companion fly: --sitl=moon: expected",)),
+    "bad preset": ((*FLY, "--preset", "papr"), (r"--preset papr: .*paper, recommended",)),
+    "bad controller": ((*FLY, "--controller", "pid"), (r"--controller pid: .*available: adaptive",)),
+    "option before the mission": (
+        ("fly", "--sitl", "mission.yaml", "--preset", "papr"),
+        (r"--preset papr: .*paper, recommended",),
+    ),
+    "set without a value": ((*FLY, "--set"), (r"^companion fly: argument --set: expected",)),
+    "set without =": ((*FLY, "--set", "world.seed"), (r"--set world\.seed: no '='; expected SECTION\.KEY=VALUE",)),
+    "set with nothing behind =": ((*FLY, "--set", "world.seed="), (r"--set world\.seed: no value",)),
+    "set of no section": ((*FLY, "--set", "wrld.seed=1"), (r"unknown section 'wrld'; did you mean world",)),
+    "set of no key": ((*FLY, "--set", "world.sed=1"), (r"--set world\.sed: unknown key; did you mean seed",)),
+    "set without the unit": ((*FLY, "--set", "world.payload=0.1"), (r"world\.payload: unknown key; write payload_kg",)),
+    "set to a text": ((*FLY, "--set", "world.payload_kg=0.1kg"), (r"expected a number.*write 0\.1; .*unit",)),
+    "set to nan": ((*FLY, "--set", "world.payload_kg=.nan"), (r"world\.payload_kg: .*\.nan",)),
+    "set to infinity": ((*FLY, "--set", "world.rotor_lag_s=.inf"), (r"world\.rotor_lag_s: .*\.inf",)),
+    "set to something negative": ((*FLY, "--set", "world.seed=-1"), (r"world\.seed: .*>= 0, got -1",)),
+    "set past the end of a list": (
+        (*FLY, "--set", "mission.phases[9].duration_s=1"),
+        (r"phases has no \[9\]; indices there: 0 to 6",),
+    ),
+    "two values behind one set, both wrong": (
+        (*FLY, "--set", "world.payload_kg=9", "world.seed=-1"),
+        (r"world\.payload_kg: .*from 0 to 2, got 9", r"world\.seed: .*got -1"),
+    ),
+    "two values behind --set=, both wrong": (
+        (*FLY, "--set=world.payload_kg=9", "world.seed=-1"),
+        (r"world\.payload_kg: .*from 0 to 2, got 9", r"world\.seed: .*got -1"),
+    ),
+    "waypoint outside of the room": (
+        (*FLY, "--set", "mission.phases[2].to_m=[2.0, 0, 1]"),
+        (
+            r"phase 'catch' flies too fast",
+            r"phase 'catch' could not stop within the tether sphere",
+            r"mission\.yaml:\d+:\d+: .*phase 'catch' leaves the room.*x = 2\.45 m.*inwards",
+        ),
+    ),
+    "empty out": (("fly", "mission.yaml", "--sitl", "--out", ""), (r"^companion fly: --out: .*folder",)),
+    "out is a file": (("fly", "mission.yaml", "--sitl", "--out", "vehicle.yaml"), (r"--out vehicle\.yaml: is a file",)),
+    "out is below a file": (
+        ("fly", "mission.yaml", "--sitl", "--out", "vehicle.yaml/a"),
+        (r"--out vehicle\.yaml/a: Not a directory; choose a folder",),
+    ),
+    # The one folder that neither root nor anybody else can write to.
+    "out cannot be written": (
+        ("fly", "mission.yaml", "--sitl", "--out", "/proc"),
+        (r"--out /proc: .*; choose a fold",),
+    ),
+    "replay of nothing": (("replay", "nofile.mcap"), (r"^nofile\.mcap: cannot be read: No such file",)),
+    "replay of no log": (("replay", "mission.yaml"), (r"^mission\.yaml: ",)),
+    "report of nothing": (("report", "nofile.mcap"), (r"^nofile\.mcap: cannot be read: No such file",)),
+    "schema of nothing": (("schema", "moon"), (r"^companion schema: .*'moon'.*'mission'",)),
+    "a world of a bad mission": (("sitl", "nofile.yaml"), (r"^nofile\.yaml: no such file$",)),
+}
+
+
+FROM_A_SHELL = (
+    "no command",
+    "unknown option",
+    "missing mission",
+    "bad preset",
+    "replay of no log",
+    "a world of a bad mission",
+)
+
+
+@pytest.mark.parametrize("case", [case for case in COMMAND_LINES if case != "a world of a bad mission"])
+def test_bad_command_line(sandbox: Sandbox, companion: Command, case: str) -> None:
+    assert_refused(sandbox, companion, *COMMAND_LINES[case])
+
+
+@pytest.mark.parametrize("case", FROM_A_SHELL)
+def test_bad_command_line_from_a_shell(sandbox: Sandbox, case: str) -> None:
+    assert_refused(sandbox, sandbox.run, *COMMAND_LINES[case])
+
+
+def replaced(old: str, new: str) -> Callable[[str], str]:
+    def edit(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return edit
+
+
+BAD_FILES: dict[str, tuple[str, Callable[[str], str], tuple[str, ...]]] = {
+    "unknown key": (
+        "mission.yaml",
+        replaced("yaw_deg: 0.0", "yaw_degg: 0.0"),
+        (r"^mission\.yaml:\d+:3: start\.yaw_degg: unknown key; did you mean yaw_deg\?",),
+    ),
+    "duplicate key": (
+        "mission.yaml",
+        replaced("  yaw_deg: 0.0", "  yaw_deg: 0.0\n  yaw_deg: 1.0"),
+        (r"^mission\.yaml:\d+:3: .*yaw_deg.*(twice|duplicate|already)",),
+    ),
+    "wrong unit": (
+        "mission.yaml",
+        replaced("speed_max_m_s: 0.8", "speed_max_km_h: 3"),
+        (r"^mission\.yaml:\d+:3: limits\.speed_max_km_h: unknown key; write speed_max_m_s, in m/s",),
+    ),
+    "wrong type": (
+        "mission.yaml",
+        replaced("to_m: [1.0, 0.0, 1.0]", "to_m: 1.0"),
+        (r"^mission\.yaml:\d+:\d+: phases\[2\]\.to_m: expected a list of 3 numbers, got 1\.0",),
+    ),
+    "not a number": (
+        "mission.yaml",
+        replaced("height_m: 1.0", "height_m: .nan"),
+        (r"^mission\.yaml:\d+:\d+: phases\[0\]\.height_m: .*\.nan",),
+    ),
+    "negative duration": (
+        "mission.yaml",
+        replaced("duration_s: 3.0", "duration_s: -3.0"),
+        (r"^mission\.yaml:\d+:\d+: phases\[0\]\.duration_s: expected a number > 0 and <= 600, got -3\.0",),
+    ),
+    "no YAML": ("mission.yaml", lambda text: "[" + text, (r"^mission\.yaml:\d+:\d+: ",)),
+    "empty": ("mission.yaml", lambda text: "", (r"^mission\.yaml: is empty",)),
+    "waypoint beyond the tether": (
+        "vehicle.yaml",
+        replaced("length_m: 3.0", "length_m: 2.0"),
+        (r"^mission\.yaml:\d+:\d+: .*leaves the tether sphere.*allowed; shorten the line or move the anchor",),
+    ),
+    "vehicle that cannot lift itself": (
+        "vehicle.yaml",
+        replaced("thrust_max_n: 60.0", "thrust_max_n: 20.0"),
+        (r"^vehicle\.yaml:\d+:\d+: airframe\.thrust_max_n: 20 N do not lift 3 kg",),
+    ),
+    "unknown key in the vehicle": (
+        "vehicle.yaml",
+        replaced("  baud: 3000000", "  baudrate: 3000000"),
+        (r"^vehicle\.yaml:\d+:\d+: devices\.arm\.baudrate: unknown key; did you mean baud\?",),
+    ),
+    "two problems, two lines": (
+        "mission.yaml",
+        lambda text: text.replace("height_m: 1.0", "height_m: tall", 1).replace("yaw_deg: 0.0", "yaw: 0.0", 1),
+        (r"start\.yaw: unknown key; write yaw_deg", r"phases\[0\]\.height_m: expected a number.*\"tall\""),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+@pytest.mark.parametrize("command", ["fly", "check"])
+def test_bad_file(sandbox: Sandbox, companion: Command, case: str, command: str) -> None:
+    name, edit, patterns = BAD_FILES[case]
+    path = sandbox.cwd / name
+    path.write_text(edit(path.read_text(encoding="utf-8")), encoding="utf-8")
+    assert_refused(sandbox, companion, FLY if command == "fly" else ("check", "mission.yaml", "--plan-only"), patterns)
+
+
+def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox, companion: Command) -> None:
+    (sandbox.cwd / "out").mkdir()
+    (sandbox.cwd / "out/flight.mcap").write_bytes(b"an earlier flight")
+    assert_refused(sandbox, companion, FLY, (r"--out out: there is a flight\.mcap already; choose another folder",))
+
+
+def test_the_good_files_that_the_bad_ones_are_made_of_pass(sandbox: Sandbox) -> None:
+    ended = sandbox.run("check", "mission.yaml", "--plan-only", "--set", "world.payload_kg=0.1", "world.seed=2")
+    assert (ended.code, ended.err) == (EXIT_OK, "")
+    assert "can be flown" in ended.out

@@ -1,0 +1,99 @@
+"""`companion hover fit` on the real log of a flight: flown in the fast loop, written by the recorder, read by the command."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.analysis.hover_fit import HoverFit, VoltageSlope
+from companion.analysis.log import FlightLog
+from companion.cli import main as cli
+from companion.cli.hover import jsonable, lines
+from companion.config.loader import load_flight
+from companion.config.yaml_strict import read_document
+from sitl.campaigns.flights import log_of
+from sitl.fast.loop import FastFlight
+from tests.analysis.recorded import record
+
+ERROR = 0.05
+"""Of the hover thrust that was flown with."""
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[FlightLog, float]:
+    """A flight, and the true hover thrust of its world."""
+    flight = FastFlight(load_flight("configs/missions/catch.yaml", overrides=(f"world.hover_thrust_error={ERROR}",)))
+    truth = flight.plant.world.hover_command
+    return log_of(flight.config, flight.run(), None), truth
+
+
+@pytest.fixture(scope="module")
+def recorded(flown: tuple[FlightLog, float], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(flown[0], tmp_path_factory.mktemp("hover") / "flight.mcap")
+
+
+def test_it_prints_the_truth_and_what_to_write_into_the_vehicle_file(
+    flown: tuple[FlightLog, float], recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["hover", "fit", str(recorded)]) == 0
+    out = capsys.readouterr().out
+    value = re.search(r"^hover thrust +(0\.\d{4}) ± (0\.\d{4}) \(standard error\), from (\d+\.\d) s", out)
+    assert value is not None, out
+    assert float(value[1]) == pytest.approx(flown[1], rel=0.005)
+    assert 0.0 < float(value[2]) < 0.002
+    assert float(value[3]) > 10.0
+    began = re.search(r"^flight began with 0\.\d{4}, \+(\d\.\d\d) % of the fitted one$", out, re.M)
+    assert began is not None, out
+    assert float(began[1]) == pytest.approx(100 * ERROR, abs=0.5)
+    assert "V or more are needed for a slope" in out
+    patch = tmp_path / "patch.yaml"
+    patch.write_text(out[out.index("#") :], encoding="utf-8")
+    assert patch.read_text(encoding="utf-8").startswith("# configs/vehicles/tarot650_2r.yaml\n")
+    assert read_document(patch).data == {"airframe": {"hover_thrust": float(value[1])}}
+
+
+def test_the_value_that_it_gives_is_one_that_flies(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As JSON; the patch is a value that the vehicle file takes."""
+    assert cli.main(["hover", "fit", str(recorded), "--json"]) == 0
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert set(told) == set(jsonable(HoverFit(0.5, 0.0, 2.0, None, None, None, None, None)))
+    value = told["patch"]["airframe"]["hover_thrust"]
+    config = load_flight("configs/missions/catch.yaml", overrides=(f"vehicle.airframe.hover_thrust={value}",))
+    assert config.vehicle.airframe.hover_thrust == value == round(told["hover_thrust"], 4)
+    assert told["configured_error"] == pytest.approx(ERROR, abs=0.005)
+    assert told["slope_per_v"] is None
+
+
+def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_line(
+    flown: tuple[FlightLog, float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = flown[0]
+    ground = sum(o.mission_t_s == 0.0 for o in log.outputs)
+    short = FlightLog(log.path, log.inputs[:ground], log.outputs[:ground], log.sent[:ground], log.metadata, True)
+    text = tmp_path / "notes.txt"
+    text.write_text("thirty characters and then some", encoding="utf-8")
+    for path, reason in (
+        (record(short, tmp_path / "short.mcap"), "0.0 s of calm flight, expected 2 s or more"),
+        (text, "no MCAP file"),
+        (tmp_path / "absent.mcap", "No such file"),
+    ):
+        assert cli.main(["hover", "fit", str(path)]) == 2
+        told = capsys.readouterr()
+        assert told.out == ""
+        assert told.err.startswith(f"{path}: ")
+        assert reason in told.err
+        assert told.err.count("\n") == 1
+
+
+def test_a_slope_is_told_with_the_voltage_that_the_value_holds_for() -> None:
+    fit = HoverFit(0.4912, 0.0003, 31.2, 0.5, 0.492, 15.62, 1.4, VoltageSlope(-0.021, 0.0008))
+    told = lines(fit, "my_vehicle.yaml")
+    assert told[0] == "hover thrust      0.4912 ± 0.0003 (standard error) at 15.62 V, from 31.2 s of calm flight"
+    assert told[1] == "flight began with 0.5000, +1.79 % of the fitted one"
+    assert told[3].endswith("15.62 V on average, changed by 1.40 V; slope -0.0210 ± 0.0008 per V")
+    assert told[-3:] == ["# my_vehicle.yaml", "airframe:", "  hover_thrust: 0.4912"]
+    assert jsonable(fit)["slope_per_v"] == -0.021

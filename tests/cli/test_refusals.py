@@ -1,0 +1,346 @@
+"""Devices that are not there or not as they must be, on the hardware path: `companion fly` without --sitl against a simulated
+world that runs on its own. Each time: exit 3, one clear line, never armed, nothing left, and everything free for the next attempt.
+
+Each device and each way to be wrong has a whole `fly`; of the rest the line is read where a flight opens its devices, in this process.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import struct
+import tty
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+from pymavlink import mavutil
+
+from companion.config.loader import load_flight
+from companion.io.devices import open_edges
+from companion.io.protocols import DeviceError
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
+from companion.runtime.clock import flight_clock
+from companion.runtime.event_loop import run
+from tests.support import CATCH, DEADLINE_S, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+
+SHARED = pytest.mark.xdist_group("the world that refuses")
+"""Tests that share one world run in one process."""
+QUICK = {"discovery_timeout_s": 1.0}
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    with sandbox_in(tmp_path_factory.mktemp("world")) as sandbox, World(sandbox) as world:
+        yield world
+
+
+@pytest.fixture
+def fresh_world(tmp_path: Path) -> Iterator[World]:
+    """A world for one test: once the servos have held the arm and let it go, it hangs, until somebody folds it by hand."""
+    with sandbox_in(tmp_path / "world") as sandbox, World(sandbox) as world:
+        yield world
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path) as sandbox:
+        yield sandbox
+
+
+def udp_port() -> socket.socket:
+    """A UDP port of 127.0.0.1 that is taken, and on which nobody speaks."""
+    taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    taken.bind(("127.0.0.1", 0))
+    return taken
+
+
+@contextmanager
+def silent_pty() -> Iterator[str]:
+    """A serial port whose other end never answers."""
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        yield os.ttyname(slave)
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+def refused(sandbox: Sandbox, world: World, *options: str, events: bool = False) -> Ended:
+    """Fly the catch with these options; asserts everything that all refusals have in common.
+
+    That the computer is too busy may be said beside each of them, and is left out here.
+    """
+    armings = world.armings
+    ended = sandbox.run("fly", CATCH, "--out", "out", *options)
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_REFUSED, ended
+    assert "Traceback" not in ended.err + ended.out
+    assert (sandbox.cwd / "out/flight.log").read_text(encoding="utf-8") == ""
+    assert (world.armings, world.crashes) == (armings, 0)
+    assert world.process.poll() is None
+    summary = read_summary(sandbox.cwd / "out")
+    assert summary["outcome"] == "refused"
+    assert bool([event for event in summary["events"] if event["id"] != "computer_busy"]) == events
+    lines = [line for line in ended.err.splitlines(keepends=True) if not line.startswith("this computer is too busy")]
+    return replace(ended, err="".join(lines))
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """One thing that is wrong, and the line that says so."""
+
+    line: str
+    but: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    """Device settings."""
+    also: Mapping[str, object] = field(default_factory=dict)
+    """Other settings."""
+
+
+WRONG = {
+    "malformed autopilot address": Wrong(
+        r"^autopilot here:14540: expected an address like udpin://.*; correct devices\.autopilot\.address$",
+        {"autopilot": {"address": "here:14540"}},
+    ),
+    "autopilot on a serial port that is not there": Wrong(
+        r"^autopilot serial:///dev/ttyNONE:921600: expected the serial port /dev/ttyNONE, found No such file.*; plug",
+        {"autopilot": {"address": "serial:///dev/ttyNONE:921600"}},
+    ),
+    "servo id that does not exist": Wrong(
+        r"^arm bus /dev/pts/\d+: servo 7 \(joint 2\): does not answer at 3000000 baud; ids that answer: 1, 2; check",
+        also={"vehicle.arm.joints[1].servo_id": 7},
+    ),
+    "arm port that is not there": Wrong(
+        r"^arm bus /dev/ttyNONE: no such port; .*; correct devices\.arm\.port or plug",
+        {"arm": {"port": "/dev/ttyNONE"}},
+    ),
+    "arm port that is a file": Wrong(
+        r"^arm bus /etc/hostname: is not a usable serial port", {"arm": {"port": "/etc/hostname"}}
+    ),
+    "arm baud rate": Wrong(
+        r"^arm bus /dev/pts/\d+: servo 1 \(joint 1\): does not answer at 57600 baud; .*; check .*baud rate",
+        {"arm": {"baud": 57600}},
+    ),
+    "mocap body never seen": Wrong(
+        r"^mocap 127\.0\.0\.1:\d+: rigid body id 7 was never seen within .*streams: 1 \"tarot650-2r\"; set devices\.mocap",
+        {"mocap": {"rigid_body_id": 7}},
+    ),
+    "mocap version": Wrong(
+        r"^mocap 127\.0\.0\.1:\d+: .* speaks NatNet 4\.1, expected 3\.0; set .*devices\.mocap\.natnet_version$",
+        {"mocap": {"natnet_version": "3.0"}},
+    ),
+    "mocap interface of another machine": Wrong(
+        r"^mocap 127\.0\.0\.1:\d+: cannot open UDP 192\.0\.2\.1:0: .*; set devices\.mocap\.interface",
+        {"mocap": {"interface": "192.0.2.1"}},
+    ),
+    "force port that is not there": Wrong(
+        r"^force sensor /dev/ttyNONE: no such port; .*; plug the sensor in or set devices\.force\.port$",
+        {"force": {"port": "/dev/ttyNONE"}},
+    ),
+}
+
+
+AT_EACH_DEVICE = ("arm baud rate", "mocap body never seen", "force port that is not there")
+FLOWN = ("malformed autopilot address", *AT_EACH_DEVICE)
+
+
+@SHARED
+@pytest.mark.waits
+@pytest.mark.parametrize("case", FLOWN)
+def test_refuses(sandbox: Sandbox, world: World, case: str) -> None:
+    wrong = WRONG[case]
+    ended = refused(sandbox, world, *world.addresses(**wrong.but), *set_options(**wrong.also))
+    assert_one_line(ended, wrong.line)
+
+
+def refused_at_opening(world: World, *options: str) -> str:
+    """The line of the device at which a flight with these options ends. Nothing is armed, and no port stays open."""
+    config = load_flight(CATCH, overrides=[word for word in options if word != "--set"], hardware=True)
+
+    async def opening() -> None:
+        async with open_edges(config, flight_clock()):
+            pass
+
+    with pytest.raises(DeviceError) as caught:
+        run(opening())
+    assert (world.armings, world.crashes) == (0, 0)
+    with (
+        serial.Serial(world.devices["arm"]["port"], exclusive=True),
+        serial.Serial(world.devices["force"]["port"], exclusive=True),
+    ):
+        return str(caught.value)
+
+
+@SHARED
+@pytest.mark.waits
+@pytest.mark.parametrize("case", sorted(WRONG.keys() - set(FLOWN)))
+def test_names(world: World, case: str) -> None:
+    wrong = WRONG[case]
+    line = refused_at_opening(world, *world.addresses(**wrong.but), *set_options(**wrong.also))
+    assert re.search(wrong.line, line), (wrong.line, line)
+
+
+@pytest.mark.flight
+def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: World) -> None:
+    """The arm and the vehicle both stand elsewhere: one line for each, and no other."""
+    start = {"mission.start.arm_deg": [150.0, 140.0], "mission.start.position_m": [-0.5, 0.0]}
+    ended = refused(sandbox, fresh_world, *fresh_world.addresses(), *set_options(**start))
+    assert len(ended.err_lines) == 2, ended.err
+    for pattern in (
+        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) deg within 10 deg; move it there by hand",
+        r"^start place in motion capture's axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m .*; carry it there",
+    ):
+        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
+
+
+def assert_one_line(ended: Ended, pattern: str) -> None:
+    assert len(ended.err_lines) == 1, ended.err
+    assert re.search(pattern, ended.err_lines[0]), (pattern, ended.err)
+
+
+@SHARED
+@pytest.mark.waits
+def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, world: World) -> None:
+    with closing(udp_port()) as nobody:
+        autopilot = {"address": f"udpout://127.0.0.1:{nobody.getsockname()[1]}", **QUICK}
+        ended = refused(sandbox, world, *world.addresses(autopilot=autopilot))
+    assert_one_line(
+        ended, r"^autopilot udpout://.*: expected a PX4 heartbeat within 1 s, found none; power the autopilot"
+    )
+
+
+@SHARED
+@pytest.mark.waits
+def test_names_a_busy_udp_port(world: World) -> None:
+    with closing(udp_port()) as busy:
+        port = busy.getsockname()[1]
+        autopilot = {"address": f"udpin://127.0.0.1:{port}", **QUICK}
+        line = refused_at_opening(world, *world.addresses(autopilot=autopilot))
+    assert re.search(
+        rf"^autopilot udpin://.*: expected port {port} to be free, found another program on it; stop", line
+    )
+
+
+@SHARED
+@pytest.mark.waits
+def test_refuses_an_arm_port_that_another_program_holds(sandbox: Sandbox, world: World) -> None:
+    with serial.Serial(world.devices["arm"]["port"], 3000000, exclusive=True):
+        ended = refused(sandbox, world, *world.addresses())
+    assert_one_line(ended, r"^arm bus /dev/pts/\d+: port is busy; another program .*: close that one$")
+
+
+@SHARED
+@pytest.mark.waits
+def test_refuses_a_force_port_that_another_program_holds(sandbox: Sandbox, world: World) -> None:
+    with serial.Serial(world.devices["force"]["port"], 115200, exclusive=True):
+        ended = refused(sandbox, world, *world.addresses())
+    assert_one_line(ended, r"^force sensor /dev/pts/\d+: in use by another program; close it")
+
+
+@SHARED
+@pytest.mark.waits
+def test_names_an_arm_bus_without_any_servo(world: World) -> None:
+    with silent_pty() as port:
+        line = refused_at_opening(world, *world.addresses(arm={"port": port}))
+    assert re.search(
+        rf"^arm bus {port}: servo 1 \(joint 1\): does not answer .*; no servo answers at all; check its", line
+    )
+
+
+@SHARED
+@pytest.mark.waits
+def test_names_a_silent_force_sensor(world: World) -> None:
+    with silent_pty() as port:
+        line = refused_at_opening(world, *world.addresses(force={"port": port}))
+    assert re.search(
+        rf"^force sensor {port}: no answer .* nothing was received; check the sensor's power and cable$", line
+    )
+
+
+@SHARED
+@pytest.mark.waits
+def test_names_a_silent_mocap_server(world: World) -> None:
+    with closing(udp_port()) as silent:
+        port = silent.getsockname()[1]
+        line = refused_at_opening(world, *world.addresses(mocap={"command_port": port}))
+    assert re.search(
+        rf"^mocap 127\.0\.0\.1:{port}: no answer to the NatNet connect request within .*; is Motive running", line
+    )
+
+
+@contextmanager
+def px4_param(world: World, name: str, value: float) -> Iterator[None]:
+    """One parameter of the world's PX4 changed over MAVLink, and set back afterwards."""
+    before = exchange_param(world, name, lambda mav: mav.param_request_read_send(1, 1, name.encode(), -1))
+    kind = before.param_type
+    set_param(world, name, value if kind == mavutil.mavlink.MAV_PARAM_TYPE_REAL32 else as_float_bits(int(value)), kind)
+    try:
+        yield
+    finally:
+        set_param(world, name, before.param_value, kind)
+
+
+def set_param(world: World, name: str, wire_value: float, kind: int) -> None:
+    answer = exchange_param(world, name, lambda mav: mav.param_set_send(1, 1, name.encode(), wire_value, kind))
+    assert answer.param_value == pytest.approx(wire_value)
+
+
+def exchange_param(world: World, name: str, ask: Callable[[Any], None]) -> Any:
+    """One question about a parameter, and the PARAM_VALUE that answers it."""
+    address = world.devices["autopilot"]["address"].removeprefix("udpout://")
+    with closing(mavutil.mavlink_connection(f"udpout:{address}", source_system=255)) as ground:
+        ask(ground.mav)
+        while True:
+            answer = ground.recv_match(type="PARAM_VALUE", blocking=True, timeout=DEADLINE_S)
+            assert answer is not None, f"no answer about {name}"
+            if answer.param_id == name:
+                return answer
+
+
+def as_float_bits(value: int) -> float:
+    """PX4 carries an INT32 in the bytes of the message's float."""
+    return float(struct.unpack("<f", struct.pack("<i", value))[0])
+
+
+@pytest.mark.waits
+def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world: World) -> None:
+    with px4_param(fresh_world, "EKF2_EV_CTRL", 0):
+        ended = refused(sandbox, fresh_world, *fresh_world.addresses())
+    for pattern in (
+        r"^EKF2_EV_CTRL: 0, wanted 11 or 15; set EKF2_EV_CTRL to 11 \(companion px4 params --write\)$",
+        r"^EKF2 fuses motion capture: the estimator says that it has no good .*, wanted fused for 2 s; check EKF2_EV_CTRL = 11",
+    ):
+        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
+
+
+@pytest.mark.flight
+def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox, tmp_path: Path) -> None:
+    refuses = ("world.faults=[{kind: arming_refused, phase: ground}]",)
+    with sandbox_in(tmp_path / "world") as around, World(around, CATCH, refuses) as world:
+        ended = refused(sandbox, world, *world.addresses(), events=True)
+    assert_one_line(ended, r"^PX4 did not arm; PX4 said: ARM refused: temporarily rejected")
+
+
+@SHARED
+@pytest.mark.flight
+def test_after_refusals_the_same_world_flies_though_its_terminal_goes_away(
+    sandbox: Sandbox, world: World, tmp_path: Path
+) -> None:
+    for case in AT_EACH_DEVICE:
+        with sandbox_in(tmp_path / case) as its:
+            assert_one_line(refused(its, world, *world.addresses(**WRONG[case].but)), WRONG[case].line)
+    with sandbox.start("fly", HOVER, "--out", "out", *world.addresses()) as running:
+        running.wait_for("  wait\n")
+        running.close_output()
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_OK, ""), ended
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "completed"
+    world.wait_for(lambda message: message["type"] == "at_rest" and not message["at_rest"])
+    assert (world.armings, world.crashes) == (1, 0)

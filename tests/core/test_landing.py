@@ -1,0 +1,211 @@
+"""Touch-down with one source spoiled: no rotor stops in the air, none turns on the floor for ever."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.model.types import (
+    AutopilotRequest,
+    FlightMode,
+    Inputs,
+    LandedState,
+    MocapPose,
+    Outcome,
+    PhaseKind,
+    SafetyAction,
+    Vec3,
+    VehicleState,
+)
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.fast.loop import FastFlight, FastResult
+from tests.safety.healthy import put
+from tests.support import CATCH, SHORT_CATCH
+
+replace = dataclasses.replace
+Change = Callable[[Inputs], Inputs]
+STANDS_M = load_flight("configs/missions/catch.yaml").vehicle.airframe.ground_clearance_m
+
+
+def configured(mission: Path) -> FlightConfig:
+    return load_flight(mission, preset="recommended")
+
+
+class Spoiled(FastFlight):
+    """Motion capture that has the floor elsewhere, and what else the companion is told wrong."""
+
+    def __init__(self, config: FlightConfig, change: Change, lift_m: float) -> None:
+        super().__init__(config)
+        self._change, self._lift_m = change, lift_m
+
+    def _pose(self, frame: object) -> MocapPose:
+        """The error comes in slowly, as a shifting volume would bring it; PX4 is told the same."""
+        pose = super()._pose(frame)  # type: ignore[arg-type]
+        share = min(1.0, max(0.0, (pose.stamp_s - 11.0) / 8.0))
+        x, y, z = pose.position_world_m
+        return replace(pose, position_world_m=(x, y, z + self._lift_m * share))
+
+    def _inputs(self, tick: int) -> Inputs:
+        return self._change(super()._inputs(tick))
+
+
+class Deaf:
+    """A land detector that never finds anything."""
+
+    landed = maybe_landed = ground_contact = False
+
+    def __init__(self, px4: Px4Stub) -> None:
+        self._real = px4.land
+
+    def update(self, *arguments: object, **named: object) -> None:
+        if not arguments[1]:  # disarmed
+            self.landed = self.maybe_landed = self.ground_contact = True
+        else:
+            self.landed = self.maybe_landed = self.ground_contact = False
+
+
+def flown(change: Change = lambda i: i, lift_m: float = 0.0, *, deaf: bool = False) -> tuple[FastFlight, FastResult]:
+    # The error of the height takes 8 s to come.
+    flight = Spoiled(configured(CATCH if lift_m else SHORT_CATCH), change, lift_m)
+    if deaf:
+        flight.px4.land = Deaf(flight.px4)  # type: ignore[assignment]
+    return flight, flight.run()
+
+
+@cache
+def ordinary() -> tuple[FastFlight, FastResult]:
+    """A flight in which nothing is wrong."""
+    return flown()
+
+
+def ids(result: FastResult) -> list[str]:
+    return [event.id for o in result.outputs for event in o.events]
+
+
+def rotors_stopped_at_m(result: FastResult) -> float:
+    """How high the machine truly was when the thrust was first taken away in the landing."""
+    first = next(
+        o for o in result.outputs if o.phase_kind is PhaseKind.LANDING and o.attitude and o.attitude.thrust < 0.02
+    )
+    return next(truth.position_world_m[2] for truth in result.truth if truth.t_s >= first.t_s)
+
+
+def assert_landed(flight: FastFlight, result: FastResult, outcome: Outcome) -> None:
+    assert result.outputs[-1].outcome is outcome, ids(result)
+    assert not result.crashed
+    assert not flight.px4.armed, "the rotors turn on the floor"
+    assert result.truth[-1].position_world_m[2] < STANDS_M + 0.02
+
+
+def test_with_all_sources_it_touches_down() -> None:
+    flight, result = ordinary()
+    assert_landed(flight, result, Outcome.COMPLETED)
+    assert rotors_stopped_at_m(result) < STANDS_M + 0.02
+
+
+@pytest.mark.parametrize("lift_m", [0.1, 0.2, 0.3])
+def test_a_floor_that_reads_too_high_is_found_by_thrust_and_px4(lift_m: float) -> None:
+    flight, result = flown(lift_m=lift_m)
+    assert_landed(flight, result, Outcome.COMPLETED)
+    touchdown = next(event for o in result.outputs for event in o.events if event.id == "touchdown")
+    assert touchdown.t_s < result.outputs[-1].t_s < touchdown.t_s + 5.0
+    assert rotors_stopped_at_m(result) < STANDS_M + 0.02
+
+
+@pytest.mark.parametrize("lift_m", [-0.1, -0.2])
+def test_a_floor_that_reads_too_low_stops_no_rotor_in_the_air(lift_m: float) -> None:
+    flight, result = flown(lift_m=lift_m)
+    assert result.outputs[-1].outcome in (Outcome.COMPLETED, Outcome.ABORTED)
+    assert_landed(flight, result, result.outputs[-1].outcome)
+    assert rotors_stopped_at_m(result) < STANDS_M + 0.03
+
+
+def test_a_land_detector_that_never_fires_is_overruled_on_the_floor() -> None:
+    flight, result = flown(deaf=True)
+    assert_landed(flight, result, Outcome.COMPLETED)
+    forced = [o.t_s for o in result.outputs if o.request is AutopilotRequest.FORCE_DISARM]
+    zero = next(o.t_s for o in result.outputs if o.phase == "disarm")
+    assert forced and forced[0] - zero > 3.9
+
+
+def test_a_land_detector_that_always_fires_stops_no_rotor_in_the_air() -> None:
+    def change(i: Inputs) -> Inputs:
+        return put("status", landed=LandedState.ON_GROUND)(i) if i.t_s > 5.0 else i
+
+    flight, result = flown(change)
+    assert_landed(flight, result, Outcome.COMPLETED)
+    assert rotors_stopped_at_m(result) < STANDS_M + 0.02
+
+
+def test_in_px4s_own_landing_its_detector_may_be_deaf() -> None:
+    """Motion capture lags behind what PX4 says of itself: the ladder lets PX4 land, which never finds the floor."""
+    flight, result = flown(
+        lambda i: put("vehicle", attitude_wxyz=(0.8, 0.6, 0.0, 0.0))(i) if 6.5 < i.t_s < 6.65 else i, deaf=True
+    )
+    assert "tilt" in ids(result)
+    assert_landed(flight, result, Outcome.ABORTED)
+    assert AutopilotRequest.FORCE_DISARM in {o.request for o in result.outputs}
+
+
+def test_estimate_frozen_just_above_the_floor_is_no_touchdown() -> None:
+    """Low and still by PX4's estimate, and the law presses; motion capture sees the vehicle sink on."""
+
+    def change(i: Inputs) -> Inputs:
+        vehicle = i.vehicle
+        if vehicle is None or vehicle.position_world_m[2] > STANDS_M + 0.11 or i.t_s < 7.0:
+            return i
+        held: Vec3 = (*vehicle.position_world_m[:2], STANDS_M + 0.1)
+        return replace(i, vehicle=replace(vehicle, position_world_m=held, velocity_world_m_s=(0.0, 0.0, 0.001)))
+
+    flight, result = flown(change)
+    assert rotors_stopped_at_m(result) < STANDS_M + 0.02
+    assert not flight.px4.armed and not result.crashed
+
+
+def test_nobody_takes_thrust_back_from_what_sinks() -> None:
+    """The detector alone: height stands by itself, thrust is taken back, the poses sink, all of it is given again."""
+    from companion.safety.touchdown import Touchdown
+
+    detector, z, reliefs = Touchdown(0.3), 0.5, []
+    vehicle = ordinary()[1].inputs[1000].vehicle
+    assert isinstance(vehicle, VehicleState)
+    frozen = replace(vehicle, position_world_m=(0.0, 0.0, 0.4), velocity_world_m_s=(0.0, 0.0, 0.0))
+    sink_m_s = 0.0
+    for k in range(600):
+        t_s = 1.0 + 0.005 * k
+        sink_m_s = max(0.0, sink_m_s + 0.005 * 9.81 * (1.0 - detector.relief) - 0.01 * (detector.relief == 1.0))
+        z -= 0.005 * sink_m_s
+        pose = MocapPose(t_s, None, k, (0.0, 0.0, z), (1.0, 0.0, 0.0, 0.0), True, 0.0)
+        assert not detector.update(t_s, frozen, pose, 0.2, 0.9, landed=False)
+        reliefs.append(detector.relief)
+    assert 0.6 < min(reliefs) < 1.0
+
+
+def test_hanging_on_the_tether_is_no_touchdown() -> None:
+    """Thrust next to nothing, nothing sinks, PX4's detector agrees: and it is a metre up."""
+    from companion.safety.touchdown import Touchdown
+
+    detector = Touchdown(0.3)
+    vehicle = ordinary()[1].inputs[1000].vehicle
+    assert isinstance(vehicle, VehicleState)
+    hangs = replace(vehicle, position_world_m=(0.0, 0.0, 1.2), velocity_world_m_s=(0.0, 0.0, 0.0))
+    for k in range(1000):
+        t_s = 1.0 + 0.005 * k
+        pose = MocapPose(t_s, None, k, (0.0, 0.0, 1.2), (1.0, 0.0, 0.0, 0.0), True, 0.0)
+        assert not detector.update(t_s, hangs, pose, 0.0, 0.1, landed=True)
+        assert detector.relief == 1.0
+
+
+def test_a_touchdown_in_order_is_told_before_px4_would_say_so() -> None:
+    _, result = ordinary()
+    inputs, outputs = result.inputs, result.outputs
+    told = next(o for o in outputs if any(event.id == "touchdown" for event in o.events))
+    assert inputs[told.tick].status is not None
+    assert inputs[told.tick].status.landed is not LandedState.ON_GROUND  # type: ignore[union-attr]
+    assert inputs[told.tick].status.mode is FlightMode.OFFBOARD  # type: ignore[union-attr]
+    assert outputs[-1].action is SafetyAction.NOMINAL

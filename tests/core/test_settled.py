@@ -1,0 +1,101 @@
+"""No take-off on an estimate that wanders, and none without a stream of setpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import pytest
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.core.flight_core import FlightCore
+from companion.model import flight_stage as seq
+from companion.model.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.types import AutopilotRequest, FlightMode, Inputs, Outcome, Outputs
+from sitl.fast.loop import FastFlight
+from tests.safety.healthy import put
+
+replace = dataclasses.replace
+Change = Callable[[Inputs], Inputs]
+
+
+def configured(*overrides: str) -> FlightConfig:
+    return load_flight("configs/missions/hover.yaml", overrides=overrides)
+
+
+class Changed(FastFlight):
+    def __init__(self, change: Change) -> None:
+        super().__init__(configured())
+        self._change = change
+
+    def _inputs(self, tick: int) -> Inputs:
+        return self._change(super()._inputs(tick))
+
+
+def off_by(x_m: float, yaw_deg: float, *, until_s: float = math.inf, swing_s: float | None = None) -> Change:
+    """PX4's estimate is this far from motion capture, steadily or swinging to and fro."""
+
+    def change(i: Inputs) -> Inputs:
+        if i.vehicle is None or i.t_s >= until_s:
+            return i
+        share = 1.0 if swing_s is None else math.sin(2.0 * math.pi * i.t_s / swing_s)
+        x, y, z = i.vehicle.position_world_m
+        turn = quat_from_euler_zyx(0.0, 0.0, math.radians(share * yaw_deg))
+        attitude = quat_multiply(turn, i.vehicle.attitude_wxyz)
+        return put("vehicle", position_world_m=(x + share * x_m, y, z), attitude_wxyz=attitude)(i)
+
+    return change
+
+
+def events(outputs: list[Outputs]) -> list[tuple[str, str]]:
+    return [(event.id, event.text) for o in outputs for event in o.events]
+
+
+@pytest.mark.parametrize(
+    ("change", "wanders"),
+    [
+        (off_by(0.07, 0.0), "its position is 7"),
+        (off_by(0.05, 0.0, swing_s=0.7), "wanders by 3"),
+        (off_by(0.0, 6.5), "its yaw is 6."),
+        (off_by(0.0, 5.0, swing_s=0.6), "wanders by 3."),
+    ],
+    ids=["off", "swings", "turned", "swings in yaw"],
+)
+def test_an_estimate_that_has_not_settled_is_refused_and_named(change: Change, wanders: str) -> None:
+    result = Changed(change).run(limit_s=20.0)
+    assert result.outputs[-1].outcome is Outcome.REFUSED
+    [(id_, text)] = events(result.outputs)
+    assert id_ == "estimate_unsteady"
+    assert wanders in text
+    assert {o.request for o in result.outputs} <= {AutopilotRequest.NONE, AutopilotRequest.DISARM}
+    assert result.outputs[-1].t_s == pytest.approx(seq.WAIT_TIMEOUT_S, abs=0.5)
+
+
+def test_it_takes_off_a_second_after_the_estimate_has_settled() -> None:
+    result = Changed(off_by(0.06, 0.0, until_s=3.0)).run(limit_s=30.0)
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    asked_s = next(o.t_s for o in result.outputs if o.request is AutopilotRequest.OFFBOARD)
+    # The mean of a second is near long before the spread has become small.
+    assert 3.0 + 0.85 * seq.TARE_S < asked_s - seq.STREAM_BEFORE_OFFBOARD_S < 3.0 + 1.1 * seq.TARE_S
+
+
+def test_an_ordinary_start_waits_for_no_more_than_the_tare() -> None:
+    outputs = FastFlight(configured()).run(limit_s=3.0).outputs
+    waited_s = next(o.t_s for o in outputs if o.phase != "wait") - outputs[0].t_s
+    assert waited_s == pytest.approx(seq.TARE_S, abs=0.02)
+
+
+def test_a_px4_that_is_in_offboard_already_is_given_a_stream_before_it_is_armed() -> None:
+    """So it is after a landing: it would refuse to arm on no setpoints."""
+    flight = FastFlight(configured())
+    inputs = flight.run(limit_s=4.0).inputs
+    core, armed_s, streamed_s = FlightCore(flight.config), None, None
+    for i in inputs:
+        o = core.step(put("status", mode=FlightMode.OFFBOARD, armed=False)(i))
+        if o.attitude is not None and streamed_s is None:
+            streamed_s = o.t_s
+        if o.request is AutopilotRequest.ARM and armed_s is None:
+            armed_s = o.t_s
+    assert streamed_s is not None and armed_s is not None
+    assert armed_s - streamed_s > 0.9 * seq.STREAM_BEFORE_OFFBOARD_S

@@ -1,0 +1,177 @@
+"""The site builds without a warning and loads nothing from a network; reference, safety case and troubleshooting match the code."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from companion.config.schema import KINDS
+from companion.model.types import SafetyAction
+from companion.safety.rules import RULES, Rule
+from tests.support import DEADLINE_S
+from tools.docs.reference import main, page, unit
+
+ROOT = Path(__file__).parents[2]
+CASE, TROUBLE = ROOT / "docs/safety-case.md", ROOT / "docs/troubleshooting.md"
+LANDS = {SafetyAction.LAND, SafetyAction.AUTOPILOT_LAND, SafetyAction.TERMINATE}
+
+
+def text_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def lands(rule: Rule) -> bool:
+    return bool(LANDS & {rule.ground, rule.air})
+
+
+def rows() -> list[list[str]]:
+    """Cells of every row of the safety case's tables of hazards."""
+    found = []
+    header = "| hazard | how it begins | monitor | action | test | what remains |"
+    for table in text_of(CASE).split(header)[1:]:
+        for line in table.strip().splitlines()[1:]:
+            if not line.startswith("|"):
+                break
+            found.append([cell.strip() for cell in line.strip()[1:-1].split("|")])
+    return found
+
+
+@cache
+def functions_of(file: str) -> frozenset[str]:
+    return frozenset(
+        node.name
+        for node in ast.walk(ast.parse(text_of(ROOT / file)))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    )
+
+
+# -- the site ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+    return out
+
+
+def test_every_page_of_docs_is_in_it(site: Path) -> None:
+    for source in (ROOT / "docs").rglob("*.md"):
+        assert (site / source.relative_to(ROOT / "docs").with_suffix(".html")).is_file(), source.name
+
+
+def test_it_loads_nothing_from_a_network(site: Path) -> None:
+    loads = r"""<(?:script|img|iframe|source)[^>]*\ssrc=["']?(?:https?:)?//|<link[^>]*\shref=["']?(?:https?:)?//"""
+    for file in site.rglob("*.html"):
+        assert re.search(loads, text_of(file)) is None, file.name
+    for file in site.rglob("*.css"):
+        assert re.search(r"(?:url\(|@import)\s*[\"']?(?:https?:)?//", text_of(file)) is None, file.name
+    assert (site / "search/search_index.json").is_file()
+
+
+def test_links_within_it_lead_somewhere(site: Path) -> None:
+    ids = {file: set(re.findall(r'\bid="([^"]+)"', text_of(file))) for file in site.rglob("*.html")}
+    wrong = []
+    for file in ids:
+        for target in re.findall(r'<(?:a|img)[^>]*\s(?:href|src)="([^"]+)"', text_of(file)):
+            name, _, anchor = target.partition("#")
+            if re.match(r"\w+:", target) or file.name in ("404.html", "search.html"):
+                continue
+            led = (file.parent / name).resolve() if name else file
+            if not led.exists() or (anchor and led in ids and anchor not in ids[led]):
+                wrong.append(f"{file.name}: {target}")
+    assert wrong == []
+
+
+# -- the reference -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_reference_is_what_the_models_say(kind: str) -> None:
+    """Made by `python -m tools.docs.reference docs/reference`."""
+    assert text_of(ROOT / f"docs/reference/{kind}.md") == page(kind)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_key_of_every_section_is_in_it(kind: str) -> None:
+    schema = KINDS[kind].json_schema()
+    told = set(re.findall(r"^\| `(\w+)` \|", page(kind), flags=re.M))
+    models = [schema, *schema.get("$defs", {}).values()]
+    assert told == {key for model in models for key in model.get("properties", {})}
+
+
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    [
+        ("mass_kg", "kg"),
+        ("inertia_kg_m2", "kg m^2"),
+        ("jerk_max_m_s3", "m/s^3"),
+        ("torque_per_amp_nm_a", "N m/A"),
+        ("thrust_slew_max_per_s", "1/s"),
+        ("zero_count", "counts"),
+        ("row_weights_s", ""),
+        ("phases", ""),
+        ("s", ""),
+    ],
+)
+def test_units_are_told_by_the_name(key: str, expected: str) -> None:
+    assert unit(key) == expected
+
+
+def test_a_folder_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "gone")]) == 2
+    assert main([]) == 2
+    assert [line.count("\n") for line in capsys.readouterr().err.splitlines()] == [0, 0]
+
+
+# -- the safety case ---------------------------------------------------------------------------------------------------
+
+
+def test_every_rule_that_it_names_exists_and_every_rule_that_lands_is_in_it() -> None:
+    # In a cell of the monitors: an id, a command's name, or an event that no rule brings about.
+    named = {name for row in rows() for name in re.findall(r"`(\w+)`", row[2])}
+    known = {rule.id for rule in RULES}
+    assert named - known == {"guardian_took_over", "disarm_refused"}
+    assert {rule.id for rule in RULES if lands(rule)} <= named
+
+
+def test_every_test_that_it_names_exists() -> None:
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text_of(CASE))
+    assert [f"{file}::{name}" for file, name in named if name not in functions_of(file)] == []
+
+
+def test_every_hazard_has_all_that_belongs_to_it() -> None:
+    assert len(rows()) > 30
+    for row in rows():
+        assert len(row) == 6, row[0]
+        assert all(row[:5]), row[0]
+        assert "::test_" in row[4], row[0]
+
+
+# -- troubleshooting ---------------------------------------------------------------------------------------------------
+
+
+def test_whatever_lands_is_among_the_symptoms() -> None:
+    told = set(re.findall(r"`(\w+)`", text_of(TROUBLE)))
+    assert {rule.id for rule in RULES if lands(rule)} <= told
+
+
+def test_every_event_of_the_sequence_that_ends_a_flight_is_among_the_symptoms() -> None:
+    safety = text_of(ROOT / "docs/safety.md")
+    table = safety.partition("| id | when |")[2].partition("\n## ")[0]
+    ends = set(re.findall(r"^\| `(\w+)` \|.*(?:refused|lands)", table, flags=re.M))
+    assert {"arming_refused", "no_touchdown"} <= ends <= set(re.findall(r"`(\w+)`", text_of(TROUBLE)))
+
+
+def test_every_row_of_the_preflight_is_among_the_symptoms() -> None:
+    listed = set(re.findall(r"^\| `(\w+\.\w+)` \|", text_of(ROOT / "docs/preflight.md"), flags=re.M))
+    assert len(listed) > 50
+    assert listed <= set(re.findall(r"`(\w+\.\w+)`", text_of(TROUBLE)))

@@ -1,0 +1,367 @@
+"""What a command does and what is said of it, flown: hold, resume, land, abort and start in every stage. Fast closed loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+
+import pytest
+
+from companion.config.loader import load_flight
+from companion.core.flight_core import FlightCore
+from companion.flight.command_effect import Effect, effect_of
+from companion.model.codec import differences
+from companion.model.types import (
+    FlightMode,
+    Inputs,
+    OperatorCommand,
+    Outcome,
+    Outputs,
+    SafetyAction,
+)
+from sitl.fast.loop import FastFlight
+from tests.flights.test_ladder_flights import TAUT
+from tests.safety.healthy import put
+
+HOLD, RESUME, LAND, ABORT, START = (
+    OperatorCommand.HOLD,
+    OperatorCommand.RESUME,
+    OperatorCommand.LAND,
+    OperatorCommand.ABORT,
+    OperatorCommand.START,
+)
+Change = Callable[[Inputs], Inputs]
+Script = Sequence[tuple[float, OperatorCommand]]
+
+
+@dataclass
+class Commanded:
+    """A flight with commands of one tick each, and what was said of them."""
+
+    inputs: list[Inputs]
+    outputs: list[Outputs]
+    flight: FastFlight
+    effects: list[Effect] = field(default_factory=list)
+
+    @property
+    def ids(self) -> list[str]:
+        return [event.id for o in self.outputs for event in o.events]
+
+    @property
+    def outcome(self) -> Outcome | None:
+        return self.outputs[-1].outcome
+
+    def at(self, t_s: float) -> Outputs:
+        return next(o for o in self.outputs if o.t_s >= t_s)
+
+
+class _Asking(FastFlight):
+    def __init__(self, script: Script, change: Change, *overrides: str) -> None:
+        super().__init__(load_flight("configs/missions/hover.yaml", overrides=overrides))
+        self._script = list(script)
+        self._change = change
+
+    def _inputs(self, tick: int) -> Inputs:
+        i = self._change(super()._inputs(tick))
+        if self._script and i.t_s >= self._script[0][0]:
+            return dataclasses.replace(i, command=self._script.pop(0)[1])
+        return i
+
+
+def commanded(
+    *script: tuple[float, OperatorCommand], change: Change = lambda i: i, sets: Sequence[str] = ()
+) -> Commanded:
+    flight = _Asking(script, change, *sets)
+    result = flight.run(limit_s=60.0)
+    assert not result.crashed
+    flown = Commanded(result.inputs, result.outputs, flight)
+    for k, i in enumerate(result.inputs):
+        if i.command is not OperatorCommand.NONE:
+            before = result.outputs[k - 1] if k else None
+            flown.effects.append(effect_of(i.command, before, result.outputs[k]))
+    assert len(flown.effects) == len(script), "the flight was over before a command came"
+    return flown
+
+
+@cache
+def ordinary() -> Commanded:
+    """A flight without a command."""
+    return commanded()
+
+
+def off_its_way(since_s: float, until_s: float, x_m: float = 0.65) -> Change:
+    """PX4 and motion capture both have the vehicle elsewhere: off its reference, by their word."""
+
+    def change(i: Inputs) -> Inputs:
+        if i.vehicle is None or i.mocap is None or not since_s <= i.t_s < until_s:
+            return i
+        (x, y, z), (a, b, c) = i.vehicle.position_world_m, i.mocap.position_world_m
+        i = put("vehicle", position_world_m=(x + x_m, y, z))(i)
+        return put("mocap", position_world_m=(a + x_m, b, c))(i)
+
+    return change
+
+
+# -- hold, resume, land ----------------------------------------------------------------------------------------------
+
+
+def test_hold_resume_hold_resume_land() -> None:
+    first = ((7.0, HOLD), (8.0, HOLD), (9.0, RESUME), (9.5, RESUME), (9.8, HOLD), (10.3, RESUME))
+    flown = commanded(*first, (11.0, LAND), (11.5, LAND), (11.7, HOLD), (11.9, RESUME), (12.1, START))
+    assert flown.effects == [
+        (True, "holding"),
+        (True, "holding already"),
+        (True, "going on"),
+        (False, "nothing to resume: not holding"),
+        (True, "holding"),
+        (True, "going on"),
+        (True, "landing"),
+        (True, "already landing"),
+        (False, "not held: it is landing"),
+        (False, "nothing to resume: it is landing"),
+        (False, "start refused: in the air already"),
+    ]
+    asked = [id_ for id_ in flown.ids if id_.startswith("operator_")]
+    assert asked == [
+        *("operator_hold", "operator_hold", "operator_resume", "operator_resume", "operator_hold", "operator_resume"),
+        *("operator_land", "operator_land", "operator_hold", "operator_resume", "operator_start"),
+    ]
+    assert flown.outcome is Outcome.ABORTED
+
+
+def test_the_same_commands_again_give_the_same_flight_bit_for_bit() -> None:
+    flown = commanded((2.0, START), (9.0, HOLD), (10.0, RESUME), (11.0, ABORT), sets=WAITS)
+    assert flown.effects[-1] == (True, "aborted: landing, the arm folds")
+    core = FlightCore(flown.flight.config)
+    for i, o in zip(flown.inputs, flown.outputs, strict=True):
+        assert differences(o, core.step(i)) is None
+
+
+def test_a_hold_that_nobody_may_end_yet() -> None:
+    """Off its reference: held by the monitor; going on is refused until that has been gone for a second."""
+    flown = commanded((7.5, RESUME), (8.0, RESUME), (8.7, RESUME), change=off_its_way(7.0, 7.3, 0.7), sets=FORGIVING)
+    for accepted, text in flown.effects[:2]:
+        assert not accepted
+        assert text.startswith("resume refused: 0.")
+        assert text.endswith("m off the reference")
+    assert flown.effects[2] == (True, "going on")
+    assert [id_ for id_ in flown.ids if id_ in ("tracking_hold", "resume_refused")] == [
+        *("tracking_hold", "resume_refused", "resume_refused"),
+    ]
+    assert {flown.at(t_s).action for t_s in (7.52, 8.02)} == {SafetyAction.HOLD}
+    assert flown.at(8.72).action is SafetyAction.NOMINAL
+    assert flown.outcome is Outcome.COMPLETED
+
+
+def test_a_resume_while_a_cause_stands_that_came_during_the_hold_is_refused() -> None:
+    flown = commanded((6.5, HOLD), (8.0, RESUME), change=off_its_way(7.0, 99.0, 0.7), sets=FORGIVING)
+    assert flown.effects[0] == (True, "holding")
+    assert flown.effects[1][1].startswith("resume refused: ")
+    assert flown.at(8.5).action is SafetyAction.HOLD
+
+
+# A jump of pose and estimate together is no finding of the ones that watch for jumps; 0.8 m off would be a landing.
+FORGIVING = (
+    "vehicle.safety.mocap_jump_m=2.0",
+    "vehicle.safety.mocap_inertial_m=2.0",
+    "vehicle.safety.tracking_error_abort_m=5",
+    "vehicle.safety.hold_max_s=6",
+)
+
+
+def test_commands_while_it_goes_back_along_the_tether() -> None:
+    flown = commanded((7.0, HOLD), (7.1, RESUME), (7.3, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"))
+    assert flown.effects[:2] == [
+        (False, "not held: it goes back along the tether and lands"),
+        (False, "nothing to resume: it goes back along the tether and lands"),
+    ]
+    assert flown.effects[2] == (True, "landing")
+
+
+def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
+    flown = commanded((3.9, HOLD))
+    assert flown.effects == [(True, "too low to hold: landing")]
+    begin_s = times_of(ordinary())["land"]
+    flown = commanded((begin_s + 0.5, HOLD), (begin_s + 1.0, RESUME))
+    assert flown.effects == [(False, "not held: it is landing"), (True, "the landing goes on")]
+    assert flown.outcome is Outcome.COMPLETED
+
+
+def test_nothing_is_done_against_a_pilot() -> None:
+    def change(i: Inputs) -> Inputs:
+        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 7.0 else i
+
+    flown = commanded((7.5, HOLD), (7.6, RESUME), (7.7, LAND), (7.8, ABORT), (7.9, START), change=change)
+    assert flown.effects == [(False, "a pilot has the vehicle: nothing is sent against them")] * 5
+    assert flown.at(7.5).phase == "a pilot flies"
+    assert all(o.attitude is None for o in flown.outputs if o.t_s > 7.1)
+
+
+def test_commands_while_px4_lands_on_its_own() -> None:
+    blind = ("world.faults=[{kind: mocap_loss, t_s: 6.0}]",)
+    flown = commanded((8.0, LAND), (8.1, ABORT), (8.2, HOLD), (8.3, RESUME), (8.4, START), sets=blind)
+    assert flown.effects[:2] == [(True, "recorded; PX4 is landing on its own, it goes on")] * 2
+    assert [accepted for accepted, _ in flown.effects[2:]] == [False, False, False]
+    assert all("PX4 is landing on its own" in text for _, text in flown.effects)
+
+
+# -- before take-off -------------------------------------------------------------------------------------------------
+
+WAITS = ("mission.start.takeoff=by_operator",)
+
+
+def times_of(flown: Commanded) -> dict[str, float]:
+    """When each phase begins."""
+    found: dict[str, float] = {}
+    for o in flown.outputs:
+        found.setdefault(o.phase, o.t_s)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("phase", "command", "text"),
+    [
+        ("wait", HOLD, "not taking off: standing down"),
+        ("offboard", HOLD, "not taking off: standing down"),
+        ("arm", HOLD, "not taking off: standing down"),
+        ("spool up", HOLD, "not taking off: the rotors spool down"),
+        ("wait", LAND, "not taking off: standing down"),
+        ("arm", ABORT, "not taking off: standing down"),
+        ("spool up", LAND, "not taking off: the rotors spool down"),
+    ],
+)
+def test_called_off_before_it_lifts(phase: str, command: OperatorCommand, text: str) -> None:
+    begin_s = times_of(ordinary())[phase]
+    flown = commanded((begin_s + 0.004, command))
+    assert flown.effects == [(True, text)]
+    assert flown.outcome is Outcome.ABORTED
+    assert "takeoff" not in flown.ids
+    assert not flown.flight.px4.armed
+
+
+def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
+    phases = times_of(ordinary())
+    begin_s = [phases[phase] for phase in ("wait", "offboard", "arm", "spool up")]
+    flown = commanded(
+        *((t_s + late_s, command) for t_s in begin_s for late_s, command in ((0.004, START), (0.104, RESUME)))
+    )
+    assert flown.effects[0::2] == [
+        (False, "start refused: this flight takes off by itself as soon as it can"),
+        *[(True, "taking off already")] * 3,
+    ]
+    assert flown.effects[1::2] == [(False, "nothing to resume: on the ground")] * 4
+    assert flown.outcome is Outcome.COMPLETED
+
+
+def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
+    flown = commanded((2.5, HOLD), (30.0, START), sets=WAITS)
+    assert flown.effects == [(True, "it stays on the ground until start is commanded"), (True, "taking off")]
+    waiting = [o for o in flown.outputs if o.phase == "waits for start"]
+    assert waiting[-1].t_s - waiting[0].t_s > 25.0
+    assert all(o.attitude is None and o.arm_torque_nm is None and o.request.value == "none" for o in waiting)
+    assert flown.outcome is Outcome.COMPLETED
+    assert [id_ for id_ in flown.ids if id_ != "catch"] == ["operator_start", "takeoff", "touchdown"]
+
+
+@pytest.mark.parametrize("command", [LAND, ABORT])
+def test_it_waits_for_start_and_stands_down_when_it_is_told_to(command: OperatorCommand) -> None:
+    flown = commanded((5.0, command), sets=WAITS)
+    assert flown.effects == [(True, "not taking off: standing down")]
+    assert flown.outcome is Outcome.ABORTED
+    assert flown.outputs[-1].t_s < 5.1
+
+
+def lifted_off_its_place(since_s: float, until_s: float) -> Change:
+    """Somebody carries it half a metre away and back."""
+    return off_its_way(since_s, until_s, 0.5)
+
+
+def test_what_is_lost_while_it_waits_is_told_and_may_come_back_at_any_time() -> None:
+    flown = commanded((10.0, START), (22.0, START), change=lifted_off_its_place(6.0, 18.0), sets=(*WAITS, *FORGIVING))
+    assert flown.effects[0][0] is False
+    assert "start refused: mission 'hover': starts at" in flown.effects[0][1]
+    assert flown.effects[1] == (True, "taking off")
+    assert [id_ for id_ in flown.ids if id_.startswith("operator_") or "ready" in id_ or "declined" in id_] == [
+        *("not_ready", "operator_start", "start_declined", "operator_start"),
+    ]
+    assert flown.at(15.0).phase == "wait"
+    assert flown.at(21.0).phase == "waits for start"
+    assert flown.outcome is Outcome.COMPLETED
+
+
+def test_an_estimate_that_wanders_off_while_it_waits_is_told() -> None:
+    def change(i: Inputs) -> Inputs:
+        if i.vehicle is None or not 5.0 <= i.t_s < 8.0:
+            return i
+        x, y, z = i.vehicle.position_world_m
+        return put("vehicle", position_world_m=(x + 0.07, y, z))(i)
+
+    flown = commanded((7.0, START), (11.0, START), change=change, sets=WAITS)
+    assert flown.effects[0][0] is False
+    assert flown.effects[0][1].startswith("start refused: PX4's estimate has not settled")
+    assert flown.effects[1] == (True, "taking off")
+
+
+def test_a_start_that_comes_before_it_is_ready_is_refused_and_not_remembered() -> None:
+    flown = commanded((0.7, START), (5.0, START), (5.5, START), sets=WAITS)
+    assert flown.effects[0][0] is False
+    assert flown.effects[0][1].startswith("start refused: ")
+    assert flown.at(4.0).phase == "waits for start"
+    assert flown.effects[1:] == [(True, "taking off"), (True, "taking off already")]
+
+
+def test_the_net_is_weighed_right_before_the_start() -> None:
+    """The sensor drifts by 2 N while it waits: a tare of before would feel that."""
+
+    def change(i: Inputs) -> Inputs:
+        if i.force is None:
+            return i
+        drift_n = 2.0 * min(1.0, i.t_s / 10.0)
+        x, y, z = i.force.force_sensor_n
+        return put("force", force_sensor_n=(x + drift_n, y, z))(i)
+
+    flown = commanded((12.0, START), change=change, sets=WAITS)
+    felt = [o.control.force_ext_world_n for o in flown.outputs if o.control is not None and o.phase == "hold"]
+    assert felt
+    assert max(math.hypot(*force_n) for force_n in felt) < 0.6
+    assert flown.outcome is Outcome.COMPLETED
+
+
+def test_the_plan_begins_where_it_stands_at_the_start() -> None:
+    """It was pushed 5 cm aside while it waited: within the tolerance, so it goes up from there."""
+    flown = commanded((10.0, START), change=off_its_way(4.0, 11.0, 0.05), sets=(*WAITS, *FORGIVING))
+    spooled = next(o for o in flown.outputs if o.phase == "spool up" and o.reference is not None)
+    at_start = next(i for i in flown.inputs if i.command is START)
+    assert spooled.reference is not None and at_start.vehicle is not None
+    assert math.dist(spooled.reference.position_world_m, at_start.vehicle.position_world_m) < 1e-9
+
+
+def test_a_finding_of_the_ground_refuses_it_while_it_waits() -> None:
+    def change(i: Inputs) -> Inputs:
+        return put("status", battery_remaining=0.1)(i) if i.t_s > 5.0 else i
+
+    flown = commanded(change=change, sets=WAITS)
+    assert flown.ids == ["battery_warn", "battery_low"] or flown.ids == ["battery_low", "battery_warn"]
+    assert flown.outcome is Outcome.REFUSED
+
+
+def test_armed_by_somebody_else_while_it_waits_it_is_not_flown() -> None:
+    def change(i: Inputs) -> Inputs:
+        return put("status", armed=True, mode=FlightMode.OFFBOARD)(i) if 5.0 < i.t_s < 6.0 else i
+
+    flown = commanded(change=change, sets=WAITS)
+    assert flown.ids == ["reattached"]
+    assert flown.outcome is Outcome.REFUSED
+
+
+def test_after_the_flight_nothing_is_to_be_done() -> None:
+    over = ordinary().outputs[-1]
+    assert [effect_of(command, over, over) for command in (LAND, HOLD, RESUME, START)] == [
+        (True, "down already"),
+        (False, "not held: the flight is over"),
+        (False, "nothing to resume: the flight is over"),
+        (False, "start refused: the flight is over"),
+    ]

@@ -1,0 +1,109 @@
+"""The datagrams between flight and guardian, the judgement of silence, and which poses are believed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.guardian import heartbeat as words
+from companion.guardian.heartbeat import Beat
+from companion.guardian.watch import JUMP_M, SPEED_MAX_M_S, Plausible, StallWatch
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+byte = st.integers(0, 255)
+beats = st.builds(
+    Beat,
+    tick=st.integers(0, 2**32 - 1),
+    t_s=finite,
+    origin_s=finite,
+    mission_t_s=finite,
+    lifting=st.booleans(),
+    pilot=st.booleans(),
+    goodbye=st.booleans(),
+    mocap_refused=st.booleans(),
+    autopilot_system=byte,
+    own_system=byte,
+    own_component=byte,
+    local_port=st.integers(0, 65535),
+    pose_stamp_s=finite | st.just(-math.inf),
+    position_world_m=st.tuples(finite, finite, finite),
+    peer=st.none() | st.tuples(st.ip_addresses(v=4).map(str), st.integers(1, 65535)),
+)
+
+
+@given(beats)
+def test_a_beat_comes_through_bit_for_bit(beat: Beat) -> None:
+    assert words.unpack(words.pack(beat)) == beat
+
+
+@given(beats)
+def test_a_beat_is_a_few_dozen_bytes(beat: Beat) -> None:
+    assert len(words.pack(beat)) < 100
+
+
+@given(st.binary(max_size=200))
+def test_nothing_that_comes_in_raises(datagram: bytes) -> None:
+    words.unpack(datagram)
+    words.unpack(words.BEAT + datagram)
+
+
+@given(
+    beats,
+    st.integers(0, 60),
+    st.sampled_from([b"\x00\x00\x00\x00\x00\x00\xf8\x7f", b"\x00\x00\x00\x00\x00\x00\xf0\x7f"]),
+)
+def test_a_beat_that_is_not_finite_is_none(beat: Beat, where: int, poison: bytes) -> None:
+    """NaN or infinity in any double, but for a pose that never was."""
+    data = bytearray(words.pack(beat))
+    start = len(data) - 8 * (1 + where % 7)
+    data[start : start + 8] = poison
+    stamp = len(data) - 32
+    infinite_stamp = start == stamp and poison[6:] == b"\xf0\x7f"
+    assert infinite_stamp or words.unpack(bytes(data)) is None
+
+
+def silent_after(watch: StallWatch, period_s: float, rounds: int) -> list[bool]:
+    return [watch.update(k * period_s, heard=False) for k in range(rounds)]
+
+
+def test_silence_is_a_stall_after_the_timeout() -> None:
+    verdicts = silent_after(StallWatch(0.1), 0.01, 20)
+    assert verdicts.index(True) == 11  # the first round that is more than 0.1 s after the last beat
+    assert all(verdicts[11:])
+
+
+def test_a_beat_in_time_is_no_stall() -> None:
+    watch = StallWatch(0.1)
+    assert not any(watch.update(k * 0.01, heard=k % 10 == 0) for k in range(1000))
+
+
+def test_what_the_guardian_slept_through_proves_nothing() -> None:
+    watch = StallWatch(0.1)
+    assert not watch.update(0.0, heard=True)
+    assert not watch.update(5.0, heard=False), "the whole machine was held up"
+    assert not watch.update(5.01, heard=True)
+    assert not watch.update(10.0, heard=False)
+    verdicts = [watch.update(10.0 + 0.01 * k, heard=False) for k in range(1, 20)]
+    assert any(verdicts), "but silence while it is awake counts on"
+
+
+def test_a_pose_that_cannot_be_true_is_not_believed() -> None:
+    plausible = Plausible(10.0, (1.0, 2.0, 1.5))
+    assert plausible.check(10.005, (1.01, 2.0, 1.5))
+    assert not plausible.check(10.010, (1.01 + JUMP_M + 0.1, 2.0, 1.5))
+    assert plausible.check(10.015, (1.02, 2.0, 1.5)), "the jump has not become the place to measure from"
+    assert not plausible.check(10.020, (math.nan, 2.0, 1.5))
+    late_s = 10.015 + 1.0
+    assert plausible.check(late_s, (1.02 + SPEED_MAX_M_S, 2.0, 1.5)), "after a gap more is possible"
+
+
+def test_the_first_pose_is_believed_if_there_was_none() -> None:
+    assert Plausible(-math.inf, (0.0, 0.0, 0.0)).check(3.0, (5.0, -7.0, 2.0))
+
+
+@pytest.mark.parametrize("kind", [words.ADOPT, words.READY, words.PROBLEM])
+def test_other_datagrams_are_no_beats(kind: bytes) -> None:
+    assert words.unpack(kind) is None

@@ -1,0 +1,194 @@
+"""The guardian's landing on simulated time, message by message: what it takes for true, and what it asks of PX4."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.guardian.heartbeat import Beat
+from companion.guardian.link import Link
+from companion.guardian.px4 import Px4State
+from companion.guardian.takeover_landing import Charge, Told
+from companion.mission.autopilot_landing import TIMEOUT_S
+from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
+from companion.model.types import MocapPose, Quat, Vec3
+
+STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
+START_S, STEP_S = 20.0, 0.01
+LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
+ON_ITS_BACK = quat_from_euler_zyx(math.pi, 0.0, 0.0)
+ON_ITS_ROTORS = quat_from_euler_zyx(math.radians(-55.0), 0.0, 0.0)
+ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+LAND_MODE = 4 << 16 | 6 << 24
+
+
+class Wire:
+    """PX4's end, in memory: keeps what was sent."""
+
+    ready, lost = True, False
+
+    def __init__(self) -> None:
+        self._decoder = mavlink.MAVLink(None)
+        self.sent: list[Any] = []
+
+    def fileno(self) -> int:
+        return -1
+
+    def send(self, data: bytes) -> None:
+        self.sent += self._decoder.parse_buffer(data) or []
+
+    def receive(self) -> list[bytes]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+    def commands(self, number: int) -> list[Any]:
+        return [m for m in self.sent if m.get_type() == "COMMAND_LONG" and m.command == number]
+
+    @property
+    def poses(self) -> list[Any]:
+        return [m for m in self.sent if m.get_type() == "VISION_POSITION_ESTIMATE"]
+
+
+def beat(*, mocap_refused: bool = False, pose_stamp_s: float = START_S - 0.1) -> Beat:
+    return Beat(
+        tick=1,
+        t_s=START_S - 0.1,
+        origin_s=0.0,
+        mission_t_s=5.0,
+        lifting=True,
+        pilot=False,
+        goodbye=False,
+        mocap_refused=mocap_refused,
+        autopilot_system=1,
+        own_system=1,
+        own_component=191,
+        local_port=0,
+        pose_stamp_s=pose_stamp_s,
+        position_world_m=(0.0, 0.0, STANDING_M),
+    )
+
+
+class Landing:
+    """A guardian in charge of a vehicle that PX4 lands."""
+
+    def __init__(self, last: Beat) -> None:
+        self.wire = Wire()
+        self.told: list[Told] = []
+        self.t_s = START_S
+        link = Link(self.wire, (1, 191), 1)
+        self.charge = Charge(last, STANDING_M, TILT_MAX_RAD, link, START_S, self.told.append)
+
+    def run(
+        self,
+        duration_s: float,
+        *,
+        attitude: Quat = LEVEL,
+        height_m: float = STANDING_M,
+        messages: tuple[str, ...] = ("position", "attitude", "imu"),
+        mocap: bool = True,
+        spoil: Callable[[Any], None] = lambda message: None,
+    ) -> None:
+        """PX4 in LAND, armed, its land detector deaf, at rest at this height; `spoil` changes each message of its state."""
+        q = attitude_ned_frd_from_enu_flu(attitude)
+        for _ in range(round(duration_s / STEP_S)):
+            self.t_s += STEP_S
+            state = {
+                "position": mavlink.MAVLink_local_position_ned_message(0, 0.0, 0.0, -height_m, 0.0, 0.0, 0.0),
+                "attitude": mavlink.MAVLink_attitude_quaternion_message(0, *q, 0.0, 0.0, 0.0),
+                "imu": mavlink.MAVLink_highres_imu_message(0, 0.0, 0.0, -9.81, *[0.0] * 10, 63),
+            }
+            said = [state[name] for name in messages]
+            for message in said:
+                spoil(message)
+            heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, ARMED, LAND_MODE, 4, 3)
+            if mocap:
+                number = round(self.t_s / STEP_S)
+                position: Vec3 = (0.0, 0.0, height_m)
+                self.charge.take_poses([MocapPose(self.t_s, None, number, position, attitude, True, 0.0)])
+            self.charge.take_messages(self.t_s, [heartbeat, *said])
+            if self.charge.landed is None:
+                self.charge.step(self.t_s)
+
+    @property
+    def forced(self) -> bool:
+        return any(m.param2 == 21196.0 for m in self.wire.commands(mavlink.MAV_CMD_COMPONENT_ARM_DISARM))
+
+    @property
+    def zero_thrust(self) -> bool:
+        return any(m.get_type() == "SET_ATTITUDE_TARGET" for m in self.wire.sent)
+
+
+def nan_position(message: Any) -> None:
+    if message.get_type() == "LOCAL_POSITION_NED":
+        message.x = math.nan
+
+
+@pytest.mark.parametrize(
+    ("messages", "spoil"),
+    [(("attitude",), lambda _: None), (("attitude", "imu"), lambda _: None), (("position", "attitude"), nan_position)],
+    ids=["attitude alone", "no position", "a position that is no number"],
+)
+def test_px4s_attitude_is_enough_for_a_flip(messages: tuple[str, ...], spoil: Callable[[Any], None]) -> None:
+    landing = Landing(beat())
+    landing.run(1.0, attitude=ON_ITS_BACK, height_m=1.0, messages=messages, spoil=spoil)
+    assert landing.forced
+
+
+def test_a_position_or_an_imu_sample_that_never_came_counts_for_nothing() -> None:
+    px4 = Px4State()
+    assert px4.vehicle() is None
+    px4.take(3.0, mavlink.MAVLink_attitude_quaternion_message(0, *LEVEL, 0.0, 0.0, 0.0))
+    vehicle = px4.vehicle()
+    assert vehicle is not None
+    assert (vehicle.position_stamp_s, vehicle.attitude_stamp_s, vehicle.imu_stamp_s) == (-math.inf, 3.0, -math.inf)
+
+
+def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
+    landing = Landing(beat())
+    landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
+    assert not landing.forced
+    landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
+    assert landing.forced
+    assert "tipped over on the floor: FORCE_DISARM is requested at once" in [told.text for told in landing.told]
+
+
+def test_poses_that_the_flight_process_did_not_believe_are_neither_passed_on_nor_judged_by() -> None:
+    """It landed for dragged poses and died: the guardian fed them to PX4, and took them for the vehicle's place."""
+    landing = Landing(beat(mocap_refused=True, pose_stamp_s=START_S - 5.0))
+    landing.run(10.0, attitude=ON_ITS_ROTORS)
+    assert landing.wire.poses == []
+    assert not landing.forced, "only motion capture says so low that it is tipped over"
+    assert landing.charge.pose is None
+    assert [told.id for told in landing.told].count("guardian_mocap") == 1
+    believed = Landing(beat(pose_stamp_s=START_S - 5.0))
+    believed.run(10.0, attitude=ON_ITS_ROTORS)
+    assert believed.wire.poses and believed.forced
+
+
+def test_a_height_by_dead_reckoning_is_vouched_for_once_and_not_anew_in_each_round() -> None:
+    """PX4 gives its height up 4.5 s after the last pose: in the second round of 30 s it proves nothing."""
+    landing = Landing(beat())
+    landing.run(TIMEOUT_S + 1.0, height_m=2.0, mocap=False)
+    assert not landing.zero_thrust
+    landing.run(10.0, mocap=False)
+    assert not landing.zero_thrust
+    assert landing.charge.landed is None
+
+
+def test_a_height_by_dead_reckoning_counts_from_the_last_pose_on_whoever_passed_it_on() -> None:
+    by_the_flight = Landing(beat())
+    by_the_flight.run(3.0, mocap=False)
+    assert by_the_flight.zero_thrust
+    long_ago = Landing(beat(pose_stamp_s=START_S - 4.0))
+    long_ago.run(3.0, mocap=False)
+    assert not long_ago.zero_thrust
+    by_the_guardian = Landing(beat(pose_stamp_s=START_S - 4.0))
+    by_the_guardian.run(1.0, height_m=0.5)
+    by_the_guardian.run(3.0, mocap=False)
+    assert by_the_guardian.zero_thrust

@@ -1,0 +1,48 @@
+"""A flight-only installation says in one line which extra a command needs; and flying needs none."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from companion.cli.main import _normalised, _parser
+from companion.install.extras import lacking
+
+EXTRAS = ("mujoco", "joblib", "dask", "distributed", "matplotlib", "aiohttp", "cryptography")
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        ("fly m.yaml --sitl", "companion fly --sitl"),
+        ("fly m.yaml --sitl=px4", "companion fly --sitl"),
+        ("check --sitl", "companion check --sitl"),
+        ("sitl", "companion sitl"),
+        ("compare --payloads 0.2", "companion compare"),
+        ("robustness --draws 1", "companion robustness"),
+        ("faults", "companion faults"),
+        ("faults --list", None),
+        ("fly m.yaml", None),
+        ("check", None),
+        ("schema vehicle", None),
+    ],
+)
+def test_what_lacks_the_world_says_so(words: str, what: str | None) -> None:
+    arguments = _parser().parse_args(_normalised(words.split()))
+    said = lacking(arguments, here=lambda package: False)
+    assert said == (
+        None if what is None else f"{what}: the simulated world needs mujoco: pip install 'companion[sitl]'"
+    )
+    assert lacking(arguments, here=lambda package: True) is None
+
+
+@pytest.mark.parametrize(
+    "module", ["companion.flight.main", "companion.guardian.process", "companion.recorder.main", "companion.cli.main"]
+)
+def test_no_process_of_a_flight_imports_an_extra(module: str) -> None:
+    """With all of them forbidden it starts all the same."""
+    program = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS!r})); import {module}"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr

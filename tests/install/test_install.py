@@ -1,0 +1,334 @@
+"""`companion install` in a scratch root: twice, undone, failed half way, changed by others in between."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pwd
+import shutil
+import stat
+from pathlib import Path
+
+import pytest
+
+from companion.cli.main import main
+from companion.install import apply
+from companion.install.record import PATH
+from companion.install.state import State, put
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from tests.support import ROOT
+
+pytestmark = pytest.mark.waits
+
+UNIT = "etc/systemd/system/companion.service"
+RULES = "etc/udev/rules.d/99-companion.rules"
+MISSION = "/etc/companion/missions/hover.yaml"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """What a small system has before: the files of a flight, somebody's own udev rules, and one that is to be replaced."""
+    root = tmp_path / "root"
+    for folder in ("missions", "vehicles", "controllers"):
+        shutil.copytree(ROOT / "configs" / folder, root / "etc/companion" / folder)
+    vehicle = root / "etc/companion/vehicles/tarot650_2r.yaml"
+    text = vehicle.read_text(encoding="utf-8")
+    assert "interface: 0.0.0.0 " in text, "of every network: the service would refuse to fly"
+    vehicle.write_text(text.replace("interface: 0.0.0.0 ", "interface: 192.0.2.7 "), encoding="utf-8")
+    (root / RULES).parent.mkdir(parents=True)
+    (root / RULES).write_bytes(b"# by hand, in Latin-1: \xe4\n")
+    (root / RULES).chmod(0o640)
+    (root / "etc/udev/rules.d/10-mine.rules").write_text("# mine\n")
+    (root / "etc/security").mkdir()
+    return root
+
+
+def tree(root: Path) -> dict[str, tuple[str, int, bytes]]:
+    """Kind, mode and content of everything below."""
+    found = {}
+    for path in sorted(root.rglob("*")):
+        status = path.lstat()
+        if stat.S_ISLNK(status.st_mode):
+            entry = ("link", 0, os.readlink(path).encode())
+        elif path.is_dir():
+            entry = ("folder", stat.S_IMODE(status.st_mode), b"")
+        else:
+            entry = ("file", stat.S_IMODE(status.st_mode), path.read_bytes())
+        found[str(path.relative_to(root))] = entry
+    return found
+
+
+def install(root: Path, *more: str) -> int:
+    return main(["install", "--systemd", "--root", str(root), "--mission", MISSION, "--yes", *more])
+
+
+def undo(root: Path, *more: str) -> int:
+    return main(["install", "--undo", "--root", str(root), "--yes", *more])
+
+
+def test_a_vehicle_file_that_the_service_would_refuse_is_refused_now(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(ROOT / "configs/vehicles", root / "etc/companion/vehicles", dirs_exist_ok=True)
+    before = tree(root)
+    assert install(root) == EXIT_BAD_INPUT
+    assert "interface" in capsys.readouterr().err
+    assert tree(root) == before
+
+
+def test_installed_and_undone_leaves_every_byte_as_it_was(root: Path) -> None:
+    before = tree(root)
+    assert install(root, "--arm-serial", "FT4THVLI", "--at-boot") == EXIT_OK
+    after = tree(root)
+    changed = {path for path in after if after[path] != before.get(path) and after[path][0] != "folder"}
+    assert changed == {
+        RULES, UNIT, PATH.lstrip("/"), "etc/modules-load.d/companion.conf", "etc/security/limits.d/companion.conf",
+        "etc/sysusers.d/companion.conf", "etc/systemd/system/companion-performance.service",
+        "etc/systemd/system/multi-user.target.wants/companion.service",
+        "etc/systemd/system/multi-user.target.wants/companion-performance.service",
+    }  # fmt: skip
+    assert 'ATTRS{serial}=="FT4THVLI", SYMLINK+="companion-arm"' in after[RULES][2].decode()
+    assert after[RULES][1] == 0o644
+    assert after[PATH.lstrip("/")][1] == 0o600
+    assert undo(root) == EXIT_OK
+    assert tree(root) == before
+
+
+def test_a_second_time_there_is_nothing_to_do(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert install(root) == EXIT_OK
+    first = tree(root)
+    capsys.readouterr()
+    assert install(root) == EXIT_OK
+    assert "nothing to do" in capsys.readouterr().out
+    assert tree(root) == first
+
+
+def test_a_dry_run_shows_every_byte_and_changes_none(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = tree(root)
+    assert install(root, "--dry-run", "--force-serial", "A10M") == EXIT_OK
+    told = capsys.readouterr().out
+    assert tree(root) == before
+    assert install(root, "--force-serial", "A10M") == EXIT_OK
+    for path in (RULES, UNIT, "etc/security/limits.d/companion.conf"):
+        for line in (root / path).read_text().splitlines():
+            assert not line or f"    {line}\n" in told
+    assert f"replaces  /{RULES}" in told
+    assert undo(root, "--dry-run") == EXIT_OK
+    assert (root / UNIT).exists()
+
+
+def test_installed_otherwise_and_undone_is_as_before_the_first_time(root: Path) -> None:
+    before = tree(root)
+    assert install(root, "--at-boot", "--user", "pilot") == EXIT_OK
+    assert "User=pilot" in (root / UNIT).read_text()
+    assert install(root, "--arm-serial", "FT1") == EXIT_OK
+    wants = root / "etc/systemd/system/multi-user.target.wants"
+    assert [path.name for path in wants.iterdir()] == ["companion-performance.service"]
+    assert "User=companion" in (root / UNIT).read_text()
+    assert undo(root) == EXIT_OK
+    assert tree(root) == before
+
+
+@pytest.mark.parametrize("obstacle", ["etc/security", "etc/systemd", "var", "var/lib/companion/installed.json"])
+def test_what_fails_half_way_is_put_back(root: Path, obstacle: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file where a folder is needed, or the other way round, at the start, in the middle and at the end."""
+    path = root / obstacle
+    if obstacle.endswith(".json"):
+        path.mkdir(parents=True)
+    else:
+        shutil.rmtree(path, ignore_errors=True)
+        path.write_text("in the way\n")
+    before = tree(root)
+    assert install(root) == EXIT_REFUSED
+    assert tree(root) == before
+    [line] = capsys.readouterr().err.splitlines()
+    assert path.name in line
+
+
+class PowerLossError(BaseException):
+    """As by a loss of power: no handler runs that would put anything back."""
+
+
+def fail_at_the_third_file(monkeypatch: pytest.MonkeyPatch, failure: BaseException) -> None:
+    written: list[Path] = []
+
+    def until_then(path: Path, state: State) -> None:
+        written.append(path)
+        if len(written) == 3:
+            raise failure
+        put(path, state)
+
+    monkeypatch.setattr(apply, "put", until_then)
+
+
+def test_a_full_disk_half_way_leaves_everything_as_it_was(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = tree(root)
+    fail_at_the_third_file(monkeypatch, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/etc/x"))
+    assert install(root) == EXIT_REFUSED
+    assert tree(root) == before
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == "companion install: /etc/x: No space left on device; everything is as it was before"
+
+
+def test_interrupted_half_way_everything_is_as_it_was(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = tree(root)
+    fail_at_the_third_file(monkeypatch, KeyboardInterrupt())
+    assert install(root) == EXIT_ABORTED
+    assert tree(root) == before
+
+
+def test_a_change_that_fails_half_way_leaves_the_first_installation(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = tree(root)
+    assert install(root) == EXIT_OK
+    first = tree(root)
+    with monkeypatch.context() as patch:
+        fail_at_the_third_file(patch, OSError(errno.EIO, os.strerror(errno.EIO), "/etc/x"))
+        assert install(root, "--user", "pilot", "--arm-serial", "FT1", "--at-boot") == EXIT_REFUSED
+    assert tree(root) == first
+    assert undo(root) == EXIT_OK
+    assert tree(root) == before
+
+
+def test_what_was_cut_off_half_way_is_undone(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = tree(root)
+    fail_at_the_third_file(monkeypatch, PowerLossError())
+    with pytest.raises(PowerLossError):
+        install(root)
+    assert tree(root) != before
+    assert undo(root) == EXIT_OK
+    assert tree(root) == before
+
+
+def test_a_file_that_somebody_changed_is_not_overwritten(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert install(root) == EXIT_OK
+    (root / UNIT).write_text((root / UNIT).read_text() + "Nice=0\n")
+    changed = tree(root)
+    capsys.readouterr()
+    for attempt in (undo(root), install(root, "--arm-serial", "FT1")):
+        assert attempt == EXIT_REFUSED
+        assert tree(root) == changed
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert all(f"/{UNIT}: was changed since" in line for line in lines)
+
+
+def test_a_folder_that_others_use_by_now_is_kept(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert install(root) == EXIT_OK
+    (root / "var/lib/companion/fly").mkdir()
+    assert undo(root) == EXIT_OK
+    assert (root / "var/lib/companion/fly").is_dir()
+    assert not (root / PATH.lstrip("/")).exists()
+    assert "kept /var/lib/companion" in capsys.readouterr().out
+
+
+def test_a_record_that_others_could_write_is_not_trusted(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert install(root) == EXIT_OK
+    (root / PATH.lstrip("/")).chmod(0o666)
+    assert undo(root) == EXIT_REFUSED
+    assert "not trusted" in capsys.readouterr().err
+    (root / PATH.lstrip("/")).chmod(0o600)
+    (root / PATH.lstrip("/")).write_text("{}")
+    assert undo(root) == EXIT_REFUSED
+    assert "no record" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("goes", [True, False], ids=["the user is deleted", "the user stays"])
+def test_keys_go_with_the_user_who_is_deleted_and_stay_with_one_who_stays(
+    root: Path, tmp_path: Path, goes: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A user id that is free is given to the next user: no key of an operator may wait for that one."""
+    assert install(root) == EXIT_OK
+    path = root / PATH.lstrip("/")
+    record = json.loads(path.read_text())
+    record["users"] = [pwd.getpwuid(os.geteuid()).pw_name] if goes else []
+    path.write_text(json.dumps(record))
+    home, others = root / apply.HOME.lstrip("/"), tmp_path / "others"
+    keys, log = home / ".config/companion/operators.yaml", home / "flights/1/flight.mcap"
+    for file in (keys, log, others / "secret"):
+        file.parent.mkdir(parents=True)
+        file.write_text("key")
+    (home / ".config/elsewhere").symlink_to(others)
+    (home / "flights/elsewhere").symlink_to(others)
+    assert undo(root) == EXIT_OK
+    assert keys.exists() is not goes
+    assert log.exists() and (others / "secret").exists()
+    assert ("the service's keys" in capsys.readouterr().out) is goes
+
+
+def test_undo_without_an_installation_says_so(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = tree(root)
+    assert undo(root) == EXIT_OK
+    assert "nothing to undo" in capsys.readouterr().out
+    assert tree(root) == before
+
+
+def test_without_a_yes_nothing_is_done(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = tree(root)
+    for answer in ("n", "", EOFError(), KeyboardInterrupt()):
+
+        def asked(prompt: str, answer: object = answer) -> str:
+            if isinstance(answer, BaseException):
+                raise answer
+            return str(answer)
+
+        monkeypatch.setattr("builtins.input", asked)
+        assert main(["install", "--systemd", "--root", str(root), "--mission", MISSION]) == EXIT_ABORTED
+    assert tree(root) == before
+    monkeypatch.setattr("builtins.input", lambda prompt: "y")
+    assert main(["install", "--systemd", "--root", str(root), "--mission", MISSION]) == EXIT_OK
+    assert tree(root) != before
+
+
+def test_json_is_all_that_is_printed(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert install(root, "--json", "--dry-run") == EXIT_OK
+    told = json.loads(capsys.readouterr().out)
+    assert not told["done"]
+    assert told["commands"] == []  # of a root that is not this computer's
+    assert [file["path"] for file in told["files"] if file["replaces"]] == [f"/{RULES}"]
+    assert install(root, "--json") == EXIT_OK
+    assert json.loads(capsys.readouterr().out)["done"]
+    assert install(root, "--json") == EXIT_OK
+    assert not json.loads(capsys.readouterr().out)["done"]
+    assert undo(root, "--json") == EXIT_OK
+    assert f"/{UNIT}" in json.loads(capsys.readouterr().out)["files"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("--user", "root"), "not root"),
+        (("--user", "a b"), "expected a user's name"),
+        (("--arm-serial", 'X", RUN+="/bin/sh'), "serial number"),
+        (("--mission", "/etc/companion/none.yaml"), "no such file"),
+        (("--mission", "/home/pi/hover.yaml"), "does not see /home"),
+        (("--mission", "/etc/companion/vehicles/tarot650_2r.yaml"), "tarot650_2r.yaml"),
+        (("--root", "/nowhere/at/all"), "expected a folder"),
+    ],
+)
+def test_wrong_input_is_refused(
+    root: Path, arguments: tuple[str, ...], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = tree(root)
+    assert install(root, *arguments) == EXIT_BAD_INPUT
+    assert why in capsys.readouterr().err
+    assert tree(root) == before
+
+
+def test_a_vehicle_that_nobody_could_command_is_refused(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle = root / "etc/companion/vehicles/tarot650_2r.yaml"
+    text = vehicle.read_text()
+    head, _, _ = text.partition("\nground:")
+    vehicle.write_text(head + "\nground:\n  mqtt: null\n")
+    assert install(root) == EXIT_BAD_INPUT
+    assert "nobody could command it" in capsys.readouterr().err
+
+
+def test_a_mission_that_the_service_could_not_read_is_refused(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (root / "etc/companion/missions").chmod(0o700)
+    assert install(root) == EXIT_BAD_INPUT
+    assert "chmod o+rX" in capsys.readouterr().err

@@ -1,0 +1,141 @@
+"""Pure parts of the autopilot edge: modes, battery, answers, and the pacing of requests."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from companion.io.px4 import messages
+from companion.io.px4.requests import ANSWER_DEADLINE_S, RETRY_S, SETTLE_S, RequestDesk
+from companion.io.px4.texts import SAME_TEXT_S
+from companion.model.types import AttitudeSetpoint, AutopilotRequest, FlightMode, LandedState
+
+ARM, LAND, NONE = AutopilotRequest.ARM, AutopilotRequest.LAND, AutopilotRequest.NONE
+CUSTOM = 1
+
+
+@pytest.mark.parametrize(
+    ("main", "sub", "mode"),
+    [
+        (6, 0, FlightMode.OFFBOARD),
+        (4, 2, FlightMode.TAKEOFF),
+        (4, 3, FlightMode.HOLD),
+        (4, 5, FlightMode.RETURN),
+        (4, 6, FlightMode.LAND),
+        (4, 9, FlightMode.LAND),
+        (4, 4, FlightMode.OTHER),  # mission
+        *((pilot, 0, FlightMode.MANUAL) for pilot in (1, 2, 3, 5, 7, 8)),
+        (10, 0, FlightMode.OTHER),  # termination
+        (0, 0, FlightMode.UNKNOWN),
+    ],
+)
+def test_px4_modes(main: int, sub: int, mode: FlightMode) -> None:
+    assert messages.flight_mode(CUSTOM, main << 16 | sub << 24) is mode
+
+
+def test_a_mode_without_the_custom_flag_is_unknown() -> None:
+    assert messages.flight_mode(0, 6 << 16) is FlightMode.UNKNOWN
+
+
+@pytest.mark.parametrize(("base_mode", "armed"), [(129, True), (1, False)])
+@pytest.mark.parametrize("system_status", [3, 4, 5])
+def test_a_heartbeat_says_armed_mode_and_whether_a_failsafe_acts(
+    base_mode: int, armed: bool, system_status: int
+) -> None:
+    fields = {"base_mode": base_mode, "custom_mode": 6 << 16, "system_status": system_status}
+    assert messages.heartbeat_state(json.dumps(fields)) == (armed, FlightMode.OFFBOARD, system_status)
+
+
+def test_an_unheard_of_landed_state_is_unknown() -> None:
+    assert messages.landed_state(2) is LandedState.IN_AIR
+    assert messages.landed_state(17) is LandedState.UNKNOWN
+
+
+def test_battery_that_the_autopilot_does_not_know_is_none() -> None:
+    assert messages.battery(15.2, 40.0) == pytest.approx((15.2, 0.4))
+    assert messages.battery(math.nan, math.nan) == (None, None)
+    assert messages.battery(0.0, -1.0) == (None, None)
+
+
+def test_the_setpoint_keeps_single_precision() -> None:
+    q = (0.9238795325112867, 0.0, 0.0, 0.3826834323650898)
+    fields = json.loads(messages.attitude_target_json(AttitudeSetpoint(q, 0.123456789), 2**32 + 5, 7))
+    assert fields["time_boot_ms"] == 5  # 32 bits on the wire
+    assert fields["target_system"] == 7
+    assert math.hypot(*fields["q"]) == pytest.approx(1.0, abs=1e-8)
+    assert fields["thrust"] == pytest.approx(0.123456789, abs=1e-9)
+
+
+def test_answers_in_words() -> None:
+    assert messages.refusal('{"result":0}') is None
+    assert messages.refusal('{"result":2}') == "denied (MAV_RESULT 2)"
+    assert messages.refusal('{"result":99}') == "unknown result (MAV_RESULT 99)"
+
+
+def test_a_request_repeated_in_every_tick_is_one_command_until_it_is_answered() -> None:
+    desk = RequestDesk()
+    assert desk.claim(ARM, 0.0)
+    assert not any(desk.claim(ARM, tick * 0.005) for tick in range(1, 500))
+    assert desk.pending() == 1
+    desk.answer(ARM, "denied", 2.5)
+    assert desk.claim(ARM, 2.5)
+    assert desk.take_messages(2.5) == ["ARM refused: denied"]
+    assert desk.take_messages(2.5) == []
+
+
+def test_a_refused_request_waits_half_a_second_from_command_to_command() -> None:
+    desk = RequestDesk()
+    assert desk.claim(ARM, 0.0)
+    desk.answer(ARM, "denied", 0.01)
+    assert not desk.claim(ARM, RETRY_S - 0.001)
+    assert desk.claim(ARM, RETRY_S)
+
+
+def test_the_same_refusal_is_told_again_only_after_a_while() -> None:
+    desk = RequestDesk()
+    for t_s in (0.0, 1.0, SAME_TEXT_S):
+        assert desk.claim(ARM, t_s)
+        desk.answer(ARM, "denied", t_s)
+    assert desk.take_messages(SAME_TEXT_S) == ["ARM refused: denied"] * 2
+
+
+def test_an_accepted_request_waits_for_the_heartbeat_that_shows_it() -> None:
+    desk = RequestDesk()
+    assert desk.claim(ARM, 0.0)
+    desk.answer(ARM, None, 0.01)
+    assert not desk.claim(ARM, SETTLE_S)
+    assert desk.claim(ARM, 0.01 + SETTLE_S)
+    assert desk.take_messages(2.0) == []
+
+
+def test_land_never_waits_for_another_kind() -> None:
+    desk = RequestDesk()
+    assert desk.claim(AutopilotRequest.OFFBOARD, 0.0)
+    assert desk.claim(ARM, 0.0)
+    assert desk.claim(LAND, 0.0)
+    assert not desk.claim(NONE, 0.0)
+    assert desk.pending() == 3
+
+
+def test_a_lost_answer_does_not_block_the_request_for_ever() -> None:
+    desk = RequestDesk()
+    assert desk.claim(LAND, 0.0)
+    assert not desk.claim(LAND, ANSWER_DEADLINE_S - 0.001)
+    assert desk.claim(LAND, ANSWER_DEADLINE_S)
+    assert desk.take_messages(ANSWER_DEADLINE_S) == ["LAND: no answer within 3 s, asking again"]
+
+
+def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:
+    desk = RequestDesk()
+    for number in range(500):
+        desk.hear({"severity": 2, "text": str(number), "id": number, "chunk_seq": 0}, 0.0)
+    assert desk.take_messages(0.0) == [f"critical: {number}" for number in range(300, 500)]
+
+
+def test_a_text_that_may_go_on_is_told_when_messages_are_taken_later() -> None:
+    desk = RequestDesk()
+    desk.hear({"severity": 2, "text": "x" * 50, "id": 1, "chunk_seq": 0}, 0.0)
+    assert desk.take_messages(0.1) == []
+    assert desk.take_messages(1.0) == [f"critical: {'x' * 50}"]

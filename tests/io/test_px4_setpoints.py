@@ -1,0 +1,137 @@
+"""The two ways of an attitude setpoint over real UDP against pymavlink: what leaves, and what a silent caller leaves behind."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import Literal, get_args
+
+import pytest
+
+from companion.config.vehicle import AutopilotDevice
+from companion.io.px4.driver import MavsdkAutopilot
+from companion.model.frames import quat_from_euler_zyx
+from companion.model.types import AttitudeSetpoint, FlightMode, Vec3
+from companion.runtime.clock import flight_clock
+from tests.io.px4_peer import Px4Peer, free_udp_port
+from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES, eventually
+
+pytestmark = pytest.mark.waits
+
+Way = Literal["direct", "offboard"]
+WAYS: tuple[Way, ...] = get_args(Way)
+LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5)
+
+
+def edge(port: int, way: Way) -> MavsdkAutopilot:
+    address = f"udpin://127.0.0.1:{port}"
+    device = AutopilotDevice(address=address, discovery_timeout_s=20.0, setpoint_path=way)
+    return MavsdkAutopilot(device, flight_clock())
+
+
+@pytest.mark.parametrize(("euler_world_rad", "euler_ned_rad"), GOLDEN_ATTITUDES)
+def test_the_plugin_sends_the_same_attitude_and_thrust(euler_world_rad: Vec3, euler_ned_rad: Vec3) -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port, "offboard") as autopilot:
+                assert autopilot.send_attitude(AttitudeSetpoint(quat_from_euler_zyx(*euler_world_rad), 0.625))
+                target = await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
+        expected = quat_from_euler_zyx(*euler_ned_rad)
+        dot = sum(a * b for a, b in zip(target.q, expected, strict=True))
+        assert abs(dot) == pytest.approx(1.0, abs=1e-6)
+        assert target.thrust == 0.625
+        assert target.type_mask == 7  # attitude and thrust count, body rates are ignored
+        assert (target.target_system, target.target_component) == (1, 1)
+
+    asyncio.run(fly())
+
+
+@pytest.mark.parametrize(
+    "setpoint",
+    [
+        AttitudeSetpoint((math.nan, 0.0, 0.0, 0.0), 0.5),
+        AttitudeSetpoint((0.0, 0.0, 0.0, 0.0), 0.5),
+        AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), math.nan),
+        AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 1.001),
+    ],
+    ids=["nan", "no-direction", "thrust-nan", "thrust-above-one"],
+)
+def test_a_setpoint_that_must_not_leave_does_not_reach_the_plugin(setpoint: AttitudeSetpoint) -> None:
+    """MAVSDK itself would send it."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port, "offboard") as autopilot:
+                with pytest.raises(ValueError, match="setpoint"):
+                    autopilot.send_attitude(setpoint)
+                assert autopilot.send_attitude(LEVEL)
+                await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
+            assert {target.thrust for target in peer.of("SET_ATTITUDE_TARGET")} == {LEVEL.thrust}
+
+    asyncio.run(fly())
+
+
+async def fly_in_offboard(peer: Px4Peer, autopilot: MavsdkAutopilot) -> None:
+    """PX4 says OFFBOARD, the companion has heard it, and one setpoint has arrived."""
+    peer.custom_mode = 6 << 16
+    await eventually(
+        lambda: (status := autopilot.status()) is not None and status.mode is FlightMode.OFFBOARD, "OFFBOARD"
+    )
+    assert autopilot.send_attitude(LEVEL)
+    await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
+
+
+async def counted(peer: Px4Peer, for_s: float) -> int:
+    before = peer.packets_so_far() and len(peer.of("SET_ATTITUDE_TARGET"))
+    await asyncio.sleep(for_s)
+    assert peer.packets_so_far()
+    return len(peer.of("SET_ATTITUDE_TARGET")) - before
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_a_caller_who_falls_silent_leaves_behind(way: Way) -> None:
+    """The difference between the two ways, and why the first is the default."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port, way) as autopilot:
+                await fly_in_offboard(peer, autopilot)
+                assert (await counted(peer, 1.0) > 0) is (way == "offboard")
+            assert await counted(peer, 0.5) == 0, "the edge is left"
+
+    asyncio.run(fly())
+
+
+def test_a_flight_loop_that_wants_silence_ends_the_plugins_repeating() -> None:
+    """A pilot flies, or PX4 lands: the core has no setpoint, and the last one must not be repeated."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port, "offboard") as autopilot:
+                await fly_in_offboard(peer, autopilot)
+                assert autopilot.send_attitude(None) is False
+                assert await counted(peer, 1.0) == 0
+                assert autopilot.send_attitude(LEVEL), "and it can begin again"
+                assert await counted(peer, 1.0) > 0
+
+    asyncio.run(fly())
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_neither_way_asks_for_a_mode_of_its_own(way: Way) -> None:
+    """MAVSDK's offboard.stop() would command HOLD; an edge that closes commands nothing."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port, way) as autopilot:
+                await fly_in_offboard(peer, autopilot)
+                autopilot.send_attitude(None)
+            assert peer.packets_so_far()
+            assert peer.commands(DO_SET_MODE) == []
+
+    asyncio.run(fly())

@@ -1,0 +1,109 @@
+"""A computer that is too busy is named as such, beside what it brought about."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from companion.launcher.crowding import CAUSED_BY_LATENESS, CoreWait, Crowding, busy_line, core_wait, waited
+from companion.preflight.judge import CHECKS
+from companion.safety.rules import RULES
+from tests.support import wait_until
+
+
+@pytest.mark.parametrize(
+    ("flight", "world", "late_s", "busy"),
+    [
+        (0.01, 0.02, 0.0003, False),  # a quiet computer
+        (0.14, 0.14, 0.0049, False),
+        (0.04, 0.04, 0.050, False),  # late by itself: nobody took its core
+        (0.05, 0.37, 0.0034, True),  # measured: 16 busy programs on two cores, no joint state from the arm
+        (0.16, 0.02, 0.0, True),
+        (0.06, 0.02, 0.006, True),
+    ],
+)
+def test_the_line_comes_by_the_schedulers_figures(flight: float, world: float, late_s: float, busy: bool) -> None:
+    line = busy_line((CoreWait("flight process", flight), CoreWait("simulated world", world)), late_s)
+    assert (line is not None) is busy
+
+
+def test_the_line_says_how_long_who_waited_and_what_to_do() -> None:
+    assert busy_line((CoreWait("flight process", 0.123), CoreWait("simulated world", 0.4)), 0.0231) == (
+        "this computer is too busy (flight process waited 12 % of the time for a core, simulated world waited 40 % of the time for a "
+        "core, ticks are 23 ms late); close other programs, or permit real-time priority: docs/raspberry-pi.md, Real time"
+    )
+
+
+def test_nothing_is_said_where_the_kernel_does_not_count() -> None:
+    assert busy_line((), 1.0) is None
+    assert core_wait("flight process", {}, {}, 3.0) == CoreWait("flight process", 0.0)
+
+
+def test_the_thread_that_waited_longest_speaks_for_its_process() -> None:
+    wait = core_wait("flight process", {1: 10.0, 2: 5.0, 3: 1.0}, {1: 10.3, 2: 6.5, 4: 99.0}, 3.0)
+    assert wait.share == pytest.approx(0.5)
+
+
+def test_every_id_that_lateness_may_cause_exists() -> None:
+    known = {rule.id for rule in RULES} | {check.id for check in CHECKS} | {"guardian_took_over"}
+    assert known >= CAUSED_BY_LATENESS
+
+
+LOST = {"type": "event", "id": "arm_lost", "action": "land", "severity": "critical"}
+ROW: dict[str, Any] = {"id": "arm.reads", "ok": False, "level": "refuse"}
+
+
+@pytest.mark.parametrize(
+    ("message", "judged"),
+    [
+        (LOST, True),
+        ({**LOST, "id": "guardian_took_over", "action": "autopilot_land"}, True),
+        ({**LOST, "action": "warn", "severity": "warning"}, False),
+        ({**LOST, "id": "operator_land"}, False),
+        ({"type": "preflight", "rows": [ROW]}, True),
+        ({"type": "preflight", "rows": [{**ROW, "level": "warn"}, {**ROW, "ok": True}]}, False),
+        ({"type": "preflight", "rows": [{**ROW, "id": "px4.battery"}]}, False),
+        ({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, True),
+        ({"type": "refused", "lines": ["px4.battery: 3.2 V a cell"]}, False),
+    ],
+)
+def test_it_is_judged_when_something_happens_that_lateness_may_cause(message: dict[str, Any], judged: bool) -> None:
+    waited_s = iter([1.0, 2.2])
+    crowding = Crowding({"flight process": 7}, lambda pid: {pid: next(waited_s)})
+    crowding.sample(10.0)
+    line = crowding.take(message, 13.0)
+    assert (line is not None) is judged
+    assert crowding.line == line
+    if line is not None:
+        assert "flight process waited 40 % of the time" in line
+        assert crowding.take(message, 13.1) is None, "once is enough"
+
+
+def test_a_process_that_has_ended_is_judged_by_its_last_sample() -> None:
+    """A device that does not open ends the flight process as it reports it."""
+    reads = iter([{7: 1.0}, {7: 2.2}, {}])
+    crowding = Crowding({"flight process": 7}, lambda pid: next(reads))
+    crowding.sample(10.0)
+    crowding.sample(13.0)
+    line = crowding.take({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, 13.0)
+    assert line is not None
+    assert "flight process waited 40 % of the time" in line
+
+
+def test_programs_that_share_a_core_are_seen_to_wait() -> None:
+    """Real processes and the real scheduler."""
+    cpu = min(os.sched_getaffinity(0))
+    spin = f"import os\nos.sched_setaffinity(0, [{cpu}])\nwhile True: pass"
+    programs = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
+    pid = programs[0].pid
+    try:
+        wait_until(lambda: sum(waited(pid).values()) > 0.5, lambda: f"it never waited: {waited(pid)}", 60.0)
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+    assert waited(pid) == {}, "it is gone"

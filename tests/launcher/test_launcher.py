@@ -1,0 +1,268 @@
+"""What the user started outlives its children and leaves nothing behind: Ctrl-C at every stage, a killed launcher, worlds and
+flights that die.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+
+from companion.analysis.log import FlightLog
+from companion.config.loader import load_flight
+from companion.launcher.sitl_process import SitlProcess
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
+from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options, wait_until
+
+FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=1.0")
+IN_FLIGHT = "  hold\n"
+"""Shown when the vehicle has reached its height."""
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    with sandbox_in(tmp_path) as sandbox:
+        yield sandbox
+
+
+def events_of(summary: dict[str, Any]) -> list[str]:
+    return [event["id"] for event in summary["events"]]
+
+
+@pytest.mark.waits
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_given_up_while_the_world_starts(sandbox: Sandbox, number: signal.Signals) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("Ctrl-C lands")
+        running.signal(number)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_ABORTED, "")
+    summary = read_summary(sandbox.cwd / "out")
+    assert summary["outcome"] == "aborted"
+    assert "takeoff" not in events_of(summary)
+
+
+@contextmanager
+def motive_that_never_answers() -> Iterator[tuple[socket.socket, list[str]]]:
+    """Its socket, and the options that lead there: motion capture is the first device to be opened."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as motive:
+        motive.bind(("127.0.0.1", 0))
+        motive.settimeout(DEADLINE_S)
+        there = {
+            "server": "127.0.0.1",
+            "interface": "127.0.0.1",
+            "transport": "unicast",
+            "command_port": motive.getsockname()[1],
+        }
+        yield motive, set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in there.items()})
+
+
+@pytest.mark.waits
+@pytest.mark.parametrize("background", [False, True], ids=["terminal", "background"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signal.Signals, background: bool) -> None:
+    with (
+        motive_that_never_answers() as (motive, options),
+        sandbox.start("fly", HOVER, "--out", "out", *options, background=background) as running,
+    ):
+        assert motive.recv(100)  # the flight process speaks to it
+        running.signal(number)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_ABORTED, "")
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
+    assert not (sandbox.cwd / "out/flight.mcap").exists()
+
+
+@pytest.mark.waits
+def test_the_numbers_of_flight_and_guardian_are_there_for_as_long_as_they_live(sandbox: Sandbox) -> None:
+    """A number that is left behind may be another process's by the time that somebody signals it."""
+    numbers = [sandbox.cwd / "out/flight.pid", sandbox.cwd / "out/guardian.pid"]
+    with (
+        motive_that_never_answers() as (motive, options),
+        sandbox.start("fly", HOVER, "--out", "out", *options) as running,
+    ):
+        assert motive.recv(100)
+        wait_until(lambda: all(number.exists() for number in numbers), lambda: "no process numbers")
+        assert [sandbox.pid_of("companion.flight.main"), sandbox.pid_of("companion.guardian")] == [
+            int(number.read_text()) for number in numbers
+        ]
+        running.signal(signal.SIGINT)
+        running.end()
+    assert not any(number.exists() for number in numbers)
+
+
+@pytest.mark.waits
+def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
+    with (
+        motive_that_never_answers() as (motive, options),
+        sandbox.start("fly", HOVER, "--out", "out", *options) as running,
+    ):
+        assert motive.recv(100)
+        running.process.kill()
+        sandbox.assert_nobody_left(DEADLINE_S)
+
+
+@pytest.mark.flight
+def test_given_up_before_arming(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("  wait\n")  # it weighs the net for a second
+        running.signal(signal.SIGINT)
+        running.wait_for("landing was asked for")
+        running.signal(signal.SIGINT)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_ABORTED
+    assert "Traceback" not in ended.err
+    summary = read_summary(sandbox.cwd / "out")
+    assert summary["outcome"] == "aborted"
+    assert events_of(summary) == ["operator_land"]
+    log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert log.closed
+    assert not any(inputs.status is not None and inputs.status.armed for inputs in log.inputs)
+
+
+@pytest.mark.flight
+def test_asked_to_land_in_flight_and_asked_again(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for(IN_FLIGHT)
+        running.signal(signal.SIGINT)
+        running.wait_for("landing was asked for")
+        running.signal(signal.SIGTERM)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert (ended.code, ended.err) == (EXIT_ABORTED, "")
+    summary = read_summary(sandbox.cwd / "out")
+    assert summary["outcome"] == "aborted"
+    assert {"takeoff", "operator_land", "touchdown"} <= set(events_of(summary))
+    assert_landed(FlightLog.read(sandbox.cwd / "out/flight.mcap"))
+
+
+def assert_landed(log: FlightLog) -> None:
+    """Closed by the recorder; at its end the vehicle stands, disarmed."""
+    assert log.closed
+    last = log.inputs[-1]
+    assert last.status is not None and not last.status.armed
+    assert last.mocap is not None and last.mocap.position_world_m[2] < 0.4
+
+
+@pytest.mark.flight
+def test_killed_launcher_leaves_a_flight_that_lands_by_itself(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for(IN_FLIGHT)
+        running.process.kill()
+        sandbox.assert_nobody_left(DEADLINE_S)
+    log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert "operator_land" in [event.id for outputs in log.outputs for event in outputs.events]
+    assert_landed(log)
+    assert (sandbox.cwd / "out/flight.log").read_text(encoding="utf-8") == ""
+    assert (sandbox.cwd / "out/sitl.log").read_text(encoding="utf-8") == ""
+
+
+@pytest.mark.flight
+def test_world_that_dies_in_flight_is_named_in_one_line(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY) as running:
+        running.wait_for("  take-off\n")
+        os.kill(sandbox.pid_of("sitl"), signal.SIGKILL)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.err == "sitl: the simulated world was ended by SIGKILL; see out/sitl.log\n"
+    assert ended.code == EXIT_LOST
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"
+    assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
+
+
+@pytest.mark.flight
+def test_flight_process_that_dies_in_flight_is_named_in_one_line(tmp_path: Path) -> None:
+    with sandbox_in(tmp_path, {"PYTHONFAULTHANDLER": "1"}) as sandbox:
+        with sandbox.start(*FLY) as running:
+            running.wait_for("  take-off\n")
+            os.kill(sandbox.pid_of("companion.flight.main"), signal.SIGABRT)
+            ended = running.end()
+        sandbox.assert_nobody_left()
+        assert not (sandbox.cwd / "out/tmp").exists()
+        log = (sandbox.cwd / "out/flight.log").read_text(encoding="utf-8")
+        summary = read_summary(sandbox.cwd / "out")
+        assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
+    assert "Fatal Python error: Aborted" in log
+    assert len(ended.err_lines) == 1, ended.err
+    assert ended.err.startswith("flight: the flight process was ended by SIGABRT")
+    assert ended.err.endswith("; the guardian landed the vehicle; see out/flight.log\n")
+    assert ended.code == EXIT_ABORTED
+    assert summary["outcome"] == "aborted"
+
+
+@pytest.mark.waits
+@pytest.mark.parametrize(
+    ("package", "line"),
+    [
+        (
+            "mujoco",
+            r"sitl: the simulated world ended with exit code 1 (ImportError: a broken mujoco); see out/sitl.log",
+        ),
+        (
+            "mavsdk",
+            r"flight: the flight process ended with exit code 1 (ImportError: a broken mavsdk); see out/flight.log",
+        ),
+    ],
+)
+def test_process_that_cannot_start_is_named_in_one_line(tmp_path: Path, package: str, line: str) -> None:
+    broken = tmp_path / "packages"
+    broken.mkdir()
+    (broken / f"{package}.py").write_text(f"raise ImportError('a broken {package}')\n", encoding="utf-8")
+    with sandbox_in(tmp_path / "sandbox", {"PYTHONPATH": str(broken)}) as sandbox:
+        ended = sandbox.run(*FLY)
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+    assert (ended.code, ended.err) == (EXIT_REFUSED, f"{line}\n")
+    assert summary["outcome"] == "refused"
+
+
+@pytest.mark.waits
+def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
+    # Armed, it would stay until its rotors stand: longer than the launcher waits.
+    world = SitlProcess(load_flight(HOVER), tmp_path)
+    try:
+        address = world.devices()["autopilot"]["address"].removeprefix("udpout://")
+        with closing(mavutil.mavlink_connection(f"udpout:{address}", source_system=255)) as ground:
+            ground.mav.param_set_send(1, 1, b"COM_DISARM_PRFLT", 0.0, mavutil.mavlink.MAV_PARAM_TYPE_REAL32)
+            deadline_s = time.monotonic() + DEADLINE_S
+            armed = False
+            while not armed:
+                assert time.monotonic() < deadline_s, "the world's PX4 did not arm"
+                ground.mav.set_attitude_target_send(0, 1, 1, 0b111, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, 0.0)
+                ground.mav.command_long_send(1, 1, mavutil.mavlink.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
+                ground.mav.command_long_send(1, 1, mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)
+                said = world.messages(time.monotonic() + 0.05)
+                armed = any(message["type"] == "at_rest" and not message["at_rest"] for message in said)
+    finally:
+        world.stop()
+    assert world.ended
+    assert world.process.returncode == 0, "it was killed"
+    assert world.final["payload_kg"] == json.loads((tmp_path / "sitl_config.json").read_text())["world"]["payload_kg"]
+    assert not world.final["crashed"]
+
+
+@pytest.mark.flight
+def test_a_flight_process_that_hangs_in_the_air_is_ended_without_a_guardian(sandbox: Sandbox) -> None:
+    """Both hang: nothing is sent any more, PX4 lands by itself; the launcher notices, ends the processes and tells."""
+    with sandbox.start(*FLY) as running:
+        running.wait_for(IN_FLIGHT)
+        os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGSTOP)
+        os.kill(int((sandbox.cwd / "out/flight.pid").read_text()), signal.SIGSTOP)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_LOST
+    assert "flight: the flight process said nothing for 5 s and was killed" in ended.err
+    assert "guardian: the guardian process hangs and was killed" in ended.err
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"

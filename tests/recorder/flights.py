@@ -1,0 +1,72 @@
+"""Flights for the recorder, and the recorder for flights."""
+
+from __future__ import annotations
+
+import math
+import select
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from companion.config.loader import load_flight
+from companion.model.types import Inputs, Outputs, Sent, TetherState
+from companion.recorder.client import RecorderProcess
+from sitl.fast.loop import FastResult
+from tests.analysis.synthetic_flight import synthetic_flight
+from tests.support import DEADLINE_S
+
+Row = tuple[Inputs, Outputs, Sent]
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+def config_json() -> str:
+    """The effective configuration of a real mission."""
+    return load_flight("configs/missions/catch.yaml").model_dump_json()
+
+
+def flight_of(result: FastResult) -> Iterator[Row]:
+    """Rows of a flight of the fast loop; it has no wires, so times are as they are over a good one."""
+    for i, o in zip(result.inputs, result.outputs, strict=True):
+        t_s = i.t_s
+        yield (
+            i,
+            o,
+            Sent(
+                *(i.tick, o.attitude is not None, o.arm_torque_nm, t_s - 0.0008, 0.0003),
+                *(t_s, t_s + 0.0002, t_s + 0.0004, t_s + 0.0003),
+            ),
+        )
+
+
+def tethered(end_s: float) -> Iterator[Row]:
+    """The synthetic flight up to this mission time, with a tether that comes near to its end."""
+    for inputs, outputs, sent in synthetic_flight(end_s=end_s):
+        slack_m = 0.8 + 0.7 * math.cos(outputs.mission_t_s)
+        state = TetherState(3.0 - slack_m, slack_m, slack_m - 0.05, 0.3, 0.5, 0.0, 0.0, slack_m < 0.15, False, False)
+        yield inputs, replace(outputs, tether=state), sent
+
+
+def started(path: Path, config: str) -> RecorderProcess:
+    """A recorder for a log."""
+    return RecorderProcess.start(path, config_json=config, epoch_offset_ns=EPOCH_NS, deadline_s=DEADLINE_S)
+
+
+def offer(recorder: RecorderProcess, rows: Iterable[Row]) -> int:
+    """Hand ticks over, each as soon as there is room: faster than real time the channel would drop, as it must in flight."""
+    count = 0
+    for row in rows:
+        select.select([], [recorder.client], [], DEADLINE_S)
+        recorder.client.record(*row)
+        count += 1
+    return count
+
+
+def record(path: Path, rows: Iterable[Row], *, config_json: str, plan_json: str | None = None) -> Path:
+    """Write a whole flight through the real recorder process."""
+    recorder = started(path, config_json)
+    if plan_json is not None:
+        recorder.client.metadata("plan", {"json": plan_json, "mission_s": "20.0"})
+    count = offer(recorder, rows)
+    report = recorder.finish(DEADLINE_S)
+    assert (report.samples, report.dropped, report.error) == (count, 0, None)
+    return path

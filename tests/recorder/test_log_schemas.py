@@ -1,0 +1,218 @@
+"""Every channel of a log keeps to what it says of itself and to what the viewers document."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader
+
+from companion.analysis.log import FlightLog
+from tests.recorder.flights import EPOCH_NS, config_json, offer, record, started, tethered
+from tests.recorder.protobuf_wire import Descriptors, WireError
+from tests.recorder.viewers import Viewed, view
+from tests.support import DEADLINE_S
+
+JSON = {
+    "/inputs": "companion.Inputs",
+    "/outputs": "companion.Outputs",
+    "/sent": "companion.Sent",
+    "/events": "companion.EventLine",
+}
+PROTOBUF = {
+    "/tf": "foxglove.FrameTransform",
+    "/tf_arm": "foxglove.FrameTransforms",
+    "/pose": "foxglove.PoseInFrame",
+    "/reference": "foxglove.PoseInFrame",
+    "/scene": "foxglove.SceneUpdate",
+    "/scene_path": "foxglove.SceneUpdate",
+    "/scene_static": "foxglove.SceneUpdate",
+    "/log": "foxglove.Log",
+}
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Viewed:
+    """A short flight of which every message is looked at."""
+    path = tmp_path_factory.mktemp("short") / "flight.mcap"
+    return view(record(path, tethered(end_s=6.6), config_json=config_json(), plan_json="[[0, 0, 1], [0.5, 0, 1]]"))
+
+
+def check(viewed: Viewed, *, every: int = 1) -> None:
+    """JSON messages against their own schema, one in `every`; protobuf messages were decoded by theirs when they were read."""
+    for topic, (encoding, _, _, data) in viewed.schemas.items():
+        messages = viewed.by_topic[topic]
+        if encoding == "json":
+            schema = json.loads(data)
+            jsonschema.Draft202012Validator.check_schema(schema)
+            validator = jsonschema.Draft202012Validator(schema)
+            for message in messages[::every]:
+                validator.validate(message.data)
+
+
+def test_every_channel_says_what_it_holds_in_the_terms_of_the_viewers(synthetic: Viewed) -> None:
+    said = {topic: (message, name, schema) for topic, (message, name, schema, _) in synthetic.schemas.items()}
+    assert said == {
+        **{topic: ("json", name, "jsonschema") for topic, name in JSON.items()},
+        **{topic: ("protobuf", name, "protobuf") for topic, name in PROTOBUF.items()},
+    }
+
+
+def test_no_channel_is_silent_and_every_message_keeps_to_its_schema(synthetic: Viewed) -> None:
+    counts = {topic: len(messages) for topic, messages in synthetic.by_topic.items()}
+    assert min(counts.values()) > 0, counts
+    check(synthetic)
+
+
+def test_a_whole_flight_keeps_to_its_schemas(viewed: Viewed) -> None:
+    assert len(viewed.by_topic["/outputs"]) > 2500
+    assert {message.data["id"] for message in viewed.by_topic["/events"]} >= {"takeoff", "catch", "touchdown"}
+    check(viewed, every=50)
+    for topic in ("/events", "/sent"):
+        check(Viewed(tuple(viewed.by_topic[topic]), {topic: viewed.schemas[topic]}))
+
+
+def test_a_message_that_breaks_its_schema_is_found(synthetic: Viewed) -> None:
+    first = synthetic.by_topic["/outputs"][0]
+    for key, value in (("tick", "seven"), ("phase", None), ("surprise", 1)):
+        broken = {**first.data, key: value}
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(broken, json.loads(synthetic.schemas["/outputs"][3]))
+    types = Descriptors(synthetic.schemas["/tf"][3])
+    for data in (b"\x0a\xff", b"\xfa\x7f\x01", b"\x21\x00"):
+        with pytest.raises(WireError):
+            types.decode("foxglove.FrameTransform", data)
+
+
+def test_json_schemas_use_only_what_viewers_read(synthetic: Viewed) -> None:
+    """Objects, arrays of one type, scalars: no unions, no references, no tuples; the root is an object."""
+
+    def walk(schema: dict[str, Any], where: str) -> None:
+        assert schema.keys() <= {
+            *("$schema", "title", "type", "properties", "required", "additionalProperties"),
+            *("items", "minItems", "maxItems", "enum"),
+        }, where
+        match schema["type"]:
+            case "object":
+                for name, inner in schema["properties"].items():
+                    walk(inner, f"{where}.{name}")
+            case "array":
+                assert isinstance(schema["items"], dict), where
+                assert schema["items"]["type"] != "array", f"{where}: no viewer reads lists of lists"
+                walk(schema["items"], where)
+            case other:
+                assert other in ("boolean", "integer", "number", "string"), where
+
+    for topic in JSON:
+        root = json.loads(synthetic.schemas[topic][3])
+        assert root["type"] == "object"
+        walk(root, topic)
+
+
+def test_log_time_publish_time_and_header_are_the_wall_clock_of_the_tick(synthetic: Viewed) -> None:
+    walls = {EPOCH_NS + round(m.data["t_s"] * 1e9) for m in synthetic.by_topic["/inputs"]}
+    for message in synthetic.messages:
+        assert message.publish_time_ns == message.log_time_ns
+        assert message.log_time_ns in walls, message.topic
+        for header in headers(message.data):
+            assert header["seconds"] * 1_000_000_000 + header["nanos"] == message.log_time_ns, message.topic
+    times = [message.log_time_ns for message in synthetic.messages]
+    assert times == sorted(times)
+
+
+def headers(data: Any) -> list[dict[str, int]]:
+    """Every `timestamp` of a protobuf message, nested ones too."""
+    if isinstance(data, list):
+        return [header for item in data for header in headers(item)]
+    if not isinstance(data, dict):
+        return []
+    found = [data["timestamp"]] if isinstance(data.get("timestamp"), dict) else []
+    return found + [header for key, item in data.items() if key != "timestamp" for header in headers(item)]
+
+
+def test_the_log_of_a_killed_recorder_opens_and_keeps_to_its_schemas(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    recorder = started(path, config_json())
+    offer(recorder, tethered(end_s=4.0))
+    deadline_s = time.monotonic() + DEADLINE_S
+    while path.stat().st_size < 50_000:  # it writes a chunk now and then
+        assert time.monotonic() < deadline_s, "the recorder writes nothing"
+        select.select([], [], [], 0.02)
+    recorder.process.kill()
+    recorder.process.wait(DEADLINE_S)
+    recorder.finish(DEADLINE_S)
+    found = view(path, whole=False)
+    assert found.by_topic.keys() >= {"/inputs", "/outputs", "/sent", "/tf", "/tf_arm", "/scene", "/scene_static"}
+    check(found)
+    counts = {len(found.by_topic[topic]) for topic in ("/inputs", "/outputs", "/sent")}
+    assert len(counts) == 1, "a chunk holds whole ticks"
+    log = FlightLog.read(path)
+    assert not log.closed
+    assert len(log.inputs) in counts
+
+
+FLIGHT = """
+import sys
+sys.path.insert(0, sys.argv[2])
+from pathlib import Path
+from tests.recorder.flights import config_json, offer, started, tethered
+recorder = started(Path(sys.argv[1]), config_json())
+print(recorder.process.pid, flush=True)
+print(offer(recorder, tethered(end_s=1.0)), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_log_of_a_killed_flight_is_whole_and_keeps_to_its_schemas(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    command = [sys.executable, "-c", FLIGHT, str(path), str(Path(__file__).parents[2])]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as flight:
+        assert flight.stdout is not None
+        recorder = os.pidfd_open(int(flight.stdout.readline()))
+        count = int(flight.stdout.readline())
+        flight.kill()
+    ended, _, _ = select.select([recorder], [], [], DEADLINE_S)
+    os.close(recorder)
+    assert ended, "the recorder did not end by itself"
+    found = view(path)
+    assert len(found.by_topic["/inputs"]) == count
+    check(found)
+    assert FlightLog.read(path).closed
+
+
+def test_protobuf_s_own_library_decodes_the_same(viewed: Viewed, flown: Path) -> None:
+    decoder = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
+    theirs = []
+    with flown.open("rb") as file:
+        reader = NonSeekingReader(file, decoder_factories=[decoder.DecoderFactory()])
+        try:
+            topics = list(PROTOBUF)
+            for _, channel, message, decoded in reader.iter_decoded_messages(topics=topics, log_time_order=False):
+                theirs.append((channel.topic, message.log_time, plain(decoded)))
+        except EndOfFile:
+            pytest.fail("the log is whole")
+    ours = [(m.topic, m.log_time_ns, m.data) for m in viewed.messages if m.topic in PROTOBUF]
+    assert ours == theirs
+
+
+def plain(message: Any) -> Any:
+    """A message of protobuf's library as nested dicts, defaults included."""
+    found: dict[str, Any] = {}
+    for field in message.DESCRIPTOR.fields:
+        value = getattr(message, field.name)
+        if field.message_type is None:
+            found[field.name] = list(value) if field.is_repeated else value
+        elif field.is_repeated:
+            found[field.name] = [plain(item) for item in value]
+        else:
+            found[field.name] = plain(value) if message.HasField(field.name) else None
+    return found

@@ -1,0 +1,386 @@
+"""The viewers' channels: frames, poses, the picture, their rates; and that nothing of it can cost a tick."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from companion.analysis.log import FlightLog
+from companion.config.loader import load_flight
+from companion.control.manipulator import Manipulator
+from companion.model.codec import differences, plain
+from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.types import Inputs, MocapPose, Outputs, Quat, Sent, TetherState, Vec3
+from companion.recorder.disk import Disk
+from companion.recorder.log_writer import LogWriter
+from companion.recorder.viewer_scene import hanging_line_m, machine_of, path_of
+from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
+from tests.recorder.viewers import Seen, Viewed, view
+
+NAN = math.nan
+
+
+def written(path: Path, rows: Iterable[Row], *, config: str | None = None, plan: str | None = None) -> Viewed:
+    """Rows through the writer alone."""
+    disk = Disk(path)
+    writer = LogWriter(disk, EPOCH_NS, chunk_bytes=2**19)
+    writer.metadata("companion", {"log_format": "1"})
+    writer.metadata("config", {"json": config_json() if config is None else config})
+    if plan is not None:
+        writer.metadata("plan", {"json": plan, "mission_s": "1.0"})
+    for row in rows:
+        writer.tick(*map(plain, row))
+    writer.close()
+    disk.close()
+    return view(path)
+
+
+def still(ticks: int = 1) -> list[Row]:
+    """The first ticks of a flight."""
+    rows = tethered(end_s=1.0)
+    return [next(rows) for _ in range(ticks)]
+
+
+def moved(row: Row, position: Vec3, attitude: Quat, arm: tuple[float, float]) -> Row:
+    """The same tick somewhere else, by motion capture and PX4 alike."""
+    inputs, outputs, sent = row
+    assert inputs.mocap is not None and inputs.arm is not None and inputs.vehicle is not None
+    inputs = replace(
+        inputs,
+        mocap=replace(inputs.mocap, position_world_m=position, attitude_wxyz=attitude),
+        vehicle=replace(inputs.vehicle, position_world_m=position, attitude_wxyz=attitude),
+        arm=replace(inputs.arm, angle_rad=arm),
+    )
+    return inputs, outputs, sent
+
+
+def vec(message: dict[str, float]) -> Vec3:
+    return (message["x"], message["y"], message["z"])
+
+
+def quat(message: dict[str, float]) -> Quat:
+    return (message["w"], message["x"], message["y"], message["z"])
+
+
+def in_world(transforms: list[dict[str, Any]], frame: str) -> tuple[Vec3, Quat]:
+    """Where a frame is, by following its parents."""
+    position: Vec3 = (0.0, 0.0, 0.0)
+    turn: Quat = (1.0, 0.0, 0.0, 0.0)
+    by_child = {one["child_frame_id"]: one for one in transforms}
+    while frame != "world":
+        one = by_child[frame]
+        x, y, z = quat_rotate(quat(one["rotation"]), position)
+        tx, ty, tz = vec(one["translation"])
+        position, turn = (x + tx, y + ty, z + tz), quat_multiply(quat(one["rotation"]), turn)
+        frame = one["parent_frame_id"]
+    return position, turn
+
+
+def test_the_frames_are_where_the_arm_s_kinematics_have_them(tmp_path: Path) -> None:
+    vehicle = load_flight("configs/missions/catch.yaml").vehicle
+    arm = Manipulator(vehicle.arm, vehicle.tool)
+    chance = random.Random(5)
+    for case in range(6):
+        at = (chance.uniform(-1, 1), chance.uniform(-1, 1), chance.uniform(0.5, 1.5))
+        attitude = quat_from_euler_zyx(chance.uniform(-0.3, 0.3), chance.uniform(-0.3, 0.3), chance.uniform(-3, 3))
+        angles = (chance.uniform(1.0, 3.0), chance.uniform(-0.2, 2.6))
+        viewed = written(tmp_path / f"{case}.mcap", [moved(still()[0], at, attitude, angles)])
+        (body,), (joints,) = viewed.by_topic["/tf"], viewed.by_topic["/tf_arm"]
+        frames = [body.data, *joints.data["transforms"]]
+        for frame, body_m in (("link2", arm.elbow_body_m(angles)), ("net", arm.net_body_m(angles))):
+            x, y, z = quat_rotate(attitude, body_m)
+            position, turn = in_world(frames, frame)
+            assert position == pytest.approx((at[0] + x, at[1] + y, at[2] + z), abs=1e-12)
+        # Link 2 points from the elbow to the net.
+        along = quat_rotate(turn, (vehicle.arm.link_lengths_m[1], 0.0, 0.0))
+        elbow, _ = in_world(frames, "link2")
+        assert tuple(e + a for e, a in zip(elbow, along, strict=True)) == pytest.approx(position, abs=1e-12)
+
+
+def test_each_channel_keeps_its_rate(tmp_path: Path) -> None:
+    rows = [row for row in tethered(end_s=9.0) if row[0].t_s >= 1.0]
+    viewed = written(tmp_path / "flight.mcap", rows, plan="[[0, 0, 1], [1, 0, 1]]")
+    seconds = rows[-1][0].t_s - rows[0][0].t_s
+    for topic, rate_hz in (
+        *(
+            ("/tf", 50.0),
+            ("/tf_arm", 50.0),
+            ("/pose", 50.0),
+            ("/reference", 50.0),
+            ("/scene", 20.0),
+            ("/inputs", 200.0),
+        ),
+    ):
+        assert len(viewed.by_topic[topic]) / seconds == pytest.approx(rate_hz, rel=0.02), topic
+    assert len(viewed.by_topic["/scene_static"]) == 1
+    assert 4 <= len(viewed.by_topic["/scene_path"]) <= 5
+
+
+def only(seen: list[Seen], entity: str) -> dict[str, Any]:
+    found: list[dict[str, Any]] = [one for m in seen for one in m.data["entities"] if one["id"] == entity]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_what_stands_is_drawn_once_for_good_in_its_own_frame(tmp_path: Path) -> None:
+    viewed = written(tmp_path / "flight.mcap", still(20), plan="[[0, 0, 1], [1, 0, 1], [1, 1, 1]]")
+    standing = viewed.by_topic["/scene_static"]
+    frames = {"room": "world", "anchor": "world", "planned path": "world", "vehicle": "body"}
+    frames |= {"link1": "link1", "link2": "link2", "net": "net"}
+    assert {one["id"]: one["frame_id"] for one in standing[0].data["entities"]} == frames
+    for one in standing[0].data["entities"]:
+        assert one["frame_locked"]
+        assert one["lifetime"] is None or one["lifetime"] == {"seconds": 0, "nanos": 0}
+    vehicle = load_flight("configs/missions/catch.yaml").vehicle
+    disks = only(standing, "vehicle")["cylinders"]
+    reach = [math.hypot(d["pose"]["position"]["x"], d["pose"]["position"]["y"]) + d["size"]["x"] / 2 for d in disks]
+    assert reach == pytest.approx([vehicle.airframe.radius_m] * 4)
+    corners = [vec(p) for p in only(standing, "room")["lines"][0]["points"]]
+    assert len(corners) == 24
+    assert [min(c) for c in zip(*corners, strict=True)] == [
+        vehicle.room.x_m[0],
+        vehicle.room.y_m[0],
+        vehicle.room.z_m[0],
+    ]
+    assert [max(c) for c in zip(*corners, strict=True)] == [
+        vehicle.room.x_m[1],
+        vehicle.room.y_m[1],
+        vehicle.room.z_m[1],
+    ]
+
+
+def test_a_plan_that_comes_later_is_drawn_with_everything_else_again(tmp_path: Path) -> None:
+    disk = Disk(tmp_path / "flight.mcap")
+    writer = LogWriter(disk, EPOCH_NS, chunk_bytes=2**19)
+    writer.metadata("config", {"json": config_json()})
+    rows = still(40)
+    for row in rows[:20]:
+        writer.tick(*map(plain, row))
+    writer.metadata("plan", {"json": "[[0, 0, 1], [1, 0, 1]]", "mission_s": "1.0"})
+    for row in rows[20:]:
+        writer.tick(*map(plain, row))
+    writer.close()
+    disk.close()
+    first, second = view(tmp_path / "flight.mcap").by_topic["/scene_static"]
+    names = [{one["id"] for one in message.data["entities"]} for message in (first, second)]
+    assert names[1] - names[0] == {"planned path"}
+    assert names[0] < names[1]
+
+
+GREEN, AMBER, RED = "green", "amber", "red"
+
+
+def colour_of(rgba: dict[str, float]) -> str:
+    if rgba["r"] < 0.5:
+        return GREEN
+    return AMBER if rgba["g"] > 0.4 else RED
+
+
+@pytest.mark.parametrize(
+    ("away_m", "held", "colour"),
+    [
+        (1.5, False, GREEN),
+        (2.70, False, GREEN),
+        (2.80, False, AMBER),
+        (2.97, False, RED),
+        (3.2, False, RED),
+        (1.5, True, RED),
+    ],
+)
+def test_the_tether_is_coloured_by_its_slack(tmp_path: Path, away_m: float, held: bool, colour: str) -> None:
+    tether = load_flight("configs/missions/catch.yaml").vehicle.tether
+    x, y, z = tether.anchor_world_m
+    inputs, outputs, sent = moved(still()[0], (x, y, z + away_m), (1.0, 0.0, 0.0, 0.0), (2.0, 2.0))
+    watched = TetherState(away_m, 3.0 - away_m, 0.0, 0.0, 1.0, 0.0, 0.0, False, held, False)
+    viewed = written(tmp_path / "flight.mcap", [(inputs, replace(outputs, tether=watched), sent)])
+    line = only(viewed.by_topic["/scene"], "tether")["lines"][0]
+    assert colour_of(line["color"]) == colour
+    assert vec(line["points"][0]) == pytest.approx(tether.anchor_world_m)
+    assert vec(line["points"][-1]) == pytest.approx((x, y, z + away_m))
+
+
+@pytest.mark.parametrize("end", [(2.0, 0.0, 0.0), (1.5, 1.0, 1.0), (0.5, 0.0, 2.5), (0.3, 0.0, -2.0), (0.05, 0.0, 1.0)])
+@pytest.mark.parametrize("slack_m", [0.02, 0.3, 1.5])
+def test_the_hanging_line_is_as_long_as_the_tether_and_below_its_chord(end: Vec3, slack_m: float) -> None:
+    length_m = math.hypot(*end) + slack_m
+    points = hanging_line_m((0.0, 0.0, 0.0), end, length_m)
+    drawn_m = sum(map(math.dist, points, points[1:]))
+    assert drawn_m <= length_m * 1.001
+    assert drawn_m >= length_m * 0.97, "thirteen points cut corners, but not more"
+    for k, point in enumerate(points):
+        assert point[2] <= end[2] * k / (len(points) - 1) + 1e-12
+    on_floor = hanging_line_m((0.0, 0.0, 0.0), end, length_m, floor_m=-0.1)
+    assert min(p[2] for p in on_floor[1:-1]) >= -0.1
+
+
+def test_a_short_line_is_straight() -> None:
+    points = hanging_line_m((0.0, 0.0, 0.0), (3.0, 0.0, 0.0), 2.9)
+    assert {p[2] for p in points} == {0.0}
+
+
+def test_the_flown_path_stays_short_however_long_the_flight(tmp_path: Path) -> None:
+    inputs, outputs, sent = still()[0]
+    seen = mocap(0.0)
+
+    def circling() -> Iterable[Row]:
+        for k in range(2000):
+            t_s = k * 0.05
+            pose = replace(seen, stamp_s=t_s, position_world_m=(math.cos(t_s), math.sin(t_s), 1.0))
+            yield replace(inputs, tick=k, t_s=t_s, mocap=pose), replace(outputs, tick=k, t_s=t_s), replace(sent, tick=k)
+
+    viewed = written(tmp_path / "flight.mcap", circling())
+    sizes = [len(only([m], "flown")["lines"][0]["points"]) for m in viewed.by_topic["/scene_path"]]
+    assert max(sizes) <= 256
+    assert sizes[-1] >= 128
+    last = viewed.by_topic["/scene_path"][-1]
+    start = vec(only([last], "flown")["lines"][0]["points"][0])
+    assert start == pytest.approx((1.0, 0.0, 1.0), abs=0.1), "the beginning of the flight is in it"
+
+
+def mocap(t_s: float, **changes: Any) -> MocapPose:
+    usual = MocapPose(t_s, 0.002, 1, (0.1, 0.2, 1.0), (1.0, 0.0, 0.0, 0.0), True, 1e-4)
+    return replace(usual, **changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"tracking_valid": False},
+        {"stamp_s": -1.0},
+        {"stamp_s": NAN},
+        {"position_world_m": (NAN, 0.2, 1.0)},
+        {"attitude_wxyz": (0.0, 0.0, 0.0, 0.0)},
+        {"attitude_wxyz": (1e200, 0.0, 0.0, 0.0)},
+    ],
+)
+def test_without_a_pose_of_motion_capture_px4_s_is_shown(tmp_path: Path, changes: dict[str, Any]) -> None:
+    inputs, outputs, sent = moved(still()[0], (0.7, 0.8, 0.9), (1.0, 0.0, 0.0, 0.0), (2.0, 2.0))
+    viewed = written(tmp_path / "flight.mcap", [(replace(inputs, mocap=mocap(inputs.t_s, **changes)), outputs, sent)])
+    assert vec(viewed.by_topic["/tf"][0].data["translation"]) == (0.7, 0.8, 0.9)
+    assert len(viewed.by_topic["/pose"]) == (1 if "stamp_s" in changes else 0), "what is no pose is not shown as one"
+
+
+def sick(rows: list[Row], chance: random.Random) -> Row:
+    """A tick with any of its fields absent or not finite, as deep as they go."""
+
+    def spoil(record: Any) -> Any:
+        if isinstance(record, float):
+            return chance.choice([record, record, NAN, math.inf, -math.inf, 1e308, -0.0])
+        if isinstance(record, tuple):
+            return tuple(spoil(item) for item in record)
+        if hasattr(record, "__dataclass_fields__"):
+            changed = {}
+            for name, field in record.__dataclass_fields__.items():
+                absent = "None" in str(field.type) and chance.random() < 0.2
+                changed[name] = None if absent else spoil(getattr(record, name))
+            return replace(record, **changed)
+        if isinstance(record, str):
+            return chance.choice([record, "", "\ud800 half a character", "\x00", "ä" * 300])
+        return record
+
+    inputs, outputs, sent = chance.choice(rows)
+    return spoil(inputs), spoil(outputs), spoil(sent)
+
+
+def test_no_sick_tick_is_lost_or_stops_the_viewers(tmp_path: Path) -> None:
+    chance = random.Random(11)
+    healthy = [row for row in tethered(end_s=7.5) if row[0].t_s > 6.0]
+    rows: list[Row] = []
+    for k in range(400):
+        inputs, outputs, sent = sick(healthy, chance)
+        # What the flight counts itself is always whole.
+        rows.append((replace(inputs, tick=k), replace(outputs, tick=k), replace(sent, tick=k)))
+    path = tmp_path / "flight.mcap"
+    last = healthy[-1]
+    viewed = written(path, [*rows, last])
+    log = FlightLog.read(path)
+    assert len(log.inputs) == len(rows) + 1
+    for (inputs, outputs, sent), row in zip(rows, log.rows(), strict=False):
+        assert all(differences(one, other) is None for one, other in zip((inputs, outputs, sent), row, strict=True))
+    shown = {message.topic for message in viewed.messages if message.log_time_ns == EPOCH_NS + round(last[0].t_s * 1e9)}
+    assert {"/tf", "/tf_arm", "/pose", "/reference", "/scene"} <= shown
+    for message in viewed.messages:
+        if message.topic in ("/tf", "/tf_arm", "/pose", "/reference", "/scene", "/scene_path"):
+            assert all(map(math.isfinite, floats(message.data))), message
+
+
+def test_a_tick_that_cannot_be_drawn_is_recorded_and_told_once(tmp_path: Path) -> None:
+    disk = Disk(tmp_path / "flight.mcap")
+    writer = LogWriter(disk, EPOCH_NS, chunk_bytes=2**19)
+    rows = still(12)
+    for inputs, outputs, sent in rows:
+        torn: Any = (0.0, 1.0)
+        writer.tick(plain(replace(inputs, mocap=mocap(inputs.t_s, position_world_m=torn))), plain(outputs), plain(sent))
+    writer.close()
+    disk.close()
+    viewed = view(tmp_path / "flight.mcap")
+    assert len(viewed.by_topic["/inputs"]) == len(viewed.by_topic["/sent"]) == len(rows)
+    assert [message.data["name"] for message in viewed.by_topic["/log"]] == ["recorder"]
+    assert viewed.by_topic["/log"][0].data["message"].startswith("no viewer messages of tick 0: ValueError")
+
+
+def floats(data: Any) -> Iterable[float]:
+    if isinstance(data, dict):
+        for item in data.values():
+            yield from floats(item)
+    elif isinstance(data, list):
+        for item in data:
+            yield from floats(item)
+    elif isinstance(data, float):
+        yield data
+
+
+@pytest.mark.parametrize(
+    "config",
+    ["", "null", "[]", "nonsense", '{"vehicle": 7}', '{"vehicle": {"arm": {"link_lengths_m": ["a", 1]}, "room": []}}'],
+)
+def test_any_configuration_gives_a_log_and_at_least_the_frame(tmp_path: Path, config: str) -> None:
+    viewed = written(tmp_path / "flight.mcap", still(20), config=config, plan='{"no": "path"}')
+    assert len(viewed.by_topic["/inputs"]) == 20
+    assert viewed.by_topic["/tf"]
+    assert not viewed.by_topic["/tf_arm"]
+    assert not viewed.by_topic["/scene"]
+
+
+def test_geometry_is_taken_where_it_is_whole() -> None:
+    whole = machine_of(json.loads(config_json()))
+    assert None not in (whole.arm, whole.tether, whole.room_min_world_m, whole.radius_m)
+    assert machine_of({"vehicle": {"tether": {"anchor_world_m": [0, 0, 0], "length_m": 0}}}).tether is None
+    assert machine_of({"vehicle": {"tether": {"anchor_world_m": [0, NAN, 0], "length_m": 1}}}).tether is None
+    assert path_of([[0, 0, 1], [1, 0, "1"]]) == ()
+    assert path_of([[0, 0, 1], [1, 0, 1]]) == ((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
+
+
+def test_a_log_from_before_these_channels_is_read_as_ever(tmp_path: Path) -> None:
+    """The same records without any viewer's channel: what the reader gives back does not differ."""
+    new = tmp_path / "new.mcap"
+    written(new, tethered(end_s=1.0))
+    old = tmp_path / "old.mcap"
+    with new.open("rb") as source, old.open("wb") as target:
+        writer = Writer(target)
+        writer.start(profile="companion")
+        channels: dict[int, int] = {}
+        reader = make_reader(source)
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        topics = ["/inputs", "/outputs", "/sent"]
+        for schema, channel, message in reader.iter_messages(topics=topics, log_time_order=False):
+            assert schema is not None
+            if channel.id not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    before, after = FlightLog.read(old), FlightLog.read(new)
+    rows: list[tuple[Inputs, Outputs, Sent]] = list(after.rows())
+    assert len(rows) > 300
+    assert list(before.rows()) == rows

@@ -1,0 +1,53 @@
+"""What the terminal of `companion fly` shows of a flight's messages, where standard output is no terminal."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+
+from companion.model.types import Outputs
+from companion.runtime.console import FlightDisplay
+from companion.runtime.realtime import Realtime
+from tests.flights.test_fast_flights import flown
+
+
+def shown(*messages: dict[str, object]) -> list[str]:
+    """Lines below the title."""
+    out = io.StringIO()
+    with FlightDisplay(Console(file=out, width=60), "a flight") as display:
+        for message in messages:
+            display.on_message(message)
+    return out.getvalue().splitlines()[1:]
+
+
+def test_what_the_flight_got_of_the_system_is_one_line() -> None:
+    got = str(Realtime(50, (2, 3), False, ("memory not locked (RLIMIT_MEMLOCK is 8192 kB, expected unlimited)",)))
+    [line] = shown({"type": "started", "recorder_pid": 1, "realtime": got})
+    assert line.split(maxsplit=2) == ["real", "time", got]
+
+
+def test_what_the_system_refused_is_no_markup() -> None:
+    got = "normal priority (PermissionError: [bold]no[/] permission)"
+    [line] = shown({"type": "started", "recorder_pid": 1, "realtime": got})
+    assert line.endswith(got)
+
+
+def messages_of(outputs: Outputs) -> list[dict[str, object]]:
+    """As the flight process sends them in one tick."""
+    told: list[dict[str, object]] = [
+        {"type": "event", "t_s": outputs.mission_t_s, "severity": event.severity.value, "text": event.text}
+        for event in outputs.events
+    ]
+    return [*told, {"type": "status", "mission_t_s": outputs.mission_t_s, "phase": outputs.phase, "progress": 0.0}]
+
+
+def test_every_step_of_a_flight_is_printed_once() -> None:
+    result = flown(0.2, "recommended")
+    lines = shown(*(message for outputs in result.outputs for message in messages_of(outputs)))
+    steps = [line[14:] for line in lines]
+    assert len(set(steps)) == len(steps), steps
+    assert [step for step in steps if "caught" not in step] == [
+        "wait", "offboard", "arm", "spool up", "take-off", "settle", "catch", "stabilise", "return", "above the start", "land",
+        "touchdown", "disarm", "done",
+    ]  # fmt: skip

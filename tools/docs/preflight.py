@@ -1,0 +1,48 @@
+"""The tables of docs/preflight.md, made from the checks themselves: `python -m tools.docs.preflight docs/preflight.md`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from companion.preflight import arm, estimator, force, frames, machine, mission, mocap, tether
+from companion.preflight.checks import Check
+from tools.docs.tables import write_page
+
+ROOMS: dict[str, Sequence[Check]] = {
+    "px4": estimator.CHECKS,
+    "mocap": mocap.CHECKS,
+    "frames": frames.CHECKS,
+    "arm": arm.CHECKS,
+    "force": force.CHECKS,
+    "tether": tether.CHECKS,
+    "mission": mission.CHECKS,
+    "machine": machine.CHECKS,
+}
+
+
+def checks_table(checks: Sequence[Check]) -> str:
+    """One row per check."""
+    lines = ["| row | what is looked at | wanted | otherwise |", "|---|---|---|---|"]
+    for check in checks:
+        told = f"{check.why}{' (told, never refused)' if check.warns else ''}"
+        lines.append(f"| `{check.id}` | {check.title} | {check.wanted} | {told} |")
+    return "\n".join(lines)
+
+
+def tables() -> dict[str, str]:
+    """By the names of their places."""
+    return {name: checks_table(checks) for name, checks in ROOMS.items()}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Write the tables into a page."""
+    parser = argparse.ArgumentParser(prog="tools.docs.preflight", description=__doc__)
+    parser.add_argument("page", type=Path)
+    return write_page(parser.parse_args(argv).page, tables())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

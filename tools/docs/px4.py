@@ -1,0 +1,88 @@
+"""The files of configs/px4/ and the table of docs/px4.md, made from `companion.px4.wanted`.
+
+`python -m tools.docs.px4 .` writes them below the repository's root.
+"""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+
+from companion.preflight.px4 import text_of
+from companion.px4 import params_file
+from companion.px4.params_file import PACKAGED
+from companion.px4.wanted import GROUPS, NO_RADIO, RADIO, file_values
+from tools.docs.tables import written
+
+NO_RADIO_FILE = "no_radio.params"
+DOCS_MARK = "parameters"
+
+_WIDTH = 110
+
+
+def indoor_mocap_text() -> str:
+    """configs/px4/indoor_mocap.params."""
+    comments: dict[str, list[str]] = {}
+    for title, group in GROUPS.items():
+        inside = [wanted for wanted in group if wanted.file and wanted.value is not None]
+        for index, wanted in enumerate(inside):
+            above = ["", f"== {title} =="] if index == 0 else []
+            reboot = " Takes effect after a reboot." if wanted.reboot else ""
+            also = f" Accepted: {wanted.text()}." if wanted.ok or wanted.limits else ""
+            only = f" PX4 {wanted.only} only." if wanted.only else ""
+            comments[wanted.name] = above + textwrap.wrap(f"{wanted.name}: {wanted.why}.{also}{reboot}{only}", _WIDTH)
+    heading = [
+        "PX4 1.16 and 1.18, a quadrotor indoors on motion capture, without GPS.",
+        "",
+        "Load it in QGroundControl (Vehicle setup > Parameters > Tools > Load from file), or with",
+        "companion px4 params --write, which writes only what differs and keeps the old values in a file.",
+        "",
+        f"Not in here: MPC_THR_HOVER, which is measured on each vehicle, and {RADIO}, because {NO_RADIO} switches the",
+        f"pilot's radio off ({NO_RADIO_FILE}, for machines that nobody holds a radio for).",
+        "",
+    ]
+    return params_file.text(file_values(), heading, comments)
+
+
+def no_radio_text() -> str:
+    """configs/px4/no_radio.params."""
+    return params_file.text(
+        {RADIO: NO_RADIO},
+        ["Only where nobody holds a radio: PX4 then ignores sticks and mode switch.", ""],
+    )
+
+
+def table_markdown() -> str:
+    """The parameters, for docs/px4.md."""
+    lines = []
+    for title, group in GROUPS.items():
+        lines += [
+            f"**{title}**",
+            "",
+            "| parameter | set | accepted | if not | reboot | why |",
+            "|---|---|---|---|---|---|",
+        ]
+        for wanted in group:
+            value = "measured" if wanted.value is None else f"`{text_of(wanted.value)}`"
+            if not wanted.file and wanted.value is not None:
+                value += " without a radio"
+            reboot = "yes" if wanted.reboot else ""
+            name = f"`{wanted.name}` ({wanted.only} only)" if wanted.only else f"`{wanted.name}`"
+            lines.append(f"| {name} | {value} | {wanted.text()} | {wanted.level.value} | {reboot} | {wanted.why} |")
+        lines.append("")
+    return "\n".join(lines).rstrip()
+
+
+def main(root: Path) -> None:
+    """Write everything below `root`."""
+    text = indoor_mocap_text()
+    PACKAGED.write_text(text, encoding="utf-8")
+    (root / "configs/px4/indoor_mocap.params").write_text(text, encoding="utf-8")
+    (root / "configs/px4" / NO_RADIO_FILE).write_text(no_radio_text(), encoding="utf-8")
+    page = root / "docs/px4.md"
+    page.write_text(written(page.read_text(encoding="utf-8"), {DOCS_MARK: table_markdown()}), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,42 @@
+"""The result in docs/robustness.md: `python -m tools.docs.robustness docs/robustness.md robustness.json`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.campaigns.robustness import graded
+from tools.docs.tables import flown_by, write_results
+
+
+def result_markdown(results: dict[str, Any]) -> str:
+    """Return how many flights ended how, and the distribution of the position error after the catch."""
+    rows, settings, summary = results["rows"], results["settings"], results["summary"]
+    errors_mm = [1000.0 * row["e_p_m"] for row in graded(rows)]
+    outcomes = ", ".join(
+        f"{count} {outcome}" for outcome, count in Counter(row["outcome"] for row in rows).most_common()
+    )
+    p50, p90, largest = (f"{value:.1f} mm" for value in np.percentile(errors_mm, [50, 90, 100]))
+    return (
+        f"{len(rows)} draws, seed {settings['seed']}, `{settings['controller']}/{settings['preset']}`: {outcomes}; "
+        f"{summary['caught']} payloads were caught, {summary['missed']} missed the net.\n"
+        f"RMS of the position error after the catch: p50 {p50}, p90 {p90}, largest {largest}.\n{flown_by(results)}"
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Write the result into a page."""
+    parser = argparse.ArgumentParser(prog="tools.docs.robustness")
+    parser.add_argument("page", type=Path)
+    parser.add_argument("results", type=Path, help="robustness.json of companion robustness")
+    arguments = parser.parse_args(argv)
+    return write_results(arguments.page, arguments.results, lambda results: {"result": result_markdown(results)})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""The tables of docs/safety.md, made from the code: `python -m tools.docs.safety docs/safety.md` writes them in their places."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from companion.config.vehicle import ForceDevice, Safety, Tether
+from companion.model.types import Event, SafetyAction, Severity
+from companion.safety.rules import RULES, Part, Rule
+from companion.safety.supervisor import (
+    HOLD_EXPIRED,
+    RETRACT_DONE,
+    RETRACT_EXPIRED,
+    LadderTimes,
+    SupervisorState,
+    update,
+)
+from tools.docs.tables import write_page
+
+_SECTIONS: dict[str, type[BaseModel]] = {"": Safety, "tether.": Tether, "devices.force.": ForceDevice}
+_TIMES = LadderTimes(1.0, 1.0)
+_OWN_EVENTS = (
+    (RETRACT_DONE, SafetyAction.LAND),
+    ("no_room_to_stay", SafetyAction.LAND),
+)
+"""Events of the core that the ladder listens to."""
+
+
+def _default(key: str) -> str:
+    """`key` = default of a limit; without one only the key."""
+    section, _, name = key.rpartition(".")
+    model = _SECTIONS.get(f"{section}." if section else "")
+    default: Any = model.model_fields[name].default if model is not None else None
+    return f"`{key}`" if default is None else f"`{key}` = {default:g}"
+
+
+def _held(rule: Rule) -> str:
+    if isinstance(rule.hold, str):
+        return _default(rule.hold)
+    return f"{rule.hold:g} s"
+
+
+def _action(action: SafetyAction | None) -> str:
+    return "" if action is None else f"`{action.value}`"
+
+
+def monitors_table() -> str:
+    """One row per rule, in the order of the code."""
+    rows = [
+        "| id | what is found | limit | held for | on the ground | in the air |",
+        "|---|---|---|---|---|---|",
+    ]
+    for part in Part:
+        rows.append(f"| **{part.value}** | | | | | |")
+        for rule in RULES:
+            if rule.part is part:
+                limits = ", ".join(map(_default, rule.limits))
+                once = "" if rule.clears else " (told once)"
+                cells = (
+                    f"`{rule.id}`",
+                    rule.found + once,
+                    limits,
+                    _held(rule),
+                    _action(rule.ground),
+                    _action(rule.air),
+                )
+                rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def after(state: SafetyAction, event_id: str, asks: SafetyAction) -> SafetyAction:
+    """Where the ladder stands after an event, by the ladder itself."""
+    event = Event(0.0, event_id, Severity.INFO, asks, "")
+    return update(SupervisorState(state, "before", 0.0), [event], 0.0, _TIMES).action
+
+
+def ladder_table() -> str:
+    """Every state x every event in the air: the state after it."""
+    states = list(SafetyAction)
+    rows = [
+        f"| event | {' | '.join(state.value for state in states)} |",
+        f"|---|{'---|' * len(states)}",
+    ]
+    events = [(rule.id, rule.air) for rule in RULES if rule.air is not None]
+    for event_id, asks in (*events, *_OWN_EVENTS):
+        cells = [after(state, event_id, asks) for state in states]
+        shown = ["" if cell is state else cell.value for cell, state in zip(cells, states, strict=True)]
+        rows.append(f"| `{event_id}` | {' | '.join(shown)} |")
+    late = SupervisorState(SafetyAction.HOLD, "before", 0.0), SupervisorState(SafetyAction.RETRACT, "before", 0.0)
+    for name, key, start in ((HOLD_EXPIRED, "hold_max_s", late[0]), (RETRACT_EXPIRED, "retract_max_s", late[1])):
+        end = update(start, [], 2.0, _TIMES)
+        shown = [end.action.value if state is start.action else "" for state in states]
+        rows.append(f"| `{name}`, after {_default(key)} s | {' | '.join(shown)} |")
+    return "\n".join(rows)
+
+
+def tables() -> dict[str, str]:
+    """By the names of their places."""
+    return {"monitors": monitors_table(), "ladder": ladder_table()}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Write the tables into a page."""
+    parser = argparse.ArgumentParser(prog="tools.docs.safety", description=__doc__)
+    parser.add_argument("page", type=Path)
+    return write_page(parser.parse_args(argv).page, tables())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
