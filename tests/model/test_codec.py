@@ -50,7 +50,7 @@ def test_marshal_is_decoded_only_where_the_flight_process_itself_has_written_it(
         for path in package.rglob("*.py")
         if re.search(r"\bunpack_plain\(|\bmarshal\.load", path.read_text(encoding="utf-8"))
     }
-    assert users == {"record.py", "recorder_process.py", "recording/ground_desk.py"}
+    assert users == {"model/codec.py", "recorder/main.py", "recorder/telemetry_session.py"}
 
 
 def test_all_records_of_the_types_module_are_covered() -> None:
