@@ -23,7 +23,7 @@ from rich.table import Table
 from companion.analysis.log import FlightLog
 from companion.config.loader import load_flight
 from companion.launcher.launcher import Launcher, landing_signals
-from sitl.flight_faults import SIGNALS
+from sitl.faults.processes import SIGNALS
 
 MISSION = Path(__file__).parents[1] / "configs/missions/catch.yaml"
 SETPOINTS_STOP_S = 0.15

@@ -20,10 +20,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.px4_log import Px4Log, newest
 from companion.analysis.log import FlightLog, LogError
 from companion.campaigns.faults_over_wires import WITNESS
-from sitl.px4.link import Px4Error
-from sitl.px4_log import Px4Log, newest
+from sitl.px4.hil_link import Px4Error
 
 ROOT = Path(__file__).parents[1]
 MISSION = ROOT / "configs/missions/catch.yaml"

@@ -19,15 +19,15 @@ from companion.config.loader import FlightConfig
 from companion.runtime.event_loop import run
 from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime
 from sitl.autopilot.mavlink import LinkError
-from sitl.faults import FaultError, in_time
-from sitl.px4.link import Px4Error
-from sitl.px4.world import RealPx4
+from sitl.faults.timing import FaultError, in_time
+from sitl.px4.backend import RealPx4
+from sitl.px4.hil_link import Px4Error
 from sitl.server import Ports, Sitl, start_of
 
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
 
-WITNESS = "world.json"
-"""Beside the configuration: what really happened in a flight with faults."""
+TRUTH_FILE = "world.json"
+"""Written beside the configuration after a flight with faults or several throws: the true course, modes and frames."""
 
 
 def _say(message: dict[str, Any]) -> None:
@@ -37,7 +37,7 @@ def _say(message: dict[str, Any]) -> None:
         )  # unbuffered: nothing is left to be flushed into a closed pipe
 
 
-async def _serve(config: FlightConfig, for_launcher: bool, witness: Path, px4_folder: Path | None) -> None:
+async def _serve(config: FlightConfig, for_launcher: bool, truth_file: Path, px4_folder: Path | None) -> None:
     start = config.mission.start
     ports = Ports() if for_launcher else _STANDARD
     on_message = _say if for_launcher else _tell
@@ -63,13 +63,13 @@ async def _serve(config: FlightConfig, for_launcher: bool, witness: Path, px4_fo
         claim_realtime(WORLD_PRIORITY, lock_memory=False)
         await sitl.run(on_ready)
     if for_launcher:
-        _say_last(sitl, witness if config.world.faults or config.world.throws > 1 else None)
+        _say_last(sitl, truth_file if config.world.faults or config.world.throws > 1 else None)
 
 
-def _say_last(sitl: Sitl, witness: Path | None) -> None:
-    if witness is not None:
+def _say_last(sitl: Sitl, truth_file: Path | None) -> None:
+    if truth_file is not None:
         with contextlib.suppress(OSError):  # the flight's folder may be gone, or full
-            witness.write_text(json.dumps(sitl.witness()), encoding="utf-8")
+            truth_file.write_text(json.dumps(sitl.ground_truth()), encoding="utf-8")
     _say({"type": "final", "world": sitl.final()})
 
 
@@ -124,8 +124,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     try:
-        witness = arguments.config.with_name(WITNESS)
-        run(_serve(in_time(config), arguments.for_launcher, witness, arguments.px4))
+        truth_file = arguments.config.with_name(TRUTH_FILE)
+        run(_serve(in_time(config), arguments.for_launcher, truth_file, arguments.px4))
     except (OSError, LinkError, FaultError, Px4Error) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:

@@ -19,17 +19,17 @@ from companion.config.faults import FaultKind
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
 from companion.model.types import IDENTITY_QUAT, Vec2
+from sitl.autopilot.backend import AutopilotBackend, StubBackend
 from sitl.autopilot.mavlink import Ports as LinkPorts
-from sitl.ends import AutopilotEnd, StubEnd
-from sitl.faults import Faults, Sample, sample
-from sitl.flight_faults import SIGNALS, FlightFaults, environment, strike
+from sitl.faults.injector import Faults, Sample, sample
+from sitl.faults.processes import SIGNALS, ProcessFaults, environment, strike
 from sitl.force_torque import ForceTorqueServer
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
-from sitl.px4.link import Px4Error
+from sitl.px4.hil_link import Px4Error
 from sitl.servo.bus import ServoBus
-from sitl.servo.knobs import plugged_in, servos_of
+from sitl.servo.from_config import plugged_in, servos_of
 from sitl.servo.model import ServoModel
-from sitl.world.arm_hand import ArmHand
+from sitl.world.arm_handling import ArmHandling
 from sitl.world.plant import MocapFrame, Plant
 from sitl.world.world import PHYSICS_DT_S
 
@@ -83,7 +83,7 @@ class Sitl:
         start: Start,
         ports: Ports,
         on_message: OnMessage,
-        autopilot: AutopilotEnd | None = None,
+        autopilot: AutopilotBackend | None = None,
     ) -> None:
         self._vehicle = vehicle
         self._config = config
@@ -91,7 +91,7 @@ class Sitl:
         self.servos = servos_of(vehicle, config)
         self._on_bus = plugged_in(self.servos, config)
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
-        self.autopilot: AutopilotEnd = autopilot or StubEnd(config, stub_ports)
+        self.autopilot: AutopilotBackend = autopilot or StubBackend(config, stub_ports)
         pose = (start.position_m, start.yaw_rad, start.arm_rad)
         self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=True)
         self.autopilot.attach(self.plant.world)
@@ -107,8 +107,8 @@ class Sitl:
             self.plant.faults = self.faults
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
-        self._arm_hand = ArmHand(vehicle.arm, pose[2]) if config.arm_hand else None
-        self.flight = FlightFaults()
+        self._arm_hand = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand else None
+        self.flight = ProcessFaults()
         self.course: list[Sample] = []
         """Where the machine truly was, from the first fault on."""
         self._course_due_s = 0.0
@@ -237,11 +237,11 @@ class Sitl:
         self.force.set_wrench(*plant.force_torque())
         self.force.tick(plant.t_s)
         autopilot.pump(plant.t_s, plant.battery())
-        noticed, armed = autopilot.noticed(), autopilot.armed
-        mode = None if noticed.nav_state is None else noticed.nav_state.name
+        observed, armed = autopilot.observe(), autopilot.armed
+        mode = None if observed.nav_state is None else observed.nav_state.name
         if not self.modes or self.modes[-1][1:] != (mode, armed):
             self.modes.append((plant.t_s, mode, armed))
-        if self.flight.watch(plant.t_s, *noticed, armed):
+        if self.flight.watch(plant.t_s, *observed, armed):
             self.flight.sample(plant.truth.position_world_m, plant.truth.attitude_wxyz)
         for event in plant.world.take_events():
             self._on_message({"type": "event", "kind": event.kind, "t_s": event.t_s})
@@ -250,7 +250,7 @@ class Sitl:
             self._at_rest = at_rest
             self._on_message({"type": "at_rest", "at_rest": at_rest})
 
-    def _hold_arm(self, hand: ArmHand) -> None:
+    def _hold_arm(self, hand: ArmHandling) -> None:
         servos, world = self.servos, self.plant.world
         first, second = world.layout.joint_q
         held = hand.angles_rad(
@@ -274,7 +274,7 @@ class Sitl:
         plant = self.plant
         for kind in SIGNALS:
             if plant.fault(kind) is not None:
-                seen = self.autopilot.noticed()
+                seen = self.autopilot.observe()
                 self.flight.plant(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
         self._strike()
         self._note_course()
@@ -310,7 +310,7 @@ class Sitl:
         self._course_due_s = plant.t_s + COURSE_PERIOD_S
         self.course.append(sample(plant.world, self._vehicle.tether.anchor_world_m))
 
-    def witness(self) -> dict[str, Any]:
+    def ground_truth(self) -> dict[str, Any]:
         """What a campaign wants to know of a flight with faults."""
         return {
             **self.final(),

@@ -23,7 +23,7 @@ from companion.safety.touchdown import HEIGHT_MARGIN_M
 from sitl.campaigns import flights as campaign
 from sitl.campaigns.flights import CampaignError, Data
 from sitl.fast.loop import FastFlight, FastResult
-from sitl.faults import FaultError, in_time
+from sitl.faults.timing import FaultError, in_time
 from sitl.world.world import Snapshot
 
 

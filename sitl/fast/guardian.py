@@ -103,7 +103,7 @@ class _StubEnd:
         """Nobody reads it."""
 
 
-class StandIn:
+class FastGuardian:
     """The guardian of one fast flight.
 
     Args:

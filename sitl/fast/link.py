@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from companion.model.types import AutopilotStatus, VehicleState
 from sitl.autopilot.autopilot import Px4Stub
-from sitl.faults import Faults
+from sitl.faults.injector import Faults
 from sitl.world.world import World
 
 MEMORY = 400

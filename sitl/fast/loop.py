@@ -41,18 +41,19 @@ from companion.model.types import (
     VehicleState,
 )
 from sitl.autopilot.autopilot import Command7, Px4Stub
+from sitl.autopilot.backend import set_hover_thrust, stub_of
 from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.telemetry import system_status
 from sitl.autopilot.types import AttitudeTarget, ImuSample
-from sitl.ends import set_hover_thrust, stub_of
 from sitl.fast.bus import scales_of
-from sitl.fast.guardian import TAKE_OVER_S, Landing, StandIn
+from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
-from sitl.faults import COOL_C, Faults, in_time
+from sitl.faults.injector import COOL_C, Faults
+from sitl.faults.timing import in_time
 from sitl.server import start_of
 from sitl.servo.drive import MODE_CURRENT
-from sitl.servo.knobs import plugged_in, servos_of
+from sitl.servo.from_config import plugged_in, servos_of
 from sitl.world.plant import MocapFrame, Plant, battery_voltage_v
 from sitl.world.world import Layout, Snapshot, Truth
 
@@ -153,7 +154,7 @@ class FastFlight:
         self.faults = Faults(world, self.plant.world, self.px4, self._drives, vehicle.tether.anchor_world_m)
         if world.faults:
             self.plant.faults = self.faults
-        self._guardian = StandIn(vehicle, self.px4) if world.faults else None
+        self._guardian = FastGuardian(vehicle, self.px4) if world.faults else None
         self._link = FastLink(self.faults, self.plant.world, self.px4, TICK_S)
         self._goal_s = 0.0
         hover = set_hover_thrust(self.px4, world, self.plant.world)
@@ -236,7 +237,7 @@ class FastFlight:
                 period_s += TICK_S
                 result.after.append(world.snapshot())
 
-    def _held_up(self, guardian: StandIn) -> bool:
+    def _held_up(self, guardian: FastGuardian) -> bool:
         """A fault keeps the flight process from its tick; what then goes on is what other threads do."""
         active, t_s = self.faults.active, self.plant.world.t_s
         guardian.alive = "kill_guardian" not in active
@@ -247,7 +248,7 @@ class FastFlight:
                     drive.set_goal_current(0)
         return not active.keys().isdisjoint(HOLD_UP)
 
-    def _guardian_lands(self, guardian: StandIn, result: FastResult, limit_s: float) -> None:
+    def _guardian_lands(self, guardian: FastGuardian, result: FastResult, limit_s: float) -> None:
         plant, px4 = self.plant, self.px4
         world = plant.world
         open_s = world.t_s + TAKE_OVER_S

@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Self
 
 from companion.runtime.subprocesses import how_it_ended
-from sitl.px4.link import Px4Error
+from sitl.px4.hil_link import Px4Error
 
 VARIABLE = "PX4_SITL"
 """Of the environment: the px4 binary, or the folder that a build leaves (build/px4_sitl_default)."""
@@ -93,11 +93,11 @@ class Instance:
     The simulator's TCP port is the claim: whoever listens there owns the number.
     """
 
-    def __init__(self, number: int, simulator: socket.socket, witness: socket.socket) -> None:
+    def __init__(self, number: int, simulator: socket.socket, control: socket.socket) -> None:
         self.number = number
         self.simulator = simulator
         """TCP, listening; PX4 connects to it."""
-        self.witness = witness
+        self.control = control
         """UDP; what PX4 sends to its camera link arrives here."""
 
     @property
@@ -116,7 +116,7 @@ class Instance:
         return (HOST, _ONBOARD_OWN + self.number)
 
     @property
-    def witness_address(self) -> tuple[str, int]:
+    def control_address(self) -> tuple[str, int]:
         """Where PX4's camera link listens."""
         return (HOST, _CAMERA_OWN + self.number)
 
@@ -141,11 +141,11 @@ class Instance:
         with contextlib.ExitStack() as stack:
             simulator = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
             simulator.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # only past connections keep a port busy
-            witness = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            control = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             try:
                 simulator.bind((HOST, _SIMULATOR + number))
                 simulator.listen(1)
-                witness.bind((HOST, _CAMERA + number))
+                control.bind((HOST, _CAMERA + number))
                 for port in (_ONBOARD, _ONBOARD_OWN, _GROUND_OWN, _CAMERA_OWN, _GIMBAL_OWN):
                     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
                         probe.bind((HOST, port + number))
@@ -155,13 +155,13 @@ class Instance:
                 raise
             stack.pop_all()
         simulator.setblocking(False)
-        witness.setblocking(False)
-        return cls(number, simulator, witness)
+        control.setblocking(False)
+        return cls(number, simulator, control)
 
     def close(self) -> None:
         """Give the number back."""
         self.simulator.close()
-        self.witness.close()
+        self.control.close()
 
     def __enter__(self) -> Self:
         return self

@@ -20,9 +20,9 @@ from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_norm
 from companion.model.types import Quat, Vec2, Vec3, Vec4
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
-from sitl.faults import Faults
-from sitl.world.hand import Hand, HungWeight
-from sitl.world.mocap_axes import SpoiledFrame
+from sitl.faults.injector import Faults
+from sitl.world.handling import Hand, HungWeight
+from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.world import PHYSICS_DT_S, Truth, World
 
 IMU_EVERY = 2
@@ -124,7 +124,7 @@ class Plant:
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
-        self._spoiled = SpoiledFrame.of(config)
+        self._spoiled = MocapMisalignment.of(config)
         self._hand = Hand(config, self.world.weight_n) if config.hand else None
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True

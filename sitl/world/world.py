@@ -12,7 +12,7 @@ import numpy as np
 from companion.config.vehicle import Vehicle
 from companion.config.world import World as WorldConfig
 from companion.model.types import Quat, Vec2, Vec3, Vec4
-from sitl.world.hand import Wrench
+from sitl.world.handling import Wrench
 from sitl.world.model import mjcf
 
 PHYSICS_DT_S = 0.002

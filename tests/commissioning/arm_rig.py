@@ -30,7 +30,7 @@ from companion.runtime.clock import flight_clock
 from companion.runtime.realtime import WORLD_PRIORITY
 from sitl.server import start_of
 from sitl.servo.bus import ServoBus
-from sitl.servo.knobs import plugged_in, servos_of
+from sitl.servo.from_config import plugged_in, servos_of
 from tests.support import CATCH, ROOT, Ended, Running, Sandbox, World, run_here, sandbox_in
 
 HAND = "world.arm_hand=true"

@@ -15,7 +15,7 @@ from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import ForceSample, Quat, Vec2, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
-from sitl.world.hand import HungWeight
+from sitl.world.handling import HungWeight
 from tests.support import ROOT
 
 VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")

@@ -259,7 +259,7 @@ _OLD_WORLD = """
 import sys
 
 if "sitl" in sys.orig_argv:
-    from sitl.px4.link import SimulatorLink
+    from sitl.px4.hil_link import SimulatorLink
 
     send = SimulatorLink.send
     SimulatorLink.send = lambda self, imu, *rest: send(self, imu._replace(t_s=imu.t_s + 1000.0), *rest)

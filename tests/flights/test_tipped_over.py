@@ -10,7 +10,7 @@ from companion.config.loader import load_flight
 from companion.model.frames import euler_zyx_from_quat, tilt_rad
 from companion.model.types import Outcome
 from sitl.fast.loop import FastFlight
-from sitl.world.hand import Wrench
+from sitl.world.handling import Wrench
 from tests.support import HOVER, LOW_HOVER
 
 LIES_AT_RAD = math.radians(50.0)

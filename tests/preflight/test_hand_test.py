@@ -23,7 +23,7 @@ from companion.preflight.hand_test.run import (
     HandView,
     Step,
 )
-from sitl.world.hand import ROUND_S
+from sitl.world.handling import ROUND_S
 from tests.preflight.hand_rig import Standing, world
 from tests.support import ROOT
 from tools.docs.preflight import checks_table

@@ -10,8 +10,8 @@ import pytest
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.world import World
 from sitl.fast.loop import FastFlight, FastResult
-from tests.sitl.device_ends import END_STEPS, Emitted, emitted
 from tests.sitl.knobs import Pair, Settings, fault_pairs, pairs
+from tests.sitl.simulated_devices import END_STEPS, Emitted, emitted
 from tests.support import SHORT_CATCH
 
 BASE = load_flight(SHORT_CATCH)

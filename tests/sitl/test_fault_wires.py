@@ -18,7 +18,7 @@ from companion.config.loader import load_flight
 from companion.model.types import AutopilotStatus, FlightMode, LandedState, VehicleState
 from sitl.fast.link import FastLink
 from sitl.fast.loop import TICK_S, FastFlight
-from sitl.flight_faults import strike
+from sitl.faults.processes import strike
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import packet, status

@@ -21,8 +21,8 @@ from sitl.campaigns.faults import fly, grid
 from sitl.campaigns.flights import CampaignError
 from sitl.campaigns.robustness import draw, throws
 from sitl.fast.loop import FastFlight, FastResult
-from sitl.faults import FaultError, in_time
-from sitl.flight_faults import environment
+from sitl.faults.processes import environment
+from sitl.faults.timing import FaultError, in_time
 from tests.support import CATCH, HOVER, SHORT_CATCH, sandbox_in
 
 CONFIG = load_flight(CATCH, preset="recommended")

@@ -11,8 +11,8 @@ import pytest
 
 from companion.model.frames import quat_from_euler_zyx
 from sitl.autopilot.types import ImuSample
-from sitl.px4 import link as px4_link
-from sitl.px4.link import HilSensors, Px4Error, SimulatorLink, field_frd_gauss, pressure_hpa
+from sitl.px4 import hil_link as px4_link
+from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink, field_frd_gauss, pressure_hpa
 from tests.sitl.px4_peer import Answer, LockstepPeer
 
 DEADLINE_S = 20.0

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sitl.autopilot.types import ImuSample
-from sitl.px4.link import HilSensors, Px4Error, SimulatorLink
+from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
 from sitl.px4.process import Installation, Instance, Px4Process, find
 from tests.sitl import px4_peer
 

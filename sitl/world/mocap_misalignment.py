@@ -15,7 +15,7 @@ from companion.model.types import Quat, Vec3
 _PLACE = {"x": 0, "y": 1, "z": 2}
 
 
-class SpoiledFrame:
+class MocapMisalignment:
     """True poses to streamed ones: `p' = A p`, `R' = A R Z A'` with A of `world.mocap_axes` and Z the body's wrong zero."""
 
     def __init__(self, config: World) -> None:
@@ -35,7 +35,7 @@ class SpoiledFrame:
         self._zero = quat_multiply(off, quat_conjugate(quat_from_euler_zyx(0.0, 0.0, nose_yaw_rad)))
 
     @classmethod
-    def of(cls, config: World) -> SpoiledFrame | None:
+    def of(cls, config: World) -> MocapMisalignment | None:
         """None: the server is set up as it should be."""
         upright = (config.mocap_axes, config.mocap_body_yaw_deg, config.mocap_body_tilt_deg)
         return None if upright == (("x", "y", "z"), 0.0, (0.0, 0.0)) else cls(config)

@@ -9,43 +9,28 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from companion.config.faults import Fault, FaultKind, FlightPhase
-from companion.config.loader import FlightConfig
+from companion.config.faults import Fault, FaultKind
 from companion.config.world import World as WorldConfig
-from companion.mission.plan import Plan
-from companion.mission.segments import Segment
-from companion.model.flight_stage import SPOOL_S
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
-from companion.model.types import PhaseKind, Quat, Vec3, Vec4
+from companion.model.types import Quat, Vec3, Vec4
 from sitl.autopilot.modes import NavState
 from sitl.servo.drive import COUNTS_PER_TURN, ServoDrive
 from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.world import Ball, World
 
-AFTER_CATCH_S = 0.1
-"""Phase "catch"."""
-REBOOT_ON_GROUND_S = 1.3
-"""Phase "ground": from the start on, but a restart only once there is something to restart."""
 FULL_V = 16.6
 OVERHEATED_C = 80.0
 OVERLOAD, OVERHEATING = 0x20, 0x04
 """Bits of register 70."""
 COOL_C = 35.0
-_ALONG_M = 0.3
-_EARLY_IN_LINE, _MIDDLE = 0.35, 0.5
 _FOREVER_M = 1000.0
 _OTHER_BODY_Z_M = 0.05
 _OTHER_BODY_YAW_RAD = math.radians(120.0)
 _BESIDE = (0.6, 0.8)
-_FROM_START: frozenset[FaultKind] = frozenset({"payload_missed", "payload_heavy"})
-
-
-class FaultError(Exception):
-    """A fault that this mission has no place for; one line."""
 
 
 class Servo(Protocol):
@@ -69,63 +54,6 @@ class Autopilot(Protocol):
 
     def pilot_chooses(self, state: NavState) -> None:
         """A mode by somebody else."""
-
-
-def in_time(config: FlightConfig) -> FlightConfig:
-    """The configuration with every fault at a time instead of in a phase, and a heavy payload as the one that is thrown.
-
-    Raises:
-        FaultError: the mission has no such phase.
-    """
-    faults = config.world.faults
-    if not faults:
-        return config
-    changes: dict[str, Any] = {"faults": tuple(_timed(fault, config) for fault in faults)}
-    heavy = next((fault for fault in faults if fault.kind == "payload_heavy"), None)
-    if heavy is not None:
-        changes["payload_kg"] = heavy.magnitude
-    return config.model_copy(update={"world": config.world.model_copy(update=changes)})
-
-
-def _timed(fault: Fault, config: FlightConfig) -> Fault:
-    if fault.kind in _FROM_START or fault.phase == "ground":
-        t_s = REBOOT_ON_GROUND_S if fault.kind == "autopilot_reboot" else 0.0
-        return fault.model_copy(update={"after": "start", "t_s": t_s, "phase": None})
-    if fault.phase is None:
-        return fault
-    if fault.phase == "catch" and config.world.payload_kg > 0:
-        return fault.model_copy(update={"after": "catch", "t_s": AFTER_CATCH_S, "phase": None})
-    t_s = round(SPOOL_S + _plan_time_s(fault.phase, config), 3)
-    return fault.model_copy(update={"after": "arming", "t_s": t_s, "phase": None})
-
-
-def _plan_time_s(phase: FlightPhase, config: FlightConfig) -> float:
-    """Seconds since the plan's start. The line is the first way sideways, before its middle; the return is the last one."""
-    plan = Plan.build(config.mission, config.vehicle)
-
-    def way_m(segment: Segment) -> float:
-        begin, end = plan.reference(segment.start_s), plan.reference(segment.end_s)
-        return math.dist(begin.position_world_m[:2], end.position_world_m[:2])
-
-    def within(segments: list[Segment], index: int, share: float) -> float:
-        if not segments:
-            raise FaultError(
-                f"world.faults: mission '{config.mission.name}' has no {phase}; give t_s instead of the phase"
-            )
-        segment = segments[index]
-        return segment.start_s + share * (segment.end_s - segment.start_s)
-
-    def of(kind: PhaseKind) -> list[Segment]:
-        return [segment for segment in plan.segments if segment.kind is kind]
-
-    if phase == "takeoff":
-        return within(of(PhaseKind.TAKEOFF), 0, _MIDDLE)
-    if phase == "landing":
-        return within(of(PhaseKind.LANDING), -1, _MIDDLE)
-    lines = [segment for segment in of(PhaseKind.FLIGHT) if way_m(segment) > _ALONG_M]
-    if phase == "return":
-        return within(lines[1:], -1, _MIDDLE)
-    return within(lines, 0, _MIDDLE if phase == "catch" else _EARLY_IN_LINE)
 
 
 class Faults:

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl.autopilot.params import Value
-from sitl.px4.link import Px4Error
-from sitl.px4.store import NAME, decode, restore, stored
+from sitl.px4.hil_link import Px4Error
+from sitl.px4.parameter_file import NAME, decode, restore, stored
 
 DEADLINE_S = 20.0
 NAMES = st.text("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_", min_size=1, max_size=16)
@@ -62,7 +62,7 @@ def test_it_waits_for_the_values_and_not_for_their_names(tmp_path: Path) -> None
 
 
 def test_values_that_never_come_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sitl.px4.store.STORED_DEADLINE_S", 0.2)
+    monkeypatch.setattr("sitl.px4.parameter_file.STORED_DEADLINE_S", 0.2)
     with pytest.raises(Px4Error, match="expected it to store its parameters in"):
         asyncio.run(stored(tmp_path, {"EKF2_EV_CTRL": 11}))
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.px4.link import Px4Error
-from sitl.px4_log import AfterFault, Change, Px4Log, newest
+from benchmarks.px4_log import AfterFault, Change, Px4Log, newest
+from sitl.px4.hil_link import Px4Error
 
 FAULT_S = 20.0
 

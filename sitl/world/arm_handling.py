@@ -13,7 +13,7 @@ FORGET_S: Final = 1.5
 """The lights dark for so long: whoever asked has gone, the next one begins anew."""
 
 
-class ArmHand:
+class ArmHandling:
     """Where both joints are held.
 
     Args:

@@ -1,6 +1,6 @@
 """What a real PX4's own log (ULog) says of a flight: modes, arming, what reached it and when, on PX4's clock.
 
-PX4's clock begins with `sitl.px4.link.CLOCK_ORIGIN_S` at its first sample: times here are world times. Needs `pyulog`.
+PX4's clock begins with `sitl.px4.hil_link.CLOCK_ORIGIN_S` at its first sample: times here are world times. Needs `pyulog`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.launcher.sitl_process import PX4_FOLDER
-from sitl.px4.link import CLOCK_ORIGIN_S, Px4Error
+from sitl.px4.hil_link import CLOCK_ORIGIN_S, Px4Error
 
 NAV_STATES = {
     0: "MANUAL", 1: "ALTCTL", 2: "POSCTL", 3: "MISSION", 4: "HOLD", 5: "RTL", 10: "ACRO", 12: "DESCEND", 13: "TERMINATION",

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import development as mavlink  # common, and CURRENT
 
 from sitl.autopilot.modes import NavState, nav_state_from_custom
 from sitl.autopilot.params import MAV_PARAM_TYPE_INT32, Value, decode_bytewise, encode_bytewise
-from sitl.px4.link import Px4Error
+from sitl.px4.hil_link import Px4Error
 from sitl.px4.process import Instance
 
 ASK_AGAIN_S = 0.25
@@ -47,7 +47,7 @@ class Version:
         return f"{self.release} ({self.build})" if self.build else self.release
 
 
-class Witness(asyncio.DatagramProtocol):
+class ControlLink(asyncio.DatagramProtocol):
     """The link. An async context manager on the instance's own socket."""
 
     def __init__(self, instance: Instance) -> None:
@@ -63,7 +63,7 @@ class Witness(asyncio.DatagramProtocol):
         self._closed = asyncio.Event()
 
     async def __aenter__(self) -> Self:
-        await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self._instance.witness)
+        await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self._instance.control)
         return self
 
     async def __aexit__(
@@ -110,7 +110,7 @@ class Witness(asyncio.DatagramProtocol):
         )
         if heard is None:
             raise Px4Error(
-                f"PX4: expected a heartbeat on UDP {self._instance.witness.getsockname()[1]} within "
+                f"PX4: expected a heartbeat on UDP {self._instance.control.getsockname()[1]} within "
                 f"{HEARTBEAT_DEADLINE_S:g} s, found none; is it PX4 SITL with its standard links?"
             )
 
@@ -272,7 +272,7 @@ class Witness(asyncio.DatagramProtocol):
 
     def _send(self, message: Any) -> None:
         if self._transport is not None:
-            self._transport.sendto(message.pack(self._encoder), self._instance.witness_address)
+            self._transport.sendto(message.pack(self._encoder), self._instance.control_address)
             self._encoder.seq = (self._encoder.seq + 1) % 256
 
 

@@ -15,12 +15,12 @@ from companion.config.loader import load_vehicle
 from companion.config.world import World
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
-from sitl.px4.link import Px4Error
+from sitl.px4.backend import OF_THE_STUB, refuse_what_needs_the_stub
+from sitl.px4.control_link import ControlLink, same
+from sitl.px4.hil_link import Px4Error
+from sitl.px4.parameters import parameters, rotor_geometry
 from sitl.px4.process import Instance
 from sitl.px4.relay import Relay
-from sitl.px4.vehicle import parameters, rotor_geometry
-from sitl.px4.witness import Witness, same
-from sitl.px4.world import OF_THE_STUB, refuse_what_needs_the_stub
 from tests.sitl.px4_rig import Rig
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
@@ -29,31 +29,31 @@ DEADLINE_S = 20.0
 
 
 @contextlib.asynccontextmanager
-async def witnessed() -> AsyncIterator[tuple[Witness, Rig]]:
+async def connected() -> AsyncIterator[tuple[ControlLink, Rig]]:
     with Instance.claim() as instance:
         rig = Rig({"MAV_SYS_ID": instance.number + 1})
-        port = instance.witness.getsockname()[1]
+        port = instance.control.getsockname()[1]
         stop = asyncio.Event()
         async with (
-            MavlinkServer(rig.stub, Ports(instance.witness_address[1], port)) as server,
+            MavlinkServer(rig.stub, Ports(instance.control_address[1], port)) as server,
             asyncio.TaskGroup() as group,
         ):
             group.create_task(rig.fly(server, stop))
             try:
-                async with Witness(instance) as witness:
-                    yield witness, rig
+                async with ControlLink(instance) as control:
+                    yield control, rig
             finally:
                 stop.set()
 
 
 def test_parameters_are_written_by_type_and_read_back() -> None:
     async def scenario() -> None:
-        async with witnessed() as (witness, rig):
-            await witness.until_heard()
-            await witness.write({"EKF2_EV_CTRL": 15, "MPC_THR_HOVER": 0.43, "COM_OF_LOSS_T": 0.3})
+        async with connected() as (control, rig):
+            await control.until_heard()
+            await control.write({"EKF2_EV_CTRL": 15, "MPC_THR_HOVER": 0.43, "COM_OF_LOSS_T": 0.3})
             assert rig.params["EKF2_EV_CTRL"] == 15
             assert rig.params["MPC_THR_HOVER"] == pytest.approx(0.43)
-            found = await witness.read(["EKF2_EV_CTRL", "MPC_THR_HOVER", "NO_SUCH_NAME"])
+            found = await control.read(["EKF2_EV_CTRL", "MPC_THR_HOVER", "NO_SUCH_NAME"])
             assert set(found) == {"EKF2_EV_CTRL", "MPC_THR_HOVER"}
             assert same(found["MPC_THR_HOVER"], 0.43)
             assert found["EKF2_EV_CTRL"] == 15 and isinstance(found["EKF2_EV_CTRL"], int)
@@ -62,37 +62,37 @@ def test_parameters_are_written_by_type_and_read_back() -> None:
 
 
 def test_a_parameter_that_is_not_taken_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sitl.px4.witness.PARAMS_DEADLINE_S", 0.5)
+    monkeypatch.setattr("sitl.px4.control_link.PARAMS_DEADLINE_S", 0.5)
 
     async def scenario() -> None:
-        async with witnessed() as (witness, _):
-            await witness.until_heard()
+        async with connected() as (control, _):
+            await control.until_heard()
             with pytest.raises(Px4Error, match="expected EKF2_EV_CTRL to become 15, found 11"):
-                await witness.write({"EKF2_EV_CTRL": 15.0})  # of the wrong type: PX4 ignores it
+                await control.write({"EKF2_EV_CTRL": 15.0})  # of the wrong type: PX4 ignores it
 
     asyncio.run(scenario())
 
 
 def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sitl.px4.witness.HEARTBEAT_DEADLINE_S", 0.3)
+    monkeypatch.setattr("sitl.px4.control_link.HEARTBEAT_DEADLINE_S", 0.3)
 
     async def scenario() -> None:
         with Instance.claim() as instance:
-            async with Witness(instance) as witness:
+            async with ControlLink(instance) as control:
                 with pytest.raises(Px4Error, match="expected a heartbeat on UDP"):
-                    await witness.until_heard()
+                    await control.until_heard()
 
     asyncio.run(scenario())
 
 
 def test_a_mode_is_chosen_and_seen() -> None:
     async def scenario() -> None:
-        async with witnessed() as (witness, rig):
-            await witness.until_heard()
-            witness.choose_mode(NavState.LAND)
+        async with connected() as (control, rig):
+            await control.until_heard()
+            control.choose_mode(NavState.LAND)
             async with asyncio.timeout(DEADLINE_S):
-                while witness.nav_state is not NavState.LAND:
-                    await witness.until_heard()
+                while control.nav_state is not NavState.LAND:
+                    await control.until_heard()
             assert rig.stub.nav_state is NavState.LAND
 
     asyncio.run(scenario())

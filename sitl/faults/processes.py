@@ -20,11 +20,11 @@ FlightFaultKind = Literal["kill_flight", "stop_flight", "hold_gil", "stall_loop"
 SIGNALS: dict[FlightFaultKind, signal.Signals] = {
     "kill_flight": signal.SIGKILL,
     "stop_flight": signal.SIGSTOP,
-    "hold_gil": signal.SIGUSR1,  # sitl/flight_hooks
+    "hold_gil": signal.SIGUSR1,  # sitl/faults/hang
     "stall_loop": signal.SIGUSR2,
 }
 STALL_VARIABLE = "COMPANION_SITL_STALL_S"
-"""Of the environment, for sitl/flight_hooks."""
+"""Of the environment, for sitl/faults/hang."""
 _VISION_WINDOW_S = 2.0
 _SAMPLE_S = 0.01
 
@@ -33,7 +33,7 @@ def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]
     """What the flight process's environment needs for these kinds of faults; `stall_s`: how long the loop stalls, None: for good."""
     if not kinds & {"hold_gil", "stall_loop"}:
         return {}
-    hooks = str(Path(__file__).parent / "flight_hooks")
+    hooks = str(Path(__file__).parent / "hang")
     found = {"PYTHONPATH": os.pathsep.join(filter(None, (hooks, os.environ.get("PYTHONPATH"))))}
     return found if stall_s is None else {**found, STALL_VARIABLE: str(stall_s)}
 
@@ -74,7 +74,7 @@ def _command(pid: int) -> list[str]:
     return []
 
 
-class FlightFaults:
+class ProcessFaults:
     """Plants a fault once, then watches what still reaches PX4 and what the vehicle does."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from sitl.autopilot.modes import NavState
-from sitl.flight_faults import SIGNALS, FlightFaultKind, FlightFaults, environment
+from sitl.faults.processes import SIGNALS, FlightFaultKind, ProcessFaults, environment
 from tests.support import DEADLINE_S, wait_until
 
 START = (1.0, 2.0, 1.5)
@@ -68,7 +68,7 @@ def test_who_still_runs(kind: FlightFaultKind, left: str) -> None:
             return seen == {"m", "t"}
 
         wait_until(both, lambda: f"only {seen} run")
-        faults = FlightFaults()
+        faults = ProcessFaults()
         faults.pid = process.pid
         assert faults.plant(kind, 5.0, START, 100)
         # After a hundred letters of the thread, or a spell without any, the main thread has had every chance.
@@ -93,7 +93,7 @@ def test_who_still_runs(kind: FlightFaultKind, left: str) -> None:
 
 def test_hooks_only_where_they_are_needed() -> None:
     assert environment({"kill_flight", "stop_flight", "mocap_loss"}) == {}
-    assert "flight_hooks" in environment({"hold_gil"})["PYTHONPATH"]
+    assert "faults/hang" in environment({"hold_gil"})["PYTHONPATH"]
     done = subprocess.run(
         [sys.executable, "-c", "import signal; print(signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL)"],
         env={**os.environ, **environment({"hold_gil"})},
@@ -105,16 +105,16 @@ def test_hooks_only_where_they_are_needed() -> None:
 
 
 def test_nothing_happens_without_a_flight_process() -> None:
-    faults = FlightFaults()
+    faults = ProcessFaults()
     assert not faults.plant("kill_flight", 1.0, START, 0)
     assert faults.report() is None
     assert set(SIGNALS) == {"kill_flight", "stop_flight", "hold_gil", "stall_loop"}
 
 
 @pytest.fixture
-def planted() -> Iterator[FlightFaults]:
+def planted() -> Iterator[ProcessFaults]:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        faults = FlightFaults()
+        faults = ProcessFaults()
         faults.pid = process.pid
         assert faults.plant("stop_flight", 5.0, START, 100)
         assert not faults.plant("kill_flight", 5.1, START, 100), "once"
@@ -122,7 +122,7 @@ def planted() -> Iterator[FlightFaults]:
         process.kill()
 
 
-def test_the_report_tells_late_setpoints_a_gap_in_vision_and_drift(planted: FlightFaults) -> None:
+def test_the_report_tells_late_setpoints_a_gap_in_vision_and_drift(planted: ProcessFaults) -> None:
     poses = 100
     for k in range(1, 2001):
         t_s = 5.0 + 0.002 * k
@@ -141,7 +141,7 @@ def test_the_report_tells_late_setpoints_a_gap_in_vision_and_drift(planted: Flig
     assert report["drift_m"] == pytest.approx(0.5)
 
 
-def test_the_report_does_not_make_up_what_never_happened(planted: FlightFaults) -> None:
+def test_the_report_does_not_make_up_what_never_happened(planted: ProcessFaults) -> None:
     for k in range(1, 2000):
         planted.watch(5.0 + 0.002 * k, 4.999, 100, NavState.OFFBOARD, armed=True)
     report = planted.report()

@@ -13,8 +13,8 @@ from companion.config.world import World
 from companion.io.mocap.natnet import z_up_from_y_up
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import Quat, Vec3
-from sitl.world.hand import FORWARD_M, LIFT_M, REST_S, ROUND_S, TURN_DEG
-from sitl.world.mocap_axes import SpoiledFrame
+from sitl.world.handling import FORWARD_M, LIFT_M, REST_S, ROUND_S, TURN_DEG
+from sitl.world.mocap_misalignment import MocapMisalignment
 from tests.preflight.hand_rig import Standing, world
 
 P: Vec3 = (1.0, 2.0, 0.5)
@@ -23,7 +23,7 @@ Q = quat_from_euler_zyx(0.1, -0.2, YAW)
 
 
 def streamed(**knobs: object) -> tuple[Vec3, Quat]:
-    frame = SpoiledFrame.of(World.model_validate(knobs))
+    frame = MocapMisalignment.of(World.model_validate(knobs))
     assert frame is not None
     return frame.pose(P, Q)
 
@@ -33,7 +33,7 @@ def same(a: Quat, b: Quat) -> bool:
 
 
 def test_a_server_that_is_set_up_right_is_left_alone() -> None:
-    assert SpoiledFrame.of(World()) is None
+    assert MocapMisalignment.of(World()) is None
 
 
 def test_a_y_up_stream_is_what_the_companion_turns_back() -> None:
@@ -61,7 +61,7 @@ def test_every_set_of_axes_streams_rotations_that_turn_as_they_are_seen() -> Non
     axes_of = ("x", "y", "z")
     for order in itertools.permutations(axes_of):
         for signs in itertools.product(("", "-"), repeat=3):
-            frame = SpoiledFrame(
+            frame = MocapMisalignment(
                 World.model_validate({"mocap_axes": [s + a for s, a in zip(signs, order, strict=True)]})
             )
             turn = quat_multiply(frame.pose(P, later)[1], quat_conjugate(frame.pose(P, Q)[1]))

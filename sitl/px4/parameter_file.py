@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sitl.autopilot.params import Value
-from sitl.px4.link import Px4Error
-from sitl.px4.witness import same
+from sitl.px4.control_link import same
+from sitl.px4.hil_link import Px4Error
 
 NAME = "parameters.bson"
 STORED_DEADLINE_S = 10.0

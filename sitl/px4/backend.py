@@ -14,17 +14,17 @@ from companion.config.vehicle import Airframe
 from companion.config.world import World as WorldConfig
 from companion.model.types import Vec4
 from sitl.autopilot.autopilot import Battery
+from sitl.autopilot.backend import Observation
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Value
 from sitl.autopilot.types import ImuSample
-from sitl.ends import Noticed
-from sitl.faults import Autopilot as FaultyAutopilot
-from sitl.px4.link import HilSensors, Px4Error, SimulatorLink
+from sitl.faults.injector import Autopilot as FaultyAutopilot
+from sitl.px4.control_link import ControlLink, Version, same
+from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
+from sitl.px4.parameter_file import restore, stored
+from sitl.px4.parameters import BEFORE_BOOT, NOT_EVERYWHERE, parameters
 from sitl.px4.process import HOW_TO_GET_IT, HOW_TO_START_IT, MODEL, Installation, Instance, Px4Process, find
 from sitl.px4.relay import Relay
-from sitl.px4.store import restore, stored
-from sitl.px4.vehicle import BEFORE_BOOT, NOT_EVERYWHERE, parameters
-from sitl.px4.witness import Version, Witness, same
 from sitl.world.world import World
 
 BOOT_DEADLINE_S = 30.0
@@ -87,7 +87,7 @@ class RealPx4:
         self._installation: Installation | None = find()
         self._instance = Instance.claim()
         self._link = SimulatorLink(self._instance.simulator, HilSensors(config.seed))
-        self._witness = Witness(self._instance)
+        self._control = ControlLink(self._instance)
         self._relay = Relay(self._instance) if any(f.kind in _LINK_FAULTS for f in config.faults) else None
         self._process: Px4Process | None = None
         self._version: Version | None = None
@@ -113,7 +113,7 @@ class RealPx4:
     @property
     def faulty(self) -> FaultyAutopilot:
         """Those faults that a real PX4 can have."""
-        return _Faulty(self._witness)
+        return _Faulty(self._control)
 
     def attach(self, world: World) -> None:
         """The world that PX4's sensors sense."""
@@ -125,7 +125,7 @@ class RealPx4:
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._instance.close)
             await stack.enter_async_context(self._link)
-            await stack.enter_async_context(self._witness)
+            await stack.enter_async_context(self._control)
             address = f"udpin://127.0.0.1:{self._instance.onboard_port}"
             if self._relay is not None:
                 address = await stack.enter_async_context(self._relay.opened())
@@ -150,7 +150,7 @@ class RealPx4:
                 f"{self._link.port}"
             )
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
-        self._version = await self._witness.version()
+        self._version = await self._control.version()
         self._tell(f"PX4 {self._version}, instance {self.number}: setting its parameters")
         wanted = parameters(self._airframe, self._config, self._world.hover_command)
         changed = await self._settle(wanted)
@@ -162,8 +162,8 @@ class RealPx4:
                 raise Px4Error(
                     f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; {fix}"
                 )
-        await self._witness.write(self._config.spoiled_px4_params())
-        await self._witness.show_modes()
+        await self._control.write(self._config.spoiled_px4_params())
+        await self._control.show_modes()
         self._flies = True
 
     async def _boot(self, deadline_s: float) -> None:
@@ -184,14 +184,14 @@ class RealPx4:
                 raise Px4Error(
                     f"PX4: expected it on TCP {self._link.port} within {deadline_s:g} s, found {found}; {how}"
                 )
-        await self._witness.until_heard()
+        await self._control.until_heard()
 
     def _how(self) -> str:
         return f"{HOW_TO_GET_IT}; or {HOW_TO_START_IT.format(model=MODEL, number=self.number)}"
 
     async def _settle(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
         """Write what differs; what did, in PX4's types."""
-        have = await self._witness.read(wanted)
+        have = await self._control.read(wanted)
         absent = [name for name in wanted if name not in have and name not in NOT_EVERYWHERE]
         if absent:
             raise Px4Error(
@@ -201,8 +201,8 @@ class RealPx4:
         typed = {name: _as_type_of(have[name], value) for name, value in wanted.items() if name in have}
         different = {name: value for name, value in typed.items() if not same(value, have[name])}
         if different:
-            await self._witness.write(different)
-            await self._witness.save()
+            await self._control.write(different)
+            await self._control.save()
         return different
 
     async def _restart(self, changed: Mapping[str, Value]) -> None:
@@ -263,9 +263,9 @@ class RealPx4:
     def skip(self, paused_s: float) -> None:
         """It has no clock but the world's, and a gap in its samples would throw its estimate off: it falls behind, and is seen to."""
 
-    def noticed(self) -> Noticed:
+    def observe(self) -> Observation:
         """What arrives at PX4 only its own log shows."""
-        return Noticed(None, None, self._witness.nav_state)
+        return Observation(None, None, self._control.nav_state)
 
     def about(self) -> dict[str, Any]:
         """PX4, and which one."""
@@ -289,7 +289,7 @@ class RealPx4:
             process.kill()
             return
         if self._link.armed:
-            self._witness.force_disarm()
+            self._control.force_disarm()
         t_s, end_s = imu.t_s, time.monotonic() + END_DEADLINE_S
         process.ask_to_end()
         while process.running and time.monotonic() < end_s:
@@ -305,8 +305,8 @@ class _Faulty:
     refuses_offboard = False
     refuses_arming = False
 
-    def __init__(self, witness: Witness) -> None:
-        self._witness = witness
+    def __init__(self, control: ControlLink) -> None:
+        self._control = control
 
     def reboot(self, for_s: float) -> None:
         """Was refused before the flight."""
@@ -314,7 +314,7 @@ class _Faulty:
 
     def pilot_chooses(self, state: NavState) -> None:
         """As a ground station does."""
-        self._witness.choose_mode(state)
+        self._control.choose_mode(state)
 
 
 def _as_type_of(known: Value, value: Value) -> Value:

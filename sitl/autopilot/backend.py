@@ -1,6 +1,6 @@
 """The autopilot's end of the simulated world: what the world's server needs of it, and the stub's way of giving it.
 
-The other way is a real PX4: `sitl.px4.world`.
+The other way is a real PX4: `sitl.px4.backend`.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from sitl.autopilot.mavlink import GROUND_PORTS, MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
 from sitl.autopilot.types import ImuSample
-from sitl.faults import Autopilot as FaultyAutopilot
+from sitl.faults.injector import Autopilot as FaultyAutopilot
 from sitl.world.world import World
 
 STUB_VERSION = "1.16"
 """PX4's version that the stub behaves like."""
 
 
-class Noticed(NamedTuple):
+class Observation(NamedTuple):
     """What can be seen of an autopilot from where the world is; None: not to be seen from there."""
 
     setpoint_at_s: float | None
@@ -36,7 +36,7 @@ class Noticed(NamedTuple):
     nav_state: NavState | None
 
 
-class AutopilotEnd(Protocol):
+class AutopilotBackend(Protocol):
     """An autopilot as the world's server sees it. The plant steps it by its IMU."""
 
     lockstep: bool
@@ -81,7 +81,7 @@ class AutopilotEnd(Protocol):
     def skip(self, paused_s: float) -> None:
         """The world has stood still for so long while the wall clock went on: so does the autopilot's own clock, as a real one's."""
 
-    def noticed(self) -> Noticed:
+    def observe(self) -> Observation:
         """What can be seen of it now."""
 
     def about(self) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def set_hover_thrust(px4: Px4Stub, config: WorldConfig, world: World) -> float:
     return hover_thrust
 
 
-class StubEnd:
+class StubBackend:
     """The stub, in this process."""
 
     lockstep = False
@@ -179,10 +179,10 @@ class StubEnd:
         """The clock that its messages carry."""
         self.px4.clock_ahead_s += paused_s
 
-    def noticed(self) -> Noticed:
+    def observe(self) -> Observation:
         """Everything: it is ours."""
         px4 = self.px4
-        return Noticed(px4.setpoint_at_s, px4.vision_received, px4.nav_state)
+        return Observation(px4.setpoint_at_s, px4.vision_received, px4.nav_state)
 
     def about(self) -> dict[str, Any]:
         """A stub, and what it behaves like."""

@@ -25,11 +25,11 @@ from companion.config.loader import FlightConfig
 from companion.io.force_torque import rft
 from companion.io.mocap.natnet import Message
 from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu, quat_from_euler_zyx
+from sitl.autopilot.backend import StubBackend
 from sitl.autopilot.commander import Command
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.autopilot.types import AttitudeTarget
-from sitl.ends import StubEnd
-from sitl.faults import in_time
+from sitl.faults.timing import in_time
 from sitl.server import Ports, Sitl, start_of
 from sitl.servo import registers as reg
 from sitl.servo.protocol import Instruction, packet
@@ -85,7 +85,7 @@ async def _emitted(config: FlightConfig, end: int, usual: Emitted | None) -> Emi
     loop = asyncio.get_running_loop()
     assert isinstance(loop, WorldLoop)
     events: list[Any] = []
-    autopilot = StubEnd(config.world, LinkPorts(0, 0))
+    autopilot = StubBackend(config.world, LinkPorts(0, 0))
     start = start_of(START_M, 0.0, config.mission.start.arm_deg)
     sitl = Sitl(config.vehicle, config.world, start, Ports(), events.append, autopilot)
     steps: list[tuple[Any, ...]] = []
@@ -196,7 +196,7 @@ def _received(opened: socket.socket) -> bytes:
 class Pilot:
     """Takes off, flies in +x through the catch and holds the arm as it was; leaves the rotors off if a hand is there."""
 
-    def __init__(self, config: FlightConfig, autopilot: StubEnd, plant: Plant, partner: Partner) -> None:
+    def __init__(self, config: FlightConfig, autopilot: StubBackend, plant: Plant, partner: Partner) -> None:
         self._joints, self._arm_rad = config.vehicle.arm.joints, plant.world.q[slice(*_span(plant))]
         self._px4, self._plant, self._partner = autopilot.px4, plant, partner
         self._arms = not config.world.hand
