@@ -23,7 +23,7 @@ import aiohttp
 import aiomqtt
 
 from companion.config.ground import broker_address
-from companion.ground.messages import MESSAGE_MAX_BYTES, CommandName, Topic
+from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, CommandName, Topic
 from tests.browser import ARGUMENTS
 
 VIEWERS = 20

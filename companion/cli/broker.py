@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from companion.config.document import ConfigError
-from companion.ground.keys import user_name
-from companion.ground.messages import Topic
+from companion.ground.protocol.keys import user_name
+from companion.ground.protocol.messages import Topic
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
 
@@ -159,8 +159,8 @@ def _instructions(folder: Path, wanted: Wanted, ends: str) -> list[str]:
 
 def _check(arguments: argparse.Namespace) -> int:
     from companion.config.ground import VEHICLE_NAME
-    from companion.ground.access import broker_access
     from companion.ground.broker.check import CheckError, check
+    from companion.ground.protocol.access import broker_access
 
     if arguments.vehicle is not None and VEHICLE_NAME.fullmatch(arguments.vehicle) is None:
         raise ConfigError([f"--vehicle {arguments.vehicle!r:.60}: expected 1 to 40 letters, digits, '_', '-' or '.'"])

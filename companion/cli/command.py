@@ -10,14 +10,14 @@ from typing import Any
 
 from companion.cli.monitor import add_broker_options, vehicle_option
 from companion.config.document import ConfigError
-from companion.ground.access import broker_access
-from companion.ground.keys import SAFER
-from companion.ground.messages import CommandName, Topic
+from companion.ground.protocol.access import broker_access
+from companion.ground.protocol.keys import SAFER
+from companion.ground.protocol.messages import CommandName, Topic
+from companion.ground.station.command_sender import INSTEAD, Failed, Sent, signer_of, told
 from companion.ground.station.link import BrokerRefused
-from companion.ground.station.orders import INSTEAD, Failed, Sent, signer_of, told
 from companion.ground.station.station import Station
 from companion.ground.station.tasks import until_first
-from companion.ground.station.watch import LIVE_S, Vehicle
+from companion.ground.station.vehicles import LIVE_S, Vehicle
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
 

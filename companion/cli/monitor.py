@@ -11,19 +11,21 @@ import threading
 import webbrowser
 from collections.abc import Coroutine, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion.analysis.log import LogError
 from companion.config.document import ConfigError
 from companion.config.ground import VEHICLE_NAME, Mqtt
-from companion.ground.access import BrokerAccess, broker_access
-from companion.ground.proof import Signer
+from companion.ground.protocol.access import BrokerAccess, broker_access
+from companion.ground.protocol.proof import Signer
+from companion.ground.station.command_sender import signer_of
 from companion.ground.station.link import BrokerRefused
-from companion.ground.station.orders import signer_of
-from companion.ground.station.replayed import Replayed
 from companion.ground.station.tasks import until_first
 from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
+
+if TYPE_CHECKING:
+    from companion.ground.station.replay_log import ReplayLog
 
 PORT = 8642
 
@@ -128,14 +130,14 @@ def _station_settings(arguments: argparse.Namespace) -> tuple[BrokerAccess, Sign
 
 def _serve(arguments: argparse.Namespace) -> None:
     try:
-        from companion.ground.station import page_server
+        from companion.ground.station import web
     except ModuleNotFoundError as error:
         if error.name != "aiohttp":
             raise
         raise _Refusal("the page needs aiohttp: pip install 'companion[ground]'; --text does not") from None
-    serving = page_server.Serving(arguments.host, arguments.port, _tls(arguments.cert, arguments.key))
+    serving = web.Serving(arguments.host, arguments.port, _tls(arguments.cert, arguments.key))
 
-    def listening(monitor: page_server.Monitor) -> None:
+    def listening(monitor: web.Monitor) -> None:
         print(f"companion monitor: {monitor.url}  (Ctrl-C ends)", flush=True)
         if monitor.why_not is not None and not arguments.logs:
             print(f"companion monitor: view only: {monitor.why_not}", flush=True)
@@ -146,17 +148,17 @@ def _serve(arguments: argparse.Namespace) -> None:
 
     try:
         if arguments.logs:
-            work = page_server.serve_logs(serving, _read(arguments.logs), listening)
+            work = web.serve_logs(serving, _read(arguments.logs), listening)
         else:
-            work = page_server.serve_live(serving, *_station_settings(arguments), listening)
+            work = web.serve_live(serving, *_station_settings(arguments), listening)
         asyncio.run(until_signal(work))
-    except page_server.WebError as error:
+    except web.WebError as error:
         raise _Refusal(str(error)) from None
     except LogError as error:
         raise ConfigError([str(error)]) from None
 
 
-def _read(paths: Sequence[Path]) -> list[Replayed]:
+def _read(paths: Sequence[Path]) -> list[ReplayLog]:
     """Before anything is served: an hour's log takes a minute or two, and Ctrl-C ends it."""
     from companion.ground.station.replay_log import read_for_page
 

@@ -1,1 +1,1 @@
-"""What vehicle and ground station share: messages, their topics, signed commands; and the ground station itself."""
+"""The ground segment: the protocol over MQTT, telemetry records, the ground station and the broker's setup."""

@@ -22,9 +22,9 @@ from companion.guardian import heartbeat as words
 from companion.guardian.heartbeat import Beat
 from companion.guardian.link import Link, Wire, address_problem, is_udp, open_wire
 from companion.guardian.mocap import MocapClient, MocapProblem
+from companion.guardian.monitors import StallWatch
 from companion.guardian.settings import Settings, read_settings
 from companion.guardian.takeover_landing import Charge, Told
-from companion.guardian.watch import StallWatch
 from companion.model.codec import pack_plain
 from companion.model.types import SafetyAction, Severity
 from companion.runtime import ipc

@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.heartbeat import Beat
 from companion.guardian.link import Link
+from companion.guardian.monitors import Plausible
 from companion.guardian.px4 import Px4State
-from companion.guardian.watch import Plausible
 from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.model.types import (
     AutopilotRequest,

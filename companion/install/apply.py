@@ -19,7 +19,7 @@ from pathlib import Path
 from companion.install.plan import PERFORMANCE, SERVICE, Command, Plan
 from companion.install.record import PATH, Entry, Record, inside, load, save
 from companion.install.state import InstallError, State, put, read
-from companion.install.texts import STATE
+from companion.install.templates import STATE
 
 GROUP = "dialout"
 COMMAND_TIMEOUT_S = 60.0

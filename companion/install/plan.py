@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.install import texts
+from companion.install import templates
 
 SERVICE = "companion.service"
 PERFORMANCE = "companion-performance.service"
@@ -65,14 +65,14 @@ class Plan:
 
 def plan(settings: Settings) -> Plan:
     """Files first, in this order, then commands."""
-    unit = texts.service(settings.user, settings.program, settings.mission, settings.vehicle)
-    rules = texts.udev_rules(settings.arm_serial, settings.force_serial)
+    unit = templates.service(settings.user, settings.program, settings.mission, settings.vehicle)
+    rules = templates.udev_rules(settings.arm_serial, settings.force_serial)
     items = [
-        Item(_SYSUSERS, "the service's user, without a login, in dialout", texts.sysusers(settings.user)),
-        Item("/etc/modules-load.d/companion.conf", "drivers of USB serial ports, from boot on", texts.modules()),
+        Item(_SYSUSERS, "the service's user, without a login, in dialout", templates.sysusers(settings.user)),
+        Item("/etc/modules-load.d/companion.conf", "drivers of USB serial ports, from boot on", templates.modules()),
         Item("/etc/udev/rules.d/99-companion.rules", "latency timer 1 ms, stable names", rules),
-        Item("/etc/security/limits.d/companion.conf", "real time for people in dialout", texts.limits()),
-        Item(f"{_UNITS}/{PERFORMANCE}", "full clock", texts.performance_service()),
+        Item("/etc/security/limits.d/companion.conf", "real time for people in dialout", templates.limits()),
+        Item(f"{_UNITS}/{PERFORMANCE}", "full clock", templates.performance_service()),
         Item(f"{_UNITS}/{SERVICE}", "the flight, waiting for an operator's start", unit),
         Item(f"{_AT_BOOT}/{PERFORMANCE}", "full clock from boot on", link=f"{_UNITS}/{PERFORMANCE}"),
     ]

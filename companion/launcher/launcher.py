@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from companion.config.loader import FlightConfig
 from companion.guardian.heartbeat import HANGS
-from companion.launcher.crowding import Crowding
+from companion.launcher.cpu_contention import Crowding
 from companion.launcher.guardian_process import GuardianProcess
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_CODES

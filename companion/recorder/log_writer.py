@@ -15,10 +15,10 @@ from foxglove.channels import LogChannel
 from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel
 
-from companion.ground.messages import EventLine
+from companion.ground.protocol.messages import EventLine
 from companion.model.codec import json_schema, json_text, jsonable_from_plain
 from companion.model.types import Inputs, Outputs, Sent
-from companion.recorder.disk import Disk
+from companion.recorder.log_file import Disk
 from companion.recorder.viewer_channels import ViewerChannels, timestamp
 
 _LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}

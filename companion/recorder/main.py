@@ -27,7 +27,7 @@ from typing import Any
 from companion.model.codec import fingerprint, unpack_plain
 from companion.model.types import Inputs, Outputs, Sent
 from companion.recorder.channel import FLUSH_PERIOD_S, Channel
-from companion.recorder.disk import Disk
+from companion.recorder.log_file import Disk
 from companion.recorder.log_writer import LogWriter
 from companion.recorder.telemetry import Telemetry, wanted
 from companion.recorder.versions import versions

@@ -15,11 +15,11 @@ import aiomqtt
 from companion.config.document import ConfigError
 from companion.config.ground import Mqtt, topic_name
 from companion.config.loader import FlightConfig
-from companion.ground.access import KEYS, BrokerAccess, broker_access
-from companion.ground.commands import Verifier
-from companion.ground.connection import Connection, why
-from companion.ground.keys import load_operators
-from companion.ground.messages import MESSAGE_MAX_BYTES, RETAINED, STREAM_PERIOD_S, Command, Topic
+from companion.ground.protocol.access import KEYS, BrokerAccess, broker_access
+from companion.ground.protocol.commands import Verifier
+from companion.ground.protocol.connection import Connection, why
+from companion.ground.protocol.keys import load_operators
+from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, RETAINED, STREAM_PERIOD_S, Command, Topic
 from companion.model.codec import pack_plain
 from companion.recorder.telemetry_session import INFO, WARNING, GroundDesk, Outgoing
 from companion.runtime.packets import TEXT, UNNUMBERED

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 
 from companion.config.ground import topic_name
 from companion.config.loader import FlightConfig
-from companion.ground.commands import Accepted, Verifier
-from companion.ground.messages import (
+from companion.ground.protocol.commands import Accepted, Verifier
+from companion.ground.protocol.messages import (
     VERSION,
     Ack,
     Command,
@@ -25,9 +25,9 @@ from companion.ground.messages import (
     Topic,
     encode,
 )
-from companion.ground.proof import with_proof, with_proofs
-from companion.ground.scene import scene_of
-from companion.ground.snapshot import StreamMaker, shortened
+from companion.ground.protocol.proof import with_proof, with_proofs
+from companion.ground.telemetry.scene import scene_of
+from companion.ground.telemetry.stream import StreamMaker, shortened
 from companion.model.codec import restore, unpack_plain
 from companion.model.types import Inputs, Outcome, Outputs, Sent
 from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK

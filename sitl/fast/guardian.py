@@ -15,9 +15,9 @@ from companion.config.vehicle import Vehicle
 from companion.flight.heartbeat import Heartbeats
 from companion.guardian.heartbeat import Beat
 from companion.guardian.link import Link
+from companion.guardian.monitors import StallWatch
 from companion.guardian.process import PERIOD_S
 from companion.guardian.takeover_landing import Charge, Tell, Told
-from companion.guardian.watch import StallWatch
 from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Outputs, SafetyAction, Severity
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver

@@ -18,9 +18,9 @@ from mcap.reader import make_reader
 from companion.analysis.log import FlightLog
 from companion.config.ground import topic_name
 from companion.config.loader import load_flight
-from companion.ground.commands import FlightClock, make_command
-from companion.ground.keys import load_operators
-from companion.ground.messages import (
+from companion.ground.protocol.commands import FlightClock, make_command
+from companion.ground.protocol.keys import load_operators
+from companion.ground.protocol.messages import (
     Ack,
     CommandName,
     Presence,
@@ -31,7 +31,7 @@ from companion.ground.messages import (
     encode,
     vehicle_of,
 )
-from companion.ground.proof import ack_proven, stream_proven
+from companion.ground.protocol.proof import ack_proven, stream_proven
 from companion.model.exit_codes import EXIT_ABORTED
 from companion.model.types import OperatorCommand, Outcome, SafetyAction
 from tests.broker import loopback_broker

@@ -16,10 +16,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from companion.ground.access import broker_access
-from companion.ground.keys import Operator, Operators
-from companion.ground.proof import Signer
-from companion.ground.station.page_server import Monitor, Serving, serve_live
+from companion.ground.protocol.access import broker_access
+from companion.ground.protocol.keys import Operator, Operators
+from companion.ground.protocol.proof import Signer
+from companion.ground.station.web import Monitor, Serving, serve_live
 from tests.support import DEADLINE_S
 
 ANNA = Operator("anna", b"a" * 32)

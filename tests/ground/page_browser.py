@@ -10,10 +10,10 @@ from typing import Any
 
 from playwright.sync_api import sync_playwright
 
-from companion.ground.messages import VERSION, Events, Preflight, PreflightRow, Stream
+from companion.ground.protocol.messages import VERSION, Events, Preflight, PreflightRow, Stream
 from tests.browser import ARGUMENTS
 from tests.browser import chromium as chromium_path
-from tests.ground.page_stand import NAME, SESSION, Message, Stand, told
+from tests.ground.monitor_stub import NAME, SESSION, Message, Stand, told
 from tests.support import DEADLINE_S
 
 SIZES = {"desktop": (1440, 900), "small": (1024, 768), "tablet": (768, 1024)}

@@ -1,6 +1,6 @@
 """Pictures of the monitor's page for the documentation: `python -m tests.ground.pictures [FOLDER]` (default: docs/pictures).
 
-A flight of the fast loop, shown by the page in headless Chromium; `tests/ground/page_stand.py` plays the monitor.
+A flight of the fast loop, shown by the page in headless Chromium; `tests/ground/monitor_stub.py` plays the monitor.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 
 from PIL import Image
 
-from companion.ground.messages import Presence
+from companion.ground.protocol.messages import Presence
 from companion.model.codec import to_jsonable
+from tests.ground.monitor_stub import Stand, ack, event, flown, hello, preflight, retained, state, told
 from tests.ground.page_browser import Page, chromium, events_of, greeted, watching
-from tests.ground.page_stand import Stand, ack, event, flown, hello, preflight, retained, state, told
 from tests.support import ROOT
 
 NONCE = "0123456789abcdef" * 2

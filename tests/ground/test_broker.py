@@ -24,12 +24,12 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from companion.ground.broker import setup as broker_setup
-from companion.ground.broker.files import supplied
-from companion.ground.commands import Accepted, Reason, Refused, Verifier, make_command
-from companion.ground.keys import load_login, load_operators, new_key
-from companion.ground.messages import COMMAND_MAX_BYTES, Command, CommandName, Topic, encode
+from companion.ground.protocol.commands import Accepted, Reason, Refused, Verifier, make_command
+from companion.ground.protocol.keys import load_login, load_operators, new_key
+from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, CommandName, Topic, encode
 from tests.broker import LOOPBACK, Broker, free_port, loopback_broker
 from tests.support import DEADLINE_S, ROOT
+from tools.docs.mosquitto import example_files
 
 pytestmark = pytest.mark.waits
 
@@ -432,10 +432,10 @@ def test_open_broker_lets_it_pass_and_the_vehicle_refuses(site: Site, tmp_path: 
 
 
 def test_supplied_profile_is_what_broker_init_writes() -> None:
-    """Made by `python -m companion.ground.broker.files configs/mosquitto`."""
+    """Made by `python -m companion.ground.broker.mosquitto_config configs/mosquitto`."""
     folder = ROOT / "configs/mosquitto"
-    assert {name: (folder / name).read_text() for name in supplied()} == supplied()
-    assert {path.name for path in folder.iterdir()} == {*supplied(), LOOPBACK.name}
+    assert {name: (folder / name).read_text() for name in example_files()} == example_files()
+    assert {path.name for path in folder.iterdir()} == {*example_files(), LOOPBACK.name}
 
 
 def test_profile_is_a_drop_in_of_the_system_service(site: Site, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from companion.cli.main import _parser, main
 from companion.config.ground import Ground
 from companion.ground.broker import setup as broker_setup
 from companion.ground.broker.certificates import hosts_of, make_authority, make_server
-from companion.ground.keys import load_login, load_operators
+from companion.ground.protocol.keys import load_login, load_operators
 from tests.broker import free_port, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
 

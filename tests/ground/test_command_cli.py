@@ -11,9 +11,9 @@ import pytest
 
 from companion.cli import command as command_command
 from companion.cli import main as cli
-from companion.ground.keys import Operator, Operators, load_operators, operators_text, write_private
-from companion.ground.messages import Presence, Topic
-from companion.ground.station.orders import TRIES
+from companion.ground.protocol.keys import Operator, Operators, load_operators, operators_text, write_private
+from companion.ground.protocol.messages import Presence, Topic
+from companion.ground.station.command_sender import TRIES
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from tests.broker import Broker, free_port, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, play

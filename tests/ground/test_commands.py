@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.ground.commands import (
+from companion.ground.protocol.commands import (
     AHEAD_MAX_S,
     ANSWERS_PER_S,
     LIMITS,
@@ -26,8 +26,8 @@ from companion.ground.commands import (
     make_command,
     sign,
 )
-from companion.ground.keys import May, Operator, Operators, new_key
-from companion.ground.messages import COMMAND_MAX_BYTES, Command, CommandName, encode
+from companion.ground.protocol.keys import May, Operator, Operators, new_key
+from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, CommandName, encode
 
 VEHICLE, SESSION, NOW_T_S = "tarot", "f3a9", 100.0
 ANNA, BERT, VIEWER = new_key(), new_key(), new_key()

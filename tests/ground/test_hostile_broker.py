@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from companion.ground.access import broker_access
-from companion.ground.commands import Accepted, Verifier, make_command
-from companion.ground.messages import (
+from companion.ground.protocol.access import broker_access
+from companion.ground.protocol.commands import Accepted, Verifier, make_command
+from companion.ground.protocol.messages import (
     VERSION,
     Ack,
     CommandName,
@@ -29,13 +29,13 @@ from companion.ground.messages import (
     Topic,
     encode,
 )
-from companion.ground.proof import with_proof, with_proofs
-from companion.ground.scene import scene_of
+from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.station.hub import Hub, Outbox
 from companion.ground.station.station import Station
 from companion.ground.station.tasks import until_first
 from companion.ground.station.text_view import Around, frame, line
-from companion.ground.station.watch import LIVE_S, VEHICLES_MAX, Watch
+from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, Watch
+from companion.ground.telemetry.scene import scene_of
 from companion.model.codec import to_jsonable
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play, until

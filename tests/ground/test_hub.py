@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from companion.config.document import ConfigError
-from companion.ground.access import broker_access
-from companion.ground.messages import VERSION, Ack, CommandName, Events, Presence, Topic, encode
+from companion.ground.protocol.access import broker_access
+from companion.ground.protocol.messages import VERSION, Ack, CommandName, Events, Presence, Topic, encode
 from companion.ground.station.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Outbox
-from companion.ground.station.watch import LIVE_S, VEHICLES_MAX, Heard, Watch
+from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, Heard, Watch
 from companion.ground.station.web_guard import MESSAGES_BURST, Bucket, host_allowed, origin_allowed, same_token
 from tests.ground.vehicle import flight, state_of
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from companion.config.document import ConfigError
-from companion.ground.keys import (
+from companion.ground.protocol.keys import (
     May,
     Operator,
     load_login,
@@ -22,7 +22,7 @@ from companion.ground.keys import (
     own_file,
     write_private,
 )
-from companion.ground.messages import CommandName
+from companion.ground.protocol.messages import CommandName
 from tests.support import DEADLINE_S, ROOT
 
 KEY = base64.b64encode(bytes(range(32))).decode()
@@ -84,7 +84,7 @@ def test_umask_opens_no_file(home: Path) -> None:
 
 def test_processes_that_start_at_once_share_one_key(home: Path) -> None:
     program = (
-        "import sys; from companion.ground.keys import load_operators\n"
+        "import sys; from companion.ground.protocol.keys import load_operators\n"
         "print('ready', flush=True); sys.stdin.readline(); o = load_operators(); print(o.key(o.names[0]).hex())"
     )
     environment = {**os.environ, "XDG_CONFIG_HOME": str(home / "config")}
@@ -123,14 +123,6 @@ def test_own_file_that_cannot_be_made_is_one_line(home: Path) -> None:
     with pytest.raises(ConfigError, match=r"operators.yaml: .*; name another file") as refused:
         load_operators()
     assert len(refused.value.lines) == 1
-
-
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    path = private(tmp_path / "operators.yaml", "mine")
-    with pytest.raises(FileExistsError):
-        write_private(path, b"other")
-    assert path.read_text() == "mine"
-    assert [path.name for path in tmp_path.iterdir()] == ["operators.yaml"]
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o606, 0o610, 0o601, 0o644, 0o777])

@@ -17,8 +17,8 @@ import pytest
 
 from companion.cli import main as cli
 from companion.config.loader import load_flight
-from companion.ground.keys import operators_text, write_private
-from companion.ground.messages import Events, Preflight, Scene, State, Stream, decode
+from companion.ground.protocol.keys import operators_text, write_private
+from companion.ground.protocol.messages import Events, Preflight, Scene, State, Stream, decode
 from companion.ground.station.replay_log import read_for_page
 from companion.model.codec import json_text
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED

@@ -8,12 +8,12 @@ import jsonschema
 import pytest
 
 from companion.config.loader import load_flight
-from companion.ground.messages import MESSAGE_MAX_BYTES, Scene, Topic, decode, encode
-from companion.ground.scene import PATH_POINTS_MAX, scene_of
-from companion.ground.schemas import FOLDER, schema_file, schema_of, schema_text
+from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Scene, Topic, decode, encode
+from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.mission.plan import Plan
 from companion.model.types import Vec3
 from tests.support import CATCH
+from tools.docs.telemetry import FOLDER, schema_file, schema_of, schema_text
 
 
 def test_the_scene_is_the_vehicle_file_and_the_mission() -> None:
@@ -53,7 +53,7 @@ def test_a_long_path_is_thinned_out_evenly(count: int) -> None:
 
 @pytest.mark.parametrize("topic", list(Topic))
 def test_schemas_in_the_docs_are_up_to_date(topic: Topic) -> None:
-    """Made by `python -m companion.ground.schemas`."""
+    """Made by `python -m tools.docs.telemetry`."""
     assert schema_file(topic).read_text(encoding="utf-8") == schema_text(topic)
     jsonschema.Draft202012Validator.check_schema(schema_of(topic))
 

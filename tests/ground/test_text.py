@@ -20,14 +20,14 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.ground.access import broker_access
-from companion.ground.keys import operators_text, write_private
-from companion.ground.messages import CommandName, Presence, encode
-from companion.ground.proof import with_proofs
+from companion.ground.protocol.access import broker_access
+from companion.ground.protocol.keys import operators_text, write_private
+from companion.ground.protocol.messages import CommandName, Presence, encode
+from companion.ground.protocol.proof import with_proofs
 from companion.ground.station.station import Station
 from companion.ground.station.text_monitor import _Screen
 from companion.ground.station.text_view import STALE_S, Around, Note, frame, line, stale, word
-from companion.ground.station.watch import Vehicle, Watch
+from companion.ground.station.vehicles import Vehicle, Watch
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play
 from tests.ground.vehicle import flight, played_vehicle, state_of
@@ -107,7 +107,7 @@ def test_old_figures_do_not_look_alive() -> None:
 
 def test_a_taut_tether_is_loud() -> None:
     tether = {"slack_m": 0.0, "stop_slack_m": 0.0, "pull_n": 3.0, "turns": 0.0, "taut": True, "snagged": False}
-    from companion.ground.messages import TetherView
+    from companion.ground.protocol.messages import TetherView
 
     assert "TETHER TAUT" in drawn(known(tether=TetherView(**tether)))  # type: ignore[arg-type]
 

@@ -13,11 +13,11 @@ import aiohttp
 import aiomqtt
 import pytest
 
-from companion.ground.access import broker_access
-from companion.ground.messages import Topic
+from companion.ground.protocol.access import broker_access
+from companion.ground.protocol.messages import Topic
 from companion.ground.station.hub import Hub
-from companion.ground.station.page_server import Monitor, Serving, WebError
 from companion.ground.station.station import Station
+from companion.ground.station.web import Monitor, Serving, WebError
 from companion.ground.station.web_guard import HEADERS, MESSAGE_MAX_BYTES
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import (

@@ -10,12 +10,12 @@ import aiomqtt
 import pytest
 
 from companion.config.document import ConfigError
-from companion.ground.access import broker_access
-from companion.ground.keys import Operator, operators_text, write_private
-from companion.ground.messages import CommandName, Presence
-from companion.ground.proof import Signer
-from companion.ground.station.orders import NO_ANSWER, TRIES, signer_of
-from companion.ground.station.watch import LIVE_S
+from companion.ground.protocol.access import broker_access
+from companion.ground.protocol.keys import Operator, operators_text, write_private
+from companion.ground.protocol.messages import CommandName, Presence
+from companion.ground.protocol.proof import Signer
+from companion.ground.station.command_sender import NO_ANSWER, TRIES, signer_of
+from companion.ground.station.vehicles import LIVE_S
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, play, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle

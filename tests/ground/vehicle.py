@@ -13,9 +13,9 @@ from typing import Any
 import aiomqtt
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.ground.commands import Accepted, Refused, Verifier
-from companion.ground.keys import Operators
-from companion.ground.messages import (
+from companion.ground.protocol.commands import Accepted, Refused, Verifier
+from companion.ground.protocol.keys import Operators
+from companion.ground.protocol.messages import (
     STREAM_PERIOD_S,
     VERSION,
     Ack,
@@ -30,9 +30,9 @@ from companion.ground.messages import (
     Topic,
     encode,
 )
-from companion.ground.proof import with_proof, with_proofs
-from companion.ground.scene import scene_of
-from companion.ground.snapshot import replay
+from companion.ground.protocol.proof import with_proof, with_proofs
+from companion.ground.telemetry.scene import scene_of
+from companion.ground.telemetry.stream import replay
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import CATCH
 

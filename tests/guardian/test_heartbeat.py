@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from companion.guardian import heartbeat as words
 from companion.guardian.heartbeat import Beat
-from companion.guardian.watch import JUMP_M, SPEED_MAX_M_S, Plausible, StallWatch
+from companion.guardian.monitors import JUMP_M, SPEED_MAX_M_S, Plausible, StallWatch
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 byte = st.integers(0, 255)

@@ -18,9 +18,9 @@ from mcap.reader import NonSeekingReader
 from paho.mqtt.enums import CallbackAPIVersion
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.ground.commands import FlightClock, make_command
-from companion.ground.keys import Operator, load_login, new_key, operators_text, write_private
-from companion.ground.messages import (
+from companion.ground.protocol.commands import FlightClock, make_command
+from companion.ground.protocol.keys import Operator, load_login, new_key, operators_text, write_private
+from companion.ground.protocol.messages import (
     CommandName,
     Stream,
     Topic,

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 
 from companion.analysis.log import FlightLog
-from companion.ground.messages import (
+from companion.ground.protocol.messages import (
     RETAINED,
     Ack,
     CommandName,
@@ -25,11 +25,11 @@ from companion.ground.messages import (
     Topic,
     decode,
 )
-from companion.ground.schemas import schema_of
 from companion.model.types import OperatorCommand, SafetyAction, Severity
 from tests.broker import Broker, free_port, loopback_broker
 from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, flight_with, log_lines
 from tests.support import DEADLINE_S, wait_until
+from tools.docs.telemetry import schema_of
 
 pytestmark = pytest.mark.waits
 

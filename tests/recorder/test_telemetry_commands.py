@@ -23,9 +23,9 @@ from companion.analysis.log import FlightLog
 from companion.config.ground import topic_name
 from companion.config.loader import load_flight
 from companion.ground.broker import setup as broker_setup
-from companion.ground.commands import make_command
-from companion.ground.keys import load_operators, new_key, write_private
-from companion.ground.messages import (
+from companion.ground.protocol.commands import make_command
+from companion.ground.protocol.keys import load_operators, new_key, write_private
+from companion.ground.protocol.messages import (
     Ack,
     CommandName,
     Events,

@@ -15,8 +15,8 @@ import paho.mqtt.client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 from paho.mqtt.reasoncodes import ReasonCode
 
-from companion.ground.access import BrokerAccess
-from companion.ground.messages import Topic, vehicle_of
+from companion.ground.protocol.access import BrokerAccess
+from companion.ground.protocol.messages import Topic, vehicle_of
 
 ANSWER_S = 5.0
 """For each answer of the broker."""

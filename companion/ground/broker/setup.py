@@ -26,8 +26,9 @@ from pathlib import Path
 from companion.config.document import ConfigError
 from companion.config.ground import VEHICLE_NAME
 from companion.ground.broker.certificates import CertificateError, Pair, ends, hosts_of, make_authority, make_server
-from companion.ground.broker.files import INSTALLED, acl_text, profile_text
-from companion.ground.keys import OPERATOR_NAME, Operator, new_key, operators_text, write_private
+from companion.ground.broker.mosquitto_config import INSTALLED, acl_text, profile_text
+from companion.ground.protocol.keys import OPERATOR_NAME, Operator, new_key, operators_text, write_private
+from companion.runtime.files import write_whole
 
 DAYS_MAX = 3000
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
@@ -106,9 +107,7 @@ def renew(folder: Path, hosts: Sequence[str], days: int, now: datetime.datetime)
         server = make_server(authority, known, days, now)
         for name, data in (("server.key", server.key), ("server.pem", server.certificate)):
             named = folder / name
-            new = folder / f".{name}.{secrets.token_hex(8)}"
-            write_private(new, data)
-            new.replace(named)
+            write_whole(named, data, mode=0o600, durable=True)
     except OSError as error:
         raise ConfigError(
             [f"{error.filename or named}: {error.strerror or error}; expected a folder of broker init"]

@@ -12,8 +12,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from companion.ground.messages import Topic
-from companion.ground.station.watch import VEHICLES_MAX, Heard, Watch
+from companion.ground.protocol.messages import Topic
+from companion.ground.station.vehicles import VEHICLES_MAX, Heard, Watch
 from companion.model.codec import json_text, to_jsonable
 
 OUTBOX_MAX = 1000

@@ -9,9 +9,9 @@ from typing import NoReturn
 
 import aiomqtt
 
-from companion.ground.access import BrokerAccess
-from companion.ground.connection import Connection, OnMessage, code_of, why
-from companion.ground.messages import MESSAGE_MAX_BYTES
+from companion.ground.protocol.access import BrokerAccess
+from companion.ground.protocol.connection import Connection, OnMessage, code_of, why
+from companion.ground.protocol.messages import MESSAGE_MAX_BYTES
 
 ANSWER_S = 2.0
 """For each answer of the broker."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -11,10 +12,9 @@ from pydantic import ValidationError
 from companion.analysis.log import FlightLog, LogError, writer
 from companion.config.ground import topic_name
 from companion.config.loader import FlightConfig
-from companion.ground.messages import VERSION, Preflight, PreflightRow, Presence, State
-from companion.ground.scene import PATH_POINTS_MAX, scene_of
-from companion.ground.snapshot import replay
-from companion.ground.station.replayed import Replayed
+from companion.ground.protocol.messages import VERSION, Preflight, PreflightRow, Presence, State
+from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
+from companion.ground.telemetry.stream import replay
 from companion.model.codec import json_text, to_jsonable
 from companion.model.types import Vec3
 
@@ -24,7 +24,17 @@ TICKS_MAX = 60_000
 _GZIP_LEVEL = 5
 
 
-def read_for_page(path: Path, number: int) -> Replayed:
+@dataclass(frozen=True, slots=True)
+class ReplayLog:
+    """One log, ready to be sent to the page."""
+
+    name: str
+    """Path as the user wrote it; unique among the logs of one page."""
+    gzip_json: bytes
+    """``{"state", "scene", "preflight", "events", "streams": [...]}``: records of `companion.ground.protocol.messages`."""
+
+
+def read_for_page(path: Path, number: int) -> ReplayLog:
     """Read a log and make of it what the page plays.
 
     Args:
@@ -60,7 +70,7 @@ def read_for_page(path: Path, number: int) -> Replayed:
     texts = [f'"{name}":{json_text(part)}' for name, part in parts.items()]
     texts.append(f'"streams":[{",".join(json_text(to_jsonable(stream)) for stream in streams)}]')
     body = gzip.compress(f"{{{','.join(texts)}}}".encode(), _GZIP_LEVEL, mtime=0)
-    return Replayed(str(path), body)
+    return ReplayLog(str(path), body)
 
 
 def _epoch_offset_s(log: FlightLog) -> float:

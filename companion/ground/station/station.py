@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from companion.ground.access import BrokerAccess
-from companion.ground.messages import Topic
-from companion.ground.proof import Signer
+from companion.ground.protocol.access import BrokerAccess
+from companion.ground.protocol.messages import Topic
+from companion.ground.protocol.proof import Signer
+from companion.ground.station.command_sender import Orders
 from companion.ground.station.link import Link
-from companion.ground.station.orders import Orders
-from companion.ground.station.watch import HEARD_TOPICS, Heard, Watch
+from companion.ground.station.vehicles import HEARD_TOPICS, Heard, Watch
 
 OnHeard = Callable[[Heard], None]
 OnChange = Callable[[bool, str], None]

@@ -15,14 +15,14 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.live import Live
 
-from companion.ground.access import BrokerAccess
-from companion.ground.messages import Ack, CommandName, Topic
-from companion.ground.proof import Signer
-from companion.ground.station.orders import Failed, Sent, told
+from companion.ground.protocol.access import BrokerAccess
+from companion.ground.protocol.messages import Ack, CommandName, Topic
+from companion.ground.protocol.proof import Signer
+from companion.ground.station.command_sender import Failed, Sent, told
 from companion.ground.station.station import Station
 from companion.ground.station.tasks import until_first
 from companion.ground.station.text_view import Around, Note, frame, line
-from companion.ground.station.watch import Heard, Vehicle
+from companion.ground.station.vehicles import Heard, Vehicle
 from companion.runtime.console import terminal_console
 
 PERIOD_S = 0.125

@@ -10,8 +10,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from companion.ground.messages import EventLine, Light, Presence, Stream
-from companion.ground.station.watch import Vehicle
+from companion.ground.protocol.messages import EventLine, Light, Presence, Stream
+from companion.ground.station.vehicles import Vehicle
 from companion.model.types import LandedState, PhaseKind, SafetyAction
 
 STALE_S = 0.3

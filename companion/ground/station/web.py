@@ -4,7 +4,7 @@ WebSocket at ``/ws``, JSON text. Server to page:
 
     {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first of all; again when the token came late
     {"kind": "broker", "connected", "text", "rubbish"?, "rubbish_text"?}             how it stands with the broker
-    {"kind": "state" | "scene" | "preflight" | "events" | "ack", "vehicle", "data"}  records of `companion.ground.messages`
+    {"kind": "state" | "scene" | "preflight" | "events" | "ack", "vehicle", "data"}  records of `companion.ground.protocol.messages`
     {"kind": "stream", "vehicle", "age_s", "data"}                                   age_s: how late it came to the server
     {"kind": "sent", "vehicle", "command", "nonce"}                                  to who commanded; its `ack` has the nonce
     {"kind": "refused", "vehicle", "command", "text"}                                to the viewer who commanded
@@ -30,10 +30,13 @@ from typing import Any, NoReturn
 from aiohttp import WSMsgType, web
 
 from companion import __version__
-from companion.ground.messages import CommandName
+from companion.ground.protocol.access import BrokerAccess
+from companion.ground.protocol.messages import CommandName
+from companion.ground.protocol.proof import Signer
+from companion.ground.station.command_sender import Failed, Orders, Sent
 from companion.ground.station.hub import GOING_AWAY, TOO_SLOW, VIEWERS_MAX, Hub, Outbox, Parting
-from companion.ground.station.orders import Failed, Orders, Sent
-from companion.ground.station.replayed import Replayed
+from companion.ground.station.replay_log import ReplayLog
+from companion.ground.station.station import Station
 from companion.ground.station.tasks import until_first
 from companion.ground.station.web_guard import (
     HEADERS,
@@ -81,16 +84,16 @@ class Monitor:
         serving: where.
         hub: what viewers are told; None in a replay.
         orders: commands; None in a replay.
-        replayed: the logs of a replay.
+        replay_logs: the logs of a replay.
     """
 
     def __init__(
-        self, serving: Serving, hub: Hub | None, orders: Orders | None, replayed: Sequence[Replayed] = ()
+        self, serving: Serving, hub: Hub | None, orders: Orders | None, replay_logs: Sequence[ReplayLog] = ()
     ) -> None:
         self._serving = serving
         self._hub = hub
         self._orders = orders
-        self._replayed = tuple(replayed)
+        self._replay_logs = tuple(replay_logs)
         self._token = new_token()
         self._errands: asyncio.TaskGroup | None = None
         self._outboxes: set[Outbox] = set()
@@ -167,10 +170,10 @@ class Monitor:
 
     async def _log(self, request: web.Request) -> web.Response:
         number = int(request.match_info["number"])
-        if number >= len(self._replayed):
+        if number >= len(self._replay_logs):
             raise web.HTTPNotFound(text="no such log\n")
         return web.Response(
-            body=self._replayed[number].gzip_json,
+            body=self._replay_logs[number].gzip_json,
             content_type="application/json",
             charset="utf-8",
             headers={"Content-Encoding": "gzip"},
@@ -205,7 +208,7 @@ class Monitor:
                 "operator": None if self._orders is None else self._orders.operator,
                 "why_not": why_not,
                 "replay": self._hub is None,
-                "logs": [log.name for log in self._replayed],
+                "logs": [log.name for log in self._replay_logs],
             }
         )
 
@@ -234,6 +237,38 @@ class Monitor:
         """Give a command; it is followed to its end even if the viewer goes away."""
         assert self._orders is not None and self._errands is not None
         self._errands.create_task(self._orders.give(vehicle, command, lambda note: outbox.put(_note(note)), hold))
+
+
+Listening = Callable[[Monitor], None]
+"""Called once, when the page can be opened."""
+
+
+async def serve_live(
+    serving: Serving, access: BrokerAccess, signer: Signer | str, only: str | None, listening: Listening
+) -> None:
+    """Serve what vehicles send, until cancelled.
+
+    Raises:
+        WebError: cannot listen.
+        BrokerRefused: the broker does not want us.
+    """
+    hub: Hub
+    station = Station(
+        access, signer, only, lambda heard: hub.relay(heard), lambda connected, text: hub.broker(connected, text)
+    )
+    hub = Hub(station.watch, station.link.text)
+    monitor = Monitor(serving, hub, station.orders)
+    await until_first(monitor.serve(lambda: listening(monitor)), station.run())
+
+
+async def serve_logs(serving: Serving, logs: Sequence[ReplayLog], listening: Listening) -> None:
+    """Serve logs, until cancelled.
+
+    Raises:
+        WebError: cannot listen.
+    """
+    monitor = Monitor(serving, None, None, logs)
+    await monitor.serve(lambda: listening(monitor))
 
 
 class _Session:

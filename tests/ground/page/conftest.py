@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.ground.monitor_stub import BROKER, Stand, hello, retained
 from tests.ground.page_browser import Page, chromium, watching
-from tests.ground.page_stand import BROKER, Stand, hello, retained
 
 
 @pytest.fixture(scope="package")

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from companion.ground.messages import Presence, Stream
+from companion.ground.protocol.messages import Presence, Stream
+from tests.ground.monitor_stub import BROKER, NAME, Message, Stand, ack, event, flown, hello, retained, state, told
 from tests.ground.page_browser import Page, events_of, playing, watching
-from tests.ground.page_stand import BROKER, NAME, Message, Stand, ack, event, flown, hello, retained, state, told
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 

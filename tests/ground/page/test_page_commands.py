@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from companion.ground.messages import Presence
+from companion.ground.protocol.messages import Presence
+from tests.ground.monitor_stub import NAME, Message, Stand, ack, flown, retained, state, told
 from tests.ground.page_browser import Page, playing
-from tests.ground.page_stand import NAME, Message, Stand, ack, flown, retained, state, told
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 

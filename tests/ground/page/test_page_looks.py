@@ -14,8 +14,8 @@ from companion.config.loader import load_flight
 from companion.control.manipulator import Manipulator
 from companion.model.codec import to_jsonable
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from tests.ground.monitor_stub import BROKER, Stand, event, flown, hello, retained, told
 from tests.ground.page_browser import SIZES, Page, events_of, watching
-from tests.ground.page_stand import BROKER, Stand, event, flown, hello, retained, told
 from tests.support import CATCH
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]

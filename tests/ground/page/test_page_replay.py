@@ -13,13 +13,13 @@ import pytest
 
 from companion.analysis.log import FlightLog
 from companion.config.loader import load_flight
-from companion.ground.messages import Presence, Stream
+from companion.ground.protocol.messages import Presence, Stream
 from companion.model.codec import to_jsonable
 from sitl.fast.loop import FastFlight
 from tests.analysis.recorded import record
 from tests.broker import free_port
+from tests.ground.monitor_stub import Message, Stand, flown, hello, preflight, sent_at, state
 from tests.ground.page_browser import Page, watching
-from tests.ground.page_stand import Message, Stand, flown, hello, preflight, sent_at, state
 from tests.support import CATCH, sandbox_in
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]

@@ -5,7 +5,7 @@ import { onColours } from "./colours.js";
 import { Commands } from "./commands.js";
 import { byId, setData, setHidden, setText } from "./dom.js";
 import { EventList } from "./events.js";
-import { judge } from "./judge.js";
+import { judge } from "./verdict.js";
 import { Link, takeToken } from "./link.js";
 import { ControlDetails, Figures, Lights, PreflightList } from "./panels.js";
 import { Plots } from "./plots.js";

@@ -2,7 +2,7 @@
 
 import { byId, make, setData, setText } from "./dom.js";
 import { fixed, NOTHING, norm, quantity, words } from "./format.js";
-import { tetherLevel, trackingLevel } from "./judge.js";
+import { tetherLevel, trackingLevel } from "./verdict.js";
 
 const worstLight = (stream, name) => stream?.lights?.find((light) => light.name.toLowerCase().includes(name))?.light ?? "unknown";
 

@@ -5,9 +5,9 @@ import { colours, levelColour } from "./colours.js";
 import { fitCanvas } from "./dom.js";
 import { fixed, quantity } from "./format.js";
 import { add, circle, hanging, LEVEL, mix, rotate } from "./geometry.js";
-import { tetherLevel } from "./judge.js";
+import { tetherLevel } from "./verdict.js";
 import { drawForce, drawGhost, drawMachine, drawShadow } from "./machine.js";
-import { Pen } from "./pen.js";
+import { Pen } from "./renderer.js";
 
 export class SceneView {
   /** @param changed called when it should be drawn again */

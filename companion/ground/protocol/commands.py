@@ -22,9 +22,9 @@ from enum import StrEnum
 from typing import NamedTuple, TypeAlias
 
 from companion.config.ground import VEHICLE_NAME
-from companion.ground.keys import OPERATOR_NAME, SAFER, Operators
-from companion.ground.messages import COMMAND_MAX_BYTES, VERSION, Command, CommandName
-from companion.ground.wire import WireError, parse
+from companion.ground.protocol.keys import OPERATOR_NAME, SAFER, Operators
+from companion.ground.protocol.messages import COMMAND_MAX_BYTES, VERSION, Command, CommandName
+from companion.ground.protocol.strict_json import WireError, parse
 from companion.model.codec import RecordError, from_jsonable
 
 DOMAIN = "companion command 2"
@@ -132,7 +132,7 @@ def sign(command: Command, key: bytes) -> Command:
 def make_command(
     name: CommandName, vehicle: str, session: str, operator: str, key: bytes, t_ms: int, hold: int = 0
 ) -> Command:
-    """A signed command with a nonce of its own; `companion.ground.messages.encode` makes the payload.
+    """A signed command with a nonce of its own; `companion.ground.protocol.messages.encode` makes the payload.
 
     Args:
         name: what is asked for.

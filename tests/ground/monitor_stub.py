@@ -18,7 +18,7 @@ from typing import Any, Self
 from aiohttp import WSMsgType, web
 
 from companion.config.loader import load_flight
-from companion.ground.messages import (
+from companion.ground.protocol.messages import (
     VERSION,
     Ack,
     CommandName,
@@ -31,10 +31,10 @@ from companion.ground.messages import (
     State,
     Stream,
 )
-from companion.ground.scene import scene_of
-from companion.ground.snapshot import replay
 from companion.ground.station.web import PAGE
 from companion.ground.station.web_guard import HEADERS
+from companion.ground.telemetry.scene import scene_of
+from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_jsonable
 from companion.model.types import Sent
 from sitl.fast.loop import FastFlight

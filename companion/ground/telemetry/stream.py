@@ -13,8 +13,7 @@ from collections.abc import Iterable
 from typing import TypeVar
 
 from companion.config.loader import FlightConfig
-from companion.ground.lights import Ages, Lights, Look
-from companion.ground.messages import (
+from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     VERSION,
     ControlView,
@@ -24,8 +23,9 @@ from companion.ground.messages import (
     TetherView,
     Timing,
 )
-from companion.ground.timings import Worst, worst_of
-from companion.ground.wire import NUMBER_MAX
+from companion.ground.protocol.strict_json import NUMBER_MAX
+from companion.ground.telemetry.health import Ages, Lights, Look
+from companion.ground.telemetry.timings import Worst, worst_of
 from companion.model.flight_stage import Stage
 from companion.model.types import (
     ControlLog,

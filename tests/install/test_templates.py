@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from companion.cli.main import _normalised, _parser
-from companion.install import texts
+from companion.install import templates
 from companion.install.adapters import adapters, choose
 from companion.runtime.realtime import FLIGHT_PRIORITY, GUARDIAN_PRIORITY
 
@@ -29,8 +29,8 @@ def test_systemd_accepts_the_units(tmp_path: Path) -> None:
         pytest.skip("systemd-analyze is not here (Debian package systemd)")
     awkward = "/etc/companion/a mission, 100% $HOME.yaml"
     units = {
-        "companion.service": texts.service("companion", PROGRAM, awkward, None),
-        "companion-performance.service": texts.performance_service(),
+        "companion.service": templates.service("companion", PROGRAM, awkward, None),
+        "companion-performance.service": templates.performance_service(),
     }
     for name, text in units.items():
         (tmp_path / name).write_text(text)
@@ -47,7 +47,7 @@ def test_udev_accepts_the_rules(tmp_path: Path) -> None:
     if tool is None:
         pytest.skip("udevadm is not here (Debian package udev)")
     rules = tmp_path / "99-companion.rules"
-    rules.write_text(texts.udev_rules("FT4THVLI", "A10M"))
+    rules.write_text(templates.udev_rules("FT4THVLI", "A10M"))
     ended = subprocess.run([tool, "verify", str(rules)], capture_output=True, text=True, check=False)
     if "Unknown command" in ended.stderr:
         pytest.skip("this udevadm cannot verify rules (it can from 254 on)")
@@ -57,13 +57,13 @@ def test_udev_accepts_the_rules(tmp_path: Path) -> None:
 def test_every_rule_is_a_list_of_matches_and_assignments() -> None:
     """udev(7): a rule that it does not understand is skipped, with a line in a log that nobody reads."""
     term = r'[A-Z]+(\{[A-Za-z_]+\})?(==|!=|\+=|=)"[^"]*"'
-    for line in texts.udev_rules("FT4THVLI", "A10M").splitlines():
+    for line in templates.udev_rules("FT4THVLI", "A10M").splitlines():
         assert line.startswith("#") or re.fullmatch(rf"{term}(, {term})*", line), line
-    assert "SYMLINK" not in texts.udev_rules(None, None)
+    assert "SYMLINK" not in templates.udev_rules(None, None)
 
 
 def test_the_service_starts_a_flight_that_waits_on_the_ground() -> None:
-    unit = texts.service("companion", "/opt/companion/bin/companion", "/etc/m.yaml", "/etc/v.yaml")
+    unit = templates.service("companion", "/opt/companion/bin/companion", "/etc/m.yaml", "/etc/v.yaml")
     program, *words = value(unit, "ExecStart").split()
     assert program == "/opt/companion/bin/companion"
     arguments, unknown = _parser().parse_known_args(_normalised(words))
@@ -74,7 +74,7 @@ def test_the_service_starts_a_flight_that_waits_on_the_ground() -> None:
 
 
 def test_nothing_starts_a_flight_again_and_stopping_lands() -> None:
-    unit = texts.service("companion", "/opt/companion/bin/companion", "/etc/m.yaml", None)
+    unit = templates.service("companion", "/opt/companion/bin/companion", "/etc/m.yaml", None)
     assert value(unit, "Restart") == "no"
     assert value(unit, "KillSignal") == "SIGTERM"
     assert value(unit, "KillMode") == "process"  # a SIGTERM to all would end the guardian in the air
@@ -85,10 +85,10 @@ def test_nothing_starts_a_flight_again_and_stopping_lands() -> None:
 
 
 def test_the_limits_allow_what_the_processes_ask_for() -> None:
-    unit = texts.service("companion", "/opt/companion/bin/companion", "/etc/m.yaml", None)
+    unit = templates.service("companion", "/opt/companion/bin/companion", "/etc/m.yaml", None)
     assert int(value(unit, "LimitRTPRIO")) >= max(FLIGHT_PRIORITY, GUARDIAN_PRIORITY)
     assert value(unit, "LimitMEMLOCK") == "infinity"
-    assert f"@dialout - rtprio {value(unit, 'LimitRTPRIO')}\n" in texts.limits()
+    assert f"@dialout - rtprio {value(unit, 'LimitRTPRIO')}\n" in templates.limits()
 
 
 def test_full_clock_is_set_and_what_was_is_put_back(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_full_clock_is_set_and_what_was_is_put_back(tmp_path: Path) -> None:
     for name, governor in before.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "scaling_governor").write_text(f"{governor}\n")
-    unit = texts.performance_service(f"{tmp_path}/policy*/scaling_governor", f"{tmp_path}/before")
+    unit = templates.performance_service(f"{tmp_path}/policy*/scaling_governor", f"{tmp_path}/before")
 
     def run(key: str) -> dict[str, str]:
         command = re.fullmatch(r"/bin/sh -c '(.*)'", value(unit, key))

@@ -1,15 +1,11 @@
-"""What a mosquitto for several computers reads: its profile and its access list, as text. Pure.
-
-`python -m companion.ground.broker.files configs/mosquitto` writes the supplied examples again.
-"""
+"""Text of the mosquitto configuration for a broker that several computers use: mosquitto.conf(5) and its access list. Pure."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion.ground.messages import MESSAGE_MAX_BYTES, Topic
+from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Topic
 
 INSTALLED = Path("/etc/mosquitto/companion")
 """Where the system service finds the files."""
@@ -74,16 +70,3 @@ def acl_text(vehicles: Sequence[str], operators: Sequence[str], viewers: Sequenc
     for viewer in viewers:
         blocks.append("\n".join([f"user {viewer}", *read]))
     return "\n\n".join(blocks) + "\n"
-
-
-def supplied() -> dict[str, str]:
-    """File name and text of the examples in ``configs/mosquitto/``."""
-    return {
-        "secure.conf": profile_text(INSTALLED),
-        "acl": acl_text(["tarot650-2r"], ["operator"], ["viewer"]),
-    }
-
-
-if __name__ == "__main__":
-    for file_name, file_text in supplied().items():
-        (Path(sys.argv[1]) / file_name).write_text(file_text, encoding="utf-8")

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
-from companion.ground.messages import Health, Light
+from companion.ground.protocol.messages import Health, Light
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.types import Inputs, Outputs, PhaseKind
 from companion.safety.monitors_arm import WATCHDOG_RESTARTED, error_text

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from companion.ground.lights import UNKNOWN_S
-from companion.ground.messages import Timing
+from companion.ground.protocol.messages import Timing
+from companion.ground.telemetry.health import UNKNOWN_S
 from companion.model.types import Inputs, Outputs, Sent
 
 

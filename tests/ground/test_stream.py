@@ -14,11 +14,19 @@ from companion.analysis import log
 from companion.analysis.timing import timing_of
 from companion.config.loader import load_flight
 from companion.core import flight_core as core
-from companion.ground import snapshot
-from companion.ground.lights import NAMES
-from companion.ground.messages import EVENTS_KEPT, MESSAGE_MAX_BYTES, Events, Light, Stream, Topic, decode, encode
-from companion.ground.schemas import schema_of
-from companion.ground.snapshot import TEXT_MAX, StreamMaker, replay
+from companion.ground.protocol.messages import (
+    EVENTS_KEPT,
+    MESSAGE_MAX_BYTES,
+    Events,
+    Light,
+    Stream,
+    Topic,
+    decode,
+    encode,
+)
+from companion.ground.telemetry import stream as snapshot
+from companion.ground.telemetry.health import NAMES
+from companion.ground.telemetry.stream import TEXT_MAX, StreamMaker, replay
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import (
     AttitudeSetpoint,
@@ -33,6 +41,7 @@ from companion.model.types import (
 )
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import CATCH, position_error_m
+from tools.docs.telemetry import schema_of
 
 Row = tuple[Inputs, Outputs, Sent]
 CONFIG = load_flight(CATCH)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from companion.config.document import ConfigError
 from companion.config.ground import BrokerAddress, broker_address
-from companion.ground.keys import load_login
+from companion.ground.protocol.keys import load_login
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from companion.launcher.crowding import CAUSED_BY_LATENESS, CoreWait, Crowding, busy_line, core_wait, waited
+from companion.launcher.cpu_contention import CAUSED_BY_LATENESS, CoreWait, Crowding, busy_line, core_wait, waited
 from companion.preflight.judge import CHECKS
 from companion.safety.rules import RULES
 from tests.support import wait_until

@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from companion.ground.access import BrokerAccess
-from companion.ground.commands import make_command
-from companion.ground.keys import load_operators, own_file
-from companion.ground.messages import Ack, CommandName, Topic, encode
-from companion.ground.proof import Signer
+from companion.ground.protocol.access import BrokerAccess
+from companion.ground.protocol.commands import make_command
+from companion.ground.protocol.keys import load_operators, own_file
+from companion.ground.protocol.messages import Ack, CommandName, Topic, encode
+from companion.ground.protocol.proof import Signer
 from companion.ground.station.link import Link, LinkError
-from companion.ground.station.watch import Vehicle, Watch
+from companion.ground.station.vehicles import Vehicle, Watch
 
 ANSWER_S = 1.5
 """For the vehicle's `Ack`."""

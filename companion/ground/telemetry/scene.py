@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from companion.config.loader import FlightConfig
-from companion.ground.messages import VERSION, Scene
+from companion.ground.protocol.messages import VERSION, Scene
 from companion.mission.plan import _name as phase_name
 from companion.model.types import Vec2, Vec3
 

@@ -1,4 +1,4 @@
-"""JSON Schemas of the telemetry's messages, one file per topic: `python -m companion.ground.schemas` writes them into the docs."""
+"""JSON Schemas of the telemetry messages: `python -m tools.docs.telemetry` writes one file per topic to docs/telemetry."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.ground.messages import RECORDS, Topic
+from companion.ground.protocol.messages import RECORDS, Topic
 from companion.model.codec import json_schema
 
 FOLDER = Path(__file__).parents[2] / "docs/telemetry"
 
 
 def schema_of(topic: Topic) -> dict[str, Any]:
-    """JSON Schema (2020-12) of the messages on a topic."""
+    """Return the JSON Schema (2020-12) of the messages on a topic."""
     cls = RECORDS[topic]
     return {**json_schema(cls), "description": (inspect.getdoc(cls) or "").splitlines()[0]}
 
 
 def schema_text(topic: Topic) -> str:
-    """As it stands in the file."""
+    """Return the content of a topic's schema file."""
     return json.dumps(schema_of(topic), indent=2, ensure_ascii=False) + "\n"
 
 
 def schema_file(topic: Topic, folder: Path = FOLDER) -> Path:
-    """Where it stands."""
+    """Return the path of a topic's schema file."""
     return folder / f"{topic.value}.schema.json"
 
 
 def main() -> int:
-    """Write all of them."""
+    """Write all schema files; returns the exit code."""
     try:
         FOLDER.mkdir(exist_ok=True)
         for topic in Topic:

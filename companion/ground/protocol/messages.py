@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeVar
 
-from companion.ground.wire import WireError, check_finite, parse
+from companion.ground.protocol.strict_json import WireError, check_finite, parse
 from companion.model.codec import RecordError, from_jsonable, json_text, to_jsonable
 from companion.model.frozen import quick
 from companion.model.types import Quat, Vec2, Vec3, Vec4
@@ -290,7 +290,7 @@ class Stream:
     waits_for_start: bool
     """All is well and it waits on the ground for `start`."""
     proofs: tuple[str, ...] = ()
-    """One for each operator whose key the vehicle holds (`companion.ground.proof`); empty if it hears no commands."""
+    """One for each operator whose key the vehicle holds (`companion.ground.protocol.proof`); empty if it hears no commands."""
 
 
 class CommandName(Enum):
@@ -306,7 +306,7 @@ class CommandName(Enum):
 @quick
 @dataclass(frozen=True, slots=True)
 class Command:
-    """``command``: signed with the operator's key over every other field (`companion.ground.commands`)."""
+    """``command``: signed with the operator's key over every other field (`companion.ground.protocol.commands`)."""
 
     v: int
     vehicle: str
@@ -342,7 +342,7 @@ class Ack:
     phase: str
     action: str
     proof: str = ""
-    """For the operator who commanded (`companion.ground.proof`)."""
+    """For the operator who commanded (`companion.ground.protocol.proof`)."""
 
 
 RECORDS: dict[Topic, type] = {
@@ -366,8 +366,8 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
     """A record from the wire.
 
     Raises:
-        MessageError: too large, not JSON as `companion.ground.wire` reads it, another version, not the record, or a number in it that
-            is not finite.
+        MessageError: the payload is too large, is not strict JSON (`companion.ground.protocol.strict_json`), has another version, does
+            not fit the record, or holds a number that is not finite.
     """
     if len(payload) > max_bytes:
         raise MessageError(f"{len(payload)} bytes, at most {max_bytes} expected")

@@ -21,7 +21,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from companion.ground.access import BrokerAccess
+from companion.ground.protocol.access import BrokerAccess
 
 KEEPALIVE_S = 5
 """After 1.5 times this without a word the broker sends the last will (MQTT 5, 3.1.2.10)."""

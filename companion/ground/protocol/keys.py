@@ -32,7 +32,8 @@ from companion.config.base import Model, refuse
 from companion.config.document import ConfigError, problem_lines
 from companion.config.explain import validate
 from companion.config.yaml_strict import read_document
-from companion.ground.messages import CommandName
+from companion.ground.protocol.messages import CommandName
+from companion.runtime.files import write_whole
 
 OPERATOR_NAME = re.compile(r"[A-Za-z0-9_.-]{1,40}")
 KEY_BYTES = 32
@@ -234,19 +235,10 @@ def write_private(path: Path, data: bytes) -> None:
     """Write a new file of mode 0600; it appears whole or not at all.
 
     Raises:
-        FileExistsError: it is there already; left as it is.
-        OSError: it cannot be written.
+        FileExistsError: the file exists; it is left as it is.
+        OSError: the file cannot be written.
     """
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-    try:
-        with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.link(beside, path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            beside.unlink()
+    write_whole(path, data, mode=0o600, replace=False, durable=True)
 
 
 def _make_own(path: Path) -> None:

@@ -1,7 +1,7 @@
-"""What a ground station knows of the vehicles: the newest record of each kind, and which clock each flight goes by. No I/O.
+"""State of the vehicles as a ground station knows it: the newest record of each kind and each flight's clock. No I/O.
 
-A ground station with an operator's key tells a stream message that the vehicle has proven (`companion.ground.proof`) from one that
-anybody may have sent. Commands are dated by proven ones only, and while those come in the others are not taken.
+A ground station with an operator's key tells stream messages that the vehicle has proven (`companion.ground.protocol.proof`) from
+messages that anyone may have sent. Only proven messages date commands; while they arrive, unproven ones are rejected.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from companion.config.ground import VEHICLE_NAME
-from companion.ground.commands import FlightClock
-from companion.ground.messages import (
+from companion.ground.protocol.commands import FlightClock
+from companion.ground.protocol.messages import (
     RECORDS,
     Ack,
     Events,
@@ -25,7 +25,7 @@ from companion.ground.messages import (
     decode,
     vehicle_of,
 )
-from companion.ground.proof import Signer, ack_proven, stream_proven
+from companion.ground.protocol.proof import Signer, ack_proven, stream_proven
 
 HEARD_TOPICS = (Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS, Topic.STREAM, Topic.ACK)
 VEHICLES_MAX = 64

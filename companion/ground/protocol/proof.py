@@ -11,7 +11,7 @@ import hmac
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-from companion.ground.messages import Ack, Stream
+from companion.ground.protocol.messages import Ack, Stream
 from companion.model.codec import json_text, to_jsonable
 
 _STREAM_DOMAIN = "companion stream 2"

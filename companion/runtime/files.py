@@ -1,0 +1,52 @@
+"""Writing a file whole: a reader finds the old content or the new, never a part of either."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from pathlib import Path
+
+
+def write_whole(
+    path: Path,
+    data: bytes,
+    *,
+    mode: int | None = None,
+    owner: tuple[int, int] | None = None,
+    replace: bool = True,
+    durable: bool = False,
+) -> None:
+    """Write a file through a temporary file in the same folder; a failure leaves no part behind.
+
+    Args:
+        path: the file.
+        data: its content.
+        mode: permission bits; None for the default of the process (umask).
+        owner: user and group id; None for those of the process.
+        replace: False refuses to replace an existing file.
+        durable: wait until the content is on the medium, so that it survives a loss of power.
+
+    Raises:
+        FileExistsError: the file exists and `replace` is False; it is left as it is.
+        OSError: the file cannot be written; an existing one is left as it is.
+    """
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    try:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        with open(os.open(part, flags, 0o666 if mode is None else 0o600), "wb") as file:
+            if owner is not None:
+                os.fchown(file.fileno(), *owner)
+            if mode is not None:
+                os.fchmod(file.fileno(), mode)
+            file.write(data)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        if replace:
+            part.replace(path)
+        else:
+            os.link(part, path)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
