@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+import stat
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from companion.config.explain import validate
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import parse_value, read_document
 from companion.config.yaml_text import flow_text
+from companion.runtime.files import write_whole
 
 _BOM = "\ufeff"
 
@@ -94,7 +93,7 @@ class Patch:
                     [f"{self.shown}: has been changed meanwhile; nothing was written, run the tool again"]
                 )
             backup = _back_up(path, self.before)
-            _replace(path, self.after)
+            write_whole(path, self.after, mode=stat.S_IMODE(path.stat().st_mode), durable=True)
         except OSError as error:
             raise ConfigError(
                 [f"{self.shown}: cannot be written: {error.strerror or error}; change it by hand as printed"]
@@ -195,19 +194,3 @@ def _back_up(path: Path, data: bytes) -> Path:
             number += 1
             continue
         return backup
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """All of it or nothing, whatever happens."""
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, path.stat().st_mode & 0o7777)
-        os.replace(name, path)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(name)
-        raise

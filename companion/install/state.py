@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from companion.runtime.files import write_whole
+
 
 class InstallError(Exception):
     """It cannot be done; one line. What had been done is put back already, unless the line says otherwise."""
@@ -86,30 +88,18 @@ def read(path: Path) -> State:
 
 
 def put(path: Path, state: State) -> None:
-    """Make it stand there, as a whole or not at all, also through a loss of power.
+    """Bring a path to a state, whole or not at all, also through a loss of power.
 
     Raises:
-        OSError: it cannot be done.
+        OSError: it cannot be done; the path is as it was.
     """
-    if state.absent:
+    if state.link is not None:
+        beside = path.with_name(f".{path.name}.companion-new")
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(state.link)
+        beside.replace(path)
+    elif state.content is not None:
+        owner = None if state.owner == (os.geteuid(), os.getegid()) else state.owner
+        write_whole(path, state.content, mode=state.mode, owner=owner, durable=True)
+    else:
         path.unlink(missing_ok=True)
-        return
-    beside = path.with_name(f".{path.name}.companion-new")
-    beside.unlink(missing_ok=True)
-    try:
-        if state.link is not None:
-            beside.symlink_to(state.link)
-        else:
-            assert state.content is not None
-            with open(beside, "xb") as file:
-                if state.owner is not None and state.owner != (os.geteuid(), os.getegid()):
-                    os.fchown(file.fileno(), *state.owner)
-                os.fchmod(file.fileno(), state.mode)
-                file.write(state.content)
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(beside, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            beside.unlink(missing_ok=True)
-        raise

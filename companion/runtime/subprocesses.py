@@ -12,6 +12,8 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+from companion.runtime.files import write_whole
+
 TMP_PREFIX = "tmp-"
 
 
@@ -48,18 +50,14 @@ def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file of the flight's folder at once: a reader finds it whole or as it was before.
+    """Write a file of the flight's folder whole (`companion.runtime.files.write_whole`).
 
     Raises:
-        LaunchError: it cannot be written.
+        LaunchError: the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
     try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        write_whole(path, text.encode())
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
         raise LaunchError(f"{path}: cannot be written: {error.strerror}; choose another --out") from None
 
 

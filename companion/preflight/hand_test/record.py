@@ -15,6 +15,7 @@ from typing import Any
 
 from companion.config.vehicle import Vehicle
 from companion.model.rows import Row
+from companion.runtime.files import write_whole
 
 SCHEMA_VERSION = 1
 FILE = "companion/hand-tests.json"
@@ -110,11 +111,9 @@ def save(path: Path, tests: Sequence[Passed]) -> None:
         RecordError: it cannot be written.
     """
     document = {"schema_version": SCHEMA_VERSION, "passed": [asdict(test) for test in tests]}
-    part = path.with_name(f"{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps(document, indent=1), encoding="utf-8")
-        part.replace(path)
+        write_whole(path, json.dumps(document, indent=1).encode())
     except OSError as error:
         raise RecordError(f"{path}: cannot be written ({error.strerror}); correct its permissions") from None
 
