@@ -1,10 +1,11 @@
 """Adaptive impedance control without a model of the coupling (paper, eqs. control_law and adaptive_law_full; corrected, discrete).
 
-Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. The attitude rows belong to PX4's attitude loop: they are masked out of every
-norm and get no torque. Order of the steps as in docs/control-law.md; zero-order hold is exact, so H and zeta stay >= 0 for any input.
+The rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. PX4's attitude loop owns the attitude rows: they are masked out of every
+norm and get no torque. The order of the steps is that of docs/control-law.md. The zero-order hold is exact, so H and zeta stay >= 0 for
+any input.
 
-Sums over the five active rows are written out, with the row in every name (`s0` .. `s2` for x y z, `s6` and `s7` for the joints): plain
-floats are several times as fast as loops or arrays, and an equation still stands in one place.
+Sums over the five active rows are written out, with the row in every name (`s0` to `s2` for x y z, `s6` and `s7` for the joints),
+because plain floats are several times as fast as loops or arrays.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ from companion.model.frames import body_x_z_axes_world
 from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
 
 FRICTION_RATE_RAD_S = 0.1
-"""Below it the friction that is fed forward fades: a joint at rest is not to be shaken."""
+"""Joint rate below which the friction feedforward fades out, so that a joint at rest is not shaken."""
 
 Rows = tuple[float, float, float, float, float]
-"""Of the active rows: x, y, z, alpha_1, alpha_2."""
+"""Values of the active rows: x, y, z, alpha_1, alpha_2."""
 
 
 def active(rows: tuple[float, ...]) -> Rows:
-    """The active ones of eight rows."""
+    """Return the five active rows of eight."""
     x, y, z, _, _, _, a1, a2 = rows
     return (x, y, z, a1, a2)
 
 
 class Adaptation:
-    """H_0 .. H_3 and zeta (eq. adaptive_law_full), exact zero-order hold."""
+    """Adaptive gains H_0 to H_3 and zeta (eq. adaptive_law_full), integrated with an exact zero-order hold."""
 
     def __init__(self, config: AdaptiveConfig) -> None:
         self._epsilon = config.epsilon
@@ -50,18 +51,20 @@ class Adaptation:
             return (*decays, *((1.0 - decay) / leakage for decay, leakage in zip(decays, nu, strict=True)))
 
         self._held = HoldTable(held)
-        """e^{-nu T} of H_0 .. H_3, then (1 - e^{-nu T}) / nu."""
+        """e^{-nu T} for H_0 to H_3, then (1 - e^{-nu T}) / nu."""
         self.h: Vec4 = config.h_initial
         self.zeta = config.zeta_initial
 
     def rho(self, regressor: Vec4) -> float:
-        """Gain of the robust term: H . b + zeta, capped."""
+        """Return the gain of the robust term: H . b + zeta, capped."""
         (h0, h1, h2, h3), (b0, b1, b2, b3) = self.h, regressor
         rho = h0 * b0 + h1 * b1 + h2 * b2 + h3 * b3 + self.zeta
         return rho if rho < self._rho_max else self._rho_max
 
     def advance(self, dt_s: float, norm_s: float, regressor: Vec4, frozen: bool) -> None:
-        """One step with ||S s|| and the regressor held; `frozen`: the actuators clipped, so nothing is to be learnt."""
+        """Integrate one step with ||S s|| and the regressor held. With `frozen` the gains do not change, because the actuators are
+        saturated.
+        """
         (h0, h1, h2, h3), (b0, b1, b2, b3) = self.h, regressor
         if norm_s < self._varpi:
             c = 1.0 + (h0 * b0 + h1 * b1 + h2 * b2 + h3 * b3) * norm_s
@@ -78,7 +81,7 @@ class Adaptation:
 
 
 class AccelerationFilter:
-    """chi'' of the active rows: measured on the base, differenced on the joints, low-passed, exact for a held input."""
+    """Low-pass filter of chi'' of the active rows, exact for a held input: measured for the base, differenced for the joints."""
 
     def __init__(self, cutoff_hz: float) -> None:
         self._w = 2.0 * math.pi * cutoff_hz
@@ -86,7 +89,7 @@ class AccelerationFilter:
         self._value: Rows | None = None
 
     def step(self, dt_s: float, state: PlantState) -> Rows:
-        """m/s^2 and rad/s^2; starts at its first sample."""
+        """Return the filtered acceleration, m/s^2 and rad/s^2. The filter starts at its first sample."""
         w6, w7 = rate = state.arm_rate_rad_s
         w6_before, w7_before = self._arm_rate_rad_s or rate
         self._arm_rate_rad_s = rate
@@ -103,7 +106,7 @@ class AccelerationFilter:
 
 
 class AdaptiveController:
-    """The whole law for vehicle and arm."""
+    """The adaptive impedance law for vehicle and arm."""
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
@@ -139,12 +142,12 @@ class AdaptiveController:
         x, y, z = (min(1.0, fed + yielding) for fed, yielding in shares)
         self._accounted: Vec3 = (x, y, z)
         self._known_n: Vec3 = (0.0, 0.0, 0.0)
-        """Of the last tick: rotors, weight, and the measured force as far as it is accounted for."""
+        """Known force on the base in the last tick: rotors, weight, and the part of the measured force that the law accounts for."""
         self.hover_thrust = hover_thrust
-        """For the log; who estimates it sets it before every step."""
+        """Normalised hover thrust, for the log. Its estimator sets it before every step."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
-        """One tick of `dt_s`; see `companion.control.types.Controller`."""
+        """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
         adaptation, impedance, sent = self._adaptation, self._impedance, self._actuation
         clipped_before = sent.any_clipped
         acceleration = self._acceleration.step(dt_s, state)
@@ -188,7 +191,7 @@ class AdaptiveController:
         return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
 
     def _torque_error(self, arm_rad: Vec2, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Vec8, Vec2, Vec2]:
-        """e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that carry the arm."""
+        """Return e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that hold the arm against gravity."""
         (xx, xy, xz), (zx, zy, zz) = body_x, body_z
         jx6, jx7, jz6, jz7, g6, g7 = self._manipulator.joint_terms(arm_rad, GRAVITY_M_S2 * xz, GRAVITY_M_S2 * zz)
         (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
@@ -211,7 +214,7 @@ class AdaptiveController:
         )
 
     def _norms(self, s: Vec8, error: Vec8, error_rate: Vec8, acceleration: Rows) -> Vec3:
-        """||S s||, ||S [e; e']||, ||S chi_dd||."""
+        """Return ||S s||, ||S [e; e']|| and ||S chi_dd||."""
         s0, s1, s2, _, _, _, s6, s7 = s
         e0, e1, e2, _, _, _, e6, e7 = error
         v0, v1, v2, _, _, _, v6, v7 = error_rate
@@ -230,7 +233,8 @@ class AdaptiveController:
         )
 
     def _tau(self, s: Vec8, robust: float, error_rate: Vec8, tau_d: Vec2, reference: Reference) -> Rows:
-        """Eq. tau with - D gamma and dtau = -rho S^2 s / max(||S s||, varpi); `robust` is rho over that maximum. Row by row
+        """Return tau (eq. tau) with - D gamma and dtau = -rho S^2 s / max(||S s||, varpi). `robust` is rho over that maximum. Row by
+        row:
 
         tau = M_d (chi''_d - Phi e') - (Lambda + robust S^2) s - D gamma - tau_d.
         """
@@ -253,7 +257,7 @@ class AdaptiveController:
         )
 
     def _base_force(self, tau: Rows, reference: Reference, force: Vec3, disturbance: Vec3) -> Vec3:
-        """tau of the base and hover thrust; and, as far as the configuration asks for it: force sensor, disturbance, lead."""
+        """Return the force on the base: tau and hover thrust, plus the configured force feedforward, disturbance compensation and lead."""
         (x, y, z, _, _), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = tau, force, disturbance, self._force_share
         x -= c0 * f0 + d0
         y -= c1 * f1 + d1
@@ -275,9 +279,10 @@ class AdaptiveController:
         state: PlantState,
         reference: Reference,
     ) -> Vec2:
-        """tau of the joints and arm gravity; and the options (M_arm - M_d) alpha''* + C alpha' and the friction at alpha'*.
+        """Return the joint torques: tau and gravity, plus the configured (M_arm - M_d) alpha''* + C alpha' and friction at alpha'*.
 
-        Star: what the target asks for now, alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d - Phi e + gamma = alpha' - s.
+        The star marks what the target impedance asks for now: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d - Phi e +
+        gamma = alpha' - s.
         """
         t6, t7 = tau[3] + gravity[0], tau[4] + gravity[1]
         rates = state.arm_rate_rad_s
@@ -297,6 +302,8 @@ class AdaptiveController:
         return (t6, t7)
 
     def _remember(self, sent_n: Vec3, force: Vec3) -> None:
-        """The measured force is none of the observer's business as far as it is fed forward or the base is to give way to it."""
+        """Store the known force for the disturbance observer. It contains the measured force as far as the law feeds it forward or
+        complies with it.
+        """
         (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
         self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)

@@ -1,4 +1,4 @@
-"""A plain PD on the joints: holds or folds the arm when the impedance law is not flying (on the ground, after an abort)."""
+"""PD control of the joints: holds or folds the arm while the impedance law does not run (on the ground, after an abort)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def hold_torque_nm(
     target_rate_rad_s: Vec2,
     attitude: Quat,
 ) -> Vec2:
-    """Joint torques towards the target, nominal gravity carried."""
+    """Return the joint torques towards the target, N m, with nominal gravity compensation."""
     gravity = manipulator.gravity_torque_nm(angle_rad, attitude)
     torque = [
         g + STIFFNESS_NM_RAD * (target - angle) + DAMPING_NMS_RAD * (target_rate - rate)

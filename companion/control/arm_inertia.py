@@ -1,6 +1,6 @@
-"""The arm's own nominal dynamics in closed form: inertia and Coriolis torque of a 2R arm on a base that stands still.
+"""Nominal dynamics of the arm in closed form: inertia and Coriolis torque of a 2R arm on a fixed base.
 
-The same numbers as `Dynamics.arm_terms` (a test compares), at a tenth of the cost: with beta = alpha_2,
+The values equal those of `Dynamics.arm_terms` (a test compares them) at a tenth of the cost. With beta = alpha_2,
 
     M = [[A + B + 2 C cos beta, -(B + C cos beta)], [., B]] + armature
     Coriolis = C sin beta [alpha_2' (alpha_2' - 2 alpha_1'), alpha_1'^2]
@@ -16,7 +16,7 @@ from companion.model.types import Vec2
 
 
 class ArmInertia:
-    """Torques that move the arm, without gravity."""
+    """Inverse dynamics of the arm without gravity."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         dynamics, armature = Dynamics(vehicle), vehicle.arm.joint_armature_kg_m2
@@ -28,7 +28,7 @@ class ArmInertia:
         self._armature = armature
 
     def torque_nm(self, angle_rad: Vec2, rate_rad_s: Vec2, acceleration_rad_s2: Vec2) -> Vec2:
-        """M alpha'' + C alpha', N m."""
+        """Return M alpha'' + C alpha', N m."""
         beta = angle_rad[1]
         v1, v2 = rate_rad_s
         a1, a2 = acceleration_rad_s2

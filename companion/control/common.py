@@ -1,6 +1,6 @@
-"""What every law shares: errors, the filtered external force, the force that is taken for granted, and the way to the actuators.
+"""Parts that every law shares: errors, the filtered external force, the desired force, and the saturation of commands.
 
-Plain floats, written out axis by axis: all of it runs in the control tick.
+Everything here runs in the control tick and is therefore written in plain floats, axis by axis.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Vec8, Vec8]:
-    """e = chi - chi_d and e', 8 rows; rows 3 and 4 (roll, pitch) are 0: their reference is the law's own."""
+    """Return e = chi - chi_d and e', 8 rows each. Rows 3 and 4 (roll, pitch) are 0 because their reference is the law's own output."""
     px, py, pz = state.position_world_m
     vx, vy, vz = state.velocity_world_m_s
     a1, a2 = state.arm_rad
@@ -44,9 +44,9 @@ def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> 
 
 
 class ForceFilter:
-    """The external force, low-passed; zero while there is no sample to be trusted, and it starts again from there.
+    """First-order low-pass filter of the external force, exact for a held input.
 
-    First order, exact for a held input; starts at its first sample.
+    It returns zero while there is no valid sample and starts again at the next valid one.
     """
 
     def __init__(self, cutoff_hz: float) -> None:
@@ -54,7 +54,7 @@ class ForceFilter:
         self._force_n: Vec3 | None = None
 
     def step(self, dt_s: float, sample_world_n: Vec3 | None) -> Vec3:
-        """Filtered force, world, N."""
+        """Return the filtered force, world frame, N."""
         before = self._force_n
         if sample_world_n is None:
             sample_world_n = (0.0, 0.0, 0.0)
@@ -67,10 +67,10 @@ class ForceFilter:
 
 
 class DesiredForce:
-    """F_d: follows the external force slowly, so that a carried payload is no disturbance for ever.
+    """Desired force F_d. It follows the external force slowly, so that a carried payload stops being a disturbance.
 
     Args:
-        time_s: time constant; None: F_d stays 0.
+        time_s: time constant; with None F_d stays 0.
     """
 
     def __init__(self, time_s: float | None) -> None:
@@ -78,7 +78,7 @@ class DesiredForce:
         self.world_n: Vec3 = (0.0, 0.0, 0.0)
 
     def advance(self, dt_s: float, force_world_n: Vec3) -> None:
-        """One step with the force held."""
+        """Integrate one step with the force held."""
         if self._time_s is None:
             return
         k = dt_s / self._time_s
@@ -89,25 +89,26 @@ class DesiredForce:
 
 
 class ActuationConfig(Protocol):
-    """The part of a law's configuration that limits what it asks for."""
+    """The part of a law's configuration that limits its commands."""
 
     @property
     def lateral_force_max_n(self) -> float:
-        """Largest horizontal force."""
+        """Largest horizontal force, N."""
 
     @property
     def attitude_filter_rad_s(self) -> float:
-        """Bandwidth of the desired roll and pitch."""
+        """Bandwidth of the filter of desired roll and pitch, rad/s."""
 
     @property
     def attitude_filter_damping(self) -> float:
-        """Damping of the same filter."""
+        """Damping ratio of the filter of desired roll and pitch."""
 
 
 class Actuation:
-    """From force and joint torques to what is sent: vertical first, then lateral within tilt; smooth roll and pitch; torque limits.
+    """Convert force and joint torques to commands: vertical force first, then lateral force within the tilt limit, filtered roll and
+    pitch, joint torques within their limits.
 
-    What it says of the last tick are its attributes: a record more per tick would cost more than the arithmetic.
+    Results of the last tick are attributes, because one more record per tick would cost more than the arithmetic.
     """
 
     def __init__(self, config: ActuationConfig, vehicle: Vehicle, hover_thrust: float) -> None:
@@ -125,10 +126,10 @@ class Actuation:
         self.roll_pitch_yaw_rad: Vec3 = (0.0, 0.0, 0.0)
         self.collective_n = 0.0
         self.force_world_n: Vec3 = (0.0, 0.0, 0.0)
-        """After saturation."""
+        """Force after saturation, world frame, N."""
         self.arm_torque_nm: Vec2 = (0.0, 0.0)
         self.clipped = (False, False, False)
-        """Vertical force, lateral force, joint torque."""
+        """Whether vertical force, lateral force and joint torque were saturated."""
         self.any_clipped = False
 
     def step(
@@ -140,14 +141,14 @@ class Actuation:
         yaw_rad: float,
         vertical_scale: float,
     ) -> None:
-        """One tick.
+        """Run one tick.
 
         Args:
-            dt_s: since the last tick.
-            force_world_n: wanted on the base.
-            torque_nm: wanted on the joints.
-            body_z_world: the body's z axis as it is now.
-            yaw_rad: asked for.
+            dt_s: time since the last tick.
+            force_world_n: desired force on the base.
+            torque_nm: desired joint torques.
+            body_z_world: current direction of the body's z axis.
+            yaw_rad: desired yaw.
             vertical_scale: as in `companion.control.types.Controller`.
         """
         force, clipped_z, clipped_xy = saturate_force(force_world_n, self._limits)

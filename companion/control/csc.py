@@ -6,9 +6,9 @@ with a known model. On every row
     M_d e'' + K_d e' + K_p e = tau_ext - tau_d,        chi''_cmd = chi''_d - M_d^-1 (K_d e' + K_p e - (tau_ext - tau_d)),
     tau = M(chi) chi''_cmd + C(chi, chi') chi' + g(chi) - tau_ext,
 
-with tau_ext = [F; 0; J'F] as measured. The model knows no payload and nothing adapts: a payload is a lasting external force, to
-which the whole system gives way by F / K_p. The attitude rows are PX4's: their chi'' is what PX4's loop is expected to do towards
-the attitude last asked for, and enters through the coupling alone.
+with the measured tau_ext = [F; 0; J'F]. The model contains no payload and nothing adapts, so a payload is a constant external force
+that displaces the whole system by F / K_p. PX4 controls the attitude rows: their chi'' is the expected response of PX4's loop to the
+last attitude setpoint and enters through the coupling only.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from companion.model.types import Reference, Vec3, Vec8
 
 
 class CscController(ModelBasedLaw):
-    """The whole law for vehicle and arm."""
+    """The CSC law for vehicle and arm."""
 
     def __init__(self, config: CscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         super().__init__(config, vehicle, hover_thrust, config.model_mass_scale)
         self._c = config
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
-        """One tick of `dt_s`; see `companion.control.types.Controller`."""
+        """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
         force = self._force.step(dt_s, state.force_ext_world_n)
         error, error_rate = tracking_errors(state, reference, yaw_from_quat(state.attitude_wxyz))
         tau_ext, e_tau = self._external(state, force)
@@ -47,7 +47,7 @@ class CscController(ModelBasedLaw):
         return self._end(dt_s, error, error_rate, e_tau, force)
 
     def _external(self, state: PlantState, force: Vec3) -> tuple[Vec8, Vec8]:
-        """tau_ext and tau_ext - tau_d; the base's share as configured."""
+        """Return tau_ext and tau_ext - tau_d. The share of the base is configured."""
         ext, desired = self._joint_torques_nm(state, force)
         x, y, z = (share * f for share, f in zip(self._c.external_xyz, force, strict=True))
         dx, dy, dz = (share * f for share, f in zip(self._c.desired_force_xyz, self._desired.world_n, strict=True))
@@ -57,7 +57,7 @@ class CscController(ModelBasedLaw):
         )
 
     def _tau(self, state: PlantState, reference: Reference, error: Vec8, error_rate: Vec8, e_tau: Vec8) -> list[float]:
-        """M chi''_cmd + C chi' + g, 8 rows."""
+        """Return M chi''_cmd + C chi' + g, 8 rows."""
         rpy = euler_zyx_from_quat(state.attitude_wxyz)
         q_rate = chi_rate_from_body_rate(rpy, state.angular_rate_body_rad_s)
         roll_d, pitch_d, _ = self._actuation.roll_pitch_yaw_rad

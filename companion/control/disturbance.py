@@ -1,8 +1,8 @@
-"""What acts on the base beside the forces that the companion knows of: a first-order observer on Newton's law.
+"""Disturbance observer: estimates the unknown force on the base from Newton's law, first order.
 
     d' = (m a - F - d) / T,    F = the known force, lagged as the rotors and the attitude loop lag
 
-Nothing is assumed of where the force comes from: wind, a payload, the arm's reaction, the tether, a wrong hover thrust.
+The estimate contains any unknown force: wind, a payload, the arm's reaction, the tether, a wrong hover thrust.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from companion.model.types import Vec3
 
 
 class DisturbanceObserver:
-    """Force on the base, world frame, N.
+    """Estimate of the unknown force on the base, world frame, N.
 
     Args:
-        mass_kg: of the whole machine.
-        time_xyz_s: time constant per axis; 0: that axis stays 0.
-        lag_s: from the force asked for to the force given.
+        mass_kg: mass of the whole machine.
+        time_xyz_s: time constant per axis; an axis with 0 stays 0.
+        lag_s: time constant from the commanded to the actual force.
         max_n: bound of the estimate per axis.
     """
 
@@ -30,16 +30,16 @@ class DisturbanceObserver:
         self._max_n = max_n
         self._lagged: Vec3 | None = None
         self.force_n: Vec3 = (0.0, 0.0, 0.0)
-        """The estimate."""
+        """The estimate, world frame, N."""
 
     def step(self, dt_s: float, known_n: Vec3, acceleration_world_m_s2: Vec3, learn: bool) -> Vec3:
-        """One tick; the estimate.
+        """Run one tick and return the estimate, world frame, N.
 
         Args:
-            dt_s: since the last tick.
-            known_n: every force that is known to have been asked for in the last tick, weight included.
-            acceleration_world_m_s2: measured now.
-            learn: false: the estimate stands still (on the ground, or where the actuators clip).
+            dt_s: time since the last tick.
+            known_n: sum of all known forces commanded in the last tick, weight included.
+            acceleration_world_m_s2: measured acceleration.
+            learn: if false the estimate does not change (on the ground, or while the actuators are saturated).
         """
         if not self._on:
             return self.force_n
@@ -65,6 +65,6 @@ class DisturbanceObserver:
         return self.force_n
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Reset the estimate to zero."""
         self._lagged = None
         self.force_n = (0.0, 0.0, 0.0)

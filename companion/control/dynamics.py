@@ -3,9 +3,9 @@
 chi = [p (world, m); roll, pitch, yaw (ZYX, rad); alpha_1, alpha_2 (rad)]; tau = [force on the body origin, world, N; generalised
 torques of roll, pitch, yaw, N m; joint torques, N m]. The arm moves in the body's x-z plane; angles as in `manipulator`.
 
-Built in the coordinates (origin velocity in body axes, body rate, joint rates), where the planar arm leaves few terms, then carried to
-chi by the Euler-rate matrix W: omega_body = W(roll, pitch) q'. Floats and tuples only: this runs in the control tick, and a replay on
-another machine must not depend on the order in which a linear-algebra library adds.
+The terms are built in the coordinates (origin velocity in body axes, body rate, joint rates), where the planar arm leaves few terms,
+and then transformed to chi by the Euler-rate matrix W: omega_body = W(roll, pitch) q'. The module uses floats and tuples only: it runs
+in the control tick, and a replay on another machine must not depend on the summation order of a linear-algebra library.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _Vec4 = tuple[float, float, float, float]
 
 ROD_AXIAL_SHARE = 0.1
 ROD_AXIAL_KG_M2 = 1e-5
-"""Inertia of a link about its own length: this share of the one across, and this much."""
+"""Inertia of a link about its own axis: a share of the transverse inertia plus a constant."""
 TOOL_PART_INERTIA_KG_M2 = 1e-4
-"""Of the sensor, and of the net, about any axis."""
+"""Inertia of the sensor and of the net about any axis, kg m^2."""
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicsTerms:
-    """The three terms at one state; rows of `mass` are rows of M."""
+    """The three terms at one state. The rows of `mass` are the rows of M."""
 
     mass: Mat8
     coriolis: Vec8
@@ -41,7 +41,7 @@ class DynamicsTerms:
 
 @dataclass(frozen=True, slots=True)
 class ArmTerms:
-    """The same for the arm on a base that stands still; gravity is `Manipulator.gravity_torque_nm`."""
+    """The same terms for the arm on a fixed base. Gravity is `Manipulator.gravity_torque_nm`."""
 
     mass: Mat2
     coriolis: Vec2
@@ -49,9 +49,9 @@ class ArmTerms:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """A rigid part of the arm at body place (x, y, z), as a function of the joints.
+    """A rigid part of the arm at the body position (x, y, z), as a function of the joint angles.
 
-    Its centre moves by (jx . alpha', 0, jz . alpha'), is accelerated by (kx, 0, kz) when the joint rates are held, and turns with
+    Its centre moves by (jx . alpha', 0, jz . alpha'), accelerates by (kx, 0, kz) when the joint rates are constant, and rotates with
     `turn` . alpha' about body y. Its inertia in body axes is [[xx, 0, xz], [0, yy, 0], [xz, 0, zz]].
     """
 
@@ -75,7 +75,7 @@ class Dynamics:
 
     Args:
         vehicle: masses, lengths, inertia of the base and of the joints.
-        mass_scale: every mass and inertia of the model is multiplied by it; 1 is the vehicle file's belief.
+        mass_scale: factor on every mass and inertia of the model; 1 is the vehicle file's model.
     """
 
     def __init__(self, vehicle: Vehicle, mass_scale: float = 1.0) -> None:
@@ -92,7 +92,7 @@ class Dynamics:
         self._armature = mass_scale * arm.joint_armature_kg_m2
 
     def arm_terms(self, angle_rad: Vec2, rate_rad_s: Vec2) -> ArmTerms:
-        """M and C alpha' of the arm alone, kg m^2 and N m."""
+        """Return M (kg m^2) and C alpha' (N m) of the arm alone."""
         m11 = m12 = m22 = c1 = c2 = 0.0
         for part in self._parts(angle_rad, rate_rad_s):
             m, jx, jz, (t1, t2) = part.mass_kg, part.jx, part.jz, part.turn
@@ -104,13 +104,13 @@ class Dynamics:
         return ArmTerms(((m11 + self._armature, m12), (m12, m22 + self._armature)), (c1, c2))
 
     def terms(self, rotation: Mat3, roll_pitch_yaw_rad: Vec3, angle_rad: Vec2, chi_rate: Vec8) -> DynamicsTerms:
-        """M, C chi' and g at a state; position does not matter.
+        """Return M, C chi' and g at a state. They do not depend on the position.
 
         Args:
-            rotation: body to world; the matrix of the three angles.
+            rotation: body to world, the matrix of the three angles.
             roll_pitch_yaw_rad: ZYX; |pitch| < 90 deg.
-            angle_rad: joints.
-            chi_rate: chi', rows 3-5 are the rates of roll, pitch, yaw.
+            angle_rad: joint angles.
+            chi_rate: chi'; rows 3-5 are the rates of roll, pitch, yaw.
         """
         w, w_rate = _euler_rate_matrices(roll_pitch_yaw_rad, chi_rate)
         q_rate = (chi_rate[3], chi_rate[4], chi_rate[5])
@@ -207,7 +207,7 @@ class Dynamics:
         return DynamicsTerms(mass, coriolis, gravity)
 
     def _parts(self, angle_rad: Vec2, rate_rad_s: Vec2) -> tuple[_Part, _Part, _Part]:
-        """Link 1, link 2, and sensor with net at the end of link 2."""
+        """Return link 1, link 2, and sensor with net at the end of link 2."""
         a1 = angle_rad[0]
         b = a1 - angle_rad[1]
         s1, c1, s2, c2 = math.sin(a1), math.cos(a1), math.sin(b), math.cos(b)
@@ -250,7 +250,7 @@ class Dynamics:
 
 
 def chi_rate_from_body_rate(roll_pitch_yaw_rad: Vec3, rate_body_rad_s: Vec3) -> Vec3:
-    """q' = W^-1 omega: rates of roll, pitch, yaw, rad/s; |pitch| < 90 deg."""
+    """Return q' = W^-1 omega: rates of roll, pitch, yaw, rad/s. |pitch| must be less than 90 deg."""
     roll, pitch, _ = roll_pitch_yaw_rad
     x, y, z = rate_body_rad_s
     s, c = math.sin(roll), math.cos(roll)
@@ -259,7 +259,7 @@ def chi_rate_from_body_rate(roll_pitch_yaw_rad: Vec3, rate_body_rad_s: Vec3) -> 
 
 
 def rotation_matrix(attitude_wxyz: Quat) -> Mat3:
-    """Body to world, from a unit quaternion."""
+    """Return the rotation from body to world of a unit quaternion."""
     w, x, y, z = attitude_wxyz
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -269,14 +269,14 @@ def rotation_matrix(attitude_wxyz: Quat) -> Mat3:
 
 
 def _rod(mass_kg: float, length_m: float, c: float, s: float, scale: float) -> _Vec4:
-    """xx, yy, zz, xz of a rod along (c, 0, -s) in body axes."""
+    """Return xx, yy, zz, xz of a rod along (c, 0, -s) in body axes."""
     across = mass_kg * length_m * length_m / 12.0
     axial = ROD_AXIAL_SHARE * across + scale * ROD_AXIAL_KG_M2
     return (axial * c * c + across * s * s, across, axial * s * s + across * c * c, (across - axial) * c * s)
 
 
 def _euler_rate_matrices(rpy: Vec3, chi_rate: Vec8) -> tuple[Mat3, Mat3]:
-    """W with omega_body = W q', and dW/dt."""
+    """Return W, with omega_body = W q', and dW/dt."""
     roll, pitch, _ = rpy
     sr, cr, sp, cp = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
     dr, dp = chi_rate[3], chi_rate[4]
@@ -296,7 +296,7 @@ def _mat_vec(m: Mat3, v: Vec3) -> Vec3:
 
 
 def _vec_mat(v: Vec3, m: Mat3) -> Vec3:
-    """v' M, the transpose's product."""
+    """Return v' M."""
     (a, b, c), (d, e, f), (g, h, i) = m
     x, y, z = v
     return (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z)

@@ -1,4 +1,4 @@
-"""The law that a configuration asks for."""
+"""Build the configured control law."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from companion.control.types import Law
 
 
 def build_controller(config: ControllerConfig, vehicle: Vehicle, hover_thrust: float) -> Law:
-    """A fresh controller; `hover_thrust` is the normalised thrust that holds the vehicle's own mass."""
+    """Return a new controller. `hover_thrust` is the normalised thrust that carries the vehicle without payload."""
     match config:
         case AdaptiveConfig():
             return AdaptiveController(config, vehicle, hover_thrust)

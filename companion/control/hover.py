@@ -1,8 +1,9 @@
-"""Hover thrust, estimated in flight: which normalised thrust carries the machine without payload. Pure; time is an argument.
+"""Estimator of the hover thrust in flight: the normalised thrust that carries the machine without payload. Pure; time is an argument.
 
-Balance along body z, the machine taken as one mass:  (m g / h) u = m f_z - F_z,  with u the thrust that the rotors give now (commanded
-thrust behind delay and rotor lag), h the hover thrust, f_z the specific force along body z (IMU) and F_z the measured force on the net:
-a caught payload pulls on the sensor and is no change of h. What is left in h is battery, propellers, air density and the true mass.
+The balance along body z, with the machine as one mass, is (m g / h) u = m f_z - F_z, where u is the thrust that the rotors give now
+(commanded thrust behind delay and rotor lag), h the hover thrust, f_z the specific force along body z (IMU) and F_z the measured force
+on the net. A caught payload acts on the sensor and does not change h. The remaining changes of h come from battery, propellers, air
+density and the true mass.
 """
 
 from __future__ import annotations
@@ -15,20 +16,22 @@ from companion.model.frames import body_z_component
 from companion.model.types import Inputs, LandedState, Quat, Vec3
 
 SHARE_MAX = 0.25
-"""The estimate stays within this share of its start value: a broken accelerometer must not take the vehicle down."""
+"""Largest relative deviation of the estimate from its start value. It keeps a faulty accelerometer from making the vehicle sink."""
 AIRBORNE_M = 0.10
-"""Height above standing from which the floor no longer carries."""
+"""Height above the standing height from which the ground no longer carries the vehicle, m."""
 _LAG_S = 0.05
-"""Command to thrust: transmission and rotor lag. Over the estimator's own seconds its exact value does not matter."""
+"""Lag from command to thrust: transmission and rotors. Its exact value does not matter against the estimator's time constants of
+seconds.
+"""
 _TIME_MIN_S, _TIME_MAX_S = 1.0, 6.0
-"""The estimate is a running mean over the time in the air, at first over the shorter, at last over the longer."""
+"""The estimate is a running mean over the time in the air, at least over the first and at most over the second of these times."""
 _TILT_COS_MIN = math.cos(math.radians(15.0))
 _ACCELERATION_MAX_M_S2 = 1.5
 _ACCELERATION_LOWPASS_S = 0.05
 
 
 class Balance:
-    """Thrust given and load carried, tick by tick, wherever the balance can be trusted."""
+    """Thrust and load of each tick in which the balance is valid."""
 
     def __init__(self, mass_kg: float) -> None:
         self._mass_kg = mass_kg
@@ -38,9 +41,9 @@ class Balance:
     def step(
         self, dt_s: float, thrust_sent: float, acceleration_world_m_s2: Vec3, force_world_n: Vec3, attitude_wxyz: Quat
     ) -> tuple[float, float] | None:
-        """Normalised thrust that the rotors give now, and the load as a share of the weight (1: hover without payload).
+        """Return the normalised thrust that the rotors give now and the load as a share of the weight (1 is hover without payload).
 
-        None: leaning, jerked up or down, or the command at its limits.
+        Returns None while the vehicle is tilted or accelerates strongly, or the command is at its limits.
         """
         before = thrust_sent if self._thrust is None else self._thrust
         self._thrust = before + (1.0 - math.exp(-dt_s / _LAG_S)) * (thrust_sent - before)
@@ -59,10 +62,10 @@ class Balance:
 
 
 class HoverThrust:
-    """The estimator.
+    """Estimator of the hover thrust.
 
     Args:
-        start: hover thrust to begin with (PX4's MPC_THR_HOVER or the vehicle file), 0 to 1.
+        start: initial hover thrust (PX4's MPC_THR_HOVER or the vehicle file), 0 to 1.
         mass_kg: nominal mass of the whole machine, without payload.
     """
 
@@ -73,14 +76,14 @@ class HoverThrust:
         self.value = start
 
     def step(self, dt_s: float, thrust_sent: float, state: PlantState, airborne: bool, carrying: bool) -> float:
-        """One tick; the estimate, 0 to 1.
+        """Run one tick and return the estimate, 0 to 1.
 
         Args:
-            dt_s: since the last step.
-            thrust_sent: normalised thrust commanded in the last tick; at its limits nothing is learnt.
-            state: of this tick.
-            airborne: nothing but the rotors carries the machine.
-            carrying: a payload was caught; without force sensor nothing is learnt then.
+            dt_s: time since the last step.
+            thrust_sent: normalised thrust sent in the last tick. At its limits the estimate does not change.
+            state: state of this tick.
+            airborne: whether only the rotors carry the machine.
+            carrying: whether a payload was caught. Without a force sensor the estimate does not change then.
         """
         force = state.force_ext_world_n
         # The filters follow in any case: when learning sets in they must not start from stale values.
@@ -102,7 +105,7 @@ class HoverThrust:
 
 
 def off_the_ground(inputs: Inputs, ground_clearance_m: float) -> bool:
-    """Nothing but the rotors carries: PX4 says so, and the height does."""
+    """Return whether only the rotors carry the machine, by PX4's landed state and by height."""
     if inputs.vehicle is None or inputs.status is None or inputs.status.landed is not LandedState.IN_AIR:
         return False
     return inputs.vehicle.position_world_m[2] > ground_clearance_m + AIRBORNE_M

@@ -1,7 +1,7 @@
 """The target impedance: error coordinates, external torque, and the auxiliary state gamma (paper, eqs. s_general to I_cl).
 
-Corrected as printed in docs/control-law.md: gamma' = M_d^-1 (e_tau - D gamma) with D = K_d - M_d Phi, gamma(0) = 0.
-Written out row by row: this runs in the control tick.
+Corrected as in docs/control-law.md: gamma' = M_d^-1 (e_tau - D gamma) with D = K_d - M_d Phi, gamma(0) = 0. Written out row by row
+because it runs in the control tick.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from companion.model.types import Vec8
 
 
 class Impedance:
-    """gamma and s of the target impedance M_d e'' + K_d e' + K_p e = e_tau."""
+    """States gamma and s of the target impedance M_d e'' + K_d e' + K_p e = e_tau."""
 
     def __init__(self, config: AdaptiveConfig) -> None:
         self.inertia = config.inertia_md
@@ -34,7 +34,7 @@ class Impedance:
         self.gamma = [0.0] * 8
 
     def sliding(self, error: Sequence[float], error_rate: Sequence[float]) -> Vec8:
-        """s = e' + Phi e - gamma (eq. s_general)."""
+        """Return s = e' + Phi e - gamma (eq. s_general)."""
         e0, e1, e2, e3, e4, e5, e6, e7 = error
         v0, v1, v2, v3, v4, v5, v6, v7 = error_rate
         p0, p1, p2, p3, p4, p5, p6, p7 = self.phi
@@ -51,7 +51,7 @@ class Impedance:
         )
 
     def advance(self, dt_s: float, e_tau: Sequence[float]) -> Vec8:
-        """gamma over one step with e_tau held (eq. adaptive_1, corrected; exact)."""
+        """Integrate gamma over one step with e_tau held (eq. adaptive_1, corrected; exact)."""
         k0, k1, k2, k3, k4, k5, k6, k7, b0, b1, b2, b3, b4, b5, b6, b7 = self._held[dt_s]
         t0, t1, t2, t3, t4, t5, t6, t7 = e_tau
         g0, g1, g2, g3, g4, g5, g6, g7 = self.gamma

@@ -1,8 +1,8 @@
 """Kinematics and nominal gravity of the 2R arm.
 
-Angles are the paper's: alpha_1 is the angle of link 1 from body +x, positive turning down (about body +y); alpha_2 turns link 2 the
-other way, so that link 2 points along alpha_1 - alpha_2. Everything lives in the body's x-z plane. Floats and tuples only: these run in
-the control tick.
+Angles are those of the paper: alpha_1 is the angle of link 1 from body +x, positive downwards (about body +y); alpha_2 rotates link 2
+in the opposite direction, so that link 2 points along alpha_1 - alpha_2. The arm moves in the body's x-z plane. The module uses floats
+and tuples only, because it runs in the control tick.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Manipulator:
         self._sensor_in_link2: Quat = quat_from_euler_zyx(roll, pitch, yaw)
 
     def net_body_m(self, angle_rad: Vec2) -> Vec3:
-        """Centre of the net in the body frame."""
+        """Return the centre of the net in the body frame, m."""
         a1 = angle_rad[0]
         b = a1 - angle_rad[1]
         sx, sy, sz = self._shoulder
@@ -43,12 +43,12 @@ class Manipulator:
         )
 
     def elbow_body_m(self, angle_rad: Vec2) -> Vec3:
-        """Elbow joint in the body frame."""
+        """Return the elbow joint in the body frame, m."""
         sx, sy, sz = self._shoulder
         return (sx + self._l1 * math.cos(angle_rad[0]), sy, sz - self._l1 * math.sin(angle_rad[0]))
 
     def jacobian_body_m(self, angle_rad: Vec2) -> tuple[Vec2, Vec2]:
-        """Rows x and z of d net_body / d alpha (the y row is zero), m/rad: the paper's J_alpha."""
+        """Return rows x and z of d net_body / d alpha, m/rad (the y row is zero): the paper's J_alpha."""
         a1 = angle_rad[0]
         b = a1 - angle_rad[1]
         s1, c1 = self._l1 * math.sin(a1), self._l1 * math.cos(a1)
@@ -56,7 +56,7 @@ class Manipulator:
         return ((-s1 - s2, s2), (-c1 - c2, c2))
 
     def joint_torque_from_force(self, angle_rad: Vec2, force_body_n: Vec3) -> Vec2:
-        """J' F: joint torques that a force on the net exerts, N m."""
+        """Return J' F: the joint torques of a force on the net, N m."""
         (jx1, jx2), (jz1, jz2) = self.jacobian_body_m(angle_rad)
         fx, _, fz = force_body_n
         return (jx1 * fx + jz1 * fz, jx2 * fx + jz2 * fz)
@@ -64,7 +64,7 @@ class Manipulator:
     def gravity_torque_nm(
         self, angle_rad: Vec2, attitude_wxyz: Quat, specific_force_m_s2: float = GRAVITY_M_S2
     ) -> Vec2:
-        """Motor torques that hold the arm against gravity in the attitude given, payload excluded."""
+        """Return the motor torques that hold the arm against gravity at the given attitude, N m, payload excluded."""
         # "Up" seen from the body: the arm must push that way.
         up_x, _, up_z = quat_rotate(
             (attitude_wxyz[0], -attitude_wxyz[1], -attitude_wxyz[2], -attitude_wxyz[3]), (0.0, 0.0, specific_force_m_s2)
@@ -78,12 +78,13 @@ class Manipulator:
     def joint_terms(
         self, angle_rad: Vec2, up_x_m_s2: float, up_z_m_s2: float
     ) -> tuple[float, float, float, float, float, float]:
-        """Rows x and z of the Jacobian (m/rad), then the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in one.
+        """Return rows x and z of the Jacobian (m/rad) and the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in one
+        call.
 
         Args:
-            angle_rad: both joints.
-            up_x_m_s2: body x component of what the arm must push against, 9.81 m/s^2 upwards.
-            up_z_m_s2: body z component.
+            angle_rad: both joint angles.
+            up_x_m_s2: body x component of the reaction to gravity, 9.81 m/s^2 upwards.
+            up_z_m_s2: its body z component.
         """
         a1, a2 = angle_rad
         b = a1 - a2
@@ -96,6 +97,6 @@ class Manipulator:
         return -l1 * s1 - s2, s2, -l1 * c1 - c2, c2, about_1 + about_2, -about_2
 
     def sensor_attitude_body(self, angle_rad: Vec2) -> Quat:
-        """Rotation from the force-torque sensor's frame to the body frame."""
+        """Return the rotation from the force-torque sensor's frame to the body frame."""
         half = 0.5 * (angle_rad[0] - angle_rad[1])
         return quat_multiply((math.cos(half), 0.0, math.sin(half), 0.0), self._sensor_in_link2)

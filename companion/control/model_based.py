@@ -1,4 +1,4 @@
-"""What the laws that know the machine's model share: their parts, the torque of an external force on the joints, the end of a tick."""
+"""Parts that the model-based laws share: model, external joint torque, and the end of a tick."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from companion.model.types import ControlLog, Vec2, Vec3, Vec8
 
 
 class ModelBasedConfig(ActuationConfig, Protocol):
-    """The part of such a law's configuration that says what becomes of the measured force."""
+    """The part of a model-based law's configuration that concerns the measured force."""
 
     @property
     def force_lowpass_hz(self) -> float:
-        """Cutoff of the external force."""
+        """Cutoff frequency of the external force's filter, Hz."""
 
     @property
     def desired_force_time_s(self) -> float | None:
-        """How fast F_d follows; None: it stays 0."""
+        """Time constant of F_d, s; with None F_d stays 0."""
 
 
 class ModelBasedLaw:
-    """Base of such a law.
+    """Base class of the model-based laws.
 
     Args:
-        config: of the law.
+        config: configuration of the law.
         vehicle: the nominal machine, without payload.
-        hover_thrust: normalised thrust that holds it, 0 to 1.
-        model_mass_scale: the model's masses against the nominal ones.
+        hover_thrust: normalised thrust that carries it, 0 to 1.
+        model_mass_scale: ratio of the model's masses to the nominal ones.
     """
 
     def __init__(
@@ -44,10 +44,10 @@ class ModelBasedLaw:
         self._desired = DesiredForce(config.desired_force_time_s)
         self._actuation = Actuation(config, vehicle, hover_thrust)
         self.hover_thrust = hover_thrust
-        """For the log; who estimates it sets it before every step."""
+        """Normalised hover thrust, for the log. Its estimator sets it before every step."""
 
     def _joint_torques_nm(self, state: PlantState, force_world_n: Vec3) -> tuple[Vec2, Vec2]:
-        """J'F and J'F_d."""
+        """Return J'F and J'F_d, N m."""
         to_body = quat_conjugate(state.attitude_wxyz)
         ext = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force_world_n))
         desired = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, self._desired.world_n))
@@ -62,7 +62,7 @@ class ModelBasedLaw:
         force_world_n: Vec3,
         payload_estimate_kg: float | None = None,
     ) -> Wrench:
-        """Let F_d follow the force, and write down the tick; what belongs to an adaptive law is 0."""
+        """Advance F_d and return the tick's log record. Fields of adaptive laws are 0."""
         self._desired.advance(dt_s, force_world_n)
         sent = self._actuation
         (fx, fy, fz), (t1, t2) = sent.force_world_n, sent.arm_torque_nm

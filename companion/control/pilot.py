@@ -1,4 +1,4 @@
-"""Hands on the controls: from inputs and a reference to an attitude setpoint and joint torques. Pure; time is an argument."""
+"""Convert inputs and a reference to an attitude setpoint and joint torques. Pure; time is an argument."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from companion.model.types import AttitudeSetpoint, ControlLog, Inputs, Referenc
 
 FOLD_RATE_RAD_S = 1.2
 PULL_TIME_S, PULL_LAG_S, PULL_MAX_N = 0.1, 0.05, 100.0
-"""Of the force that acts on the machine, for the safety monitors."""
+"""Parameters of the disturbance estimate for the safety monitors."""
 
 
 @quick
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What one tick wants to send; the gate has the last word."""
+    """Command of one tick, before the gate."""
 
     attitude: AttitudeSetpoint | None = None
     arm_torque_nm: Vec2 | None = None
@@ -33,13 +33,13 @@ class Command:
 
 
 class Pilot:
-    """Owns the control law, the force sensor's tare and the arm's holding target.
+    """Owner of the control law, the force sensor's tare and the arm's holding target.
 
     Args:
-        config: the effective configuration; `vehicle.airframe.hover_thrust` must be known by now.
+        config: the effective configuration; `vehicle.airframe.hover_thrust` must be set.
 
     Raises:
-        ValueError: the hover thrust is not known.
+        ValueError: the hover thrust is not set.
     """
 
     def __init__(self, config: FlightConfig) -> None:
@@ -58,52 +58,52 @@ class Pilot:
         self._acceleration = MeanAcceleration()
         self._catch = CatchDetector()
         self._state: PlantState | None = None
-        """Of the last tick that the law flew."""
+        """State in the last tick in which the law ran."""
         self._law = build_controller(config.controller, vehicle, hover_thrust)
         self._controller: Controller = self._law
         fold = vehicle.safety.fold_arm_deg
         self.fold_rad: Vec2 = (math.radians(fold[0]), math.radians(fold[1]))
         self._arm_target_rad: Vec2 | None = None
         self.tracking_error_m: float | None = None
-        """Distance from the reference in the last tick that the law flew."""
+        """Distance from the reference in the last tick in which the law ran, m."""
         self._pull = DisturbanceObserver(
             vehicle.airframe.mass_kg, (PULL_TIME_S, PULL_TIME_S, PULL_TIME_S), PULL_LAG_S, PULL_MAX_N
         )
         self.disturbance_world_n: Vec3 | None = None
-        """What acts on the machine beside rotors and weight, payload included, N; None on the ground."""
+        """Force on the machine other than rotors and weight, payload included, world frame, N. None on the ground."""
 
     @property
     def thrust_share(self) -> float:
-        """Thrust of the last command that the law gave, as a share of hover thrust."""
+        """Return the thrust of the law's last command as a share of hover thrust."""
         return self._thrust_sent / self._hover.value
 
     def begin_tare(self) -> None:
-        """Weigh the net anew; until that is finished the tare stays as it is."""
+        """Start a new tare. The previous one holds until it is finished."""
         self._sensing.begin_tare()
 
     def collect_tare(self, i: Inputs) -> None:
-        """Add this tick's force sample, at rest, to the tare; the arm is to be held where it is."""
+        """Add this tick's force sample, taken at rest, to the tare, and return the command that holds the arm."""
         if i.vehicle is not None and i.arm is not None and i.force is not None:
             self._sensing.collect(i.force, i.vehicle.attitude_wxyz, i.arm.angle_rad)
             self._arm_target_rad = i.arm.angle_rad
 
     def finish_tare(self) -> None:
-        """Fix the force sensor's bias."""
+        """Set the force sensor's bias from the collected samples."""
         self._sensing.finish_tare()
 
     def level(self, i: Inputs) -> AttitudeSetpoint | None:
-        """Level, at the present yaw, no thrust; None if the attitude is not known."""
+        """Return a level attitude at the current yaw without thrust, or None if the attitude is not known."""
         if i.vehicle is None:
             return None
         yaw = euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2]
         return AttitudeSetpoint(quat_from_euler_zyx(0.0, 0.0, yaw), 0.0)
 
     def wait(self, i: Inputs) -> Command:
-        """No thrust, the arm held where it is: what streams before take-off and after touch-down."""
+        """Return zero thrust with the arm held in place: the stream before take-off and after touchdown."""
         return Command(self.level(i), self._hold(i))
 
     def fold(self, i: Inputs, dt_s: float) -> Command:
-        """Nothing for the vehicle; the arm moves to its folded pose at a bounded rate."""
+        """Return no setpoint for the vehicle and move the arm to its folded pose at a limited rate."""
         goal, step = self.fold_rad, FOLD_RATE_RAD_S * dt_s
         # Never held yet: from where it is.
         now = self._arm_target_rad or (i.arm.angle_rad if i.arm is not None else None)
@@ -124,7 +124,7 @@ class Pilot:
         )
 
     def fly(self, i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:
-        """One tick of the control law. `vertical_scale` as in `Controller.step`."""
+        """Run one tick of the control law. `vertical_scale` is as in `Controller.step`."""
         vehicle, arm = i.vehicle, i.arm
         if vehicle is None:
             return Command()
@@ -158,7 +158,7 @@ class Pilot:
         return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, wrench.log)
 
     def _watch_disturbance(self, dt_s: float, state: PlantState, vertical_scale: float) -> None:
-        """By the attitude that the body has, not the one asked for: a vehicle slow to lean is not being pulled at."""
+        """Update the disturbance estimate with the measured attitude, not the setpoint: a slow attitude response is not a disturbance."""
         if vertical_scale < 1.0:
             self._pull.reset()
             self.disturbance_world_n = None
@@ -169,11 +169,11 @@ class Pilot:
         self.disturbance_world_n = self._pull.step(dt_s, known, state.acceleration_world_m_s2, learn=True)
 
     def catch_s(self, t_s: float, log: ControlLog) -> float | None:
-        """Time of the blow, in the one tick in which a catch becomes certain."""
+        """Return the time of the impact in the one tick in which a catch is confirmed, else None."""
         return self._catch.caught_s if self._catch.update(t_s, log.force_ext_world_n) else None
 
     def payload_left(self, t_s: float) -> bool:
-        """True in the one tick in which it becomes certain that a caught payload has left the net; after `fly`."""
+        """Return True in the one tick in which it is confirmed that a caught payload has left the net. Call it after `fly`."""
         state = self._state
         if self._catch.caught_s is None or state is None:
             return False

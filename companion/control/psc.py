@@ -1,12 +1,12 @@
-"""Partitioned compliance: the arm alone is compliant, the vehicle holds its position by itself, each as if the other were not there.
+"""Partitioned compliance: the arm alone is compliant, the vehicle holds its position, and each ignores the other.
 
-After Wang et al., "Impact absorbing and compensation for heavy object catching with an unmanned aerial manipulator", RA-L 2024.
-The arm: impedance of the joints on a base that stands still,
+After Wang et al., "Impact absorbing and compensation for heavy object catching with an unmanned aerial manipulator", RA-L 2024. The arm
+has a joint impedance on a fixed base,
 
     tau = M_arm (alpha''_d - M_d^-1 (K_d e' + K_p e - (tau_ext - tau_d))) + C_arm alpha' + g_arm - tau_ext,    tau_ext = J'F.
 
-The vehicle: PID with the mass of machine and payload, (m + m_hat) (p''_d - K_d e' - K_p e - K_i int e + g e_z). m_hat comes from what a
-companion can know: the thrust it commanded and the acceleration that the IMU felt.
+The vehicle has a PID controller with the mass of machine and payload, (m + m_hat) (p''_d - K_d e' - K_p e - K_i int e + g e_z). m_hat
+is estimated from the commanded thrust and the acceleration measured by the IMU.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from companion.model.types import Reference, Vec2, Vec3, Vec8
 
 
 class PayloadEstimator:
-    """Mass carried beyond the machine's own: thrust / specific force along body z, low-passed.
+    """Estimate of the payload's mass: thrust / specific force along body z, low-passed, less the machine's own mass.
 
-    In the air the rotors' thrust is the only force that an accelerometer on the machine feels (drag aside), so their ratio is the mass
-    that hangs on it, whatever the machine does. The thrust is the one commanded, delayed as the rotors delay it.
+    In the air the rotors' thrust is the only force that an accelerometer on the machine measures (drag aside), so their ratio is the
+    total mass, whatever the motion. The thrust is the commanded one, delayed as the rotors delay it.
     """
 
     _LIFTING_SHARE = 0.7
-    """Of the machine's weight: below it the ground may carry a part."""
+    """Share of the machine's weight below which the ground may carry a part of it."""
 
     def __init__(self, config: PscConfig, mass_kg: float) -> None:
         self._mass_kg = mass_kg
@@ -43,7 +43,7 @@ class PayloadEstimator:
         self.payload_kg = 0.0
 
     def step(self, dt_s: float, commanded_n: float, specific_force_z_m_s2: float, airborne: bool) -> float:
-        """One tick with the thrust that was commanded in the last one; the estimate, kg, within [0, payload_max_kg]."""
+        """Run one tick with the thrust commanded in the last one and return the estimate, kg, within [0, payload_max_kg]."""
         if self._thrust_n is None:
             self._thrust_n = commanded_n
         k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0
@@ -57,7 +57,7 @@ class PayloadEstimator:
 
 
 class PscController(ModelBasedLaw):
-    """Both laws, side by side."""
+    """The PSC law: the arm's impedance and the vehicle's PID."""
 
     def __init__(self, config: PscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         super().__init__(config, vehicle, hover_thrust)
@@ -68,7 +68,7 @@ class PscController(ModelBasedLaw):
         self._commanded_n = 0.0
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
-        """One tick of `dt_s`; see `companion.control.types.Controller`."""
+        """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
         flying = vertical_scale >= 1.0
         felt = state.acceleration_world_m_s2
         body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
@@ -87,7 +87,7 @@ class PscController(ModelBasedLaw):
         return self._end(dt_s, error, error_rate, rows, force, payload_kg)
 
     def _vehicle(self, reference: Reference, error: Vec8, error_rate: Vec8, mass_kg: float) -> Vec3:
-        """Force on the vehicle, world, N."""
+        """Return the force on the vehicle, world frame, N."""
         c = self._c
         x, y, z = (
             mass_kg * (feed - c.position_kd_xyz[i] * error_rate[i] - c.position_kp_xyz[i] * error[i] - integral)
@@ -98,7 +98,7 @@ class PscController(ModelBasedLaw):
         return (x, y, z + mass_kg * GRAVITY_M_S2)
 
     def _integrate(self, dt_s: float, error: Vec8, flying: bool, clipped: tuple[bool, bool, bool]) -> None:
-        """The integral part stands still on the ground and where the actuators clip."""
+        """Integrate the position error, except on the ground and while the actuators are saturated."""
         limit = self._c.integral_max_m_s2
         for i, held in enumerate((clipped[1], clipped[1], clipped[0])):
             if flying and not held:
@@ -108,7 +108,7 @@ class PscController(ModelBasedLaw):
     def _arm(
         self, state: PlantState, reference: Reference, error: Vec8, error_rate: Vec8, force: Vec3
     ) -> tuple[Vec2, Vec2]:
-        """tau_ext - tau_d and the motors' torques, N m."""
+        """Return tau_ext - tau_d and the motor torques, N m."""
         c = self._c
         ext, desired = self._joint_torques_nm(state, force)
         e_tau: Vec2 = (ext[0] - desired[0], ext[1] - desired[1])

@@ -1,4 +1,4 @@
-"""From raw inputs to what the law needs: acceleration from the IMU, the tared external force, the catch."""
+"""Convert raw inputs for the law: acceleration from the IMU, the tared external force, and the catch."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from companion.model.types import ForceSample, Quat, Vec2, Vec3, VehicleState
 
 
 def acceleration_world_m_s2(vehicle: VehicleState) -> Vec3:
-    """Coordinate acceleration of the body: specific force turned into the world, gravity taken off."""
+    """Return the acceleration of the body in the world frame: specific force rotated, gravity removed."""
     x, y, z = quat_rotate(vehicle.attitude_wxyz, vehicle.specific_force_body_m_s2)
     return (x, y, z - GRAVITY_M_S2)
 
 
 class MeanAcceleration:
-    """Coordinate acceleration over all IMU samples since the last call: one for each tick would alias vibration to a steady pull."""
+    """Mean acceleration over all IMU samples since the last call. One sample per tick would alias vibration to a constant force."""
 
     GAP_MAX_S = 0.05
-    """Over a longer interval between two calls, or without PX4's times, the newest sample stands for itself."""
+    """Longest interval between two calls over which the mean is taken. Beyond it, or without PX4's timestamps, the newest sample is
+    used.
+    """
 
     def __init__(self) -> None:
         self._before: VehicleState | None = None
         self._value_m_s2: Vec3 | None = None
 
     def update(self, vehicle: VehicleState) -> Vec3:
-        """Return the acceleration, m/s2, world frame; the last one while no new sample has come."""
+        """Return the acceleration, world frame, m/s^2, or the last value if no new sample has arrived."""
         before, boot_s, total = self._before, vehicle.imu_boot_s, vehicle.delta_velocity_body_m_s
         if before is None or boot_s is None or total is None:
             self._before = vehicle
@@ -60,11 +62,11 @@ class ForceSensing:
         self.bias_sensor_n: Vec3 | None = None
 
     def begin_tare(self) -> None:
-        """What was collected counts no more; the bias stays until it is fixed again."""
+        """Discard the collected samples. The bias stays until `finish_tare`."""
         self._sum, self._count = [0.0, 0.0, 0.0], 0
 
     def collect(self, sample: ForceSample, attitude_wxyz: Quat, arm_rad: Vec2) -> None:
-        """Add one sample at rest to the tare; a sample seen before is not counted twice."""
+        """Add one sample at rest to the tare. A repeated sample is counted once."""
         if sample.stamp_s == self._last_stamp_s:
             return
         self._last_stamp_s = sample.stamp_s
@@ -75,7 +77,7 @@ class ForceSensing:
         self._count += 1
 
     def finish_tare(self) -> int:
-        """Fix the bias from what was collected; returns the number of samples."""
+        """Set the bias from the collected samples and return their number."""
         if self._count:
             self.bias_sensor_n = (
                 self._sum[0] / self._count,
@@ -85,7 +87,7 @@ class ForceSensing:
         return self._count
 
     def external_world_n(self, sample: ForceSample | None, attitude_wxyz: Quat, arm_rad: Vec2) -> Vec3 | None:
-        """External force on the net; None without sample or tare."""
+        """Return the external force on the net, world frame, N, or None without a sample or a tare."""
         if sample is None or self.bias_sensor_n is None:
             return None
         b, f = self.bias_sensor_n, sample.force_sensor_n
@@ -97,17 +99,19 @@ class ForceSensing:
 
 
 class CatchDetector:
-    """A caught payload: a blow on the sensor, followed by a lasting pull downwards. It has left the net when the pull has ended."""
+    """Detector of a caught payload: an impact on the sensor followed by a lasting downward force. The payload has left when that force
+    ends.
+    """
 
     BLOW_N = 1.5
     PULL_N = 0.3
     PULL_TIME_S = 0.25
     LEFT_SHARE = 0.3
-    """Of the payload's weight as it was felt so far: less force than that, in any direction, is an empty net."""
+    """The net is empty when the force, in any direction, is less than this share of the measured payload's weight."""
     LEFT_TIME_S = 0.5
-    """A bump from below takes the weight off for less."""
+    """Time for which the force must stay below that share. A bump from below unloads the net for less."""
     FALLING_SHARE = 0.6
-    """Of gravity: with less specific force than that the whole machine falls, and what is in the net weighs little, too."""
+    """Share of gravity. With less specific force the whole machine falls, and the force of a payload in the net is small as well."""
     LOWPASS_S, WEIGHT_S = 0.05, 1.0
 
     def __init__(self) -> None:
@@ -116,14 +120,14 @@ class CatchDetector:
         self._samples = 0
         self._weight_n = 0.0
         self._carried_n: Vec3 = (0.0, 0.0, 0.0)
-        """Low-passed, while a payload is in the net."""
+        """Low-passed force while a payload is in the net, N."""
         self._last_s = 0.0
         self._light_since_s: float | None = None
         self.caught_s: float | None = None
-        """Time of the blow of the payload that is in the net; None: it is empty."""
+        """Time of the impact of the payload in the net, or None if the net is empty."""
 
     def update(self, t_s: float, force_world_n: Vec3 | None) -> bool:
-        """True in the one tick in which a catch becomes certain; `caught_s` is then the time of the blow."""
+        """Return True in the one tick in which a catch is confirmed. `caught_s` is then the time of the impact."""
         if self.caught_s is not None or force_world_n is None:
             return False
         x, y, z = force_world_n
@@ -145,18 +149,18 @@ class CatchDetector:
 
     @property
     def unconfirmed_s(self) -> float | None:
-        """Time of a blow that is followed by a downward pull so far, but not yet for `PULL_TIME_S`; None if there is none."""
+        """Return the time of an impact followed by a downward force for less than `PULL_TIME_S` so far, or None."""
         if self.caught_s is not None or not self._samples or self._pull / self._samples >= -self.PULL_N:
             return None
         return self._blow_s
 
     def left(self, t_s: float, force_world_n: Vec3 | None, acceleration_z_m_s2: float) -> bool:
-        """True in the one tick in which it becomes certain that the payload has left the net; the next catch may come.
+        """Return True in the one tick in which it is confirmed that the payload has left the net. The next catch can then be detected.
 
         Args:
             t_s: flight clock.
-            force_world_n: on the net; None: unknown.
-            acceleration_z_m_s2: of the vehicle, upwards.
+            force_world_n: force on the net, or None if it is not known.
+            acceleration_z_m_s2: vertical acceleration of the vehicle, upwards.
         """
         if self.caught_s is None:
             return False

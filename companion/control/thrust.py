@@ -1,4 +1,4 @@
-"""From a desired force to a saturated force, an attitude and a collective thrust."""
+"""Convert a desired force to a saturated force, an attitude and a collective thrust."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from companion.model.types import Quat, Vec3
 
 @dataclass(frozen=True, slots=True)
 class ForceLimits:
-    """What the rotors may be asked for."""
+    """Limits of the rotors' force."""
 
     vertical_min_n: float
     vertical_max_n: float
     lateral_max_n: float
     tilt_max_tan: float
-    """Lateral over vertical force at the steepest tilt."""
+    """Ratio of lateral to vertical force at the largest tilt."""
 
 
 def saturate_force(force_world_n: Vec3, limits: ForceLimits) -> tuple[Vec3, bool, bool]:
-    """Vertical first, then lateral within tilt limit and lateral limit.
+    """Saturate the vertical force, then the lateral force within the tilt limit and the lateral limit.
 
     Returns:
-        The force that may be asked for, whether the vertical was clipped, whether the lateral was clipped.
+        The saturated force, whether the vertical force was saturated, and whether the lateral force was saturated.
     """
     fx, fy, fz = force_world_n
     low, high, allowed = limits.vertical_min_n, limits.vertical_max_n, limits.lateral_max_n
@@ -39,7 +39,7 @@ def saturate_force(force_world_n: Vec3, limits: ForceLimits) -> tuple[Vec3, bool
 
 
 class TiltFilter:
-    """Second-order low-pass of the desired roll and pitch, implicit Euler: stable for any step."""
+    """Second-order low-pass filter of desired roll and pitch, implicit Euler: stable for any step."""
 
     def __init__(self, bandwidth_rad_s: float, damping: float) -> None:
         self._w = bandwidth_rad_s
@@ -48,7 +48,7 @@ class TiltFilter:
         self._roll_rate_rad_s = self._pitch_rate_rad_s = 0.0
 
     def step(self, dt_s: float, roll_rad: float, pitch_rad: float) -> tuple[float, float]:
-        """Filtered roll and pitch, rad."""
+        """Return the filtered roll and pitch, rad."""
         w = self._w
         pull = w * w * dt_s
         denominator = 1.0 + 2.0 * self._d * w * dt_s + pull * dt_s
@@ -61,7 +61,7 @@ class TiltFilter:
 
 
 def roll_pitch_from_force(force_world_n: Vec3, yaw_rad: float) -> tuple[float, float]:
-    """Roll and pitch (ZYX, rad) that point body z along the force at the yaw given."""
+    """Return the roll and pitch (ZYX, rad) that align body z with the force at the given yaw."""
     fx, fy, fz = force_world_n
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     forward, left = c * fx + s * fy, -s * fx + c * fy
@@ -71,12 +71,12 @@ def roll_pitch_from_force(force_world_n: Vec3, yaw_rad: float) -> tuple[float, f
 
 
 def collective_n(force_world_n: Vec3, body_z_world: Vec3) -> float:
-    """u = F . z_body, N: what the rotors must give in the attitude that the body really has."""
+    """Return u = F . z_body, N: the thrust along the current body z axis."""
     (fx, fy, fz), (zx, zy, zz) = force_world_n, body_z_world
     return fx * zx + fy * zy + fz * zz
 
 
 def attitude_from_roll_pitch_yaw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
-    """Attitude setpoint, w >= 0."""
+    """Return the attitude setpoint as a quaternion with w >= 0."""
     q = quat_from_euler_zyx(roll_rad, pitch_rad, yaw_rad)
     return q if q[0] >= 0 else (-q[0], -q[1], -q[2], -q[3])

@@ -1,4 +1,4 @@
-"""Records between the core and a controller."""
+"""Records and Protocols between the core and a controller."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from companion.model.types import ControlLog, Quat, Reference, Vec2, Vec3
 @quick
 @dataclass(frozen=True, slots=True)
 class PlantState:
-    """What a controller may know of the machine at one tick; world ENU, body FLU."""
+    """State of the machine at one tick as a controller sees it; world ENU, body FLU."""
 
     position_world_m: Vec3
     velocity_world_m_s: Vec3
     acceleration_world_m_s2: Vec3
-    """From the IMU, gravity removed."""
+    """Acceleration from the IMU, gravity removed."""
     attitude_wxyz: Quat
     angular_rate_body_rad_s: Vec3
     arm_rad: Vec2
     arm_rate_rad_s: Vec2
     force_ext_world_n: Vec3 | None
-    """On the net, tared, net's weight removed, not filtered; None: no sensor to be trusted."""
+    """Force on the net, tared, without the net's weight, not filtered; None without a valid sample."""
 
 
 @quick
 @dataclass(frozen=True, slots=True)
 class Wrench:
-    """What a controller asks of vehicle and arm."""
+    """Force on the vehicle and joint torques of one tick."""
 
     attitude_wxyz: Quat
     collective_n: float
@@ -38,14 +38,14 @@ class Wrench:
 
 
 class Controller(Protocol):
-    """One control law; holds its own state, reads no clock."""
+    """Protocol of a control law. It holds its own state and reads no clock."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
-        """One tick of `dt_s`. `vertical_scale` (0 to 1) scales the vertical force while rotors spool up or down on the ground."""
+        """Run one tick of `dt_s`. `vertical_scale` (0 to 1) scales the vertical force while rotors spool up or down on the ground."""
 
 
 class Law(Controller, Protocol):
-    """A controller as the pilot owns it."""
+    """Protocol of a controller as `Pilot` uses it."""
 
     hover_thrust: float
-    """For the log: the normalised thrust that is taken to carry the machine without payload; set before every step."""
+    """Normalised thrust that carries the machine without payload, for the log; set before every step."""

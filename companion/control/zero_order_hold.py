@@ -1,18 +1,18 @@
-"""Constants of an exact zero-order hold, by the length of the step."""
+"""Constants of an exact zero-order hold for each step length."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 _MOST = 64
-"""Steps remembered: the clock of a simulation knows a handful, a real one as many as ticks."""
+"""Largest number of stored steps: a simulation has a handful of step lengths, a real clock as many as ticks."""
 
 
 class HoldTable(dict[float, tuple[float, ...]]):
-    """Numbers that depend on the length of a step alone, remembered by its exact value: what is found is what would be computed.
+    """Values that depend on the step length only, stored by its exact value.
 
     Args:
-        compute: the numbers of a step of so many seconds.
+        compute: returns the values for a step length in seconds.
     """
 
     def __init__(self, compute: Callable[[float], tuple[float, ...]]) -> None:
@@ -20,7 +20,7 @@ class HoldTable(dict[float, tuple[float, ...]]):
         self._compute = compute
 
     def __missing__(self, dt_s: float) -> tuple[float, ...]:
-        """Computed, and remembered."""
+        """Compute and store the values of a new step length."""
         if len(self) >= _MOST:
             self.clear()
         numbers = self[dt_s] = self._compute(dt_s)
