@@ -1,6 +1,7 @@
-"""Jerk-limited motion of the arm by ruckig: from rest to rest, both joints in step.
+"""Jerk-limited motion of the arm by ruckig: from rest to rest, both joints synchronised.
 
-Both joints follow one share of their way, so the arm moves straight in joint space, and the joint with the least reserve decides.
+Both joints follow the same normalised profile, so the arm moves on a straight line in joint space and the more limited joint sets the
+duration.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ _DECIMALS = 12
 
 
 JERK_BOUND = 32.0
-"""Jerk times duration cubed over distance of the fastest move that only jerk limits."""
+"""Jerk times duration cubed over distance of the fastest move that is limited by jerk alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmLimits:
-    """What the planned motion of the joints may not exceed."""
+    """Limits of the planned joint motion."""
 
     speed_max_rad_s: Vec2
     acceleration_max_rad_s2: float
@@ -34,15 +35,15 @@ class ArmLimits:
 
 @dataclass(frozen=True, slots=True)
 class JerkLimited:
-    """A share from 0 at u = 0 to 1 at u = 1, at rest on both ends: cubics, one after another. A `Profile`."""
+    """A profile from 0 at u = 0 to 1 at u = 1, at rest at both ends, made of consecutive cubics. A `Profile`."""
 
     knots: tuple[float, ...]
-    """Where each cubic begins."""
+    """Start of each cubic."""
     cubics: tuple[tuple[float, float, float, float], ...]
-    """Share, f', f'' / 2, f''' / 6 at the beginning of each."""
+    """f, f', f'' / 2, f''' / 6 at the start of each cubic."""
 
     def __call__(self, u: float) -> Shape:
-        """f, f', f'', f''' at u in [0, 1]."""
+        """Return f, f', f'', f''' at u in [0, 1]."""
         if u >= 1.0:
             return (1.0, 0.0, 0.0, 0.0)
         index = max(0, bisect_right(self.knots, u) - 1)
@@ -57,28 +58,28 @@ class JerkLimited:
 
 
 SPEED_ENOUGH, ACCELERATION_ENOUGH, JERK_ENOUGH = 20.0, 400.0, 2.0e4
-"""In units of the whole move and its least duration: a move with these takes an eighth of it."""
+"""Limits in units of the whole move and its least duration. With these a move takes an eighth of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmMotion:
-    """How a move of the arm is made."""
+    """Profile and duration of a move of the arm."""
 
     profile: JerkLimited
     duration_s: float
-    """As ruckig planned it: at least the least duration, or what was asked for if that is longer."""
+    """Duration as planned by ruckig: the least possible, or the requested one if that is longer."""
 
 
 def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> ArmMotion:
-    """Plan one move; some microseconds.
+    """Plan one move. It takes some microseconds.
 
     Args:
-        delta_rad: how far each joint goes; not both zero.
-        limits: of each joint's speed, of any joint's acceleration and jerk.
-        duration_s: the least duration wanted.
+        delta_rad: displacement of each joint; not both zero.
+        limits: speed of each joint, acceleration and jerk of any joint.
+        duration_s: requested least duration.
 
     Raises:
-        ValueError: ruckig refuses, which finite angles and positive limits give no reason for.
+        ValueError: ruckig refuses the input. Finite angles and positive limits are always accepted.
     """
     farthest_rad = max(map(abs, delta_rad))
     if not farthest_rad > 0.0:
@@ -112,7 +113,7 @@ def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> Arm
 
 
 def _share(times: Sequence[float], jerks: Sequence[float]) -> JerkLimited:
-    """The profile over u from phases of constant jerk, which bring a thing at rest to rest."""
+    """Return the profile over u from phases of constant jerk that start and end at rest."""
     total, strongest = math.fsum(times), max(map(abs, jerks))
     knots, cubics = [], []
     at = f = df = ddf = 0.0

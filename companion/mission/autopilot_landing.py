@@ -1,11 +1,11 @@
-"""Landing by PX4's own LAND mode, watched by the companion, which finishes what PX4 cannot.
+"""Landing in PX4's LAND mode, supervised by the companion, which completes what PX4 cannot.
 
-PX4 lands on its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; then it only descends at constant
-thrust and never finds that it stands (measured). So the companion watches for touch-down as long as the dead-reckoned height can be
-trusted, takes OFFBOARD back with zero thrust once the vehicle stands, and disarms. No single source decides: PX4's estimate and motion
-capture must both see a vehicle that stands while PX4 wants it down, and if PX4 alone never notices, it is disarmed all the same.
-`companion.safety.rotor_stop` decides when a stop of the rotors may be requested, also of a vehicle that is flipped or tipped over.
-Pure; time is an argument.
+PX4 lands on its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; from then on it descends at constant
+thrust and never detects the ground (measured). The companion therefore watches for touchdown as long as the dead-reckoned height is
+valid, takes OFFBOARD back with zero thrust once the vehicle has landed, and disarms. No single source decides: PX4's estimate and
+motion capture must both show a vehicle at rest while PX4 descends. If PX4's land detector alone does not respond, the vehicle is
+disarmed all the same. `companion.safety.rotor_stop` decides when a stop of the rotors may be requested, also for a vehicle that is
+flipped or tipped over. Pure; time is an argument.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from companion.safety.rotor_stop import (
 from companion.safety.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking
 
 ZERO_THRUST_STREAM_S = 0.6
-"""Zero-thrust setpoints flow for this long before OFFBOARD is asked for: no older setpoint may take effect."""
+"""Zero-thrust setpoints are streamed for this time before OFFBOARD is requested, so that no older setpoint takes effect."""
 BEGUN_S = 1.0
-"""PX4 takes a moment from LAND to a descent: until then a vehicle that does not sink proves nothing."""
+"""Time from LAND to the start of PX4's descent. Before that a vehicle that does not sink is not evidence of touchdown."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
 FLIPPED = "flipped: FORCE_DISARM is requested at once"
@@ -36,17 +36,17 @@ TIPPED = "tipped over on the floor: FORCE_DISARM is requested at once"
 
 @dataclass(frozen=True, slots=True)
 class LandingStep:
-    """What one tick of the landing asks for."""
+    """Requests of one tick of the landing."""
 
     request: AutopilotRequest
     zero_thrust: bool
-    """Send a level, zero-thrust setpoint."""
+    """Whether to send a level, zero-thrust setpoint."""
     ended: bool
-    """The vehicle stands and is disarmed, or nothing more can be done."""
+    """Whether the vehicle stands disarmed, or nothing more can be done."""
     landed: bool
-    """Meaningful with `ended`."""
+    """Whether the vehicle has landed. Valid with `ended`."""
     text: str | None = None
-    """Something to tell."""
+    """Message to report, or an empty text."""
 
 
 class AutopilotLanding:
@@ -54,11 +54,11 @@ class AutopilotLanding:
 
     Args:
         start_s: flight time at its start.
-        clearance_m: height of the body's origin when the vehicle stands.
-        tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
-        pilot: a pilot took over: watch only, ask for nothing. One who takes over later is seen by PX4's mode.
-        pose_s: flight time of the newest pose that PX4 has had; -inf: its estimate counts for nothing until poses come.
-        flipped: the vehicle is known to be flipped, and has been for long enough.
+        clearance_m: height of the body's origin when the vehicle stands on the ground.
+        tilt_max_rad: `safety.tilt_abort_deg`; a vehicle on the ground beyond this tilt is tipped over.
+        pilot: a pilot has taken over: monitor only, request nothing. A later takeover is seen by PX4's mode.
+        pose_s: flight time of the newest pose sent to PX4; with -inf its estimate is not used until poses arrive.
+        flipped: the vehicle is known to have been flipped for the required time.
     """
 
     def __init__(
@@ -82,17 +82,17 @@ class AutopilotLanding:
         self._landing_since_s: float | None = None
         self._zero_thrust_since_s: float | None = None
         self.overturned = False
-        """The vehicle was flipped or tipped over, and its rotors were to be stopped for that."""
+        """Whether the vehicle was flipped or tipped over and a stop of its rotors was requested for that reason."""
         self._pose_s = pose_s
         self._stop = RotorStop(clearance_m, tilt_max_rad, pose_s, flipped=flipped)
 
     @property
     def pilot(self) -> bool:
-        """Somebody else flies."""
+        """Whether a pilot has control."""
         return self._pilot
 
     def step(self, i: Inputs) -> LandingStep:
-        """One tick."""
+        """Run one tick."""
         elapsed = i.t_s - self._start_s
         heard = hears_px4(i)
         self._stop.update(i)
@@ -127,14 +127,14 @@ class AutopilotLanding:
         return LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
 
     def _pilot_takes_over(self, i: Inputs) -> bool:
-        """A mode in which somebody steers; or, once PX4 was landing, any that only people choose."""
+        """Return whether PX4 is in a manual mode or, once PX4 was landing, in any mode that only a pilot selects."""
         mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
         self._was_landing = self._was_landing or mode is FlightMode.LAND
         chosen = i.status is not None and people_chose(i.status)
         return mode is FlightMode.MANUAL or (self._was_landing and chosen)
 
     def _touches(self, i: Inputs) -> bool:
-        """PX4 is landing, the height that it believes in says that the vehicle stands, and motion capture does not contradict."""
+        """Return whether PX4 is landing, its valid height shows the vehicle on the ground, and motion capture does not contradict."""
         pose = fresh_pose(i)
         if pose is not None:
             self._pose_s = pose.stamp_s
@@ -159,7 +159,9 @@ class AutopilotLanding:
         return high or sink_m_s is None or sink_m_s > STILL_M_S
 
     def _unnoticed(self, i: Inputs) -> bool:
-        """It has stood in OFFBOARD without thrust for `FORCE_DISARM_S`, and PX4's land detector has not noticed."""
+        """Return whether the vehicle has stood in OFFBOARD without thrust for `FORCE_DISARM_S` while PX4's land detector has not
+        responded.
+        """
         if not in_offboard(i.status):
             self._zero_thrust_since_s = None
         elif self._zero_thrust_since_s is None:

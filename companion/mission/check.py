@@ -1,6 +1,6 @@
-"""Is a mission flyable as written? Everything that geometry and mechanics can tell before anything is armed.
+"""Check whether a mission can be flown as written, by geometry and mechanics, before anything is armed.
 
-Pure: the plan is sampled finely and every sample is held against room, tether, joint walls, floor, limits and thrust.
+Pure: the plan is sampled finely and every sample is checked against room, tether, joint limits, floor, motion limits and thrust.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SAMPLE_S = 0.02
 SAMPLES_PER_SEGMENT_MAX = 3000
 TAKEOFF_RISE_MIN_M = 0.2
 SPEED_SHARE_MAX = 0.8
-"""Of the speed at which the flight is stopped: a caught payload, a gust and the way to the reference add to what is planned."""
+"""Largest planned share of the speed at which the flight is stopped. The rest is for a caught payload, gusts and tracking errors."""
 
 
 def check_mission(
@@ -35,19 +35,19 @@ def check_mission(
     phase_origins: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> list[str]:
-    """Every reason not to fly this mission, one clear line each: what, where, when, how to fix; empty if there is none.
+    """Return every reason not to fly this mission, one line each: what, where, when, and how to fix it. Empty if there is none.
 
-    Of each limit, the worst violation in the first phase that exceeds it is told, and which other phases do. Of a mission that repeats,
-    two repetitions are looked at: from the second on everything is the same but the winding of the tether, which adds up.
+    For each limit the worst violation in the first phase that exceeds it is reported, with the names of the other phases that do. Of a
+    repeated mission two repetitions are checked: from the second on only the winding of the tether differs, and it adds up.
 
     Args:
-        mission: what is to be flown.
-        vehicle: with what, and where.
-        start_position_world_m: measured, body origin; None: as the mission says, standing on the floor.
-        start_yaw_rad: measured; None: as the mission says.
-        start_arm_rad: measured, the paper's angles; None: as the mission says.
+        mission: the mission to check.
+        vehicle: vehicle, tether and room.
+        start_position_world_m: measured, body origin; None for the mission's start, on the floor.
+        start_yaw_rad: measured; None for the mission's value.
+        start_arm_rad: measured, the paper's angles; None for the mission's values.
         phase_origins: file:line:col of each phase (`FlightConfig.sources.phases`).
-        progress: told the share of the planning that is done, 0 to 1, while paths are solved.
+        progress: called with the completed share of the planning, 0 to 1, while paths are solved.
     """
     start = mission.start
     position = start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m)
@@ -101,7 +101,7 @@ def check_mission(
 
 
 def check_vehicle(vehicle: Vehicle) -> list[str]:
-    """Why nothing can be flown with this machine, tether and room, whatever the mission; one line each."""
+    """Return the reasons for which nothing can be flown with this machine, tether and room, whatever the mission; one line each."""
     problems = []
     rating_n, thrust_n = vehicle.tether.load_rating_n, vehicle.airframe.thrust_max_n
     if rating_n < thrust_n:
@@ -132,13 +132,13 @@ def _samples(segment: Segment) -> Iterator[float]:
 def check_start(
     mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2 | None
 ) -> list[str]:
-    """Only what depends on where the machine really stands; cheap enough for a control tick. Arguments as `check_mission`."""
+    """Check only what depends on the measured start. Cheap enough for a control tick. Arguments as in `check_mission`."""
     found = _start(mission, vehicle, position_world_m, yaw_rad, arm_rad)
     return [f"mission '{mission.name}': {text}" for text in found]
 
 
 def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, arm_rad: Vec2 | None) -> Iterator[str]:
-    """Does the machine stand where and as the mission says?"""
+    """Check that the machine stands where and as the mission says."""
     start = mission.start
     x_m, y_m = start.position_m
     away_m = math.dist(position[:2], start.position_m)
@@ -170,7 +170,7 @@ def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, a
 
 
 def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
-    """A plan that may be as fast as the monitors allow would be stopped by them."""
+    """Check that the plan stays below the speed at which the monitors stop the flight."""
     planned, stopped = mission.limits.speed_max_m_s, vehicle.safety.speed_max_m_s
     if planned > SPEED_SHARE_MAX * stopped:
         yield (
@@ -180,7 +180,7 @@ def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
 
 
 def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequence[str]) -> list[str]:
-    """What no single sample shows."""
+    """Check properties of the whole plan that no single sample shows."""
     problems: list[str] = []
     takeoff = plan.segments[0]
     top_m = plan.reference(takeoff.end_s).position_world_m[2]

@@ -1,8 +1,8 @@
-"""One instant of a plan against every limit: room, tether, floor, joints, motion, thrust.
+"""Check one instant of a plan against every limit: room, tether, floor, joints, motion, thrust.
 
-Pure. A place is judged with what a flight may differ from its plan (`TRACKING_M`, more around a catch), and so is the place where the
-vehicle would come to rest after a fault. What is asked is the governor's own `SafeSet`, and more: a plan without a violation is never
-bent.
+Pure. A position is checked with the expected tracking error (`TRACKING_M`, more around a catch), and so is the position where the
+vehicle would come to rest after a fault. The check uses the governor's own `SafeSet` and is stricter, so the governor never constrains
+a plan without violations.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 
 ARM_RADIUS_M = 0.03
-"""Half the thickness of servos and links."""
+"""Half the thickness of servos and links, m."""
 FLOOR_GAP_M = 0.01
 TRACKING_M = 0.10
-"""A flight may be so far from its plan; measured over winds of 3 m/s (benchmarks/missions.py)."""
+"""Largest expected distance from the plan, m; measured in winds of 3 m/s (benchmarks/missions.py)."""
 CATCH_M = 0.20
-"""The same, from the catch until the blow is over."""
+"""The same from the catch until the impact has decayed, m."""
 CATCH_NEAR_M = 0.05
-"""So near to the expected place, horizontally, the catch may happen."""
+"""Largest horizontal distance from the expected place at which the catch can happen, m."""
 CATCH_S = 2.0
 THRUST_SHARE_MAX = 0.9
-"""Whatever `limits.thrust_share_max` allows: the rest is for holding the attitude."""
+"""Upper bound of `limits.thrust_share_max`; the rest is reserved for attitude control."""
 STOP = "stop "
-"""Before the name of a limit: it holds where the vehicle is to be, but not where it would come to rest."""
+"""Prefix of a limit's name: the planned position keeps the limit, but the position where the vehicle would come to rest does not."""
 TOLERANCE = 1e-6
-"""Relative; so that a mission may use its limits to the full."""
+"""Relative tolerance, so that a mission may use its limits fully."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +50,10 @@ class Violation:
 
 
 class Judge:
-    """Holds one instant of a plan after another against every limit.
+    """Check of consecutive instants of a plan against every limit.
 
     Raises:
-        ValueError: vehicle, tether and room leave nothing to fly in; one line.
+        ValueError: vehicle, tether and room leave no space to fly in; one line.
     """
 
     def __init__(self, mission: Mission, vehicle: Vehicle) -> None:
@@ -68,18 +68,20 @@ class Judge:
         self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg
         self._tether_n = tether.weight_n_per_m * tether.length_m
         self._blow_until_s = 0.0
-        """0: the catch is still to come; a way back over the same place is none."""
+        """Time at which the catch's impact has decayed; 0 before the catch. A way back over the same place is not a catch."""
         self._repetition = 0
         self._windings: list[tuple[float, float]] = []
-        """Turns about anchor and vehicle in the course of the second repetition."""
+        """Turns about anchor and vehicle during the second repetition."""
 
     def begin_repetition(self, repetition: int) -> None:
-        """The instants that follow are of this repetition, from 1, with a catch of its own; 0: of what is flown once."""
+        """Start a repetition, from 1, with a catch of its own; 0 for the part that is flown once."""
         self._repetition = repetition
         self._blow_until_s = 0.0
 
     def turns_in_the_end(self, repetitions: int) -> float:
-        """Most turns of the tether in the last repetition: what the second one winds, each further one winds as well."""
+        """Return the largest number of turns of the tether in the last repetition. Each one after the second winds as much as the
+        second.
+        """
         if not self._windings:
             return 0.0
         most = 0.0
@@ -91,13 +93,13 @@ class Judge:
     def violations(
         self, t_s: float, reference: Reference, jerks: tuple[Vec3, Vec2], kind: PhaseKind
     ) -> Iterator[Violation]:
-        """What is wrong at one instant; instants must come in order.
+        """Return the violations at one instant. Instants must be passed in order.
 
         Args:
-            t_s: on the plan's clock.
-            reference: of the plan then.
+            t_s: time of the plan.
+            reference: the plan's reference at that time.
             jerks: of the vehicle, world frame, m/s^3, and of the joints, rad/s^3.
-            kind: of the phase.
+            kind: kind of the phase.
         """
         clearance_m = self._vehicle.airframe.ground_clearance_m
         x_m, y_m, z_m = reference.position_world_m
@@ -121,7 +123,7 @@ class Judge:
         yield from self._thrust(reference)
 
     def _off_m(self, t_s: float, position: Vec3, kind: PhaseKind) -> float:
-        """How far from the plan the vehicle may be now."""
+        """Return how far from the plan the vehicle may be at this instant, m."""
         if self._catch is not None and kind is PhaseKind.FLIGHT and not 0.0 < self._blow_until_s <= t_s:
             if math.dist(position[:2], self._catch.expected_at_m) <= CATCH_NEAR_M:
                 self._blow_until_s = t_s + CATCH_S
@@ -160,9 +162,10 @@ class Judge:
             )
 
     def _stop(self, position: Vec3, reference: Reference, kind: PhaseKind, off_m: float) -> Iterator[Violation]:
-        """Where it would come to rest after a fault at this instant, as far off the plan as the place itself may be.
+        """Check the position where the vehicle would come to rest after a fault at this instant, with the same tracking error as the
+        position itself.
 
-        The monitors judge the measured velocity: a flight that is a little off its plan must not be stopped by them.
+        The monitors use the measured velocity, and must not stop a flight with a small tracking error.
         """
         safe = self._safe
         speed = math.hypot(*reference.velocity_world_m_s)
@@ -189,7 +192,7 @@ class Judge:
                 )
 
     def _line(self, t_s: float, position: Vec3, reference: Reference) -> Iterator[Violation]:
-        """The tether itself: wound up, or in the rotors' way."""
+        """Check the tether itself: wound up, or in the rotors' way."""
         tether = self._vehicle.tether
         attitude = _leaning(reference)
         state = self._watch.update(t_s, position, reference.velocity_world_m_s, attitude, reference.arm_rad, None, None)
@@ -287,7 +290,7 @@ def _allowance(off_m: float) -> str:
 
 
 def _leaning(reference: Reference) -> Quat:
-    """Attitude of a vehicle that accelerates as the reference does."""
+    """Return the attitude of a vehicle that accelerates as the reference does."""
     ax, ay, az = reference.acceleration_world_m_s2
     c, s = math.cos(reference.yaw_rad), math.sin(reference.yaw_rad)
     ahead, left, up = c * ax + s * ay, c * ay - s * ax, az + GRAVITY_M_S2
@@ -295,7 +298,7 @@ def _leaning(reference: Reference) -> Quat:
 
 
 def _world(position: Vec3, yaw_rad: float, body_m: Vec3) -> Vec3:
-    """A point of the level vehicle, world frame."""
+    """Transform a point of the level vehicle to the world frame."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     x_m, y_m, z_m = body_m
     return (position[0] + c * x_m - s * y_m, position[1] + s * x_m + c * y_m, position[2] + z_m)

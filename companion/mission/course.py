@@ -1,7 +1,7 @@
-"""The plan that is being flown, since when, and how fast its time goes by.
+"""The active plan, its start time, and the rate of its time.
 
-A HOLD does not leave the plan: it lets the plan's time run slower until it stands still. So the machine comes to rest on the planned
-way, which was checked against tether and room, the arm with it; and going on takes it from there.
+A HOLD does not leave the plan: it slows the plan's time down to a standstill. Vehicle and arm come to rest on the planned path, which
+was checked against tether and room, and a resume continues from there.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ class Course:
     """One plan on the flight clock.
 
     Args:
-        plan: what is flown.
-        start_s: flight time at its beginning.
+        plan: the plan.
+        start_s: flight time at its start.
     """
 
     def __init__(self, plan: Plan, start_s: float) -> None:
         self.plan = plan
         self._origin_s = start_s
-        """Flight time less plan time, while the plan's time runs as fast as the flight's."""
+        """Flight time minus plan time while the plan's time runs at rate 1."""
         self._change: tuple[float, float, float, float, float] | None = None
-        """Begin (flight time), plan time there, duration, rate before, rate after."""
+        """Start of a change of rate: flight time, plan time there, duration, rate before, rate after."""
         self._asked_s: float | None = None
-        """The flight time that was asked about last; several ask in one tick."""
+        """Flight time of the last query, because several callers query one tick."""
         self._segment: Segment | None = None
 
     @property
     def held(self) -> bool:
-        """The plan's time stands still, or is coming to that."""
+        """Return whether the plan's time stands still or slows down to a standstill."""
         return self._change is not None and self._change[4] == 0.0
 
     def pace(self, t_s: float) -> tuple[float, float, float, float]:
-        """Plan time, its rate (1: as the flight's, 0: held), and the rate's first and second derivative, at a flight time."""
+        """Return the plan time, its rate (1 is real time, 0 is held), and the rate's first and second derivatives at a flight time."""
         if self._change is None:
             return t_s - self._origin_s, 1.0, 0.0, 0.0
         begin_s, plan_s, duration_s, before, after = self._change
@@ -62,12 +62,12 @@ class Course:
         return now_s, before + rise * rate, rise * change * once, rise * jerk * twice
 
     def hold(self, t_s: float) -> None:
-        """Come to rest on the planned way."""
+        """Come to rest on the planned path."""
         if not self.held:
             self._turn_to(0.0, t_s)
 
     def resume(self, t_s: float) -> None:
-        """Go on from where it was held."""
+        """Continue from where the plan was held."""
         if self.held:
             self._turn_to(1.0, t_s)
 
@@ -79,13 +79,13 @@ class Course:
         self._asked_s = None
 
     def reference(self, t_s: float) -> Reference:
-        """Where the machine should be at a flight time."""
+        """Return the reference at a flight time."""
         plan_s, rate, change, jerk = self.pace(t_s)
         reference = self.plan.reference(plan_s)
         return reference if rate == 1.0 and change == 0.0 else _paced(reference, rate, change, jerk)
 
     def segment(self, t_s: float) -> Segment:
-        """The plan's segment at a flight time."""
+        """Return the plan's segment at a flight time."""
         if t_s != self._asked_s:
             plan_s, segment = self.pace(t_s)[0], self._segment
             if segment is None or not segment.start_s <= plan_s < segment.end_s:
@@ -96,16 +96,16 @@ class Course:
         return self._segment
 
     def left_s(self, t_s: float) -> float:
-        """Plan time that is left; negative after its end."""
+        """Return the remaining plan time, s; negative after its end."""
         return self.plan.duration_s - self.pace(t_s)[0]
 
     def progress(self, t_s: float) -> float:
-        """Share of the plan's duration, 0 to 1."""
+        """Return the completed share of the plan's duration, 0 to 1."""
         return self.plan.progress(self.pace(t_s)[0])
 
 
 def _paced(r: Reference, rate: float, change: float, jerk: float) -> Reference:
-    """The reference under a plan time that goes by at a rate s: s v, s^2 a + s_d v, s^3 j + 3 s s_d a + s_dd v (chain rule)."""
+    """Return the reference for a plan time with rate s: s v, s^2 a + s_d v, s^3 j + 3 s s_d a + s_dd v (chain rule)."""
     squared, mixed, cubed = rate * rate, 3.0 * rate * change, rate * rate * rate
     (vx, vy, vz), (ax, ay, az) = r.velocity_world_m_s, r.acceleration_world_m_s2
     (jx, jy, jz), (da1, da2), (dda1, dda2) = r.jerk_world_m_s3, r.arm_rate_rad_s, r.arm_acceleration_rad_s2

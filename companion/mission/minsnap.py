@@ -1,7 +1,7 @@
-"""Minimum snap for the vehicle: how long a straight line takes at least, and the way through several points without stopping.
+"""Minimum-snap motion of the vehicle: the least duration of a straight line, and paths through several points without a stop.
 
 Mellinger and Kumar 2011, Richter et al. 2016. A line from rest to rest is the septic `reference.minimum_snap`. A path is solved by
-minsnap-trajectories, which wants the time of every waypoint; those times are found here.
+minsnap-trajectories, which needs the time of every waypoint; this module finds those times.
 """
 
 from __future__ import annotations
@@ -20,35 +20,36 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Progress: TypeAlias = Callable[[float], None]
-"""Told the share of the work that is done, 0 to 1."""
+"""Callback with the completed share of the work, 0 to 1."""
 
 PEAK_SPEED = 2.1875
-"""Largest f' of `minimum_snap`; 35 / 16, half-way."""
+"""Largest f' of `minimum_snap`: 35 / 16, at half time."""
 PEAK_ACCELERATION = 84.0 * math.sqrt(5.0) / 25.0
 """Largest |f''|."""
 PEAK_JERK = 52.5
-"""Largest |f'''|, half-way."""
+"""Largest |f'''|, at half time."""
 LEAST_S = 0.2
-"""No line takes less, however short."""
+"""Least duration of a line, however short."""
 TIME_STEP_S = 1e-3
-"""Durations that are found, not given, are rounded up to this."""
+"""Computed durations are rounded up to a multiple of this."""
 _STEPS = (1.25, 1.12, 1.06, 1.03)
-"""By what the share of one piece is changed, in search of a shorter flight; coarse first."""
+"""Changes of one piece's share of time in the search for a shorter flight, coarse first."""
 _PIECES_FOR_TWO_PASSES = 12
 _WORTH = 1e-4
-"""Less of a gain counts as none, so that no rounding error decides."""
+"""A smaller gain counts as none, so that no rounding error decides."""
 _SAMPLES = 150
 _MARGIN = 1.001
-"""Over the largest of `_SAMPLES` samples of a piece; the true peak lies at most so far above it."""
+"""Margin over the largest of `_SAMPLES` samples of a piece, which covers the true peak."""
 _DECIMALS = 9
-"""Velocities, accelerations and jerks at the waypoints are rounded, so that a replay elsewhere, whose linear algebra differs in the
-last bit, builds the same plan."""
+"""Velocities, accelerations and jerks at the waypoints are rounded, so that a replay on another machine, whose linear algebra differs
+in the last bit, builds the same plan.
+"""
 _KNOWN_MAX = 32
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleLimits:
-    """What the planned motion of the body's origin may not exceed."""
+    """Limits of the planned motion of the body's origin."""
 
     speed_max_m_s: float
     acceleration_max_m_s2: float
@@ -57,18 +58,18 @@ class VehicleLimits:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """A way through points, in a time of its own in which a piece takes 1 on average."""
+    """A path through points, in a normalised time in which a piece takes 1 on average."""
 
     knots: tuple[float, ...]
-    """When each point is passed, from 0."""
+    """Time at each point, from 0."""
     pieces: tuple[tuple[Septic, Septic, Septic], ...]
-    """x, y, z of each piece, m, against the time since its first knot."""
+    """Polynomials of x, y, z of each piece, m, against the time since its first knot."""
     least_scale_s: float
-    """The least number of seconds per unit of that time at which no limit is exceeded."""
+    """Least number of seconds per unit of normalised time at which no limit is exceeded."""
 
 
 def least_line_s(distance_m: float, limits: VehicleLimits) -> float:
-    """Least duration of a straight minimum-snap line from rest to rest, in whole milliseconds."""
+    """Return the least duration of a straight minimum-snap line from rest to rest, in whole milliseconds."""
     needed_s = max(
         PEAK_SPEED * distance_m / limits.speed_max_m_s,
         math.sqrt(PEAK_ACCELERATION * distance_m / limits.acceleration_max_m_s2),
@@ -82,16 +83,16 @@ _known: dict[tuple[tuple[Vec3, ...], VehicleLimits], Route] = {}
 
 
 def route(points_m: tuple[Vec3, ...], limits: VehicleLimits, progress: Progress | None = None) -> Route:
-    """The minimum-snap way through three points or more, at rest at the first and the last, passing the others without a stop.
+    """Return the minimum-snap path through three or more points, at rest at the first and the last, without a stop at the others.
 
-    The shares of time of the pieces are searched one by one for the shortest flight within the limits; that is a good one, not
-    provably the best. It takes tens of milliseconds for a few points, a second for thirty. A route is remembered: asked again, it
-    costs nothing, as in a control tick.
+    The pieces' shares of time are searched one by one for the shortest flight within the limits; the result is good, but not provably
+    optimal. The search takes tens of milliseconds for a few points and a second for thirty. Results are cached, so a repeated call
+    costs nothing in a control tick.
 
     Args:
-        points_m: world frame; no two consecutive ones alike.
+        points_m: world frame; no two consecutive points alike.
         limits: speed, acceleration and jerk, each as the length of the vector.
-        progress: called several times when there is work to do.
+        progress: called several times during the search.
     """
     key = (points_m, limits)
     found = _known.get(key)
@@ -128,16 +129,16 @@ def _solve(points_m: tuple[Vec3, ...], limits: VehicleLimits, progress: Progress
 
 
 def _total_s(points_m: tuple[Vec3, ...], shares: tuple[float, ...], limits: VehicleLimits) -> float:
-    """Duration of the whole way when it is flown as fast as the limits allow."""
+    """Return the duration of the whole path when it is flown as fast as the limits allow."""
     return _needed_s(shares, fast_coefficients(points_m, shares), limits) * sum(shares)
 
 
 def fast_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) -> NDArray[np.float64]:
-    """What minsnap-trajectories finds for the same arguments, in linear time, for a search that asks hundreds of times.
+    """Return the same coefficients as minsnap-trajectories, in linear time, for a search with hundreds of evaluations.
 
-    Minimum snap means that the derivatives 4 to 6 do not jump at an inner point: three equations for its velocity, acceleration and
-    jerk and those of its neighbours, block tridiagonal. The library sets up dense matrices, which the BLAS then hands out to threads:
-    on a busy machine one solution of ten pieces was seen to take 100 ms there, 2 ms here.
+    Minimum snap means that derivatives 4 to 6 are continuous at an inner point: three equations for its velocity, acceleration and jerk
+    and those of its neighbours, block tridiagonal. The library solves dense matrices, which BLAS distributes over threads: on a busy
+    machine one solution of ten pieces took 100 ms there and 2 ms here.
 
     Returns:
         Coefficients [piece, power, axis] in the piece's own time.
@@ -175,13 +176,15 @@ def fast_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) -> 
 
 
 def _normalised(shares: Sequence[float]) -> tuple[float, ...]:
-    """1 on average, in thousandths."""
+    """Return the shares scaled to 1 on average, in thousandths."""
     mean = sum(shares) / len(shares)
     return tuple(max(0.02, round(share / mean, 3)) for share in shares)
 
 
 def library_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) -> NDArray[np.float64]:
-    """Solved by minsnap-trajectories: coefficients [piece, power, axis] in the piece's own time, with the first point as origin."""
+    """Return the solution of minsnap-trajectories: coefficients [piece, power, axis] in the piece's own time, with the first point as
+    origin.
+    """
     import numpy as np
     from minsnap_trajectories import Waypoint, generate_trajectory  # SciPy: 0.3 s, spent only on a mission with a path
 
@@ -201,7 +204,7 @@ def library_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) 
 
 
 def _needed_s(shares: tuple[float, ...], coefficients: NDArray[np.float64], limits: VehicleLimits) -> float:
-    """How many seconds a unit of time must last."""
+    """Return the number of seconds that a unit of time must last."""
     import numpy as np
 
     allowed = (limits.speed_max_m_s, limits.acceleration_max_m_s2, limits.jerk_max_m_s3)
@@ -219,7 +222,7 @@ def _needed_s(shares: tuple[float, ...], coefficients: NDArray[np.float64], limi
 def _rebuilt(
     points_m: tuple[Vec3, ...], shares: tuple[float, ...], coefficients: NDArray[np.float64], scale_s: float
 ) -> Route:
-    """The same polynomials from what the rounded derivatives at the waypoints say, so that no step is left where pieces meet."""
+    """Rebuild the polynomials from the rounded derivatives at the waypoints, so that consecutive pieces meet exactly."""
     rest = (0.0, 0.0, 0.0)
     inner = [
         tuple(
@@ -250,7 +253,7 @@ def _rebuilt(
 
 
 def _septic(start: tuple[float, ...], end: tuple[float, ...], duration: float) -> Septic:
-    """The polynomial of degree 7 with the given value and first three derivatives at 0 and at `duration`."""
+    """Return the polynomial of degree 7 with the given value and first three derivatives at 0 and at `duration`."""
     p0, v0, a0, j0 = start
     p1, v1, a1, j1 = end
     t = duration

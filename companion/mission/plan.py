@@ -1,4 +1,4 @@
-"""A mission as motion: when each phase begins and ends, and where the machine should be at every instant.
+"""Plan of a mission: start and end of each phase, and the reference at every instant.
 
 Pure and deterministic: a replay builds the same plan from the same mission and the same measured start.
 """
@@ -32,29 +32,29 @@ from companion.model.frames import wrap_rad
 from companion.model.types import PhaseKind, Reference, Vec2, Vec3
 
 BELOW_GROUND_M = 0.25
-"""A landing's reference goes on below the floor, so that the vehicle is pressed down until touchdown is detected."""
+"""A landing's reference continues below the floor, so that the vehicle is pressed down until touchdown is detected."""
 LAND_SPEED_UP_S = 1.0
 LAND_SLOW_DOWN_S = 0.5
 STOP_SPEED_MAX_M_S = 1.0
-"""A landing from flight starts with the measured velocity, but not faster: the faster, the farther away it would come to rest."""
+"""Largest initial speed of a landing from flight. A higher speed would move the point of rest farther away."""
 STOP_ACCELERATION_M_S2 = 2.0
 STOP_MIN_S = 0.5
 FOLD_SPEED_RAD_S = math.radians(75.0)
 FOLD_MIN_S = 0.5
 ARM_LEAST_S = 0.1
-"""A move of the arm to where it is takes so long."""
+"""Duration of a move of the arm to its current position."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Segments from 0 to `duration_s`, and the motion in them. Built by `Plan.build` or `landing_from`."""
+    """Segments from 0 to `duration_s` and their motion. Built by `Plan.build` or `landing_from`."""
 
     name: str
     segments: tuple[Segment, ...]
-    """Without gaps; of a mission that repeats two repetitions, and what comes before and after. `segment` knows the others."""
+    """Segments without gaps. A repeated mission has two repetitions here; `segment` computes the others."""
     duration_s: float
     _starts_s: tuple[float, ...]
-    """Of the segments, as if there were two repetitions at most; the tracks are on that clock, too."""
+    """Start of each segment, with at most two repetitions; the tracks use the same clock."""
     _position: Track
     _yaw: Track
     _arm: Track
@@ -70,23 +70,22 @@ class Plan:
         start_arm_rad: Vec2 | None = None,
         progress: Progress | None = None,
     ) -> Plan:
-        """Plan a mission from where the machine really stands.
+        """Plan a mission from the measured start.
 
-        The take-off ends over the mission's start point, at the mission's yaw and with the mission's arm angles: what is measured
-        differs from them by the start's tolerances at most (`check_mission`), and that difference is taken out on the way up.
-        What is asked for in less time than the limits allow is planned in that time all the same: `check_mission` then tells
-        which limit breaks, where and when.
+        The take-off ends over the mission's start point, at the mission's yaw and arm angles. The measured start differs from them by
+        the start's tolerances at most (`check_mission`), and the difference is removed during the climb. A move with less time than the
+        limits allow is planned in that time all the same; `check_mission` then reports which limit is exceeded, where and when.
 
-        A path takes up to seconds to solve, once in a process: whatever starts there, the same path is the same motion, and is
-        remembered. So build a mission with paths once before the first control tick.
+        A path takes up to seconds to solve, once per process: its motion is the same from every start and is cached. Build a mission
+        with paths once before the first control tick.
 
         Args:
             mission: phases; positions in the world frame.
-            vehicle: for the height of the body's origin on the ground, and the speed of the joints.
-            start_position_world_m: measured, body origin; None: as the mission says, standing on the floor.
-            start_yaw_rad: measured; None: as the mission says.
-            start_arm_rad: measured, the paper's angles; None: as the mission says.
-            progress: told the share of the planning that is done, 0 to 1, while paths are solved.
+            vehicle: height of the body's origin on the ground, and speed of the joints.
+            start_position_world_m: measured, body origin; None for the mission's start, on the floor.
+            start_yaw_rad: measured; None for the mission's value.
+            start_arm_rad: measured, the paper's angles; None for the mission's values.
+            progress: called with the completed share of the planning, 0 to 1, while paths are solved.
         """
         start = mission.start
         arm_start = _radians(start.arm_deg)
@@ -132,20 +131,20 @@ class Plan:
         )
 
     def reference(self, t_s: float) -> Reference:
-        """Where the machine should be; at rest before 0 and after `duration_s`. Position, yaw and arm are C2 in time."""
+        """Return the reference at a time; at rest before 0 and after `duration_s`. Position, yaw and arm are C2 in time."""
         if self._repeats is not None:
             t_s -= self._repeats.before(t_s) * self._repeats.period_s
         return reference_at(self._position, self._yaw, self._arm, t_s)
 
     def jerks(self, t_s: float) -> tuple[Vec3, Vec2]:
-        """Third derivatives of position (world frame, m/s^3) and joint angles (rad/s^3), for checks."""
+        """Return the third derivatives of position (world frame, m/s^3) and joint angles (rad/s^3), for checks."""
         if self._repeats is not None:
             t_s -= self._repeats.before(t_s) * self._repeats.period_s
         (x, y, z), (first, second) = self._position.at(t_s)[3], self._arm.at(t_s)[3]
         return (x, y, z), (first, second)
 
     def segment(self, t_s: float) -> Segment:
-        """The segment at a time: the first before 0, the last after the end."""
+        """Return the segment at a time: the first before 0, the last after the end."""
         repeats = self._repeats
         if repeats is not None and t_s >= repeats.begin_s + repeats.period_s:
             if t_s >= repeats.end_s:
@@ -155,7 +154,7 @@ class Plan:
         return self.segments[index - 1 if index else 0]
 
     def _repeated(self, t_s: float, repeats: Repeats) -> Segment:
-        """The segment of a repetition for which the second one stands."""
+        """Return the segment of a repetition that the second one represents."""
         before = repeats.before(t_s)
         shift_s = before * repeats.period_s
         # The shift is rounded: just after the seam the shifted time may lie just before it.
@@ -166,7 +165,7 @@ class Plan:
         return Segment(name, like.kind, like.start_s + shift_s, like.end_s + shift_s, like.index, before + 2)
 
     def progress(self, t_s: float) -> float:
-        """Share of the whole duration, 0 to 1."""
+        """Return the completed share of the whole duration, 0 to 1."""
         share = t_s / self.duration_s
         return 0.0 if share <= 0.0 else share if share < 1.0 else 1.0
 
@@ -180,18 +179,18 @@ def landing_from(
     speed_m_s: float,
     vehicle: Vehicle,
 ) -> Plan:
-    """Come to rest, then descend in place while the arm folds; from anywhere, at once.
+    """Plan an immediate landing from any state: come to rest, then descend in place while the arm folds.
 
-    The descent waits so long that the arm is folded before the net could touch the floor. Two segments, both PhaseKind.LANDING.
+    The descent is delayed until the arm is folded before the net could touch the floor. Two segments, both PhaseKind.LANDING.
 
     Args:
-        position_world_m: where the reference starts: the measured position, or the last reference.
-        velocity_world_m_s: what it starts with; cut to `STOP_SPEED_MAX_M_S`.
-        yaw_rad: kept.
-        arm_rad: where the arm starts, from rest.
-        arm_fold_rad: where it goes.
-        speed_m_s: of the descent.
-        vehicle: for the height of the floor and the reach of the arm.
+        position_world_m: start of the reference: the measured position, or the last reference.
+        velocity_world_m_s: initial velocity; limited to `STOP_SPEED_MAX_M_S`.
+        yaw_rad: kept constant.
+        arm_rad: start of the arm, from rest.
+        arm_fold_rad: end of the arm.
+        speed_m_s: speed of the descent.
+        vehicle: height of the floor and reach of the arm.
     """
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
     fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
@@ -211,7 +210,7 @@ def landing_from(
 
 
 def stopping(velocity_world_m_s: Vec3) -> tuple[Vec3, float]:
-    """The velocity that a stop begins with, cut to `STOP_SPEED_MAX_M_S`, and how long it takes, s."""
+    """Return the initial velocity of a stop, limited to `STOP_SPEED_MAX_M_S`, and its duration, s."""
     speed_m_s = math.hypot(*velocity_world_m_s)
     share = min(1.0, STOP_SPEED_MAX_M_S / speed_m_s) if speed_m_s > 0.0 else 0.0
     vx, vy, vz = velocity_world_m_s
@@ -220,7 +219,7 @@ def stopping(velocity_world_m_s: Vec3) -> tuple[Vec3, float]:
 
 
 class PlanBuilder:
-    """Appends moves to the three tracks; `t_s` is where the next phase begins."""
+    """Builder that appends moves to the three tracks. `t_s` is the start of the next phase."""
 
     def __init__(self, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2) -> None:
         self.t_s = 0.0
@@ -231,31 +230,31 @@ class PlanBuilder:
 
     @property
     def height_m(self) -> float:
-        """Of the body's origin where the vehicle is."""
+        """Return the current height of the body's origin, m."""
         return self._at[0][2]
 
     @property
     def position_m(self) -> Vec3:
-        """Where the vehicle is, world frame."""
+        """Return the current position, world frame, m."""
         x_m, y_m, z_m = self._at[0]
         return (x_m, y_m, z_m)
 
     def line_m(self, to_world_m: Vec3) -> float:
-        """How far a point is from where the vehicle is."""
+        """Return the distance of a point from the current position, m."""
         return math.dist(self._at[0], to_world_m)
 
     def move_vehicle(self, to_world_m: Vec3, duration_s: float) -> None:
-        """Straight, by minimum snap."""
+        """Append a straight minimum-snap move."""
         self._go(0, to_world_m, self.t_s, duration_s, minimum_snap)
 
     def go(self, to_world_m: Vec3, duration_s: float) -> None:
-        """Straight from rest to rest, with less of a peak speed than minimum snap."""
+        """Append a straight move from rest to rest with a lower peak speed than minimum snap."""
         self._go(0, to_world_m, self.t_s, duration_s, rest_to_rest)
 
     def follow(
         self, points_m: tuple[Vec3, ...], duration_s: float | None, limits: VehicleLimits, progress: Progress | None
     ) -> float:
-        """Through points without a stop; returns how long it takes, s."""
+        """Append a path through points without a stop; returns its duration, s."""
         if len(points_m) == 1:
             duration_s = duration_s or least_line_s(self.line_m(points_m[0]), limits)
             self.move_vehicle(points_m[0], duration_s)
@@ -268,39 +267,39 @@ class PlanBuilder:
         return duration_s
 
     def turn(self, to_yaw_rad: float, duration_s: float) -> None:
-        """By the shorter way round."""
+        """Append a turn to a yaw, in the shorter direction."""
         yaw_rad = self._at[1][0]
         self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s, rest_to_rest)
 
     def least_arm_s(self, to_rad: Vec2, limits: ArmLimits) -> float:
-        """Least duration of a move of the arm."""
+        """Return the least duration of a move of the arm, s."""
         delta_rad = self._arm_delta(to_rad)
         return plan_arm(delta_rad, limits).duration_s if any(delta_rad) else ARM_LEAST_S
 
     def move_arm(self, to_rad: Vec2, delay_s: float, duration_s: float, limits: ArmLimits) -> None:
-        """By ruckig, in a duration that it is given."""
+        """Append a move of the arm by ruckig with the given duration."""
         delta_rad = self._arm_delta(to_rad)
         if any(delta_rad):
             profile = plan_arm(delta_rad, limits, duration_s).profile
             self._go(2, to_rad, self.t_s + delay_s, duration_s, profile)
 
     def fold_arm(self, to_rad: Vec2, duration_s: float) -> None:
-        """Without ruckig: an emergency waits for nobody's answer."""
+        """Append a move of the arm without ruckig, for emergencies."""
         self._go(2, to_rad, self.t_s, duration_s, rest_to_rest)
 
     def stop(self, velocity_world_m_s: Vec3) -> float:
-        """Come to rest from a velocity; returns the end, s."""
+        """Append a stop from a velocity; returns its end, s."""
         return self.stop_within(*stopping(velocity_world_m_s))
 
     def stop_within(self, velocity_world_m_s: Vec3, duration_s: float) -> float:
-        """The same, in a given time."""
+        """Append a stop of the given duration."""
         vx, vy, vz = velocity_world_m_s
         reach = duration_s
         self._append(0, Move(self.t_s, duration_s, self._at[0], (vx * reach, vy * reach, vz * reach), slow_down))
         return self.t_s + duration_s
 
     def descend(self, speed_m_s: float, to_height_m: float) -> float:
-        """Straight down from rest to rest; returns the end, s."""
+        """Append a vertical descent from rest to rest; returns its end, s."""
         x_m, y_m, z_m = self._at[0]
         depth_m = z_m - to_height_m
         ramps_m = 0.5 * speed_m_s * (LAND_SPEED_UP_S + LAND_SLOW_DOWN_S)
@@ -317,7 +316,7 @@ class PlanBuilder:
         return t_s
 
     def plan(self, name: str, repeats: Repeats | None = None) -> Plan:
-        """What was appended, its second repetition as often as there are further ones."""
+        """Return the plan. Its second repetition represents all further ones."""
         position, yaw, arm = (
             Track(initial, tuple(moves)) for initial, moves in zip(self._initial, self._moves, strict=True)
         )
@@ -345,7 +344,7 @@ class PlanBuilder:
 
 
 def _line(builder: PlanBuilder, phase: Line, limits: VehicleLimits, arm_limits: ArmLimits) -> float:
-    """Append a line and what the arm does meanwhile; returns how long it takes, s."""
+    """Append a line and the arm's simultaneous move; returns the duration, s."""
     arm_rad = None if phase.arm_deg is None else _radians(phase.arm_deg)
     delay_s = phase.arm_delay_s or 0.0
     duration_s = phase.duration_s
@@ -379,7 +378,7 @@ def _arm_limits(mission: Mission, vehicle: Vehicle) -> ArmLimits:
 
 
 def _part(progress: Progress | None, done: int, count: int) -> Progress | None:
-    """The progress of one of several paths as that of all."""
+    """Return a progress callback that converts the progress of one path into that of all."""
     return None if progress is None else lambda share: progress((done + share) / count)
 
 

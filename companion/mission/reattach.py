@@ -1,7 +1,7 @@
-"""PX4 is armed though this companion has not asked for it: does it fly, and who flies it? Pure.
+"""Decide whether a vehicle that is armed without a request of this companion is flying, and who has control. Pure.
 
-So it is when the companion, its guardian and its launcher died in the air or the computer restarted, and also when people arm by radio
-before the companion does. Nothing is ever lifted then.
+This happens after companion, guardian and launcher have died in flight or the computer has restarted, and when a pilot arms by radio
+before the companion does. The vehicle never takes off in this case.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from companion.safety.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
 
 
 def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
-    """Whether the vehicle is to be treated as flying, and in words what was found and what is done about it.
+    """Return whether the vehicle is treated as flying, and a message with the findings and the action.
 
-    A vehicle that stands with its rotors turning is disarmed. It counts as flying if people chose its mode, if the mode is neither
-    OFFBOARD nor LAND, or if motion capture does not see how high it is.
+    A vehicle on the ground with turning rotors is disarmed. It counts as flying if a pilot selected its mode, if the mode is neither
+    OFFBOARD nor LAND, or if motion capture does not measure its height.
 
     Args:
-        i: with PX4 armed.
-        clearance_m: height of the body's origin when the vehicle stands.
+        i: inputs with PX4 armed.
+        clearance_m: height of the body's origin when the vehicle stands on the ground.
     """
     pose, vehicle = fresh_pose(i), i.vehicle
     height_m = pose.position_world_m[2] if pose is not None else None

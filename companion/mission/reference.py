@@ -1,6 +1,6 @@
-"""Smooth motion in one piece: polynomial profiles along straight moves, curves of polynomials, and tracks made of both.
+"""Smooth reference motion: polynomial profiles along straight moves, polynomial curves, and tracks made of both.
 
-Plain tuples and arithmetic, no arrays: a track is asked in every control tick.
+Plain tuples and arithmetic without arrays, because a track is evaluated in every control tick.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ Shape: TypeAlias = tuple[float, float, float, float]
 Profile: TypeAlias = Callable[[float], Shape]
 Values: TypeAlias = tuple[float, ...]
 Sample: TypeAlias = tuple[Values, Values, Values, Values]
-"""Value, and its first, second and third derivative by time."""
+"""Value and its first, second and third time derivatives."""
 Septic: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 """Coefficients of one axis, the constant first, in the piece's own time from 0."""
 
 
 def minimum_snap(u: float) -> Shape:
-    """The least integral of f'''' squared from 0 to 1 with f', f'' and f''' zero on both ends: 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7."""
+    """Return the profile with the least integral of f'''' squared, with f', f'' and f''' zero at both ends: 35 u^4 - 84 u^5 + 70 u^6 -
+    20 u^7.
+    """
     u2 = u * u
     u3 = u2 * u
     return (
@@ -36,7 +38,9 @@ def minimum_snap(u: float) -> Shape:
 
 
 def rest_to_rest(u: float) -> Shape:
-    """Quintic from 0 to 1, at rest with no acceleration on both ends: 10 u^3 - 15 u^4 + 6 u^5. Peak f' = 1.875, peak f'' = 5.774."""
+    """Return the quintic from 0 to 1 with zero velocity and acceleration at both ends: 10 u^3 - 15 u^4 + 6 u^5. Peak f' = 1.875, peak
+    f'' = 5.774.
+    """
     u2 = u * u
     return (
         u2 * u * (10.0 + u * (6.0 * u - 15.0)),
@@ -47,20 +51,20 @@ def rest_to_rest(u: float) -> Shape:
 
 
 def speed_up(u: float) -> Shape:
-    """From rest to f' = 1, which itself rises as `rest_to_rest`; covers 1/2."""
+    """Return the profile from rest to f' = 1, where f' rises as `rest_to_rest`; covers 1/2."""
     u2 = u * u
     speed, acceleration, jerk, _ = rest_to_rest(u)
     return (u2 * u2 * (2.5 + u * (u - 3.0)), speed, acceleration, jerk)
 
 
 def slow_down(u: float) -> Shape:
-    """From f' = 1 to rest, the mirror of `speed_up`; covers 1/2."""
+    """Return the profile from f' = 1 to rest, the mirror of `speed_up`; covers 1/2."""
     distance, speed, acceleration, jerk = speed_up(u)
     return (u - distance, 1.0 - speed, -acceleration, -jerk)
 
 
 def steady(u: float) -> Shape:
-    """f' = 1 throughout; covers 1."""
+    """Return the profile with f' = 1 throughout; covers 1."""
     return (u, 1.0, 0.0, 0.0)
 
 
@@ -70,7 +74,7 @@ REST_TO_REST_PEAK_SPEED = 1.875
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """value(t) = origin + delta profile((t - start) / duration); at rest before and after, unless another move follows on."""
+    """value(t) = origin + delta profile((t - start) / duration); at rest before and after, unless another move follows."""
 
     start_s: float
     duration_s: float
@@ -90,7 +94,7 @@ class Move:
         return tuple(origin + delta * share for origin, delta in zip(self.origin, self.delta, strict=True))
 
     def at(self, t_s: float) -> Sample:
-        """Value and derivatives between start and end."""
+        """Return value and derivatives between start and end."""
         duration_s = self.duration_s
         f, df, ddf, dddf = self.profile((t_s - self.start_s) / duration_s)
         df /= duration_s
@@ -118,14 +122,14 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Polynomials of degree 7 in every axis, one piece after another; at rest before and after."""
+    """Consecutive pieces of polynomials of degree 7 in every axis; at rest before and after."""
 
     start_s: float
     duration_s: float
     scale_s: float
     """Seconds per unit of the time in which knots and pieces are given."""
     knots: tuple[float, ...]
-    """Where each piece begins, from 0, and where the last one ends."""
+    """Start of each piece, from 0, and the end of the last one."""
     pieces: tuple[tuple[Septic, ...], ...]
     end: Values
 
@@ -135,7 +139,7 @@ class Curve:
         return self.start_s + self.duration_s
 
     def at(self, t_s: float) -> Sample:
-        """Value and derivatives between start and end."""
+        """Return value and derivatives between start and end."""
         scale_s = self.scale_s
         t = (t_s - self.start_s) / scale_s
         index = min(len(self.pieces), max(1, bisect_right(self.knots, t))) - 1
@@ -164,7 +168,7 @@ Motion: TypeAlias = Move | Curve
 
 
 class Track:
-    """One quantity over time: motions one after another, constant between them."""
+    """One quantity over time: consecutive motions, constant between them."""
 
     __slots__ = ("_ends_s", "_moves", "_rests", "_starts_s")
 
@@ -182,7 +186,7 @@ class Track:
                 )
 
     def at(self, t_s: float) -> Sample:
-        """Value and derivatives at any time."""
+        """Return value and derivatives at any time."""
         index = bisect_right(self._starts_s, t_s)
         if index == 0 or t_s >= self._ends_s[index - 1]:
             return self._rests[index]
@@ -190,7 +194,7 @@ class Track:
 
 
 def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Reference:
-    """The three tracks at one instant."""
+    """Return the reference of the three tracks at one instant."""
     (x, y, z), (vx, vy, vz), (ax, ay, az), (jx, jy, jz) = position.at(t_s)
     (psi,), (dpsi,), _, _ = yaw.at(t_s)
     (a1, a2), (da1, da2), (dda1, dda2), _ = arm.at(t_s)
@@ -199,6 +203,6 @@ def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Referen
 
 
 def at_rest(position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2) -> Reference:
-    """A reference that stays where it is."""
+    """Return a constant reference."""
     zero3: Vec3 = (0.0, 0.0, 0.0)
     return Reference(position_world_m, zero3, zero3, yaw_rad, 0.0, arm_rad, (0.0, 0.0), (0.0, 0.0))

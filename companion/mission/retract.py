@@ -1,4 +1,4 @@
-"""The way back along the tether: come to rest, fold the arm, go inward. Never outward, never up."""
+"""Retraction along the tether: come to rest, fold the arm, move inward. Never outward, never up."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from companion.mission.segments import Segment
 from companion.model.types import PhaseKind, Vec2, Vec3
 
 LEAST_WAY_M = 0.5
-"""So far inward in any case: a tether that pulls is shorter than the file says, or caught."""
+"""Least distance inward, because a tether under tension is shorter than configured, or caught."""
 BESIDE_ANCHOR_M = 0.3
-"""Between rotors and the anchor's vertical: nobody lands on the anchor."""
+"""Distance between rotors and the anchor's vertical, so that the vehicle does not land on the anchor."""
 RETURN_MIN_S = 1.0
 
 
 def inward_only(velocity_m_s: Vec3, position_m: Vec3, anchor_m: Vec3) -> Vec3:
-    """The velocity without what leads up, or away from the anchor's vertical."""
+    """Return the velocity without its components upwards and away from the anchor's vertical."""
     vx, vy, vz = velocity_m_s
     x, y = position_m[0] - anchor_m[0], position_m[1] - anchor_m[1]
     away_m = math.hypot(x, y)
@@ -45,16 +45,18 @@ def retract_from(
     arm_fold_rad: Vec2,
     vehicle: Vehicle,
 ) -> Plan:
-    """Stop, then return slowly towards the anchor's vertical until `retract_slack_m` of tether is free; the arm folds meanwhile.
+    """Plan a stop and a slow return towards the anchor's vertical until the tether has `retract_slack_m` of slack; the arm folds
+    meanwhile.
 
-    Distance from the anchor's vertical and height never grow, and no step leads out of the room. Two segments; a landing follows.
+    Neither the distance from the anchor's vertical nor the height ever increases, and the path stays in the room. Two segments; a
+    landing follows.
 
     Args:
-        position_world_m: where the reference starts: the last reference.
-        velocity_world_m_s: what it starts with; what of it leads outward or up is dropped, the rest cut to `STOP_SPEED_MAX_M_S`.
-        yaw_rad: kept.
-        arm_rad: where the arm starts, from rest.
-        arm_fold_rad: where it goes.
+        position_world_m: start of the reference: the last reference.
+        velocity_world_m_s: initial velocity; its components outward and up are removed, the rest is limited to `STOP_SPEED_MAX_M_S`.
+        yaw_rad: kept constant.
+        arm_rad: start of the arm, from rest.
+        arm_fold_rad: end of the arm.
         vehicle: tether, room, airframe and speed of the return.
     """
     tether, safety, anchor = vehicle.tether, vehicle.safety, vehicle.tether.anchor_world_m
@@ -86,9 +88,9 @@ def retract_from(
 
 
 def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anchor_m: Vec3) -> Vec3:
-    """The velocity turned so far inward that the straight way to the point of rest leads nowhere away from the anchor's vertical.
+    """Return the velocity turned inward so far that the straight path to the point of rest never leads away from the anchor's vertical.
 
-    With r the distance at the start, a way of n inward and t sideways ends before it leads outward if n (r - n) >= t^2.
+    With the distance r at the start, a path of n inward and t sideways never leads outward if n (r - n) >= t^2.
     """
     x, y = position_m[0] - anchor_m[0], position_m[1] - anchor_m[1]
     away_m = math.hypot(x, y)
@@ -109,7 +111,7 @@ def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anch
 
 
 def _inside(to_m: Vec2, from_m: Vec2, room: Room, reach_m: float) -> Vec2:
-    """As far on the way as the rotors stay in the room; a start outside of it may go anywhere."""
+    """Limit the path to where the rotors stay in the room. A start outside of the room is not limited."""
     share = 1.0
     for goal, start, (low, high) in zip(to_m, from_m, (room.x_m, room.y_m), strict=True):
         low, high = min(low + reach_m, start), max(high - reach_m, start)

@@ -1,4 +1,4 @@
-"""Phases on a plan's clock. Of a mission that repeats two repetitions are planned; the second stands for all further ones."""
+"""Phases on a plan's clock. Of a repeated mission two repetitions are planned; the second represents all further ones."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ class Segment:
     index: int
     """Number of the phase in the mission, from 0; -1 in a plan without a mission."""
     repetition: int = 0
-    """Of a mission that repeats, from 1; 0: flown once."""
+    """Number of the repetition, from 1; 0 in the part that is flown once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """The second repetition stands for all further ones: each begins where the one before it ended, and flies the same."""
+    """Further repetitions that the second one represents: each starts where the one before it ended and has the same motion."""
 
     count: int
-    """Of all repetitions, 3 or more."""
+    """Number of all repetitions, 3 or more."""
     first: int
-    """Among the segments: the first one of the second repetition."""
+    """Index of the first segment of the second repetition."""
     begin_s: float
-    """Of the second repetition."""
+    """Start of the second repetition, s."""
     period_s: float
     names: tuple[str, ...]
-    """Of the phases that repeat, without a count."""
+    """Names of the repeated phases, without a count."""
 
     @property
     def left_out_s(self) -> float:
-        """Time of the repetitions for which the second one stands."""
+        """Return the duration of the repetitions that the second one represents, s."""
         return (self.count - 2) * self.period_s
 
     @property
     def end_s(self) -> float:
-        """Of the last repetition, on the plan's clock."""
+        """Return the end of the last repetition on the plan's clock, s."""
         return self.begin_s + self.period_s + self.left_out_s
 
     def before(self, t_s: float) -> int:
-        """How many repetitions for which the second one stands are over at a time."""
+        """Return how many of the represented repetitions are complete at a time."""
         whole = int((t_s - self.begin_s) / self.period_s)
         return 0 if whole < 1 else min(whole, self.count - 2)
 
 
 def flown_phases(mission: Mission) -> list[tuple[int, int]]:
-    """Numbers of the phases in the order in which they are planned, each with its repetition: the third repetition is the second."""
+    """Return the indices of the phases in the planned order, each with its repetition. The second repetition represents the third."""
     last = len(mission.phases) - 1
     middle = range(1, last)
     if mission.repeat == 1:
@@ -63,7 +63,7 @@ def flown_phases(mission: Mission) -> list[tuple[int, int]]:
 
 
 def repeats_of(mission: Mission, segments: Sequence[Segment], names: tuple[str, ...]) -> Repeats | None:
-    """What the second repetition stands for; None: for itself alone."""
+    """Return the repetitions that the second one represents, or None if there are none."""
     if mission.repeat < 3:
         return None
     second = [number for number, segment in enumerate(segments) if segment.repetition == 2]
@@ -72,5 +72,5 @@ def repeats_of(mission: Mission, segments: Sequence[Segment], names: tuple[str, 
 
 
 def counted(name: str, repetition: int, count: int) -> str:
-    """The name of a phase as people see it."""
+    """Return the name of a phase for display."""
     return f"{name} ({repetition} of {count})" if repetition else name

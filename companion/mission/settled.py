@@ -1,7 +1,8 @@
-"""Has PX4's estimate come to rest on motion capture? The core's own last look before it asks for OFFBOARD. Pure; time is an argument.
+"""Check that PX4's estimate has converged to motion capture: the core's last check before it requests OFFBOARD. Pure; time is an
+argument.
 
-An estimate that has only just begun to follow is near for a moment, too; one that has settled stays near. Compared are PX4's position
-and yaw with motion capture's, on a machine that stands.
+An estimate that has only begun to follow is close for a moment; one that has converged stays close. PX4's position and yaw are compared
+with motion capture's while the machine stands.
 """
 
 from __future__ import annotations
@@ -14,29 +15,29 @@ from companion.model.frames import euler_zyx_from_quat, wrap_rad
 from companion.model.types import MocapPose, Vec3, VehicleState
 
 SETTLED_S = TARE_S
-"""So long it must have been near and steady; as long as the tare, which runs meanwhile."""
+"""Time for which the estimate must be close and steady; as long as the tare, which runs meanwhile."""
 OFF_MAX_M = 0.05
-"""Mean distance, a real EKF2's noise averaged out."""
+"""Largest mean distance, with a real EKF2's noise averaged out, m."""
 SPREAD_MAX_M = 0.02
-"""Standard deviation of that, over all three axes; EKF2 with 1 cm of vision noise has a few millimetres at rest."""
+"""Largest standard deviation of the distance over all three axes, m. EKF2 with 1 cm of vision noise has a few millimetres at rest."""
 YAW_OFF_MAX_RAD = math.radians(5.0)
 YAW_SPREAD_MAX_RAD = math.radians(2.0)
 
 
 class SettledEstimate:
-    """Differences of the last `SETTLED_S`."""
+    """Differences between PX4's estimate and motion capture over the last `SETTLED_S`."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[float, Vec3, float]] = deque()
         self._since_s: float | None = None
 
     def forget(self) -> None:
-        """Inputs were missing: begin again."""
+        """Start again, because inputs were missing."""
         self._seen.clear()
         self._since_s = None
 
     def take(self, t_s: float, vehicle: VehicleState, pose: MocapPose) -> None:
-        """One tick."""
+        """Add one tick."""
         if self._since_s is None:
             self._since_s = t_s
         (x, y, z), (a, b, c) = vehicle.position_world_m, pose.position_world_m
@@ -46,7 +47,7 @@ class SettledEstimate:
             self._seen.popleft()
 
     def problem(self, t_s: float) -> str | None:
-        """What wandered, in words; None: nothing has for `SETTLED_S`."""
+        """Return what has not converged, as a message, or None if all has for `SETTLED_S`."""
         if self._since_s is None or t_s - self._since_s < SETTLED_S:
             return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s at a time"
         count = len(self._seen)
