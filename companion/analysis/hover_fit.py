@@ -1,5 +1,5 @@
-"""Hover thrust of the machine without payload, from the calm parts of a flight's log: least squares over the balance of
-`companion.control.hover`, thrust = h . load, and over the battery's voltage where that changed enough to tell.
+"""Fit of the hover thrust without payload to the calm parts of a flight's log: least squares over the balance of
+`companion.control.hover`, thrust = h . load, and over the battery voltage if it changed enough.
 """
 
 from __future__ import annotations
@@ -16,48 +16,48 @@ from companion.model.types import PhaseKind
 
 FIT_MIN_S = 2.0
 PIECE_S = 1.0
-"""What lies within so long is one piece of evidence: the vertical loop makes neighbouring ticks alike, not seconds."""
+"""Length of an independent piece of data: neighbouring ticks are correlated by the vertical loop, pieces of seconds are not."""
 SLOPE_MIN_V = 0.3
-"""Least change of the voltage from which a slope is fitted."""
+"""Least change of the voltage for which a slope is fitted."""
 
 
 class HoverFitError(ValueError):
-    """The log does not show enough hovering: one line for the user."""
+    """The log does not contain enough hovering. The text is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class VoltageSlope:
-    """How the hover thrust changes with the battery's voltage."""
+    """Change of the hover thrust with the battery voltage."""
 
     per_v: float
-    """Normalised thrust per volt; negative: an empty battery takes more."""
+    """Normalised thrust per volt; negative, because an empty battery needs more."""
     standard_error_per_v: float
 
 
 @dataclass(frozen=True, slots=True)
 class HoverFit:
-    """What a flight tells; hover thrust is normalised, 0 to 1."""
+    """Result of the fit; hover thrust is normalised, 0 to 1."""
 
     hover_thrust: float
     """At `voltage_mean_v`."""
     standard_error: float
-    """Of the noise alone; a wrong mass in the vehicle file is not in it."""
+    """Standard error from noise alone; it does not contain an error of the configured mass."""
     used_s: float
-    """Calm flight that was used."""
+    """Duration of the calm flight that was used, s."""
     configured: float | None
-    """What the flight started from."""
+    """Hover thrust at the start of the flight."""
     last_estimate: float | None
-    """What the flight itself had learnt at its end; the same as `configured` where it was not to learn."""
+    """The flight's own estimate at its end; the same as `configured` if the estimator was off."""
     voltage_mean_v: float | None
-    """None: the autopilot did not tell it throughout."""
+    """None if the autopilot did not report it throughout."""
     voltage_span_v: float | None
-    """Largest minus smallest."""
+    """Largest minus smallest voltage, V."""
     slope: VoltageSlope | None
-    """None: the voltage is not known, or did not change enough."""
+    """None if the voltage is not known or did not change enough."""
 
 
 def fit_hover_thrust(log: FlightLog) -> HoverFit:
-    """Fit a log.
+    """Fit the hover thrust to a log.
 
     Raises:
         HoverFitError: less than `FIT_MIN_S` of calm flight under the law, or no mass in the log's configuration.
@@ -93,7 +93,7 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
 
 
 def _calm(log: FlightLog) -> Array:
-    """Ticks that can be trusted: duration s, thrust given, load as a share of the weight, battery V (NaN: not known)."""
+    """Return the valid ticks: duration s, thrust, load as a share of the weight, battery V (NaN if not known)."""
     vehicle = log.config.get("vehicle") or {}
     mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
     force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)
@@ -120,7 +120,7 @@ def _calm(log: FlightLog) -> Array:
 
 
 def _least_squares(dt_s: Array, columns: Array, thrust: Array, pieces: Array) -> tuple[Array, Array]:
-    """Weighted by time: the values, and their standard errors from the scatter of whole pieces (cluster-robust)."""
+    """Return the fitted values, weighted by time, and their cluster-robust standard errors with the pieces as clusters."""
     weighted = columns * dt_s[:, None]
     inverse = np.linalg.inv(weighted.T @ columns)
     values: Array = inverse @ (weighted.T @ thrust)

@@ -1,4 +1,4 @@
-"""Reads a flight log (MCAP) back into the records of `companion.model.types`, also one that was never closed."""
+"""Read a flight log (MCAP), also one that was never closed, into the records of `companion.model`."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from companion.model.types import Inputs, Outputs, Sent
 Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
 _TOPICS = tuple(_RECORDS)
-"""In the order of a tick's records in the file."""
+"""Topics in the order of a tick's records in the file."""
 
 
 class LogError(Exception):
-    """The file is not a flight log, or not one that can be used for this: one line for the user."""
+    """The file is not a flight log, or not one that can be used for this. The text is one line for the user."""
 
 
 @dataclass(frozen=True)
 class FlightLog:
-    """A flight: three lists of the same length, one entry per recorded tick, in order; of a long flight perhaps not every tick."""
+    """A flight: three lists of the same length, one entry per recorded tick, in order. Of a long flight ticks may be left out."""
 
     path: Path
     inputs: tuple[Inputs, ...]
@@ -43,24 +43,24 @@ class FlightLog:
     metadata: dict[str, dict[str, str]]
     """All metadata records by name: companion, config, flight, recorder, ..."""
     closed: bool
-    """The recorder closed the file itself."""
+    """Whether the recorder closed the file."""
     stride: int = 1
-    """Every so many ticks are kept, and those with events; 1: all."""
+    """Every `stride`-th tick is kept, and those with events; 1 keeps all."""
     measured: Timing | None = None
-    """Of all ticks, where not all are kept."""
+    """Timing of all ticks, if not all are kept."""
 
     @staticmethod
     def read(path: Path, *, ticks_max: int | None = None) -> FlightLog:
         """Read a log.
 
         Args:
-            path: of the file.
-            ticks_max: keep no more ticks than about this, evenly spread (`stride`), and those with events; one of them takes some 8 kB
-                of memory. None: keep all, which a replay needs.
+            path: path of the file.
+            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes some 8 kB of memory.
+                None keeps all, which a replay needs.
 
         Raises:
-            LogError: no such file, no MCAP file, not written by the recorder, damaged, or records of another shape. Records of a
-                version that lacked a field which may be None are no other shape: that field is None.
+            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records of another
+                shape. A field that may be None and is missing in an older version is read as None.
         """
         rows = _Rows(ticks_max)
         metadata: dict[str, dict[str, str]] = {}
@@ -95,12 +95,12 @@ class FlightLog:
 
     @property
     def config_json(self) -> str | None:
-        """Effective configuration as recorded, or None."""
+        """Return the effective configuration as recorded, or None."""
         return self.metadata.get("config", {}).get("json") or None
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """Effective configuration as plain nested data; empty if absent."""
+        """Return the effective configuration as plain nested data; empty if absent."""
         try:
             parsed = json.loads(self.config_json or "{}")
         except ValueError:
@@ -108,33 +108,33 @@ class FlightLog:
         return parsed if isinstance(parsed, dict) else {}
 
     def missing_ticks(self) -> int:
-        """Ticks between the first and the last one that are not in the log."""
+        """Return the number of ticks between the first and the last one that are not in the log."""
         timing = self.timing
         return timing.last_tick - timing.first_tick + 1 - timing.ticks if timing.ticks else 0
 
     @cached_property
     def timing(self) -> Timing:
-        """Of every recorded tick, also of those that are not kept."""
+        """Return the timing of every recorded tick, also of those that are not kept."""
         return self.measured or timing_of(self.rows())
 
     def rows(self) -> Iterator[tuple[Inputs, Outputs, Sent]]:
-        """Ticks in order."""
+        """Iterate over the ticks in order."""
         return zip(self.inputs, self.outputs, self.sent, strict=True)
 
     def column(self, value: Callable[[Inputs, Outputs, Sent], Any], width: int = 0) -> Array:
-        """One row per tick: a float (`width` 0) or `width` floats; NaN where `value` returns None."""
+        """Return one row per tick: a float (`width` 0) or `width` floats; NaN where `value` returns None."""
         blank: Any = (np.nan,) * width if width else np.nan
         values = [blank if (v := value(*row)) is None else v for row in self.rows()]
         return np.array(values, dtype=np.float64).reshape((len(values), width) if width else (len(values),))
 
     @cached_property
     def columns(self) -> Columns:
-        """What metrics and plots share, as arrays."""
+        """Return the quantities that metrics and plots share, as arrays."""
         return _columns(self)
 
 
 class _Rows:
-    """Puts the three records of each tick together; thins out what is kept when it grows too long.
+    """Assembler of the three records of each tick. It thins the kept ticks when there are too many.
 
     Chunks hold whole ticks, so anything else means that the file was not written by the recorder.
     """
@@ -148,7 +148,7 @@ class _Rows:
         self._torn = False
 
     def take(self, topic: str, record: Any) -> None:
-        """The next record of the file."""
+        """Add the next record of the file."""
         expected = _TOPICS[len(self._open)]
         if topic != expected or (self._open and record.tick != self._open[0].tick):
             self._torn = True
@@ -174,12 +174,12 @@ class _Rows:
             self.kept = [row for row in self.kept if self._wanted(row)]
 
     def whole(self) -> bool:
-        """Every tick had its three records."""
+        """Return whether every tick had its three records."""
         return not self._torn and not self._open
 
     @property
     def measured(self) -> Timing | None:
-        """Of all ticks; None: it can be told from those that are kept."""
+        """Return the timing of all ticks, or None if the kept ticks are all."""
         return self._stopwatch.read() if self._stopwatch is not None and self.stride > 1 else None
 
 
@@ -190,11 +190,11 @@ class Columns:
     t_s: Array
     mission_t_s: Array
     mocap_position_world_m: Array
-    """From valid frames not older than `MOCAP_FRESH_S`."""
+    """From valid frames with an age of `MOCAP_FRESH_S` or less."""
     mocap_attitude_rad: Array
     """Roll, pitch, yaw (ZYX)."""
     mocap_age_s: Array
-    """From the frame's exposure to the tick."""
+    """Time from the frame's exposure to the tick."""
     reference_position_world_m: Array
     reference_velocity_world_m_s: Array
     attitude_desired_rad: Array
@@ -234,13 +234,13 @@ def _columns(log: FlightLog) -> Columns:
 
 
 def writer(metadata: dict[str, dict[str, str]]) -> str:
-    """Version and git revision of the companion that wrote a log with this metadata."""
+    """Return version and git revision of the companion that wrote a log with this metadata."""
     about = metadata.get("companion", {})
     return f"companion {about.get('version_companion', 'of unknown version')} ({about.get('version_git', 'no git revision')})"
 
 
 def _mcap_records(path: Path) -> Iterator[Any]:
-    """Records of the file in order; an unclosed file simply ends."""
+    """Iterate over the records of the file in order. An unclosed file ends without an error."""
     try:
         file = path.open("rb")
     except OSError as error:

@@ -1,4 +1,6 @@
-"""Numbers that grade a flight; pure functions of a `FlightLog`. Position and attitude are graded by mocap, never by the estimator."""
+"""Metrics of a flight; pure functions of a `FlightLog`. Position and attitude errors are measured by motion capture, never by the
+estimator.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ FINAL_WINDOW_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Percentiles:
-    """Of durations, in ms."""
+    """Percentiles of durations, ms."""
 
     p50_ms: float
     p99_ms: float
@@ -38,19 +40,19 @@ class TrackingRms:
 
 
 def catch_index(log: FlightLog) -> int | None:
-    """Tick (position in the log) of the catch: the one at the time of the first event "catch".
+    """Return the tick (position in the log) of the catch, at the time of the first event "catch".
 
-    A detector needs some time to be sure; it may date its event back to the contact, so that the kick counts as after the catch.
-    Without such an event it is the tick of an unconfirmed catch (`unconfirmed_catch_index`). None if nothing was felt.
+    The detector confirms a catch after some time and dates its event back to the contact, so that the impact counts as after the catch.
+    Without such an event it is the tick of an unconfirmed catch (`unconfirmed_catch_index`). None if no contact was measured.
     """
     confirmed = _confirmed_catch_index(log)
     return confirmed if confirmed is not None else unconfirmed_catch_index(log)
 
 
 def unconfirmed_catch_index(log: FlightLog) -> int | None:
-    """Tick of a blow with a pull after it that the flight was not given the time to confirm: it was killed, or left its course.
+    """Return the tick of an impact with a force after it that was not confirmed before the flight was killed or left its plan.
 
-    The forces in the log go through the flight's own detector once more. None if a catch was confirmed, or none was felt.
+    The logged forces pass through the flight's own detector again. None if a catch was confirmed, or no contact was measured.
     """
     if _confirmed_catch_index(log) is not None:
         return None
@@ -71,7 +73,7 @@ def _confirmed_catch_index(log: FlightLog) -> int | None:
 
 
 def flight_masks(log: FlightLog) -> tuple[Mask, Mask]:
-    """Ticks of kind FLIGHT before the catch, and from the catch on; without a catch the second is empty."""
+    """Return the ticks of kind FLIGHT before the catch, and from the catch on; without a catch the second is empty."""
     flight = np.array([o.phase_kind is PhaseKind.FLIGHT for o in log.outputs], dtype=np.bool_)
     caught = catch_index(log)
     after = np.arange(len(flight)) >= (len(flight) if caught is None else caught)
@@ -79,10 +81,10 @@ def flight_masks(log: FlightLog) -> tuple[Mask, Mask]:
 
 
 def position_error_m(log: FlightLog) -> Array:
-    """Mocap minus reference, world, (ticks, 3).
+    """Return motion capture minus reference, world frame, (ticks, 3).
 
-    A frame shows where the vehicle was at its exposure, some milliseconds before the tick: it is held against the reference of that
-    moment. At 0.5 m/s a frame that is 10 ms old would else be an error of 5 mm that nobody made.
+    A frame shows the vehicle at its exposure, some milliseconds before the tick, and is compared with the reference of that moment.
+    Otherwise a frame that is 10 ms old would count as an error of 5 mm at 0.5 m/s.
     """
     c = log.columns
     reference = c.reference_position_world_m - c.mocap_age_s[:, None] * c.reference_velocity_world_m_s
@@ -90,17 +92,17 @@ def position_error_m(log: FlightLog) -> Array:
 
 
 def attitude_error_rad(log: FlightLog) -> Array:
-    """Mocap roll, pitch, yaw minus the law's desired attitude, wrapped, (ticks, 3)."""
+    """Return roll, pitch, yaw by motion capture minus the law's desired attitude, wrapped, (ticks, 3)."""
     return _wrapped(log.columns.mocap_attitude_rad - log.columns.attitude_desired_rad)
 
 
 def arm_error_rad(log: FlightLog) -> Array:
-    """Joint angles minus reference, (ticks, 2)."""
+    """Return joint angles minus reference, (ticks, 2)."""
     return log.columns.arm_rad - log.columns.arm_reference_rad
 
 
 def tracking_rms(log: FlightLog, mask: Mask) -> TrackingRms:
-    """RMS of ||e_p||, ||e_q||, ||e_alpha|| over the ticks of the mask."""
+    """Return the RMS of ||e_p||, ||e_q||, ||e_alpha|| over the ticks of the mask."""
     e_q, e_alpha = rms_norm(attitude_error_rad(log)[mask]), rms_norm(arm_error_rad(log)[mask])
     return TrackingRms(
         rms_norm(position_error_m(log)[mask]),
@@ -110,13 +112,13 @@ def tracking_rms(log: FlightLog, mask: Mask) -> TrackingRms:
 
 
 def rms_norm(rows: Array) -> float | None:
-    """sqrt(mean ||row||^2) over rows that are known throughout; None if there is none."""
+    """Return sqrt(mean ||row||^2) over rows without NaN, or None if there is none."""
     known = rows[np.isfinite(rows).all(axis=1)]
     return float(np.sqrt(np.mean(np.sum(known * known, axis=1)))) if len(known) else None
 
 
 def final_e_z_m(log: FlightLog) -> float | None:
-    """Mean height error over the last 0.5 s of FLIGHT."""
+    """Return the mean height error over the last 0.5 s of FLIGHT, m."""
     pre, post = flight_masks(log)
     flight = pre | post
     if not flight.any():
@@ -129,11 +131,11 @@ def final_e_z_m(log: FlightLog) -> float | None:
 
 
 def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
-    """RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m); None for rows without a desired impedance,
-    and of a log that was thinned out.
+    """Return the RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m). None for rows without a desired
+    impedance, and for a log with ticks left out.
 
-    dI = M_d e'' + K_d e' + K_p e - e_tau: what keeps the machine from its desired impedance. Laws with a sliding variable s log the
-    same as M_d s' + (K_d - M_d Phi) s. Derivatives are central differences, low-passed at 10 Hz without phase shift.
+    dI = M_d e'' + K_d e' + K_p e - e_tau is the deviation from the desired impedance. Laws with a sliding variable s log the same as
+    M_d s' + (K_d - M_d Phi) s. Derivatives are central differences, low-passed at 10 Hz without phase shift.
     """
     if log.stride > 1:
         return None, None  # derivatives need every tick
@@ -152,7 +154,7 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
 
 
 def _impedance_residual(log: FlightLog, used: Mask, t_s: Array) -> Array | None:
-    """dI of the ticks of the mask, 8 rows; NaN on rows that the law gives no impedance."""
+    """Return dI of the ticks of the mask, 8 rows; NaN on rows without an impedance."""
     controller = log.config.get("controller")
     period = float(np.median(np.diff(t_s)))
 
@@ -181,7 +183,9 @@ def _impedance_residual(log: FlightLog, used: Mask, t_s: Array) -> Array | None:
 
 
 def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
-    """Second-order Butterworth forwards and backwards along axis 0 (gain 1/2 at the cutoff), odd reflection at the ends."""
+    """Filter with a second-order Butterworth forwards and backwards along axis 0 (gain 1/2 at the cutoff), odd reflection at
+    the ends.
+    """
     k = math.tan(math.pi * min(cutoff_hz * period_s, 0.49))
     norm = 1.0 / (1.0 + math.sqrt(2.0) * k + k * k)
     b0 = k * k * norm
@@ -203,23 +207,23 @@ def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
 
 
 def loop_rate_hz(log: FlightLog) -> float | None:
-    """Mean rate of ticks as they really started."""
+    """Return the mean rate of the ticks' actual starts, Hz."""
     timing = log.timing
     return (timing.last_tick - timing.first_tick) / timing.span_s if timing.span_s > 0 else None
 
 
 def missed_deadlines(log: FlightLog) -> int:
-    """Ticks that started later than one whole period."""
+    """Return the number of ticks that started more than one period late."""
     return int((log.timing.lateness_s > log.timing.period_s).sum())
 
 
 def lateness(log: FlightLog) -> Percentiles | None:
-    """Tick start after its deadline."""
+    """Return the delay of the ticks' starts after their deadlines."""
     return percentiles(log.timing.lateness_s)
 
 
 def percentiles(durations_s: Array) -> Percentiles | None:
-    """p50, p99 and maximum in ms; None if there are none."""
+    """Return p50, p99 and maximum in ms, or None for no values."""
     known = durations_s[np.isfinite(durations_s)]
     if not len(known):
         return None
@@ -228,7 +232,9 @@ def percentiles(durations_s: Array) -> Percentiles | None:
 
 
 def min_slack_m(log: FlightLog) -> float | None:
-    """Least of tether length minus distance from the anchor to the attachment point, between take-off and touchdown, by mocap."""
+    """Return the least of tether length minus distance from the anchor to the attachment point, between take-off and touchdown, by
+    motion capture.
+    """
     tether = (log.config.get("vehicle") or {}).get("tether")
     if not isinstance(tether, dict) or not {"anchor_world_m", "length_m"} <= tether.keys():
         return None
@@ -246,7 +252,7 @@ def min_slack_m(log: FlightLog) -> float | None:
 
 
 def _diagonals(controller: Any, *names: str) -> tuple[Array, ...] | None:
-    """Diagonals of eight rows from the controller's configuration; None if the law has no such gains."""
+    """Return the diagonals of eight rows from the controller's configuration, or None if the law has no such gains."""
     if not isinstance(controller, dict):
         return None
     rows = [controller.get(name) for name in names]
@@ -256,7 +262,7 @@ def _diagonals(controller: Any, *names: str) -> tuple[Array, ...] | None:
 
 
 def _arm_diagonals(controller: Any) -> tuple[Array, ...] | None:
-    """M_d, K_d, K_p of a law whose arm alone has an impedance: NaN above the joint rows."""
+    """Return M_d, K_d, K_p of a law whose arm alone has an impedance: NaN above the joint rows."""
     if not isinstance(controller, dict):
         return None
     rows = [controller.get(f"arm_{name}") for name in ("inertia_md", "damping_kd", "stiffness_kp")]

@@ -1,4 +1,4 @@
-"""What every HTML page is made of: one file, opens anywhere, prints well."""
+"""Elements that all HTML pages share. A page is one self-contained file that prints well."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pre { background: var(--card); padding: 1rem; border-radius: .5rem; overflow: au
 
 
 def opening(title: str, style: str) -> str:
-    """Everything before the body's content; `style` is CSS of this page alone, and sets `--width` of `:root`."""
+    """Return everything before the body's content. `style` is CSS of this page and sets `--width` of `:root`."""
     return (
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>"
@@ -37,7 +37,7 @@ CLOSING = "</body></html>\n"
 
 
 def picture(path: Path, title: str, caption_html: str) -> str:
-    """A PNG, held by the page itself."""
+    """Return a PNG embedded in the page."""
     data = base64.b64encode(path.read_bytes()).decode()
     return (
         f"<figure><img alt='{escape(title)}' src='data:image/png;base64,{data}'>"
@@ -46,5 +46,5 @@ def picture(path: Path, title: str, caption_html: str) -> str:
 
 
 def folded(title: str, text: str) -> str:
-    """Text that shows when it is asked for; nothing if there is none."""
+    """Return text behind a disclosure widget, or nothing if it is empty."""
     return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>" if text else ""

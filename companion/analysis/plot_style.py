@@ -1,4 +1,4 @@
-"""How every picture looks: size, colours, axes, the mark of the catch. Needs matplotlib (extra `analysis`)."""
+"""Common style of all plots: size, colours, axes, the mark of the catch. Needs matplotlib (extra `analysis`)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ WIDTH_IN = 9.0
 INK = "#22303c"
 CATCH = "#c2255c"
 DASHED = (0, (4, 2))
-"""Line of what was wanted, beside what was flown."""
+"""Line style of references and desired values."""
 
 
 def new_figure(height_in: float) -> Figure:
-    """An empty figure, as wide as every other one."""
+    """Return an empty figure of the common width."""
     return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
 
 
 def write_png(figure: Figure, path: Path) -> None:
-    """Draw it into a file."""
+    """Write the figure to a file."""
     FigureCanvasAgg(figure).print_png(path)
 
 
 def dress(ax: Any) -> None:
-    """Grid behind the data, no frame above and on the right, quiet labels."""
+    """Apply the common style: grid behind the data, no frame above and on the right, muted labels."""
     ax.grid(True, color="#e6eaee", lw=0.7)
     ax.set_axisbelow(True)
     ax.tick_params(colors=INK, labelsize=9, length=3)
@@ -42,7 +42,7 @@ def dress(ax: Any) -> None:
 
 
 def mark_catch(axes: Sequence[Any], t_s: float) -> None:
-    """A dashed vertical line through axes over time, named in the first one."""
+    """Mark the catch by a dashed vertical line through axes over time, labelled in the first one."""
     for ax in axes:
         ax.axvline(t_s, color=CATCH, lw=1.3, ls=(0, (5, 3)), zorder=2)
     axes[0].annotate(

@@ -1,6 +1,6 @@
 """The plots of a flight, as in the paper's figures: errors, arm, actuation, adaptation, force, path, timing.
 
-Needs matplotlib (extra `analysis`); nothing that flies imports this module.
+Needs matplotlib (extra `analysis`). The flight process never imports this module.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _REFERENCE = "#55626e"
 _SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
 _SERIES_DARK = ("#0b365c", "#7d3d05")  # a reference drawn over its own measurement
 _PHASES_NAMED_MAX = 40
-"""With more phases than that only their kinds are told apart."""
+"""With more phases than this only their kinds are distinguished."""
 _PHASES = {
     PhaseKind.TAKEOFF: "#eaf3fb",
     PhaseKind.FLIGHT: "#ffffff",
@@ -35,7 +35,7 @@ _PHASES = {
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One written picture."""
+    """A plot that was written."""
 
     path: Path
     title: str
@@ -43,7 +43,7 @@ class Plot:
 
 
 def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
-    """Draw every plot that the log has data for, as PNG into `out_dir`."""
+    """Write every plot for which the log has data, as PNG into `out_dir`."""
     if not log.inputs:
         return []
     makers: tuple[tuple[str, str, str, Callable[[FlightLog], Figure | None]], ...] = (
@@ -231,7 +231,7 @@ def _timing(log: FlightLog) -> Figure | None:
 def _stack(
     log: FlightLog, title: str, heights: tuple[float, ...], height_in: float = 6.8
 ) -> tuple[Figure, list[Any], Array]:
-    """Axes above each other over the mission clock, phases shaded and named, the catch marked; and the clock itself."""
+    """Return axes above each other over the mission clock, with phases shaded and named and the catch marked, and the clock itself."""
     figure = new_figure(height_in)
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
     axes = [row[0] for row in grid]

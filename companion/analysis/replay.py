@@ -1,4 +1,4 @@
-"""Runs the core again on a log's inputs and compares every output bit for bit."""
+"""Run the core again on a log's inputs and compare every output bit for bit."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from companion.model.types import Inputs, Outputs, Sent
 
 
 class Core(Protocol):
-    """`companion.core.flight_core.FlightCore`, as far as replay needs it."""
+    """The part of `companion.core.flight_core.FlightCore` that replay needs."""
 
     def step(self, inputs: Inputs) -> Outputs:
-        """One tick."""
+        """Run one tick."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """First field of the first output that came out otherwise."""
+    """First field of the first output that differs."""
 
     tick: int
     t_s: float
@@ -37,14 +37,14 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class ReplayResult:
-    """Ticks that were compared, and the first difference if there is one."""
+    """Number of compared ticks, and the first difference if there is one."""
 
     ticks: int
     first_difference: Difference | None
 
 
 def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
-    """Step a fresh core through the logged inputs; stops at the first difference.
+    """Step a new core through the logged inputs; stops at the first difference.
 
     Args:
         log: a log without gaps from its first tick on.
@@ -68,10 +68,10 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
 
 
 def check_replayable(log: FlightLog) -> str:
-    """The recorded configuration (JSON) of a log that can be replayed.
+    """Return the recorded configuration (JSON) of a log that can be replayed.
 
     Raises:
-        LogError: it cannot; says why.
+        LogError: the log cannot be replayed, with the reason.
     """
     about = log.metadata.get("companion", {})
     version = about.get("version_companion")
@@ -101,7 +101,7 @@ def check_replayable(log: FlightLog) -> str:
 
 
 def flight_core(config_json: str) -> Core:
-    """The real core, made from a recorded configuration."""
+    """Make the flight core from a recorded configuration."""
     from companion.config.loader import FlightConfig
     from companion.core.flight_core import FlightCore
 
@@ -110,7 +110,7 @@ def flight_core(config_json: str) -> Core:
 
 
 def run(path: Path) -> int:
-    """`companion replay FILE`: 0 if every output is bit-identical, 1 if not, 2 if the log cannot be replayed."""
+    """Run `companion replay FILE`: 0 if every output is bit-identical, 1 if not, 2 if the log cannot be replayed."""
     try:
         result = replay(FlightLog.read(path), flight_core)
     except LogError as error:

@@ -1,4 +1,4 @@
-"""report.html: one file with the result table, plots, events, configuration and versions; opens anywhere, prints well."""
+"""report.html: one self-contained file with the result table, plots, events, configuration and versions."""
 
 from __future__ import annotations
 

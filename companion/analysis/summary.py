@@ -1,4 +1,4 @@
-"""summary.json: the contract that outside scripts rely on. Every key is always there; None (null) where a value is not known."""
+"""summary.json: the contract that outside scripts rely on. Every key is always present; None (null) where a value is not known."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def empty_summary(
     payload_kg: float | None = None,
     recorder: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The summary of a flight that left no log; arguments as for `summarise`."""
+    """Return the summary of a flight that left no log; arguments as for `summarise`."""
     recorder = recorder or {}
     return {
         "outcome": outcome,
@@ -59,19 +59,19 @@ def summarise(
     payload_kg: float | None = None,
     recorder: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The summary of one flight.
+    """Return the summary of one flight.
 
     Args:
         log: the flight.
-        outcome: completed, refused, aborted, crashed or lost: as the launcher judged it.
+        outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
         controller: adaptive, csc or psc.
-        preset: paper, recommended or a name of the user's.
-        payload_kg: truth from SITL; None in reality.
-        recorder: the recorder's own report (samples, dropped, error); None: counted from the log.
+        preset: paper, recommended or the name of a user's preset.
+        payload_kg: truth from SITL; None on hardware.
+        recorder: the recorder's own report (samples, dropped, error); None to count from the log.
 
     Returns:
-        Keys as in the contract. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command), an event's `t_s`
-        is on the flight clock (as recorded) and comes with `mission_t_s`.
+        Keys as in the contract. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command); an event's `t_s` is
+            on the flight clock (as recorded) and comes with `mission_t_s`.
     """
     timing = log.timing
     counted = {"samples": timing.ticks, "dropped": log.missing_ticks()}
@@ -108,7 +108,7 @@ def summarise(
 
 
 def write_summary(summary: dict[str, Any], path: Path) -> None:
-    """Write it as JSON (never NaN)."""
+    """Write the summary as JSON (never NaN)."""
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -1,4 +1,4 @@
-"""When things happened in a flight, from every tick of it: small enough to be kept whole where the ticks themselves are not."""
+"""Timing of every tick of a flight, small enough to be kept whole where the ticks themselves are not."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Timing:
-    """Of consecutive recorded ticks; durations in s."""
+    """Timing of consecutive recorded ticks; durations in s."""
 
     ticks: int
     first_tick: int
@@ -24,29 +24,31 @@ class Timing:
     span_s: float
     """From the start of the first tick to that of the last."""
     period_s: float
-    """The loop's nominal period: the median of the ticks' times; NaN for less than two ticks."""
+    """Nominal period of the loop: the median of the ticks' intervals; NaN for less than two ticks."""
     lateness_s: Array
-    """Tick start after its deadline."""
+    """Delay of the tick's start after its deadline."""
     joint_read_to_write_s: Array
-    """Answers of all servos read -> currents written, both by the bus thread, of ticks that wrote currents."""
+    """From the answers of all servos read to the currents written, both by the bus thread, for ticks that wrote currents."""
     mocap_to_setpoint_s: Array
-    """Mocap datagram -> setpoint sent, of ticks that saw a new frame and sent a setpoint."""
+    """From the mocap datagram to the setpoint sent, for ticks with a new frame that sent a setpoint."""
     wait_for_joints_s: Array
-    """Tick start -> joint state there."""
+    """From the tick's start to the joint state's arrival."""
     core_s: Array
-    """Joint state there -> decided."""
+    """From the joint state's arrival to the end of the core's step."""
     send_s: Array
-    """Decided -> setpoint sent and currents handed over."""
+    """From the end of the core's step to the setpoint sent and the currents handed to the bus thread."""
     whole_s: Array
-    """Tick start -> setpoint sent and currents handed over."""
+    """From the tick's start to the setpoint sent and the currents handed to the bus thread."""
     bus_read_s: Array
-    """Joint read begun -> answers of all servos read, both by the bus thread, of ticks that saw a new joint state."""
+    """From the start of the joint read to the answers of all servos read, both by the bus thread, for ticks with a new joint state."""
     bus_cycle_s: Array
-    """Joint read begun -> the currents that were computed from it written, both by the bus thread; as `joint_read_to_write_s`."""
+    """From the start of the joint read to the currents computed from it written, both by the bus thread; otherwise as
+    `joint_read_to_write_s`.
+    """
 
 
 class Stopwatch:
-    """Takes one tick after another; 80 bytes of each are kept."""
+    """Collector of the timing, 80 bytes per tick."""
 
     def __init__(self) -> None:
         self._t_s, self._lateness_s = array("d"), array("d")
@@ -58,7 +60,7 @@ class Stopwatch:
         self._frame_s: float | None = None
 
     def take(self, inputs: Inputs, sent: Sent) -> None:
-        """The next tick."""
+        """Add the next tick."""
         self._t_s.append(inputs.t_s)
         self._lateness_s.append(sent.lateness_s)
         self._wait_s.append(sent.joint_read_s - sent.start_s)
@@ -81,7 +83,7 @@ class Stopwatch:
             self._frame_s = mocap.stamp_s
 
     def _joint(self, tick: Inputs, sent: Sent, after: Inputs) -> None:
-        """The write is known in the next tick's joint state."""
+        """Add the times of the joint read and write. The write is reported with the next tick's joint state."""
         if sent.arm_torque_sent_nm is None or tick.arm is None or after.arm is None or after.arm.written_s is None:
             return
         if after.arm.written_s >= sent.core_s and after.arm.stamp_s > tick.arm.stamp_s:
@@ -90,7 +92,7 @@ class Stopwatch:
                 self._cycle_s.append(after.arm.written_s - tick.arm.asked_s)
 
     def read(self) -> Timing:
-        """What was taken so far."""
+        """Return the timing of the ticks added so far."""
         first_tick, first_s = self._first or (0, 0.0)
         last, sent = self._before or (None, None)
         t_s = np.array(self._t_s)
@@ -113,12 +115,12 @@ class Stopwatch:
 
 
 def end_s(sent: Sent) -> float:
-    """When a tick had sent everything: setpoint to PX4, currents to the bus thread, in whichever order."""
+    """Return the time at which a tick had sent everything: setpoint to PX4 and currents to the bus thread, in either order."""
     return max(sent.setpoint_sent_s, sent.current_sent_s)
 
 
 def timing_of(rows: Iterable[tuple[Inputs, Outputs, Sent]]) -> Timing:
-    """Of ticks in order."""
+    """Return the timing of ticks in order."""
     stopwatch = Stopwatch()
     for inputs, _, sent in rows:
         stopwatch.take(inputs, sent)

@@ -257,7 +257,9 @@ class AdaptiveController:
         )
 
     def _base_force(self, tau: Rows, reference: Reference, force: Vec3, disturbance: Vec3) -> Vec3:
-        """Return the force on the base: tau and hover thrust, plus the configured force feedforward, disturbance compensation and lead."""
+        """Return the force on the base: tau and hover thrust, plus the configured force feedforward, disturbance compensation
+        and lead.
+        """
         (x, y, z, _, _), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = tau, force, disturbance, self._force_share
         x -= c0 * f0 + d0
         y -= c1 * f1 + d1

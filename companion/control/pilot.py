@@ -158,7 +158,7 @@ class Pilot:
         return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, wrench.log)
 
     def _watch_disturbance(self, dt_s: float, state: PlantState, vertical_scale: float) -> None:
-        """Update the disturbance estimate with the measured attitude, not the setpoint: a slow attitude response is not a disturbance."""
+        """Update the disturbance estimate with the measured attitude, because a slow attitude response is not a disturbance."""
         if vertical_scale < 1.0:
             self._pull.reset()
             self.disturbance_world_n = None
