@@ -44,10 +44,10 @@ from foxglove.messages import (
 )
 
 from companion.model.frames import quat_rotate
+from companion.model.hanging_line import hanging_line_m
 from companion.model.types import Quat, Vec3
 from companion.recorder.viewer_scene import (
     Machine,
-    hanging_line_m,
     machine_of,
     path_of,
     point3,

@@ -38,11 +38,6 @@ SLACK = Color(r=0.18, g=0.62, b=0.42, a=1.0)
 NEARLY_TAUT = Color(r=0.93, g=0.62, b=0.10, a=1.0)
 TAUT = Color(r=0.85, g=0.15, b=0.15, a=1.0)
 
-_LINE_POINTS = 13
-_SAG_STEPS = 12
-"""Halvings of the interval that the sag lies in: to a 4000th of the tether's length."""
-_STEEP_M = 0.02
-"""A line whose ends are nearer to each other than this, seen from above, is drawn as if they were so far apart."""
 _ROTOR_PITCH = 1.0 + 1.05 * math.sqrt(2.0)
 """Reach over radius of four disks in a square that nearly touch."""
 _ALONG_X = Quaternion(w=math.sqrt(0.5), x=0.0, y=math.sqrt(0.5), z=0.0)
@@ -149,24 +144,6 @@ def standing_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestam
     return entities
 
 
-def hanging_line_m(anchor: Vec3, end: Vec3, length_m: float, floor_m: float | None = None) -> list[Vec3]:
-    """Points of a line of this length that hangs between two points: a parabola of that length.
-
-    What would hang through the floor lies on it. A line that is too short is straight.
-    """
-    ax, ay, az = anchor
-    dx, dy, dz = end[0] - ax, end[1] - ay, end[2] - az
-    sag_m = _sag_m(math.hypot(dx, dy), dz, length_m)
-    points: list[Vec3] = []
-    for k in range(_LINE_POINTS):
-        u = k / (_LINE_POINTS - 1)
-        z = az + u * (dz - 4.0 * sag_m * (1.0 - u))
-        if floor_m is not None and z < floor_m:
-            z = floor_m
-        points.append((ax + u * dx, ay + u * dy, z))
-    return points
-
-
 def tether_colour(tether: TetherShape, slack_m: float, *, held: bool) -> Color:
     """Green: more slack than the margin; amber: less; red: taut, or `held` (taut or snagged by the watch)."""
     if held or slack_m <= tether.taut_slack_m:
@@ -184,30 +161,6 @@ def trail(points: list[Point3], colour: Color, thickness_px: float = 2.0) -> Lin
 def point3(p: Vec3) -> Point3:
     """The message of a point."""
     return Point3(x=p[0], y=p[1], z=p[2])
-
-
-def _sag_m(level_m: float, rise_m: float, length_m: float) -> float:
-    """Vertical distance of the parabola's middle below that of its chord, for its arc to have the length given.
-
-    z(u) = rise u - 4 sag u (1 - u) over the level distance h has the slopes (rise -+ 4 sag) / h at its ends, and between the slopes
-    m0 and m1 the arc h^2 / (8 sag) (F(m1) - F(m0)), F(m) = (m sqrt(1 + m^2) + asinh m) / 2.
-    """
-    h = max(level_m, _STEEP_M)
-    if length_m * length_m <= h * h + rise_m * rise_m:
-        return 0.0
-    low, high = 0.0, length_m
-    for _ in range(_SAG_STEPS):
-        sag = 0.5 * (low + high)
-        m0, m1 = (rise_m - 4.0 * sag) / h, (rise_m + 4.0 * sag) / h
-        arc = (
-            h * h / (16.0 * sag)
-            * (m1 * math.sqrt(1.0 + m1 * m1) + math.asinh(m1) - m0 * math.sqrt(1.0 + m0 * m0) - math.asinh(m0))
-        )  # fmt: skip
-        if arc < length_m:
-            low = sag
-        else:
-            high = sag
-    return 0.5 * (low + high)
 
 
 def _airframe(radius_m: float, clearance_m: float | None) -> dict[str, Any]:

@@ -19,10 +19,11 @@ from companion.config.loader import load_flight
 from companion.control.manipulator import Manipulator
 from companion.model.codec import differences, plain
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
+from companion.model.hanging_line import hanging_line_m
 from companion.model.types import Inputs, MocapPose, Outputs, Quat, Sent, TetherState, Vec3
 from companion.recorder.log_file import Disk
 from companion.recorder.log_writer import LogWriter
-from companion.recorder.viewer_scene import hanging_line_m, machine_of, path_of
+from companion.recorder.viewer_scene import machine_of, path_of
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.viewers import Seen, Viewed, view
 
