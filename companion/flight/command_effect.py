@@ -1,4 +1,4 @@
-"""What a command did, in the words of a pilot. Pure: read off the tick in which it was judged and the tick before."""
+"""Effect of an operator's command as text. Pure: derived from the outputs of the tick with the command and the tick before."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from companion.model.flight_stage import PILOT_FLIES, Stage
 from companion.model.types import OperatorCommand, Outputs, PhaseKind, SafetyAction
 
 Effect = tuple[bool, str]
-"""Accepted (it did something, or what it asks for is done already), and what was done or why nothing was."""
+"""Whether the command was accepted (it had an effect, or its request is already fulfilled), and what was done or why nothing was."""
 
 _RISING = frozenset({Stage.OFFBOARD.value, Stage.ARM.value, Stage.SPOOL.value})
-"""Phases between the word to take off and the take-off."""
+"""Phases between the start command and the take-off."""
 
 
 def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) -> Effect:
-    """What came of a command.
+    """Return the effect of a command.
 
     Args:
-        command: as it was put into `Inputs.command`, or as it would have been if a landing were not asked for already.
-        before: outputs of the tick before the command; None: there was none.
+        command: as in `Inputs.command`, or as it would have been if a landing had not been requested already.
+        before: outputs of the tick before the command; None if there was none.
         after: outputs of the tick with it.
     """
     if after.phase == PILOT_FLIES:
@@ -91,7 +91,7 @@ def _start(before: Outputs | None, after: Outputs) -> Effect:
 
 
 def _instead(after: Outputs) -> str:
-    """What it does that is not to hold."""
+    """Return what the flight does instead of holding."""
     if after.phase_kind is PhaseKind.GROUND:
         return "on the ground"
     if after.action is SafetyAction.RETRACT:

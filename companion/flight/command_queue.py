@@ -1,4 +1,4 @@
-"""What the people on the ground want: Ctrl-C and signals, and commands over the air, as one command per tick."""
+"""Queue of the operator's commands: Ctrl-C, signals and commands from the ground station, one per tick."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.model.types import GroundCommand, OperatorCommand, Outputs, Safet
 from companion.runtime import ipc
 
 WAITING_MAX = 32
-"""Commands that wait for their tick; of more than that at once the mildest are refused."""
+"""Largest number of queued commands. Of more than that the least severe are refused."""
 _GRAVEST_FIRST = {
     command: rank
     for rank, command in enumerate(
@@ -32,33 +32,33 @@ _T = TypeVar("_T")
 
 
 class Dropped(NamedTuple):
-    """A command that never has its tick."""
+    """A command that is dropped before its tick."""
 
     asked: GroundCommand
     why: str
-    """For the operator who gave it."""
+    """Reason for the operator."""
 
 
 class Turn(NamedTuple):
-    """What one tick is asked for."""
+    """Commands of one tick."""
 
     command: OperatorCommand
-    """For the core."""
+    """Command for the core."""
     asked: GroundCommand | None
-    """The command from the ground that is to be answered after the tick."""
+    """The ground station's command that is answered after the tick."""
     refused: str | None = None
-    """Then the answer, and the core is not asked; None: the answer is what came of it."""
+    """Reason for a refusal without asking the core; None if the answer is the command's effect."""
 
 
 class GivenUp(Exception):
-    """A landing was asked for before the flight began."""
+    """A landing was requested before the flight began."""
 
 
 class Operator:
-    """The launcher's messages, the signals sent to this process, and what came over the air.
+    """Commands from the launcher's messages, from signals to this process, and from the ground station.
 
     Args:
-        channel: to the launcher.
+        channel: channel to the launcher.
     """
 
     def __init__(self, channel: socket.socket) -> None:
@@ -68,12 +68,12 @@ class Operator:
         self._given = OperatorCommand.NONE
         self._holds = 0
         self.hold: int | None = None
-        """Number of the hold that stands, as `Sent.hold`; None: it does not hold."""
+        """Number of the active hold, as `Sent.hold`; None without a hold."""
 
     def ask(self, commands: Iterable[GroundCommand]) -> list[Dropped]:
-        """Commands from the ground in the order in which they came: each has its tick, the gravest first.
+        """Queue commands from the ground station in their order of arrival: each has its tick, the most severe first.
 
-        A hold, landing or abort drops every RESUME and START that waits: those were given before it. Returns what is dropped.
+        A hold, landing or abort drops every queued RESUME and START, because those were given before it. Returns the dropped commands.
         """
         dropped = []
         for asked in commands:
@@ -88,10 +88,11 @@ class Operator:
         return dropped
 
     def next(self) -> Turn:
-        """What is asked for in this tick.
+        """Return the commands of this tick.
 
-        A landing that the launcher or a signal asked for stays asked for. A command from the ground lasts one tick, and the same one
-        again comes a tick later: the core counts what begins. A RESUME that names another hold than the one that stands is refused.
+        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick, and the same
+        one again comes a tick later, because the core counts rising edges. A RESUME that names another hold than the active one is
+        refused.
         """
         waiting = self._waiting
         if self._land.is_set():
@@ -109,14 +110,12 @@ class Operator:
         return Turn(asked.command, asked)
 
     def judged(self, command: OperatorCommand, outputs: Outputs) -> int | None:
-        """Number the holds: a new one begins with `SafetyAction.HOLD`, and with every command to hold while it stands.
+        """Number the holds and return `hold`. A new one begins with `SafetyAction.HOLD`, and with every hold command while it is
+        active.
 
         Args:
-            command: of the tick.
-            outputs: what the core made of the tick.
-
-        Returns:
-            `hold`.
+            command: command of the tick.
+            outputs: the core's outputs of the tick.
         """
         if outputs.action is not SafetyAction.HOLD:
             self.hold = None
@@ -127,7 +126,7 @@ class Operator:
 
     @contextlib.contextmanager
     def attention(self) -> Iterator[None]:
-        """While inside, the channel and the signals are listened to."""
+        """Receive from the channel and handle signals while inside this context."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, self._land.set)
@@ -138,10 +137,10 @@ class Operator:
             loop.remove_reader(self._channel)
 
     async def unless_land(self, opening: Coroutine[Any, Any, _T]) -> _T:
-        """The result of `opening`, which is cancelled when a landing is asked for.
+        """Return the result of `opening`, which is cancelled when a landing is requested.
 
         Raises:
-            GivenUp: a landing was asked for first.
+            GivenUp: a landing was requested first.
         """
         task = asyncio.ensure_future(opening)
         land = asyncio.ensure_future(self._land.wait())

@@ -1,4 +1,4 @@
-"""When the core does not fly the vehicle: PX4 lands it, motion capture goes on flowing to it, and nothing else is sent."""
+"""Fallback landing without the core: PX4 lands, motion capture is still forwarded to it, and nothing else is sent."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ HAND_OVER_S = 30.0
 HAND_OVER_MIN_S = 1.5
 """PX4 says once a second whether it is armed; an older word does not count."""
 UNFLOWN_HOVER_THRUST = 0.5
-"""Of a vehicle that was found in the air: the core must be told one, and its law never flies there."""
+"""Hover thrust for a vehicle that was found in the air: the core requires one, and its law never runs there."""
 
 
 class Lander(Protocol):
-    """The autopilot edge, as far as a landing needs it."""
+    """The part of the autopilot driver that a landing needs."""
 
     def status(self) -> AutopilotStatus | None:
-        """Latest slow state."""
+        """Return the latest status."""
 
     def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
-        """None: from now on no setpoint leaves."""
+        """Send a setpoint; with None no more setpoints are sent."""
 
     def request(self, request: AutopilotRequest) -> None:
-        """Start carrying a request out."""
+        """Start a request."""
 
 
 async def hand_over(autopilot: Lander, channel: socket.socket, clock: Clock, guardian: FlightGuard | None) -> Outcome:
@@ -66,7 +66,7 @@ async def hand_over(autopilot: Lander, channel: socket.socket, clock: Clock, gua
 
 
 def unflown(config: FlightConfig) -> FlightConfig:
-    """The effective configuration of a vehicle that was found in the air: its hover thrust is not asked for."""
+    """Return the effective configuration of a vehicle that was found in the air, whose hover thrust is not read."""
     airframe = config.vehicle.airframe
     if airframe.hover_thrust is not None:
         return config

@@ -1,4 +1,4 @@
-"""What the flight process reports to the guardian in each tick. Pure but for the client that sends it."""
+"""Heartbeats of the flight process to the guardian, one per tick. Pure except for the client that sends them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, M
 
 _IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
 _REFUSALS = frozenset(rule.id for rule in (MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS))
-"""Events after which PX4 lands because motion capture is not believed."""
+"""Events after which PX4 lands because motion capture is rejected."""
 
 
 class Heartbeats:
     """The heartbeats of one flight. Pure.
 
     Args:
-        identity: of the MAVLink link that the guardian would take over.
+        identity: identity of the MAVLink link that the guardian would take over.
         origin_s: `time.monotonic` at zero of the flight clock.
     """
 
@@ -28,12 +28,12 @@ class Heartbeats:
         self._origin_s = origin_s
         self._pilot = False
         self._lands_without_mocap = False
-        """One of `_REFUSALS` has happened: from then on a pose that is not believed is more than a single bad one."""
+        """Whether one of `_REFUSALS` has happened. From then on a rejected pose is more than a single invalid one."""
         self._pose_stamp_s = float("-inf")
         self._position_world_m = (0.0, 0.0, 0.0)
 
     def of(self, inputs: Inputs, outputs: Outputs) -> Beat:
-        """The heartbeat of a tick; to be called in every tick."""
+        """Return the heartbeat of a tick; call it in every tick."""
         ids = {event.id for event in outputs.events}
         self._pilot = self._pilot or PILOT_TOOK_OVER.id in ids or outputs.phase == PILOT_FLIES
         self._lands_without_mocap = self._lands_without_mocap or not ids.isdisjoint(_REFUSALS)
@@ -64,11 +64,11 @@ class Heartbeats:
 
 
 class FlightGuard:
-    """The flight process's connection to the guardian: sends it a heartbeat in each tick.
+    """The flight process's connection to the guardian; sends it a heartbeat in each tick.
 
     Args:
-        client: to the guardian.
-        identity: of the MAVLink link that the guardian would take over.
+        client: connection to the guardian.
+        identity: identity of the MAVLink link that the guardian would take over.
         origin_s: `time.monotonic` at zero of the flight clock.
     """
 
@@ -79,30 +79,30 @@ class FlightGuard:
 
     @property
     def ready(self) -> bool:
-        """The guardian said within the last second that it could take over."""
+        """Return whether the guardian reported within the last second that it could take over."""
         self._client.listen()
         return self._client.ready
 
     @property
     def would_take_over(self) -> bool:
-        """If this process ended now, the guardian would land."""
+        """Return whether the guardian would land if this process ended now."""
         return self._last is not None and self._last.lifting and self.ready
 
     def tick(self, inputs: Inputs, outputs: Outputs) -> None:
-        """At the end of a tick: what was decided has left."""
+        """Send the heartbeat at the end of a tick, after its setpoint."""
         self._last = self._heartbeats.of(inputs, outputs)
         self._client.beat(self._last)
 
     def still_here(self) -> None:
-        """Between ticks that do not come any more: this process sees to the landing itself."""
+        """Send a heartbeat after the last tick while this process performs a landing itself."""
         if self._last is not None:
             self._client.beat(self._last)
 
     def goodbye(self, now: AutopilotStatus | None) -> None:
-        """The flight is over. While PX4 is armed no goodbye is said: the guardian takes over once this process has ended.
+        """Sign off from the guardian. While PX4 is armed nothing is sent: the guardian takes over once this process has ended.
 
         Args:
-            now: PX4's newest status; None if it was never heard.
+            now: PX4's newest status; None if none was received.
         """
         if self._last is not None and not (now is not None and now.armed):
             self._last = dataclasses.replace(self._last, goodbye=True)

@@ -1,6 +1,6 @@
-"""The flight process of `companion fly`: opens the edges, ticks the core, closes down in order.
+"""The flight process of `companion fly`: opens the devices, runs the ticks, shuts down in order.
 
-Started by the launcher as `python -m companion.flight.main --config FILE --out DIR --channel FD --guardian FD`. Ends with the
+The launcher starts it as `python -m companion.flight.main --config FILE --out DIR --channel FD --guardian FD`. It ends with the
 outcome's exit code.
 """
 
@@ -52,14 +52,14 @@ from companion.safety.rules import REATTACHED
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.002
-"""From the start of the tick; the read was begun before that."""
+"""Timeout from the start of the tick. The read was started before that."""
 JOINT_LEAD_MAX_S = 0.003
 JOINT_MARGIN_S = 0.0001
-"""The joints are read so that the answer is there when the tick starts, this much earlier, and no older than it must be."""
+"""The joint read is timed so that its answer arrives this long before the tick, neither late nor stale."""
 
 
 class Flight:
-    """One flight over open edges."""
+    """One flight with open devices."""
 
     def __init__(
         self,
@@ -82,12 +82,12 @@ class Flight:
         self._missed = 0
         self._period_s = NOMINAL_DT_S
         self._phase = ""
-        """As the launcher was told last."""
+        """The phase last reported to the launcher."""
         self._ground: str | None = None
-        """What the launcher was last told of the way to the ground stations."""
+        """The state of the link to ground stations last reported to the launcher."""
 
     async def run(self) -> Outcome:
-        """Tick until the core says that it is over."""
+        """Run ticks until the core reports the end."""
         ticker = Ticker(self._period_s, self._clock, self._mocap_rate_hz)
         self._edges.vision.on_frame = ticker.frame
         arm = self._edges.arm
@@ -165,7 +165,7 @@ class Flight:
         return inputs, outputs, sent
 
     def _answer(self, asked: GroundCommand, refused: str | None, before: Outputs | None, after: Outputs) -> None:
-        """Tell the one who commanded, the log and the launcher what came of it."""
+        """Report the effect of a command to its sender, the log and the launcher."""
         effect = (False, refused) if refused is not None else effect_of(asked.command, before, after)
         self._tell_asker(asked, *effect, after)
 
@@ -176,7 +176,9 @@ class Flight:
         ipc.send(self._channel, {"type": "command", "t_s": after.mission_t_s, **message})
 
     def _goes_on(self, outputs: Outputs) -> bool:
-        """Whether PX4, armed when its link was opened, still is: else there is nothing to land, and no reason to fly a mission."""
+        """Return whether a PX4 that was armed when its link was opened still is. If not there is nothing to land and no
+        mission to fly.
+        """
         goes_on = any(event.id == REATTACHED.id for event in outputs.events)
         lines = [f"landing without it: {line}" for line in self._edges.failures]
         if not goes_on:
@@ -208,7 +210,7 @@ class Flight:
         ipc.send(self._channel, {"type": "ground", "text": text})
 
     def _tell_ground(self) -> None:
-        """How the way to the ground stations is, when that changes."""
+        """Report the state of the link to ground stations when it changes."""
         client = self._recorder.client
         gone = client.gone and client.ground is not None
         ground = "no telemetry and no commands any more: the recorder is gone; Ctrl-C lands" if gone else client.ground
@@ -260,19 +262,19 @@ async def fly(
     *,
     sitl: bool = False,
 ) -> Outcome:
-    """Open, fly, close.
+    """Open the devices, fly, and close them.
 
     Args:
-        config: checked.
+        config: checked configuration.
         out: folder of the flight.
-        channel: to the launcher.
-        guardian_channel: to the guardian; None: nobody stands by.
-        sitl: the devices are those of the simulated world.
+        channel: channel to the launcher.
+        guardian_channel: channel to the guardian; None if there is no guardian.
+        sitl: whether the devices are those of the simulated world.
 
     Raises:
-        DeviceError: a device is not there or not as it must be; nothing was armed.
-        Refused: something is not as it must be for a flight; nothing was armed.
-        GivenUp: a landing was asked for before the first tick; nothing was armed.
+        DeviceError: a device is missing or not as required; nothing was armed.
+        Refused: the preflight refuses; nothing was armed.
+        GivenUp: a landing was requested before the first tick; nothing was armed.
     """
     origin_s = time.monotonic()
     clock = flight_clock(origin_s)

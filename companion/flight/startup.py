@@ -1,4 +1,4 @@
-"""What the flight process does between open devices and the first tick: preflight, and what PX4 must be asked."""
+"""The flight process between open devices and the first tick: preflight, and the parameters read from PX4."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _HOVER_PARAM = "MPC_THR_HOVER"
 
 
 class Refused(Exception):
-    """The preflight refuses; `lines` say why, one each."""
+    """The preflight refuses; `lines` are the reasons, one each."""
 
     def __init__(self, lines: list[str]) -> None:
         super().__init__("; ".join(lines))
@@ -35,14 +35,14 @@ class Refused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What is known of the flight once it may begin."""
+    """Results of the preflight for the flight."""
 
     plan: Plan
-    """From where the mission says that the vehicle stands."""
+    """Plan from the mission's start pose."""
     rows: tuple[Row, ...]
 
     def tell(self, recorder: RecorderClient) -> None:
-        """Planned path and preflight, for log and ground stations."""
+        """Send planned path and preflight to log and ground stations."""
         path = [[round(value, 4) for value in point] for point in path_of(self.plan)]
         recorder.metadata("plan", {"json": json.dumps(path), "mission_s": repr(self.plan.duration_s)})
         rows = [{"id": row.id, "level": "ok" if row.ok else row.level.value, "text": row.line()} for row in self.rows]
@@ -50,7 +50,7 @@ class Checked:
 
 
 def path_of(plan: Plan) -> list[Vec3]:
-    """Planned positions in the world, m, evenly in time from the first to the last moment; at most `PATH_POINTS_MAX`."""
+    """Return planned positions, world frame, m, evenly spaced in time; at most `PATH_POINTS_MAX`."""
     steps = PATH_POINTS_MAX - 1
     return [plan.reference(plan.duration_s * step / steps).position_world_m for step in range(PATH_POINTS_MAX)]
 
@@ -58,7 +58,7 @@ def path_of(plan: Plan) -> list[Vec3]:
 async def check_before_flight(
     edges: Edges, config: FlightConfig, clock: Clock, out: Path, channel: socket.socket, sitl: bool
 ) -> Checked:
-    """The preflight, told to the launcher and written to `preflight.json`.
+    """Run the preflight, report it to the launcher and write `preflight.json`.
 
     Raises:
         DeviceError: `preflight.json` cannot be written.
@@ -85,10 +85,10 @@ async def check_before_flight(
 
 
 async def with_hover_thrust(config: FlightConfig, autopilot: MavsdkAutopilot) -> FlightConfig:
-    """The effective configuration: hover thrust from PX4 unless the vehicle file gives it.
+    """Return the effective configuration with the hover thrust from PX4 unless the vehicle file gives it.
 
     Raises:
-        DeviceError: the parameter cannot be read or makes no sense.
+        DeviceError: the parameter cannot be read or is out of range.
     """
     airframe = config.vehicle.airframe
     if airframe.hover_thrust is not None:

@@ -1,4 +1,4 @@
-"""Ticks of the control loop: absolute deadlines that lean on the frames of motion capture."""
+"""Ticks of the control loop: absolute deadlines synchronised with the frames of motion capture."""
 
 from __future__ import annotations
 
@@ -9,35 +9,37 @@ from dataclasses import dataclass
 from companion.runtime.clock import Clock
 
 EARLY_S, LATE_S = 0.0015, 0.001
-"""A frame that comes so much before or after the moment that it was expected at starts the tick; without one the tick starts then."""
+"""Window around the expected time of a frame. A frame in the window starts the tick; without one the tick starts at the
+window's end.
+"""
 MATCH = 0.02
-"""Frames are ridden on if their rate differs by no more than this share from that of the ticks."""
+"""Largest relative difference between frame rate and tick rate for synchronisation."""
 _GAIN, _SLEW_S = 0.1, 0.00025
-"""Share of a frame's error by which the next tick is moved, and the most of it."""
+"""Share of a frame's timing error by which the next deadline moves, and the largest such step."""
 _PATIENCE = 3.0
-"""Periods without a frame in its place after which nothing is waited for."""
+"""Number of periods without a frame in its window after which ticks no longer wait for frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class TickTime:
-    """When a tick began."""
+    """Start of a tick."""
 
     start_s: float
     lateness_s: float
-    """Behind the frame that started it, or else behind its deadline."""
+    """Delay after the frame that started it, or else after its deadline."""
 
 
 class Ticker:
-    """Absolute deadlines: an error of one tick does not move the next. Deadlines that are past are skipped, not made up for.
+    """Absolute deadlines: a late tick does not move the next one. Deadlines in the past are skipped.
 
-    Told of frames that come as often as it ticks, it moves its deadlines onto them, by at most `_SLEW_S` a tick, and each tick begins
-    when its frame arrives. A frame that does not come within `LATE_S` is not waited for, one that comes out of its place starts
-    nothing: whatever arrives, ticks are between about half and one and a half periods apart.
+    Frames that arrive at the tick rate move the deadlines, by at most `_SLEW_S` per tick, and each tick begins when its frame arrives.
+    A tick does not wait longer than `LATE_S` for its frame, and a frame outside of its window starts no tick: whatever arrives, ticks
+    are about half to one and a half periods apart.
 
     Args:
-        period_s: between ticks.
+        period_s: period of the ticks.
         clock: the flight clock.
-        frame_rate_hz: of motion capture; 0, or too far from the ticks': frames are not looked at.
+        frame_rate_hz: rate of motion capture; frames are ignored if it is 0 or too far from the tick rate.
     """
 
     def __init__(self, period_s: float, clock: Clock, frame_rate_hz: float = 0.0) -> None:
@@ -46,14 +48,14 @@ class Ticker:
         self._rides = abs(frame_rate_hz * period_s - 1.0) <= MATCH
         self._due_s = clock() + period_s
         self._frame_s: float | None = None
-        """Newest since the last tick."""
+        """Arrival of the newest frame since the last tick."""
         self._in_place_s = -math.inf
-        """Arrival of the last frame that came about when one was expected."""
+        """Arrival of the last frame inside its window."""
         self._waiter: asyncio.Future[None] | None = None
         self.skipped = 0
 
     def frame(self, arrived_s: float) -> None:
-        """A frame of motion capture has arrived; to be called from the event loop."""
+        """Report the arrival of a motion-capture frame; call it from the event loop."""
         if not self._rides:
             return
         self._frame_s = arrived_s
@@ -62,7 +64,7 @@ class Ticker:
 
     @property
     def due_s(self) -> float:
-        """When the next tick is expected to begin."""
+        """Return when the next tick is expected to begin."""
         return self._due_s
 
     async def next(self) -> TickTime:

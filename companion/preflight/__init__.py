@@ -1,1 +1,3 @@
-"""What must be true before the machine may lift: seen on the wires for a few seconds, judged purely, one row per check."""
+"""Preflight: observe the open devices for a few seconds, evaluate what they delivered with pure functions, and report one row per
+check.
+"""

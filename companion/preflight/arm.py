@@ -1,4 +1,4 @@
-"""The arm: the right servos, set up as the law needs them, sound, answering, and where joints can be. Pure."""
+"""Checks of the arm: servo models, settings, hardware errors, communication, and joint limits. Pure."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ WATCHDOG_BIT = 0x80
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """What was seen of the arm."""
+    """Return the rows of the arm."""
     failure = o.failures.get("arm")
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
@@ -209,7 +209,7 @@ def _reads(cycles: int, missed: int) -> Row:
 
 
 def usb_latency(check: Check, latency_ms: int | None) -> Row:
-    """An adapter's latency timer; shared with the force sensor's port."""
+    """Return the row of a USB adapter's latency timer. The force sensor's port uses it as well."""
     wanted = f"{LATENCY_GOOD_MS} ms"
     if latency_ms is None:
         return check.good("not an FTDI adapter", wanted)
@@ -226,7 +226,7 @@ def _equal(check: Check, values: Sequence[int], wanted: int, text: Callable[[int
 
 
 def _both(values: Sequence[object]) -> str:
-    """One value if both servos have it, else both."""
+    """Return one value as text if both servos have it, else both values."""
     return str(values[0]) if len(set(values)) == 1 else " and ".join(map(str, values))
 
 

@@ -1,4 +1,4 @@
-"""The 48 ways in which three axes can be exchanged and turned round: 24 rotations, 24 mirrorings. Pure."""
+"""The 48 signed permutations of three axes: 24 rotations and 24 reflections. Pure."""
 
 from __future__ import annotations
 
@@ -23,49 +23,51 @@ class AxisMap:
 
     @classmethod
     def of(cls, names: tuple[str, str, str]) -> AxisMap:
-        """From names such as ("x", "z", "-y")."""
+        """Return the map for names such as ("x", "z", "-y")."""
         x, y, z = (_LETTERS.index(name[-1]) for name in names)
         a, b, c = (-1 if name[0] == "-" else 1 for name in names)
         return cls((x, y, z), (a, b, c))
 
     @property
     def names(self) -> tuple[str, str, str]:
-        """As ("x", "z", "-y"): what the streamed x, y and z truly are."""
+        """Return the true axes of the streamed x, y and z, such as ("x", "z", "-y")."""
         x, y, z = (("-" if s < 0 else "") + _LETTERS[i] for i, s in zip(self.index, self.sign, strict=True))
         return (x, y, z)
 
     @cached_property
     def determinant(self) -> int:
-        """1 for a rotation, -1 for a mirroring."""
+        """Return 1 for a rotation, -1 for a reflection."""
         a, b, c = self.index
         parity = 1 if (a, b, c) in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) else -1
         return parity * self.sign[0] * self.sign[1] * self.sign[2]
 
     @property
     def inverse(self) -> AxisMap:
-        """The way back."""
+        """Return the inverse map."""
         index, sign = [0, 0, 0], [1, 1, 1]
         for streamed, (true, factor) in enumerate(zip(self.index, self.sign, strict=True)):
             index[true], sign[true] = streamed, factor
         return AxisMap((index[0], index[1], index[2]), (sign[0], sign[1], sign[2]))
 
     def vector(self, true: Vec3) -> Vec3:
-        """A true vector as it is streamed."""
+        """Convert a true vector to the streamed one."""
         (a, b, c), (i, j, k) = self.sign, self.index
         return (a * true[i], b * true[j], c * true[k])
 
     def rotation(self, true: Quat) -> Quat:
-        """A true rotation as it is streamed when the axes of what turns are exchanged as well: A R A', a rotation even if A mirrors."""
+        """Convert a true rotation to the streamed one if the body's axes are permuted as well: A R A', a rotation even if A is a
+        reflection.
+        """
         x, y, z = self.vector((true[1], true[2], true[3]))
         d = self.determinant
         return (true[0], d * x, d * y, d * z)
 
     @cached_property
     def quat(self) -> Quat:
-        """The map as a rotation of true vectors; for determinant 1 only.
+        """Return the map as a rotation of true vectors; for determinant 1 only.
 
         Raises:
-            ValueError: the map mirrors.
+            ValueError: the map is a reflection.
         """
         if self.determinant < 0:
             raise ValueError(f"axes {self.names} are left-handed: no rotation")
@@ -83,7 +85,7 @@ class AxisMap:
 
 IDENTITY: Final = AxisMap((0, 1, 2), (1, 1, 1))
 Y_UP: Final = AxisMap.of(("x", "z", "-y"))
-"""What a stream with y up says of a world with z up: Motive's other setting."""
+"""The map of a stream with y up to a world with z up (Motive's other setting)."""
 ALL: Final = tuple(
     AxisMap((i, j, k), (a, b, c))
     for i, j, k in itertools.permutations(range(3))

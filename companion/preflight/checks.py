@@ -1,4 +1,4 @@
-"""A check has a fixed identity; what it finds becomes a row. Rooms list their checks, so that people can be told of all of them."""
+"""A check has a fixed identity and produces rows. Each module lists its checks, so that all of them can be documented."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from companion.model.rows import Level, Row
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that is looked at."""
+    """One check."""
 
     id: str
-    """Of its row."""
+    """Id of its row."""
     title: str
-    """Of its row."""
+    """Title of its row."""
     wanted: str
-    """What is ok, in words: for the table of all checks. The row itself says it with figures."""
+    """Expected result in general words, for the table of all checks. The row states it with figures."""
     why: str
-    """What goes wrong without it."""
+    """Consequence if the check fails."""
     warns: bool = False
-    """It never refuses."""
+    """Whether a failure only warns."""
     settles: bool = False
-    """It may come right by waiting: on a PX4 that has just started."""
+    """Whether the check may pass after some time, on a PX4 that has just started."""
 
     def good(self, read: str, wanted: str = "") -> Row:
-        """It is as it must be."""
+        """Return a row that passes."""
         return self._row(True, read, wanted, "", self._level)
 
     def bad(self, read: str, wanted: str, fix: str) -> Row:
-        """It is not: the machine does not lift (or, of a check that `warns`, people decide)."""
+        """Return a row that fails: the machine does not take off. If the check only warns, the operator decides."""
         return self._row(False, read, wanted, fix, self._level)
 
     def doubtful(self, read: str, wanted: str, fix: str) -> Row:
-        """It is not, but one can fly with it: people decide."""
+        """Return a row that warns: the machine can fly, and the operator decides."""
         return self._row(False, read, wanted, fix, Level.WARN)
 
     def _row(self, ok: bool, read: str, wanted: str, fix: str, level: Level) -> Row:

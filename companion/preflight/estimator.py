@@ -1,7 +1,8 @@
-"""PX4 as it shows itself on the link: alive, disarmed, fusing motion capture, charged. Firmware and parameters are judged elsewhere.
+"""Checks of PX4 by its telemetry: alive, disarmed, fusing motion capture, battery charged. `preflight.px4` checks firmware and
+parameters.
 
-Pure. Evidence that PX4 fuses vision is what its estimator says of itself and where it says that it is, for the whole time of the
-observation: PX4 takes poses that it does not fuse without a word.
+Pure. PX4 accepts poses that it does not fuse without any notice. Evidence of fusion is what its estimator reports about itself and its
+position over the whole observation.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ GRAVITY_M_S2 = 9.81
 RATE_GOOD_HZ, RATE_MIN_HZ = 80.0, 40.0
 ACCURACY_MAX_M = 0.1
 COVER_S = 0.6
-"""A stream that is there from the start on begins within this time."""
+"""A stream that is present from the start begins within this time."""
 PAIR_S = 0.1
 STEADY_M, STEADY_RAD = 0.04, math.radians(3.0)
 HOVER_GOOD, HOVER_MAX = 0.15, 0.35
@@ -88,7 +89,7 @@ FLAGS = {1: "attitude", 2: "horizontal velocity", 4: "vertical velocity", 8: "ho
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """What was seen of PX4."""
+    """Return the rows of PX4's telemetry."""
     failure = o.failures.get("autopilot")
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
@@ -144,7 +145,7 @@ def _rates(o: Observations) -> Row:
 
 
 def _lag(o: Observations, vehicle: Vehicle) -> Row:
-    """Over the whole time: arrival less PX4's own clock, against the least of it."""
+    """Return the delays over the whole observation: arrival minus PX4's own clock, relative to the least."""
     offsets_s = sorted(state.attitude_stamp_s - state.boot_s for state in o.vehicle if state.boot_s is not None)
     late_s = offsets_s[int(0.99 * (len(offsets_s) - 1))] - offsets_s[0]
     limit_s = vehicle.safety.link_lag_max_s
@@ -155,7 +156,7 @@ def _lag(o: Observations, vehicle: Vehicle) -> Row:
 
 
 def vision(o: Observations) -> Row:
-    """Evidence of fusion for the whole observation."""
+    """Return the row on evidence of fusion over the whole observation."""
     missing = missing_evidence(o)
     wanted = f"fused for {o.duration_s:.0f} s"
     if missing is None:
@@ -172,7 +173,7 @@ def vision(o: Observations) -> Row:
 
 
 def missing_evidence(o: Observations) -> str | None:
-    """What of the evidence that EKF2 fuses vision is not there; None: all of it is, from the start of the observation on."""
+    """Return what is missing of the evidence that EKF2 fuses vision, or None if it is complete from the start of the observation."""
     if not o.vehicle:
         return "no LOCAL_POSITION_NED"
     if not o.estimator:
@@ -204,12 +205,12 @@ def _ratios(report: EstimatorReport) -> tuple[float, float, float]:
 
 
 def _finite(ratio: float) -> float:
-    """A ratio of what is not fused at all may be NaN."""
+    """Return the finite values. A test ratio of a source that is not fused may be NaN."""
     return ratio if math.isfinite(ratio) else 0.0
 
 
 def agreement(o: Observations) -> Iterator[Row]:
-    """Where PX4 says that it is against motion capture, frame by frame, and how that wanders."""
+    """Return the row on the difference between PX4's position and motion capture, frame by frame, and its variation."""
     pairs = list(_pairs(o.vehicle, o.mocap))
     if not pairs:
         fix = "see the rates of both"
@@ -241,7 +242,7 @@ def agreement(o: Observations) -> Iterator[Row]:
 
 
 def _pairs(states: tuple[VehicleState, ...], poses: tuple[MocapPose, ...]) -> Iterator[tuple[VehicleState, MocapPose]]:
-    """Each state with the tracked pose that is nearest in time."""
+    """Pair each state with the tracked pose that is nearest in time."""
     tracked = [pose for pose in poses if pose.tracking_valid]
     index = 0
     for state in states:

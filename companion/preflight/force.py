@@ -1,4 +1,4 @@
-"""The force-torque sensor at rest: often enough, quiet, not overloaded, and a tare that an empty net explains. Pure."""
+"""Checks of the force-torque sensor at rest: rate, noise, overload, and a tare that an empty net explains. Pure."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ TARE_GOOD, TARE_MAX = 0.05, 0.10
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """What was seen of the force sensor."""
+    """Return the rows of the force sensor."""
     failure, stream = o.failures.get("force"), o.force_stream
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
@@ -106,7 +106,7 @@ def _rate(o: Observations, stream: ForceStream, vehicle: Vehicle) -> Row:
 
 
 def _noise(samples: Sequence[ForceSample]) -> Row:
-    """From one sample to the next: what drifts is judged elsewhere."""
+    """Return the row on the difference between consecutive samples. Drift has a row of its own."""
     squares = [0.0, 0.0, 0.0]
     for before, now in itertools.pairwise(samples):
         for axis in range(3):
@@ -129,7 +129,7 @@ def _overload(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
 
 
 def _tare(o: Observations, vehicle: Vehicle) -> Row:
-    """The bias as the flight itself would find it: mean reading less the weight of the net."""
+    """Return the row on the bias as the flight computes it: mean reading minus the weight of the net."""
     sensing = ForceSensing(vehicle.tool, Manipulator(vehicle.arm, vehicle.tool))
     for sample in o.force:
         sensing.collect(sample, o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad)
@@ -147,7 +147,7 @@ def _tare(o: Observations, vehicle: Vehicle) -> Row:
 
 
 def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
-    """Between the means of the fifths of the time."""
+    """Return the row on the differences between the means of five consecutive intervals."""
     size = max(1, len(samples) // 5)
     means = [_mean(samples[i : i + size]) for i in range(0, len(samples) - size + 1, size)]
     drift_n = max(max(mean[axis] for mean in means) - min(mean[axis] for mean in means) for axis in range(3))

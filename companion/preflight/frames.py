@@ -1,7 +1,7 @@
-"""Do motion capture, PX4 and the mission mean the same axes? What a machine at rest can tell of it. Pure.
+"""Checks at rest that motion capture, PX4 and the mission use the same axes. Pure.
 
-PX4 fuses motion capture: a wrong yaw is invisible to EKF2. Gravity by the accelerometer finds what is tilted; the mission's start place
-and yaw find what is turned; the rest is found by the hand test (`companion.preflight.hand_test.run`).
+PX4 fuses motion capture, so a wrong yaw is invisible to EKF2. Gravity by the accelerometer reveals a tilted frame; the mission's start
+position and yaw reveal a rotated one; the hand test reveals the rest (`companion.preflight.hand_test.run`).
 """
 
 from __future__ import annotations
@@ -98,18 +98,18 @@ HEIGHT_GOOD_M: Final = 0.03
 TILT_MAX_DEG: Final = 3.0
 NOISE_GOOD_MM, NOISE_MAX_MM, JUMP_MAX_MM = 2.0, 10.0, 30.0
 NOISE_GOOD_DEG, NOISE_MAX_DEG, JUMP_MAX_DEG = 0.3, 2.0, 10.0
-"""Standard deviation of all axes together; furthest of a single frame."""
+"""Limits of the standard deviation of all axes together, and of a single frame's deviation."""
 MOVED_MAX_M, MOVED_MAX_DEG = 0.01, 2.0
-"""Between the first and the last quarter."""
+"""Largest motion between the first and the last quarter."""
 RATE_MAX_DEG_S: Final = 3.0
-"""Mean of the gyro at rest."""
+"""Largest mean of the gyro at rest."""
 _EXPLAINED_DEG: Final = 10.0
 _UP: Vec3 = (0.0, 0.0, 1.0)
 _RESET = "set the machine level with its nose along the stream's +x and reset the rigid body's orientation in Motive"
 
 
 class Pose(NamedTuple):
-    """Where the machine stands by motion capture, in the mission's world as far as the stream is right."""
+    """Pose of the machine by motion capture, in the mission's world as far as the stream is right."""
 
     position_m: Vec3
     attitude: Quat
@@ -117,7 +117,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Where the mission says that it stands, with what is allowed."""
+    """Start pose of the mission with its tolerances."""
 
     position_m: Vec3
     yaw_rad: float
@@ -126,14 +126,14 @@ class Wanted:
 
     @classmethod
     def of(cls, mission: Mission, vehicle: Vehicle) -> Wanted:
-        """Of a mission and the machine that flies it."""
+        """Return the start pose of a mission and its vehicle."""
         start = mission.start
         position = (*start.position_m, vehicle.airframe.ground_clearance_m)
         return cls(position, math.radians(start.yaw_deg), start.tolerance_m, start.yaw_tolerance_deg)
 
 
 def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iterator[Row]:
-    """One row per thing that can be told at rest; no more than the first ones if there is too little to judge by, or it moved."""
+    """Return the rows that can be evaluated at rest; only the first ones if the data is insufficient or the machine moved."""
     if observations.hand_test is not None:
         yield _hand_test(observations.hand_test, observations.hand_test_changed)
     poses = [pose for pose in observations.mocap if pose.tracking_valid]
@@ -155,12 +155,12 @@ def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iter
 
 
 def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterator[Row]:
-    """Gravity, height, place and yaw of a machine at rest.
+    """Return the rows on gravity, height, position and yaw of a machine at rest.
 
     Args:
-        at: by motion capture, as configured.
-        force_m_s2: by the accelerometer, body FLU.
-        wanted: by the mission.
+        at: pose by motion capture, as configured.
+        force_m_s2: specific force by the accelerometer, body FLU.
+        wanted: start pose of the mission.
         up_axis: devices.mocap.up_axis, "y" or "z".
     """
     fix = explanation(at, force_m_s2, wanted, up_axis)
@@ -210,8 +210,9 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
 
 
 def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str:
-    """Which exchange of axes makes everything right that is wrong at rest, as a line on what to do; empty: none does, or nothing is
-    wrong. The likelier ones first; what a machine at rest cannot tell apart is left to the hand test."""
+    """Return which permutation of axes would explain every wrong value at rest, as a line on what to do. Empty if none does, or if
+    nothing is wrong. The likelier permutations come first; the hand test distinguishes those that look alike at rest.
+    """
 
     def fits(position_m: Vec3, attitude: Quat) -> bool:
         tilt = angle_rad(quat_rotate(attitude, force_m_s2), _UP)
@@ -253,7 +254,7 @@ def _least_turned(axes: AxisMap) -> float:
 
 
 def _nose(axes: AxisMap) -> Quat:
-    """The level true direction that is the stream's x, as a yaw; 0 if it is not level."""
+    """Return the yaw of the level true direction that is the stream's x, or 0 if it is not level."""
     if axes.index[0] == 2:
         return (1.0, 0.0, 0.0, 0.0)
     half = 0.5 * (math.atan2(axes.sign[0], 0.0) if axes.index[0] == 1 else math.atan2(0.0, axes.sign[0]))
@@ -272,7 +273,7 @@ def _turn(axes: AxisMap) -> str:
 
 
 def _or_so(axes: AxisMap) -> str:
-    """A turn about the vertical may be the truth."""
+    """Return the note that a rotation about the vertical is possible as well."""
     return "; unless it truly stands so: then put it as the mission says" if axes.vector(_UP) == _UP else ""
 
 
@@ -291,7 +292,7 @@ def _hand_test(passed: str, changed: str) -> Row:
 
 
 def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
-    """Was it at rest? Everything else relies on it."""
+    """Return the row on whether the machine was at rest, on which all other rows depend."""
     quarter = len(poses) // 4
     first, last = poses[:quarter], poses[-quarter:]
     moved_m = math.dist(
@@ -339,7 +340,7 @@ def _accelerometer(force_m_s2: Vec3) -> Row:
 
 
 def _px4(at: Pose, states: tuple[VehicleState, ...], vehicle: Vehicle) -> Iterator[Row]:
-    """PX4's own attitude beside motion capture's; the newest half of it, as its filter may just have begun."""
+    """Return the row on PX4's attitude against motion capture, from the newest half because its filter may have just started."""
     estimate = mean_attitude([state.attitude_wxyz for state in states[len(states) // 2 :]])
     tilt_deg = math.degrees(angle_rad(quat_rotate(estimate, _UP), quat_rotate(at.attitude, _UP)))
     read, wanted = f"{tilt_deg:.1f} deg apart", f"within {TILT_MAX_DEG:g} deg"

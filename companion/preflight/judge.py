@@ -1,4 +1,4 @@
-"""All rows of a preflight, room by room, in the order in which people look at them. Pure."""
+"""All rows of a preflight in their order of display. Pure."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ CHECKS: tuple[Check, ...] = (
     *mission.CHECKS,
     *machine.CHECKS,
 )
-"""Beside these there is one row for PX4's firmware and one for each of its parameters (`companion.preflight.px4`)."""
+"""All checks except those of `companion.preflight.px4`: one row for PX4's firmware and one for each parameter."""
 SETTLE_S = 30.0
-"""A PX4 that has just started may take that long until its estimate is steady."""
+"""Longest time until the estimate of a PX4 that has just started is steady."""
 BEGIN_S = 2.0
-"""And that long to fuse poses that have just begun to come."""
+"""Longest time until PX4 fuses poses that have just begun to arrive."""
 _SETTLES = {check.id: check.title for check in CHECKS if check.settles}
 
 
 def rows(o: Observations, config: FlightConfig) -> list[Row]:
-    """Every check, one row each; what could not be looked at because its device is missing has none."""
+    """Return one row for every check. A check of a missing device has none."""
     vehicle = config.vehicle
     link, *state = estimator.rows(o, vehicle)
     return [
@@ -46,10 +46,9 @@ def rows(o: Observations, config: FlightConfig) -> list[Row]:
 
 
 def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
-    """What may come right by waiting; None: nothing.
+    """Return what may pass after more time, or None if nothing would.
 
-    When something refuses that no waiting mends, only so long that the rest is told as it is, not as it was when motion capture began
-    to flow.
+    If a row fails for good, wait only until the other rows no longer contain the start of motion capture.
     """
     refusing = refusals(rows(o, config))
     settling = [_SETTLES[row.id] for row in refusing if row.id in _SETTLES]
@@ -59,5 +58,5 @@ def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
 
 
 def param_names() -> tuple[str, ...]:
-    """PX4's parameters that the rows are made of."""
+    """Return the PX4 parameters that the rows need."""
     return wanted.names()

@@ -1,4 +1,4 @@
-"""The computer itself: room for the log, processor, real-time permission, memory, cores, recorder. Pure."""
+"""Checks of the computer: disk space for the log, processor, real-time permission, memory, cores, recorder. Pure."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ LOG_BYTES_PER_S = 300_000
 REPORT_BYTES = 20_000_000
 DEFAULT_MISSION_S = 120.0
 GROUND_S = 30.0
-"""Before take-off and after landing."""
+"""Recording time before take-off and after landing, s."""
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """What was seen of the computer, against what the vehicle file asks of it."""
+    """Return the rows of the computer."""
     machine = o.machine
     if machine is not None:
         if machine.disk_free_bytes is not None:

@@ -1,4 +1,6 @@
-"""Can the mission be flown, is the arm as it says, does the machine stand in the room? Start place and yaw: `frames`. Pure."""
+"""Checks that the mission can be flown, the arm is as it says, and the machine stands in the room. `frames` checks start position and
+yaw. Pure.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ CHECKS = (PLAN, ARM, ROOM)
 
 
 def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
-    """Plan, start pose and place."""
+    """Return the rows on plan, arm and position."""
     mission, vehicle = config.mission, config.vehicle
     if o.plan is not None:
         if o.plan:

@@ -1,4 +1,4 @@
-"""Motion capture as a stream: often, evenly, in time, without gaps, of our body. How its frames lie is judged in `frames`. Pure."""
+"""Checks of the motion-capture stream: rate, jitter, latency, gaps, our rigid body. `frames` checks its axes. Pure."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ CLOCK_GOOD, WANDER_GOOD_S = 0.01, 0.020
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """What was seen of motion capture."""
+    """Return the rows of motion capture."""
     failure, stream = o.failures.get("mocap"), o.mocap_stream
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
@@ -168,7 +168,7 @@ def _error(poses: tuple[MocapPose, ...]) -> Row:
 
 
 def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
-    """Least squares of arrival over frame number: its slope is the server's frame period by our clock, the rest is wandering."""
+    """Fit arrival over frame number by least squares: the slope is the server's frame period by our clock, the residual is jitter."""
     count, first = len(poses), poses[0]
     n = [pose.frame_number - first.frame_number for pose in poses]
     t = [pose.stamp_s - first.stamp_s for pose in poses]

@@ -1,4 +1,4 @@
-"""Watches the open devices for some seconds and writes down what they deliver. The only part of the preflight that does I/O."""
+"""Observe the open devices for some seconds and collect what they deliver. The only part of the preflight with I/O."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from companion.runtime.cores import usable_cpus
 from companion.runtime.realtime import FLIGHT_PRIORITY, memory_lock_refused, realtime_permitted
 
 LOOK_PERIOD_S = 0.005
-"""As in flight: the servo bus is worked as hard as it will be."""
+"""Period of the observation, as in flight, so that the servo bus has the same load."""
 READ_TIMEOUT_S = 0.003
 COUNT_PERIOD_S = 0.1
 TELL_PERIOD_S = 0.5
 GOVERNORS = Path("/sys/devices/system/cpu")
 
 Tell = Callable[[str, float], None]
-"""Shown to people: what is being looked at, and the share of the time that is over."""
+"""Callback for display: the current subject and the elapsed share of the time."""
 Unsettled = Callable[[Observations], Waiting | None]
 
 _T = TypeVar("_T")
@@ -48,7 +48,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class _Counts:
-    """Counters of all edges at one time."""
+    """Counters of all devices at one time."""
 
     t_s: float
     mocap_frames: int = 0
@@ -71,19 +71,19 @@ async def observe(
     tell: Tell,
     known: Observations | None = None,
 ) -> Observations:
-    """Watch everything for `safety.preflight_s`, and on while something is worth waiting for.
+    """Observe all devices for `safety.preflight_s`, and longer while a check may still pass.
 
-    Meanwhile PX4's version and parameters are read, and the servo bus is read as in flight, which keeps its watchdogs quiet.
+    Meanwhile PX4's version and parameters are read, and the servo bus is read as in flight, which keeps its watchdogs from tripping.
 
     Args:
-        edges: open; of what could not be opened only the failure is taken over.
+        edges: open devices; for a device that could not be opened only the failure is reported.
         config: the effective configuration.
         clock: the flight clock.
-        out: folder for the files of the flight, for the disk's free space.
+        out: folder of the flight's files, for the free disk space.
         param_names: PX4's parameters to read.
-        unsettled: asked when the time is over, about the last `preflight_s`.
-        tell: progress.
-        known: what was found out elsewhere: plan, recorder, mission length, hand test.
+        unsettled: called after the time, with the last `preflight_s`; see `companion.preflight.judge.unsettled`.
+        tell: progress callback.
+        known: facts from elsewhere: plan, recorder, mission length, hand test.
     """
     watcher = _Watcher(edges, config, clock)
     duration_s = config.vehicle.safety.preflight_s
@@ -130,7 +130,7 @@ def _words(waiting: Waiting | None, elapsed_s: float, duration_s: float) -> tupl
 
 @dataclass(frozen=True, slots=True)
 class _Answers:
-    """What PX4 was asked."""
+    """PX4's replies."""
 
     firmware: str | None
     params: dict[str, float | int]
@@ -152,7 +152,7 @@ def _with_answers(seen: Observations, answers: _Answers) -> Observations:
 
 
 class _Watcher:
-    """Collects what the edges deliver; old things are forgotten when somebody asks for the newest."""
+    """Collector of what the devices deliver. Data before the queried interval is dropped."""
 
     def __init__(self, edges: Edges | SomeEdges, config: FlightConfig, clock: Clock) -> None:
         self._edges = edges
@@ -168,11 +168,11 @@ class _Watcher:
         self._counts: deque[_Counts] = deque([self._count()])
 
     def on_pose(self, pose: MocapPose) -> None:
-        """Every pose that arrives."""
+        """Add a pose."""
         self._poses.append(pose)
 
     async def look(self) -> None:
-        """Take what is new, once; one bus cycle of the arm."""
+        """Collect what is new, with one bus cycle of the arm."""
         edges = self._edges
         if edges.arm is not None:
             state = await edges.arm.read(READ_TIMEOUT_S)
@@ -196,7 +196,7 @@ class _Watcher:
         await asyncio.sleep(LOOK_PERIOD_S)
 
     def seen(self, base: Observations, duration_s: float) -> Observations:
-        """What came in the last `duration_s`, to a tenth of a second."""
+        """Return what arrived in the last `duration_s`, to a tenth of a second."""
         now = self._count()
         while len(self._counts) > 1 and self._counts[1].t_s <= now.t_s - duration_s:
             self._counts.popleft()
@@ -271,7 +271,7 @@ class _Watcher:
 
 
 def _take(kept: deque[_T], newest: _T | None) -> None:
-    """Add what is new; edges hand out the same record until another one has come."""
+    """Append a record if it is new. Devices return the same record until another arrives."""
     if newest is not None and (not kept or newest != kept[-1]):
         kept.append(newest)
 
@@ -286,7 +286,7 @@ def _between(first: StateCounts, now: StateCounts) -> StateCounts:
 
 
 def machine_of(config: FlightConfig, out: Path) -> Machine:
-    """Disk, processor, permissions, cores and serial adapters of this computer."""
+    """Return disk, processor, permissions, cores and serial adapters of this computer."""
     folder = next((path for path in (out, *out.absolute().parents) if path.is_dir()), Path())
     try:
         free_bytes: int | None = shutil.disk_usage(folder).free

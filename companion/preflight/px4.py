@@ -1,4 +1,4 @@
-"""PX4's firmware and parameters against what this project needs of them. Pure: the table is `companion.px4.wanted`."""
+"""Checks of PX4's firmware and parameters against the table `companion.px4.wanted`. Pure."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from companion.model.rows import Level, Row
 from companion.px4.wanted import WANTED, Value, Wanted
 
 KNOWN_GOOD = ((1, 16), (1, 18))
-"""Versions that missions were flown with, in simulation."""
+"""Versions with which missions were flown, in simulation."""
 OLDEST = (1, 15)
 FIRMWARE_ID, UNREAD_ID = "px4.firmware", "px4.params"
 PARAM_ID = "px4.param."
-"""Followed by the parameter's name."""
+"""Prefix of the row's id, followed by the parameter's name."""
 
 _FIRMWARE = re.compile(r"PX4 (\d+)\.(\d+)\.(\d+) (\w+)")
 _FIRMWARE_WHY = "parameters change their meaning between versions, and EKF2 its behaviour"
@@ -22,10 +22,10 @@ _WRITE = "companion px4 params --write"
 
 
 def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) -> list[Row]:
-    """One row for the firmware, one per parameter.
+    """Return one row for the firmware and one per parameter.
 
     Args:
-        firmware: as `MavsdkAutopilot.firmware` tells it; None: not known, no row.
+        firmware: as returned by `MavsdkAutopilot.firmware`; None for no row.
         params: PX4's parameters by name; one that PX4 does not have is absent.
         vehicle: limits, room, thrust and the link's address.
     """
@@ -41,7 +41,9 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
 
 
 def firmware_row(firmware: str) -> Row:
-    """`PX4 1.16.1 release (git ...)`: 1.16 and 1.18 are known good, older than 1.15 is refused, others are told."""
+    """Return the row of the firmware, such as `PX4 1.16.1 release (git ...)`: 1.16 and 1.18 pass, older than 1.15 fails,
+    others warn.
+    """
     wanted = "1.16.x or 1.18.x, a release"
 
     def row(ok: bool, level: Level = Level.WARN, fix: str = "") -> Row:
@@ -79,7 +81,7 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
 
 
 def fix_of(wanted: Wanted) -> str:
-    """What to do about a value that is not accepted."""
+    """Return what to do about a value that is not accepted."""
     if wanted.fix:
         fix = wanted.fix
     else:
@@ -88,5 +90,5 @@ def fix_of(wanted: Wanted) -> str:
 
 
 def text_of(value: Value | None) -> str:
-    """A value as people write it: REAL32 to the digits that it has."""
+    """Return a value as text: REAL32 with its significant digits."""
     return f"{value:.7g}" if isinstance(value, float) else f"{value}"

@@ -1,4 +1,4 @@
-"""A preflight from beginning to end: watch, judge, write down."""
+"""A preflight from beginning to end: observe, evaluate, write."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ async def preflight(
     known: Observations,
     sitl: bool,
 ) -> list[Row]:
-    """Watch the open devices and judge what came, at the priority of a flight and on its cores.
+    """Observe the open devices and evaluate the data, with the priority and on the cores of a flight.
 
     Args:
-        edges, config, clock, out, tell, known: as `companion.preflight.observe.observe` takes them.
-        sitl: in the simulated world no record of the hand test is asked for.
+        edges, config, clock, out, tell, known: as for `companion.preflight.observe.observe`.
+        sitl: in SITL no record of the hand test is required.
     """
     if not sitl and edges.mocap is not None and edges.mocap.server_info is not None:
         passed, changed = _hand_test(config, edges.mocap.server_info.version)
@@ -66,12 +66,12 @@ def _hand_test(config: FlightConfig, natnet_version: str) -> tuple[str, str]:
 
 
 def as_json(rows: Sequence[Row]) -> dict[str, Any]:
-    """The contract of `companion check --json` and of `preflight.json`."""
+    """Return the JSON of `companion check --json` and of `preflight.json`."""
     return {"schema_version": SCHEMA_VERSION, "ok": not refusals(rows), "rows": [row.as_json() for row in rows]}
 
 
 def write(rows: Sequence[Row], out: Path) -> None:
-    """`preflight.json` of a flight's folder.
+    """Write `preflight.json` into a flight's folder.
 
     Raises:
         OSError: it cannot be written.

@@ -1,4 +1,6 @@
-"""The safety tether as the vehicle file describes it, where the machine stands. Nothing measures it: people compare. Pure."""
+"""Rows on the safety tether as the vehicle file describes it at the current position. No sensor measures it; the operator compares.
+Pure.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ CHECKS = (LINE, STRENGTH, SLACK)
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """What can be told of the tether."""
+    """Return the rows of the tether."""
     tether, airframe = vehicle.tether, vehicle.airframe
     x, y, z = tether.anchor_world_m
     ax, ay, az = tether.attachment_body_m

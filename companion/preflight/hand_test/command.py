@@ -1,4 +1,4 @@
-"""The hand test at the terminal: says what to do, shows the motion, judges, keeps the record of a passed one."""
+"""The hand test at the terminal: instructions, progress, evaluation, and the record of a passed test."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ RECORD = Check(
 async def run_hand_test(
     edges: Edges | SomeEdges, config: FlightConfig, console: Console, json: bool = False, *, record: Path | None = None
 ) -> list[Row]:
-    """Guide somebody through the test; its rows. Any key or Ctrl-C ends it.
+    """Guide the operator through the test and return its rows. Any key or Ctrl-C ends it.
 
     Args:
-        edges: open; motion capture need not flow to PX4. The arm, if it is open, is read on, for the sake of its watchdogs.
+        edges: open devices; poses need not be forwarded to PX4. An open arm is read meanwhile to keep its watchdogs from tripping.
         config: the effective configuration.
-        console: for people.
-        json: standard output is kept free: people are told on standard error, wherever the console writes.
-        record: where a passed test is written down (`hand_record.record_path()`); None: nowhere, as in SITL.
+        console: terminal of the operator.
+        json: keep standard output free: everything for the operator goes to standard error.
+        record: where a passed test is recorded (`hand_record.record_path()`); None for nowhere, as in SITL.
     """
     outcome = await perform(edges, config, console, json)
     if isinstance(outcome, str):
@@ -70,7 +70,7 @@ async def run_hand_test(
 async def perform(
     edges: Edges | SomeEdges, config: FlightConfig, console: Console, json: bool = False
 ) -> HandResult | str:
-    """Guide somebody through the test; what was measured, or why there is nothing. Arguments as of `run_hand_test`."""
+    """Guide the operator through the test and return the measurements, or why there are none. Arguments as of `run_hand_test`."""
     mocap, autopilot, arm = edges.mocap, edges.autopilot, edges.arm
     if mocap is None or autopilot is None:
         missing = "motion capture" if mocap is None else "PX4"
@@ -114,13 +114,13 @@ def _armed(status: AutopilotStatus | None, now_s: float, config: FlightConfig) -
 
 
 class _StampClock:
-    """The flight clock as the edges' stamps tell it: monotonic time from another origin. It goes on when all of them fall silent."""
+    """The flight clock by the devices' stamps: monotonic time from another origin. It continues when all devices are silent."""
 
     def __init__(self) -> None:
         self._ahead_s: float | None = None
 
     def now(self, pose: MocapPose | None, vehicle: VehicleState | None, status: AutopilotStatus | None) -> float:
-        """Seconds; 0 while nothing has come yet."""
+        """Return the time, s; 0 before the first stamp."""
         here_s = time.monotonic()
         stamps = [
             *((pose.stamp_s,) if pose is not None else ()),
@@ -135,7 +135,7 @@ class _StampClock:
 
 @contextlib.contextmanager
 def _ended_by_hand(stop: asyncio.Event) -> Iterator[None]:
-    """Any key at a terminal, or Ctrl-C, sets the event."""
+    """Set the event on any key at a terminal, or on Ctrl-C."""
     loop = asyncio.get_running_loop()
     with contextlib.ExitStack() as stack:
         if threading.current_thread() is threading.main_thread():
@@ -159,7 +159,7 @@ def _ended_by_hand(stop: asyncio.Event) -> Iterator[None]:
 
 
 class _Screen:
-    """One bar for the step under way; without a terminal a line per step."""
+    """Progress display: a bar for the current step; without a terminal one line per step."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -186,7 +186,7 @@ class _Screen:
         self._progress.stop()
 
     def show(self, view: HandView) -> None:
-        """The newest state."""
+        """Show the newest state."""
         if view.step is not self._step:
             self._step = view.step
             number = f"{_STEPS.index(view.step) + 1}/{len(_STEPS)}" if view.step in _STEPS else "   "

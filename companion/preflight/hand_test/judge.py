@@ -1,7 +1,7 @@
-"""What a hand test has shown: rows with what was measured, and which axis is wrong. Pure.
+"""Evaluation of a hand test: rows with the measurements, and which axis is wrong. Pure.
 
-Frames: what the IMU felt is in the machine's own body frame (x forward, y left, z up), what motion capture saw in the frame of its
-rigid body. On a sound set-up the two are one.
+IMU measurements are in the machine's body frame (x forward, y left, z up), motion-capture measurements in the frame of its rigid body.
+On a correct set-up both frames are the same.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ SCALE = Check(
 CHECKS = (DONE, TOLD, LEVEL, LIFT, FORWARD, TURN, SCALE)
 
 LEVEL_MAX_DEG: Final = 5.0
-"""Between gravity by the accelerometer, turned by the streamed attitude, and the world's vertical."""
+"""Largest angle between gravity by the accelerometer, rotated by the streamed attitude, and the world's vertical."""
 AXIS_MAX_DEG: Final = 20.0
 YAW_MAX_DEG: Final = 12.0
-"""Between the nose of the rigid body and that of the machine."""
+"""Largest angle between the rigid body's forward axis and the machine's."""
 TURN_MAX_DEG: Final = 8.0
-"""Between gyro and motion capture, of some 45 deg."""
+"""Largest difference between gyro and motion capture over a turn of about 45 deg."""
 TOLD_MAX_DEG: Final = 40.0
-"""Between where it was to be moved and where the IMU felt it move."""
+"""Largest angle between the requested direction and the motion measured by the IMU."""
 SCALE_SPAN: Final = (0.7, 1.4)
 
 _UP: Vec3 = (0.0, 0.0, 1.0)
@@ -65,10 +65,10 @@ _BOARD = "correct PX4's SENS_BOARD_ROT and calibrate its accelerometer: its axes
 
 
 def rows(result: HandResult, up_axis: str) -> list[Row]:
-    """One row per thing that the test shows.
+    """Return one row per property that the test measures.
 
     Args:
-        result: of a finished test.
+        result: result of a finished test.
         up_axis: devices.mocap.up_axis, "y" or "z".
     """
     lift, forward, turn = result.lift, result.forward, result.turn
@@ -125,18 +125,18 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
 
 
 def ended(cause: str, again: str = "companion check --hand") -> Row:
-    """A test that has no result; `again` is the command that it was part of."""
+    """Return the row of a test without a result; `again` is the command to repeat."""
     return DONE.bad(cause, "lift, forward and a turn to the left, each recognised", f"do it again: {again}")
 
 
 def yaw_offset_deg(forward: Motion) -> float:
-    """By how much the streamed yaw is too large, in (-180, 180]."""
+    """Return the excess of the streamed yaw, in (-180, 180] deg."""
     (fx, fy, _), (sx, sy, _) = forward.felt_m, forward.response
     return math.degrees(math.atan2(sx * fy - sy * fx, fx * sx + fy * sy))
 
 
 def _told(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) -> Row:
-    """Was it moved as it was told, by what the IMU felt alone? If yes, the IMU's own axes are right, too."""
+    """Return the row on whether the IMU measured the requested motion. If so, the IMU's own axes are right as well."""
     up_deg = math.degrees(angle_rad(lift.felt_m, up_body))
     standing_deg = math.degrees(angle_rad(up_body, _UP))
     ahead_deg = math.degrees(angle_rad(forward.felt_m, _AHEAD))
@@ -148,14 +148,14 @@ def _told(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) -> Row:
 
 
 def _seen_as_told(result: HandResult) -> bool:
-    """By motion capture alone: up, forward, left."""
+    """Return whether motion capture alone saw the requested motion: up, forward, left."""
     most = math.radians(TOLD_MAX_DEG)
     straight = angle_rad(result.lift.seen_m, _UP) <= most and angle_rad(result.forward.seen_m, _AHEAD) <= most
     return straight and result.turn.seen_turn_rad[2] > 0.0
 
 
 def best_axes(result: HandResult) -> AxisMap:
-    """What the rigid body's streamed axes truly are, of the 48 possibilities: the nearest to all that was measured."""
+    """Return which of the 48 axis maps of the rigid body is nearest to all measurements."""
     polar = [(m.felt_m, m.response) for m in (result.lift, result.forward)]
     axial = (result.turn.felt_turn_rad, result.turn.seen_turn_rad)
 
@@ -169,7 +169,7 @@ def best_axes(result: HandResult) -> AxisMap:
 
 
 def _explain(result: HandResult, up_axis: str) -> str:
-    """The one line that says what to do."""
+    """Return one line on what to do."""
     axes = best_axes(result)
     yaw_deg = yaw_offset_deg(result.forward)
     if axes.determinant < 0:
@@ -195,7 +195,7 @@ def _explain(result: HandResult, up_axis: str) -> str:
 
 
 def _way(v: Vec3) -> str:
-    """A displacement in words: 0.29 m forward."""
+    """Return a displacement as text, such as "0.29 m forward"."""
     words = (("forward", "back"), ("left", "right"), ("up", "down"))
     size = norm(v)
     parts = [

@@ -1,8 +1,8 @@
-"""One carried move as PX4's IMU felt it beside what motion capture saw of it. Pure.
+"""Comparison of one carried motion as measured by PX4's IMU and by motion capture. Pure.
 
-PX4's attitude is made of motion capture and says nothing new; accelerometer and gyro do. Gravity and the accelerometer's bias are
-nearly constant while the machine is carried for two seconds, so both velocities are compared without their mean and their slope: no
-rest need be perfect for that, and a hand's never is.
+PX4's attitude is derived from motion capture and adds no information; accelerometer and gyro do. Gravity and the accelerometer's bias
+are nearly constant over a motion of two seconds, so both velocities are compared without mean and slope. The rest at both ends need not
+be perfect.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
 GRID_S: Final = 0.02
 GAP_MAX_S: Final = 0.3
-"""Longer without a sample, and the move is not judged."""
+"""A motion with a longer gap between samples is not evaluated."""
 
 
 class PoseAt(NamedTuple):
@@ -39,40 +39,41 @@ class ImuAt(NamedTuple):
 
 
 class GapError(ValueError):
-    """Samples are missing within a move; the text says of what, for people."""
+    """Samples are missing within a motion; the text names the source."""
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One move from rest to rest."""
+    """One motion from rest to rest."""
 
     duration_s: float
     felt_m: Vec3
-    """Displacement by the IMU, body frame at the move's start."""
+    """Displacement by the IMU, in the body frame at the start."""
     seen_m: Vec3
-    """The same by motion capture, in the frame of its rigid body at the start."""
+    """Displacement by motion capture, in the frame of its rigid body at the start."""
     seen_world_m: Vec3
-    """The same in the stream's world."""
+    """Displacement by motion capture, in the stream's world."""
     response: Vec3
-    """What motion capture saw, in its body's frame, of one metre that the IMU felt in the direction of `felt_m`: its length is the
-    ratio of their scales, its direction is to be that of `felt_m`."""
+    """Motion capture's displacement, in its body frame, per metre of the IMU's along `felt_m`: its length is the ratio of the scales,
+    its direction should be that of `felt_m`.
+    """
     felt_turn_rad: Vec3
-    """Rotation vector by the gyro, body frame at the start."""
+    """Rotation vector by the gyro, in the body frame at the start."""
     seen_turn_rad: Vec3
-    """The same by motion capture, in the frame of its rigid body at the start."""
+    """Rotation vector by motion capture, in the frame of its rigid body at the start."""
 
 
 def measure(
     poses: Sequence[PoseAt], imu: Sequence[ImuAt], start_s: float, end_s: float, gyro_bias_rad_s: Vec3
 ) -> Motion:
-    """Compare a move that begins and ends at rest.
+    """Compare a motion that begins and ends at rest.
 
     Args:
         poses: in order of time, beyond both ends.
         imu: in order of time, beyond both ends.
-        start_s: a moment of rest before.
-        end_s: a moment of rest after.
-        gyro_bias_rad_s: read on the floor.
+        start_s: a time of rest before the motion.
+        end_s: a time of rest after it.
+        gyro_bias_rad_s: measured on the floor.
 
     Raises:
         GapError: samples are missing.
@@ -106,7 +107,7 @@ def measure(
 
 
 def _felt(imu: Sequence[ImuAt], times: Sequence[float], bias: Vec3) -> tuple[list[Vec3], Quat]:
-    """Specific force integrated in the body frame of the first time, on the grid; and the rotation until the last."""
+    """Integrate the specific force in the body frame at the start, on the grid; also return the rotation until the end."""
     index = max(0, bisect_left(imu, times[0], key=lambda sample: sample.t_s) - 1)
     now_s, q = times[0], IDENTITY_QUAT
     velocity: list[Vec3] = [(0.0, 0.0, 0.0)]
@@ -136,7 +137,7 @@ def _turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
 
 
 def _places(poses: Sequence[PoseAt], times: Sequence[float]) -> list[Vec3]:
-    """Positions on the grid, between frames linear."""
+    """Return the positions on the grid, linearly interpolated between frames."""
     stamps = [pose.t_s for pose in poses]
     places = []
     for t_s in times:
@@ -152,7 +153,7 @@ def _nearest(poses: Sequence[PoseAt], t_s: float) -> PoseAt:
 
 
 def _travel(velocity: Sequence[Vec3]) -> Vec3:
-    """Distance of a velocity that is zero at both ends: what grows evenly in between is gravity and bias."""
+    """Return the distance of a velocity that is zero at both ends, with the linear growth of gravity and bias removed."""
     count = len(velocity) - 1
     drift = _scaled(velocity[-1], 1.0 / count)
     total: Vec3 = (0.0, 0.0, 0.0)
@@ -162,7 +163,7 @@ def _travel(velocity: Sequence[Vec3]) -> Vec3:
 
 
 def _detrended(values: Sequence[Vec3]) -> list[Vec3]:
-    """Without mean and slope, each axis by least squares."""
+    """Return the values without mean and slope, each axis by least squares."""
     count = len(values)
     middle = 0.5 * (count - 1)
     spread = sum((k - middle) ** 2 for k in range(count))
@@ -191,7 +192,7 @@ def _no_gaps(stamps: Sequence[float], start_s: float, end_s: float, what: str) -
 
 
 def rotation_vector(q: Quat) -> Vec3:
-    """Axis times angle (rad, at most pi) of a unit quaternion."""
+    """Return axis times angle (rad, at most pi) of a unit quaternion."""
     w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
     sine = math.sqrt(x * x + y * y + z * z)
     k = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
@@ -199,13 +200,13 @@ def rotation_vector(q: Quat) -> Vec3:
 
 
 def mean_vector(values: Sequence[Vec3]) -> Vec3:
-    """Component by component."""
+    """Return the mean of each component."""
     count = len(values)
     return (sum(v[0] for v in values) / count, sum(v[1] for v in values) / count, sum(v[2] for v in values) / count)
 
 
 def mean_attitude(values: Sequence[Quat]) -> Quat:
-    """Of attitudes near to each other."""
+    """Return the mean of attitudes that are close to each other."""
     first = values[0]
     signs = [1.0 if sum(a * b for a, b in zip(first, q, strict=True)) >= 0.0 else -1.0 for q in values]
     w, x, y, z = (sum(s * q[k] for s, q in zip(signs, values, strict=True)) for k in range(4))
@@ -213,23 +214,23 @@ def mean_attitude(values: Sequence[Quat]) -> Quat:
 
 
 def turned_rad(a: Quat, b: Quat) -> float:
-    """Angle between two attitudes."""
+    """Return the angle between two attitudes, rad."""
     return norm(rotation_vector(quat_multiply(quat_conjugate(a), b)))
 
 
 def angle_rad(a: Vec3, b: Vec3) -> float:
-    """Between two vectors; pi if one of them is nothing."""
+    """Return the angle between two vectors, rad; pi if one of them is zero."""
     size = norm(a) * norm(b)
     return math.acos(max(-1.0, min(1.0, dot(a, b) / size))) if size > 1e-12 else math.pi
 
 
 def dot(a: Vec3, b: Vec3) -> float:
-    """Scalar product."""
+    """Return the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def norm(v: Vec3) -> float:
-    """Length."""
+    """Return the length of a vector."""
     return math.sqrt(dot(v, v))
 
 

@@ -1,4 +1,4 @@
-"""The record of passed hand tests: which set-ups of motion capture have been held against an IMU once.
+"""Record of passed hand tests: the motion-capture set-ups that have been compared with an IMU.
 
 `$XDG_STATE_HOME/companion/hand-tests.json`, else `~/.local/state/companion/hand-tests.json`.
 """
@@ -22,25 +22,25 @@ FILE = "companion/hand-tests.json"
 
 
 class RecordError(Exception):
-    """The record cannot be read or written: one line for people."""
+    """The record cannot be read or written. The text is one line for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What a passed test holds for; when one of these changes, it holds no more."""
+    """Settings for which a passed test is valid. A change of any of them invalidates it."""
 
     vehicle: str
-    """Its name."""
+    """Name of the vehicle."""
     server: str
     """devices.mocap.server."""
     rigid_body_id: int
     up_axis: str
     natnet_version: str
-    """As the server said it."""
+    """NatNet version as reported by the server."""
 
     @classmethod
     def of(cls, vehicle: Vehicle, natnet_version: str) -> Setup:
-        """Of a vehicle file and the server's own word."""
+        """Return the set-up of a vehicle file and a server's reply."""
         device = vehicle.devices.mocap
         return cls(vehicle.name, device.server, device.rigid_body_id, device.up_axis, natnet_version)
 
@@ -53,11 +53,11 @@ class Passed:
     at: str
     """UTC, ISO 8601."""
     measured: Mapping[str, str]
-    """Of each row, by its id: what was read."""
+    """Measured text of each row, by the row's id."""
 
 
 def record_path(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where the record lies."""
+    """Return the path of the record."""
     state = environment.get("XDG_STATE_HOME", "")
     # The XDG specification has a relative path ignored.
     folder = Path(state) if state and Path(state).is_absolute() else Path.home() / ".local/state"
@@ -65,7 +65,9 @@ def record_path(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def on_record(setup: Setup, tests: Sequence[Passed]) -> tuple[str, str]:
-    """`Observations.hand_test` and `hand_test_changed`: when it was passed with this set-up; else what has changed since it was."""
+    """Return `Observations.hand_test` and `hand_test_changed`: when the test was passed with this set-up, or else what has changed
+    since.
+    """
     for test in reversed(tests):
         if test.setup == setup:
             return f"passed on {test.at}", ""
@@ -78,16 +80,16 @@ def on_record(setup: Setup, tests: Sequence[Passed]) -> tuple[str, str]:
 
 
 def with_passed(tests: Sequence[Passed], setup: Setup, at: datetime, rows: Sequence[Row]) -> list[Passed]:
-    """The tests with a newly passed one, which takes the place of an older one of the same set-up."""
+    """Return the tests with a newly passed one, which replaces an older one of the same set-up."""
     measured = {row.id: row.read for row in rows}
     return [*(test for test in tests if test.setup != setup), Passed(setup, at.isoformat(timespec="seconds"), measured)]
 
 
 def load(path: Path) -> list[Passed]:
-    """All passed tests; none if there is no record.
+    """Return all passed tests; none if there is no record.
 
     Raises:
-        RecordError: there is one, but it cannot be understood.
+        RecordError: the record exists but cannot be parsed.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -105,7 +107,7 @@ def load(path: Path) -> list[Passed]:
 
 
 def save(path: Path, tests: Sequence[Passed]) -> None:
-    """Replace the record as a whole.
+    """Replace the whole record.
 
     Raises:
         RecordError: it cannot be written.

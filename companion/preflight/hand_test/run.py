@@ -1,7 +1,7 @@
-"""The guided hand test: somebody carries the machine, rotors off, and every axis of motion capture is held against the IMU. Pure.
+"""The guided hand test: the operator carries the machine, rotors off, and every axis of motion capture is compared with the IMU. Pure.
 
-Stand still, lift, forward, turn left. Each step is recognised by how far and how much motion capture saw the machine move, whatever
-the directions: those are what is tested, and judged at the end (`companion.preflight.hand_test.judge`).
+The steps are: stand still, lift, forward, turn left. Each step is recognised by how far motion capture saw the machine move, whatever
+the direction, because the directions are what is tested. They are evaluated at the end (`companion.preflight.hand_test.judge`).
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ TURN_WANTED_DEG: Final = 45.0
 TURN_MIN_DEG: Final = 30.0
 STEP_TIMEOUT_S: Final = 60.0
 STAND_S: Final = 2.5
-"""On the floor; longer than anybody would take a pause by chance."""
+"""Time on the floor, longer than an accidental pause."""
 STILL_S: Final = 0.6
 STILL_M, STILL_DEG = 0.02, 5.0
-"""Furthest from the mean within `STILL_S`: a hand that holds 3 kg."""
+"""Largest deviation from the mean within `STILL_S` of a machine of 3 kg held by hand."""
 STAND_M, STAND_DEG = 0.004, 1.0
-"""The same for a machine that stands."""
+"""The same for a machine on the floor."""
 MOVE_MAX_S: Final = 8.0
-"""The IMU forgets: a move that takes longer is not judged."""
+"""Longest motion that is evaluated, because the IMU's integration drifts."""
 SILENCE_MAX_S: Final = 3.0
-"""Without a word from PX4 whether it is armed."""
+"""Longest time without a report from PX4 on whether it is armed."""
 _PERIOD_S: Final = 0.05
 _POSES_MIN: Final = 10
 _SPARSE_S: Final = 0.12
-"""Longer without a pose, and nobody can say that it was still."""
+"""Longest gap between poses during which the machine may count as still."""
 _KEEP_S: Final = 20.0
 
 
 class Step(Enum):
-    """What is to be done now."""
+    """Step of the test."""
 
     STAND = "stand"
     LIFT = "lift"
@@ -69,30 +69,30 @@ TOLD: Final = {
 
 @dataclass(frozen=True, slots=True)
 class HandSample:
-    """What is known at one moment; flight clock."""
+    """Data at one time of the flight clock."""
 
     t_s: float
     pose: MocapPose | None
     vehicle: VehicleState | None
     armed: bool | None
-    """None: PX4 has not said so lately."""
+    """Whether PX4 is armed; None if it has not reported recently."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stood:
-    """The machine on the floor, before it was lifted."""
+    """State of the machine on the floor before it was lifted."""
 
     position_m: Vec3
     attitude: Quat
-    """Both by motion capture."""
+    """Position and attitude by motion capture."""
     force_m_s2: Vec3
     rate_rad_s: Vec3
-    """Both by the IMU, body FLU; the rate is the gyro's bias."""
+    """Specific force and rate by the IMU, body FLU; the rate is the gyro's bias."""
 
 
 @dataclass(frozen=True, slots=True)
 class HandResult:
-    """Everything that was measured."""
+    """All measurements of a finished test."""
 
     stood: Stood
     lift: Motion
@@ -102,17 +102,17 @@ class HandResult:
 
 @dataclass(frozen=True, slots=True)
 class HandView:
-    """How far the test is, for people."""
+    """Progress of the test for display."""
 
     step: Step
     progress: float
-    """0 to 1 of this step."""
+    """Progress of this step, 0 to 1."""
     seen: str
-    """What motion capture sees of it."""
+    """The motion seen by motion capture, as text."""
     notice: str
-    """Why the last attempt did not count; empty: there was none."""
+    """Why the last attempt did not count; empty if there was none."""
     ended: str
-    """Why the test is over without a result; empty: it is not."""
+    """Why the test ended without a result; empty while it runs."""
     result: HandResult | None
 
 
@@ -125,7 +125,7 @@ class _Rest:
 
 
 class HandTest:
-    """`update` with every sample, in order of time; nothing else is asked of the caller."""
+    """State of the test. Call `update` with every sample in order of time."""
 
     def __init__(self) -> None:
         self._poses: list[PoseAt] = []
@@ -143,7 +143,7 @@ class HandTest:
         self._progress = 0.0
 
     def update(self, sample: HandSample) -> HandView:
-        """Take one sample in; the state of the test after it."""
+        """Process one sample and return the state of the test."""
         if self._step_s is None:
             self._step_s = self._heard_s = sample.t_s
         if not self._ended and self._step is not Step.DONE:
@@ -201,7 +201,7 @@ class HandTest:
     def _still(
         self, t_s: float, window_s: float = STILL_S, within_m: float = STILL_M, within_deg: float = STILL_DEG
     ) -> _Rest | None:
-        """The last `window_s` as a rest; None: it moved, or was not seen."""
+        """Return the last `window_s` as a rest, or None if the machine moved or was not tracked."""
         recent = self._poses[bisect_left(self._poses, t_s - window_s, key=lambda pose: pose.t_s) :]
         if len(recent) < _POSES_MIN or recent[0].t_s > t_s - window_s + _SPARSE_S or recent[-1].t_s < t_s - _SPARSE_S:
             return None
