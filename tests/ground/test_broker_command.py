@@ -159,11 +159,11 @@ def test_missing_mosquitto_passwd_is_one_line(
 def test_missing_cryptography_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import companion.ground
+    import companion.ground.broker
 
-    for name in ("broker_setup", "certificates"):
-        monkeypatch.delitem(sys.modules, f"companion.ground.{name}")
-        monkeypatch.delattr(companion.ground, name)
+    for name in ("setup", "certificates"):
+        monkeypatch.delitem(sys.modules, f"companion.ground.broker.{name}")
+        monkeypatch.delattr(companion.ground.broker, name)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     assert main(["broker", "init", str(tmp_path / "site")]) == 3
     assert capsys.readouterr().err == (

@@ -12,6 +12,7 @@ import pytest
 from companion.ground.protocol.messages import Presence, Stream
 from tests.ground.monitor_stub import BROKER, NAME, Message, Stand, ack, event, flown, hello, retained, state, told
 from tests.ground.page_browser import Page, events_of, playing, watching
+from tests.support import wait_until
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
@@ -46,6 +47,7 @@ def in_flight(**changes: Any) -> Stream:
 
 
 def test_the_page_says_its_token_first_and_hides_it(stand: Stand, page: Page) -> None:
+    wait_until(lambda: bool(stand.heard("token")), lambda: "the page sends no token")
     assert stand.heard("token") == [{"kind": "token", "token": "secret"}]
     assert page.tab.evaluate("location.hash") == ""
 
