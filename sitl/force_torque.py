@@ -7,15 +7,12 @@ noise and latency.
 
 from __future__ import annotations
 
-import asyncio
-import os
-import tty
-from types import TracebackType
 from typing import Final, Self
 
 from companion.io.force_torque import rft
 from companion.io.force_torque.rft import Command, Overload, PacketScanner, SetError, Wrench
 from companion.model.types import Vec3
+from sitl.pty import PtyLine
 
 FORCE_CAPACITY_N: Final = 200.0
 TORQUE_CAPACITY_NM: Final = 4.0
@@ -54,9 +51,7 @@ class ForceTorqueServer:
             Command.FIRMWARE_VERSION: firmware,
         }
         self._scanner = PacketScanner(rft.COMMAND_BYTES)
-        self._master: int | None = None
-        self._slave: int | None = None
-        self._port = ""
+        self._pty = PtyLine(self._on_commands)
         self._force_n: Vec3 = _ZERO
         self._torque_nm: Vec3 = _ZERO
         self._bias_force_n: Vec3 = _ZERO
@@ -69,7 +64,7 @@ class ForceTorqueServer:
     @property
     def port(self) -> str:
         """Path of the tty that the companion opens."""
-        return self._port
+        return self._pty.path
 
     @property
     def rate_hz(self) -> int:
@@ -82,25 +77,11 @@ class ForceTorqueServer:
         return self._streaming
 
     async def __aenter__(self) -> Self:
-        """Open the pty."""
-        self._master, self._slave = os.openpty()
-        # The slave is kept open here, so that a companion that closes the port does not hang the line up.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._port = os.ttyname(self._slave)
-        asyncio.get_running_loop().add_reader(self._master, self._on_commands)
+        self._pty.open()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the pty; a companion that still holds the port sees it hang up."""
-        if self._master is not None:
-            asyncio.get_running_loop().remove_reader(self._master)
-        for descriptor in (self._master, self._slave):
-            if descriptor is not None:
-                os.close(descriptor)
-        self._master = self._slave = None
+    async def __aexit__(self, *_: object) -> None:
+        self._pty.close()
 
     def set_wrench(self, force_n: Vec3, torque_nm: Vec3) -> None:
         """What the sensor feels from now on, in its own frame, N and N m; any rate."""
@@ -139,22 +120,10 @@ class ForceTorqueServer:
         self._write(rft.encode_wrench(command, self._measure()))
 
     def _write(self, packet: bytes) -> None:
-        if self._master is None or self.silent:
-            return
-        try:
-            written = os.write(self._master, packet)
-        except BlockingIOError:
-            written = 0
-        if written < len(packet):
+        if not self.silent and self._pty.write(packet):
             self.dropped += 1
 
-    def _on_commands(self) -> None:
-        if self._master is None:
-            return
-        try:
-            received = os.read(self._master, 4096)
-        except (BlockingIOError, InterruptedError):
-            return
+    def _on_commands(self, received: bytes) -> None:
         for field in self._scanner.feed(received):
             if not self.silent:
                 self._execute(Command(field[0]), field[1])

@@ -11,7 +11,6 @@ import socket
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Final, Self
 
 from companion.io.mocap.natnet import Descriptor, Message, NatNetVersion
@@ -142,9 +141,7 @@ class NatNetServer:
             asyncio.get_running_loop().add_reader(opened.fileno(), self._answer_all, opened)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close both sockets."""
         for opened in self._listening():
             asyncio.get_running_loop().remove_reader(opened.fileno())

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 import time
 from collections.abc import Callable
 from random import Random
@@ -276,12 +275,12 @@ class DynamixelWireTarget(Target):
     async def _feed(self, during: bool, noise: bytes) -> None:
         arm = self._arm
         if not during:
-            os.write(self._bus._master_fd, noise)
+            self._bus.inject(noise)
             await arm.read(1.0)
         else:
             reading = asyncio.ensure_future(arm.read(1.0))
             await asyncio.sleep(0)  # the request is on its way now, its answer is not
-            os.write(self._bus._master_fd, noise)
+            self._bus.inject(noise)
             await reading
         async with asyncio.timeout(30.0):
             while (state := await arm.read(1.0)) is None or state.read_failures:

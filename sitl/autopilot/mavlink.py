@@ -11,14 +11,14 @@ import asyncio
 import errno
 from collections import deque
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self, cast
+from typing import Any, Self
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver, hash_check_message, param_value_message
-from sitl.autopilot.streams import STREAMS, Schedule
+from sitl.autopilot.streams import Schedule
+from sitl.udp import Address, UdpEndpoint
 
 Message = Any
 
@@ -28,7 +28,6 @@ _GROUND_STATION_TIMEOUT_S = 2.5
 _STATUS_TEXT_BYTES = 50
 _TEXTS_KEPT, _TEXT_STALE_S = 8, 5.0
 """Of the mavlink_log queue; the stream passes over what is older."""
-_CLOSE_DEADLINE_S = 1.0
 
 
 _STEP_MAX_S = 0.03
@@ -52,24 +51,21 @@ ONBOARD_PORTS = Ports(14580, 14540)
 GROUND_PORTS = Ports(18570, 14550)
 
 
-class Link(asyncio.DatagramProtocol):
+class Link(UdpEndpoint):
     """One MAVLink channel: own sequence numbers, own streams, own partner."""
 
-    def __init__(self, stub: Px4Stub, receiver: Receiver, partner: tuple[str, int] | None, ground: bool) -> None:
+    def __init__(self, stub: Px4Stub, receiver: Receiver, partner: Address | None, ground: bool) -> None:
+        super().__init__()
         self.schedule = Schedule(ground)
         self.down = False
         self.delay_s = 0.0
         """Fault: everything takes so long, each way."""
-        self.port = 0
         self.messages_in = 0
-        self.messages_out = 0
-        self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._stub = stub
         self._receiver = receiver
         self._partner = partner
         self._loyal = partner is not None
         self._spoken_to_of_boot: float | None = None
-        self._transport: asyncio.DatagramTransport | None = None
         system, component = stub.params.integer("MAV_SYS_ID"), stub.params.integer("MAV_COMP_ID")
         self._encoder = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
         self._decoder = _new_decoder()
@@ -79,21 +75,6 @@ class Link(asyncio.DatagramProtocol):
         self._text_id = 0
         self._pumped: tuple[float, float] | None = None
         """Wall clock and world time."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The socket is bound."""
-        # Python 3.11's selector transport is a datagram transport in all but its base classes.
-        self._transport = cast(asyncio.DatagramTransport, transport)
-        self.port = int(transport.get_extra_info("sockname")[1])
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """The socket is closed."""
-        self._transport = None
-        if not self.closed.done():
-            self.closed.set_result(None)
-
-    def error_received(self, exc: Exception) -> None:
-        """Nobody listens at the partner's port: UDP does not care, and neither does PX4."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         """Decode and handle at once, or as late as the link is slow."""
@@ -124,26 +105,20 @@ class Link(asyncio.DatagramProtocol):
         since_s = t_s - self._stub.t_s + asyncio.get_running_loop().time() - wall_s
         return min(_STEP_MAX_S, max(0.0, since_s))  # longer: the world is held up
 
-    def close(self) -> None:
-        """Start closing the socket; `closed` tells when it is."""
-        if self._transport is not None:
-            self._transport.close()
-
     def send(self, message: Message) -> None:
         """Send one message to the partner, if there is one."""
         if self.down or self._transport is None or self._partner is None:
             return
         data = message.pack(self._encoder)
         self._encoder.seq = (self._encoder.seq + 1) % 256
-        self.messages_out += 1
         if self.delay_s:
-            asyncio.get_running_loop().call_later(self.delay_s, self._let_out, data, self._partner)
+            asyncio.get_running_loop().call_later(self.delay_s, self._send_late, data, self._partner)
         else:
-            self._transport.sendto(data, self._partner)
+            self.send_to(data, self._partner)
 
-    def _let_out(self, data: bytes, partner: tuple[str, int]) -> None:
-        if self._transport is not None and not self.down:
-            self._transport.sendto(data, partner)
+    def _send_late(self, data: bytes, partner: Address) -> None:
+        if not self.down:
+            self.send_to(data, partner)
 
     def send_all_params(self) -> None:
         """Queue _HASH_CHECK and every parameter; `pump` sends them in portions."""
@@ -178,10 +153,8 @@ class Link(asyncio.DatagramProtocol):
         self._pumped = (asyncio.get_running_loop().time(), t_s)
         if self.down or self._partner is None:
             return
-        for message_id in self.schedule.due(t_s):
-            message = STREAMS[message_id].build(self._stub)
-            if message is not None:
-                self.send(message)
+        for message in self.schedule.messages(self._stub, t_s):
+            self.send(message)
         for _ in range(min(_PARAMS_PER_PUMP, len(self._params_to_send))):
             name = self._params_to_send.popleft()
             self.send(hash_check_message(self._stub) if name is None else param_value_message(self._stub, name))
@@ -263,9 +236,7 @@ class MavlinkServer:
             self._links.append(link)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._close()
 
     def pump(self, t_s: float) -> None:
@@ -282,6 +253,4 @@ class MavlinkServer:
     async def _close(self) -> None:
         links, self._links = self._links, []
         for link in links:
-            link.close()
-        if links:
-            await asyncio.wait([link.closed for link in links], timeout=_CLOSE_DEADLINE_S)
+            await link.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,3 +101,10 @@ class Schedule:
                 ids.append(key)
                 self._due_s[key] = at_s + period_s if t_s - at_s < period_s else t_s + period_s
         return ids
+
+    def messages(self, stub: Px4Stub, t_s: float) -> Iterator[Message]:
+        """Yield the message of every stream that is due at world time `t_s` and has something to send."""
+        for message_id in self.due(t_s):
+            message = STREAMS[message_id].build(stub)
+            if message is not None:
+                yield message

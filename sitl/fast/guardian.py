@@ -21,7 +21,7 @@ from companion.guardian.takeover_landing import Charge, Tell, Told
 from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Outputs, SafetyAction, Severity
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver
-from sitl.autopilot.streams import STREAMS, Schedule
+from sitl.autopilot.streams import Schedule
 
 TAKE_OVER_S = 0.03
 """From the decision to the first message: the flight process is killed, its port opened."""
@@ -73,10 +73,8 @@ class MemoryWire:
 
     def pump(self, t_s: float) -> None:
         """Streams that are due."""
-        for message_id in self.schedule.due(t_s):
-            message = STREAMS[message_id].build(self._px4)
-            if message is not None:
-                self.post(message)
+        for message in self.schedule.messages(self._px4, t_s):
+            self.post(message)
 
     def post(self, message: Any) -> None:
         """One message of the stub."""

@@ -11,8 +11,7 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self, cast
+from typing import Any, Self
 
 from pymavlink.dialects.v20 import development as mavlink  # common, and CURRENT_MODE
 
@@ -20,6 +19,7 @@ from sitl.autopilot.modes import NavState, nav_state_from_custom
 from sitl.autopilot.params import MAV_PARAM_TYPE_INT32, Value, decode_bytewise, encode_bytewise
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.process import Instance
+from sitl.udp import UdpEndpoint
 
 ASK_AGAIN_S = 0.25
 PARAMS_DEADLINE_S = 20.0
@@ -47,43 +47,26 @@ class Version:
         return f"{self.release} ({self.build})" if self.build else self.release
 
 
-class ControlLink(asyncio.DatagramProtocol):
+class ControlLink(UdpEndpoint):
     """The link. An async context manager on the instance's own socket."""
 
     def __init__(self, instance: Instance) -> None:
+        super().__init__()
         self.nav_state: NavState | None = None
         """By the last HEARTBEAT or CURRENT_MODE."""
         self._instance = instance
         self._system = instance.number + 1
-        self._transport: asyncio.DatagramTransport | None = None
         self._encoder = mavlink.MAVLink(None, srcSystem=_OWN_SYSTEM, srcComponent=_OWN_COMPONENT)
         self._decoder = mavlink.MAVLink(None)
         self._decoder.robust_parsing = True
         self._handlers: list[Callable[[Any], None]] = []
-        self._closed = asyncio.Event()
 
     async def __aenter__(self) -> Self:
         await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self._instance.control)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._transport is not None:
-            self._transport.close()
-            await self._closed.wait()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The socket is ready."""
-        self._transport = cast(asyncio.DatagramTransport, transport)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """The socket is closed."""
-        self._transport = None
-        self._closed.set()
-
-    def error_received(self, exc: Exception) -> None:
-        """PX4 is not there: UDP does not care."""
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         """PX4's messages."""
@@ -271,9 +254,8 @@ class ControlLink(asyncio.DatagramProtocol):
             self._handlers.remove(handle)
 
     def _send(self, message: Any) -> None:
-        if self._transport is not None:
-            self._transport.sendto(message.pack(self._encoder), self._instance.control_address)
-            self._encoder.seq = (self._encoder.seq + 1) % 256
+        self.send_to(message.pack(self._encoder), self._instance.control_address)
+        self._encoder.seq = (self._encoder.seq + 1) % 256
 
 
 def _parameter(message: Any) -> tuple[str, Value | None]:

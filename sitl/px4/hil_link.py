@@ -12,7 +12,6 @@ import contextlib
 import math
 import random
 import socket
-from types import TracebackType
 from typing import Any, Self, cast
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -131,9 +130,7 @@ class SimulatorLink:
         self._server = await asyncio.get_running_loop().create_server(lambda: _Peer(self), sock=self._listener)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         if self._server is not None:
             self._server.close()
         if self._peer is not None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
-from typing import Any, cast
+from typing import Any
 
 from sitl.px4.process import HOST, Instance
+from sitl.udp import Address, UdpEndpoint
 
 
 class Relay:
@@ -21,11 +22,11 @@ class Relay:
         self.down = False
         self.delay_s = 0.0
         """One way."""
-        self.heard = 0
+        self.datagrams = 0
         """Datagrams of both sides."""
         self._instance = instance
-        self._px4 = _End(self, instance.onboard_address)
-        self._companion = _End(self, None)
+        self._px4 = _Side(self, instance.onboard_address)
+        self._companion = _Side(self, None)
 
     @contextlib.asynccontextmanager
     async def opened(self) -> AsyncIterator[str]:
@@ -34,50 +35,35 @@ class Relay:
         self._px4.other, self._companion.other = self._companion, self._px4
         await loop.create_datagram_endpoint(lambda: self._px4, local_addr=(HOST, self._instance.onboard_port))
         try:
-            transport, _ = await loop.create_datagram_endpoint(lambda: self._companion, local_addr=(HOST, 0))
-            yield f"udpout://{HOST}:{transport.get_extra_info('sockname')[1]}"
+            await loop.create_datagram_endpoint(lambda: self._companion, local_addr=(HOST, 0))
+            yield f"udpout://{HOST}:{self._companion.port}"
         finally:
-            for end in (self._px4, self._companion):
-                await end.close()
+            for side in (self._px4, self._companion):
+                await side.close()
 
 
-class _End(asyncio.DatagramProtocol):
-    """One side: passes on to the other what it hears."""
+class _Side(UdpEndpoint):
+    """One side of the relay: forwards every datagram to the other side."""
 
-    def __init__(self, relay: Relay, partner: tuple[str, int] | None) -> None:
-        self.other: _End | None = None
+    def __init__(self, relay: Relay, peer: Address | None) -> None:
+        super().__init__()
+        self.other: _Side | None = None
         self._relay = relay
-        self._partner = partner
-        """None: whoever speaks first."""
-        self._transport: asyncio.DatagramTransport | None = None
-        self._closed = asyncio.Event()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.DatagramTransport, transport)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._transport = None
-        self._closed.set()
-
-    def error_received(self, exc: Exception) -> None:
-        """Nobody there: UDP does not care."""
+        self._fixed = peer is not None
+        self._peer = peer
+        """Where this side sends; without a fixed peer, the newest sender."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        self._relay.heard += 1
-        if self._partner is None or self is not self._relay._px4:
-            self._partner = (addr[0], addr[1])
+        self._relay.datagrams += 1
+        if not self._fixed:
+            self._peer = (addr[0], addr[1])
         if self._relay.down or self.other is None:
             return
         if self._relay.delay_s:
-            asyncio.get_running_loop().call_later(self._relay.delay_s, self.other.send, data)
+            asyncio.get_running_loop().call_later(self._relay.delay_s, self.other.forward, data)
         else:
-            self.other.send(data)
+            self.other.forward(data)
 
-    def send(self, data: bytes) -> None:
-        if self._transport is not None and self._partner is not None and not self._relay.down:
-            self._transport.sendto(data, self._partner)
-
-    async def close(self) -> None:
-        if self._transport is not None:
-            self._transport.close()
-            await self._closed.wait()
+    def forward(self, data: bytes) -> None:
+        if self._peer is not None and not self._relay.down:
+            self.send_to(data, self._peer)

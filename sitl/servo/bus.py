@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import termios
-import tty
 from collections.abc import Callable, Iterable
-from types import TracebackType
 from typing import Self
 
+from sitl.pty import PtyLine
 from sitl.servo.model import ServoModel, ServoRefusal
 from sitl.servo.protocol import (
     BROADCAST_ID,
@@ -281,10 +279,7 @@ class ServoBus:
         self.damaged: Callable[[], bool] = lambda: False
         """Fault: asked at every instruction whether noise damages it."""
         self._wire_time = wire_time
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._master_fd = -1
-        self._slave_fd = -1
-        self._path = ""
+        self._pty = PtyLine(self._on_bytes)
         self._last_byte_s = 0.0
         self._line_free_s = 0.0
         self._timers: set[asyncio.TimerHandle] = set()
@@ -292,51 +287,26 @@ class ServoBus:
     @property
     def path(self) -> str:
         """Device that the master opens; valid while the bus is entered."""
-        return self._path
+        return self._pty.path
 
     async def __aenter__(self) -> Self:
-        self._master_fd, self._slave_fd = os.openpty()
-        try:
-            tty.setraw(self._slave_fd)
-            os.set_blocking(self._master_fd, False)
-            self._path = os.ttyname(self._slave_fd)
-            self._loop = asyncio.get_running_loop()
-            self._loop.add_reader(self._master_fd, self._on_bytes)
-        except BaseException:
-            self._close()
-            raise
+        self._pty.open()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close()
-
-    def _close(self) -> None:
+    async def __aexit__(self, *_: object) -> None:
         for timer in self._timers:
             timer.cancel()
         self._timers.clear()
-        if self._loop is not None:
-            self._loop.remove_reader(self._master_fd)
-            self._loop = None
-        for fd in (self._master_fd, self._slave_fd):
-            if fd >= 0:
-                os.close(fd)
-        self._master_fd = self._slave_fd = -1
+        self._pty.close()
 
-    def _on_bytes(self) -> None:
-        assert self._loop is not None
-        try:
-            data = os.read(self._master_fd, 4096)
-        except BlockingIOError:
-            return
-        now_s = self._loop.time()
+    def _on_bytes(self, data: bytes) -> None:
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
         if self.line.packet_pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
             self.line.drop_partial()
         self._last_byte_s = now_s
-        speed = termios.tcgetattr(self._slave_fd)[5]
-        # 0: a rate without a name in termios, which is none of the servos'.
-        baud_bps = _BAUD_OF_SPEED.get(speed, 0)
+        # A speed without a name in termios is none that a servo has.
+        baud_bps = _BAUD_OF_SPEED.get(self._pty.speed(), 0)
         answer, delay_s = self.answer_to(data, baud_bps)
         if not answer:
             return
@@ -346,7 +316,11 @@ class ServoBus:
         on_wire_s = (len(data) + len(answer)) * _BITS_PER_BYTE / baud_bps
         self._line_free_s = max(now_s, self._line_free_s) + on_wire_s + delay_s
         self._timers = {timer for timer in self._timers if not timer.cancelled() and timer.when() > now_s}
-        self._timers.add(self._loop.call_at(self._line_free_s, self._send, answer))
+        self._timers.add(loop.call_at(self._line_free_s, self._send, answer))
+
+    def inject(self, noise: bytes) -> None:
+        """Put bytes on the line as they are, as noise would."""
+        self._pty.write(noise)
 
     def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
         """Return what the servos answer to bytes sent at a baud rate, and their return delay in s; noise may damage the bytes."""
@@ -356,10 +330,4 @@ class ServoBus:
         return self.line.exchange(data, baud_bps)
 
     def _send(self, answer: bytes) -> None:
-        if self._loop is None:
-            return  # was due in the very turn of the event loop in which the bus was left
-        try:
-            sent = os.write(self._master_fd, answer)
-        except BlockingIOError:
-            sent = 0
-        self.dropped_bytes += len(answer) - sent
+        self.dropped_bytes += self._pty.write(answer)

@@ -474,7 +474,7 @@ def test_noise_on_the_line_costs_reads_not_the_thread() -> None:
     async def scenario(setup: Setup) -> None:
         noise = bytes(range(256)) + b"\xff\xff\xfd\x00\x0b\x0d\x00\x55\x00" * 5
         for _ in range(30):
-            os.write(setup.bus._master_fd, noise)
+            setup.bus.inject(noise)
             await setup.arm.read(1.0)
         assert (await state_when(setup.arm, lambda s: s.read_failures == 0)).hardware_error == (0, 0)
         assert not setup.arm.problem

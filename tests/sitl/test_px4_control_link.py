@@ -147,7 +147,7 @@ def test_the_relay_passes_on_both_ways_until_it_is_down() -> None:
                 px4.sendto(b"lost", source)
                 await asyncio.sleep(0)
                 relay.delay_s = 0.01
-                while relay.heard < 4:  # noqa: ASYNC110 - a datagram that is dropped sets no event
+                while relay.datagrams < 4:  # noqa: ASYNC110 - a datagram that is dropped sets no event
                     await asyncio.sleep(0.001)
                 relay.down = False
                 companion.send(b"late")

@@ -1,0 +1,74 @@
+"""A pseudo-terminal that the companion opens as a serial port: the device's end of the line."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import termios
+import tty
+from collections.abc import Callable
+
+
+class PtyLine:
+    """One serial line, served by the running event loop between `open` and `close`.
+
+    Args:
+        on_bytes: called with the bytes that the companion wrote.
+    """
+
+    def __init__(self, on_bytes: Callable[[bytes], None]) -> None:
+        self.path = ""
+        """Device that the companion opens; valid while the line is open."""
+        self._on_bytes = on_bytes
+        self._device_fd = -1
+        self._companion_fd = -1
+        """Kept open here as well, so that a companion that closes the port does not hang up the line."""
+
+    def open(self) -> None:
+        """Create the pseudo-terminal in raw mode and start to listen.
+
+        Raises:
+            OSError: the kernel has no pseudo-terminal left.
+        """
+        self._device_fd, self._companion_fd = os.openpty()
+        try:
+            tty.setraw(self._companion_fd)
+            os.set_blocking(self._device_fd, False)
+            self.path = os.ttyname(self._companion_fd)
+            asyncio.get_running_loop().add_reader(self._device_fd, self._on_readable)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close both ends; a companion that still holds the port sees the line hang up."""
+        if self._device_fd < 0:
+            return
+        asyncio.get_running_loop().remove_reader(self._device_fd)
+        os.close(self._device_fd)
+        os.close(self._companion_fd)
+        self._device_fd = self._companion_fd = -1
+
+    def write(self, data: bytes) -> int:
+        """Send bytes to the companion without blocking; nothing is sent on a closed line.
+
+        Returns:
+            How many bytes were dropped because nobody reads the line.
+        """
+        if self._device_fd < 0:
+            return 0
+        try:
+            return len(data) - os.write(self._device_fd, data)
+        except BlockingIOError:
+            return len(data)
+
+    def speed(self) -> int:
+        """Return the line speed that the companion has set, as a termios constant (`termios.B3000000` and so on)."""
+        return int(termios.tcgetattr(self._companion_fd)[5])
+
+    def _on_readable(self) -> None:
+        try:
+            data = os.read(self._device_fd, 4096)
+        except (BlockingIOError, InterruptedError):
+            return
+        self._on_bytes(data)
