@@ -59,7 +59,7 @@ def fly(kind: str, seed: int, after_catch_s: float, folder: Path) -> Row:
     config = load_flight(MISSION, overrides=[f"world.faults={fault}", f"world.seed={seed}"])
     folder.mkdir(parents=True)
     launcher = Launcher(config, folder, sitl=True, on_message=lambda message: None)
-    with landing_signals(launcher.ask_to_land):
+    with landing_signals(launcher.request_landing):
         result = launcher.run()
     report = result.world.get("flight_fault") or {}
     log = FlightLog.read(folder / "flight.mcap")

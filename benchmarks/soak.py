@@ -48,7 +48,7 @@ BATTERY_MARGIN = 5.0
 """The battery lives so many times as long as the flight: what is asked here is not when it is empty."""
 START_S, END_S = 60.0, 900.0
 """How long the flight may take beside its mission: to start, and to grade a long log."""
-_HEARD = re.compile(r"heard (\d+) beats, (\d+) missed, silent for (\d+) ms")
+_HEARD = re.compile(r"heard (\d+) (?:heart)?beats, (\d+) missed, silent for (\d+) ms")
 
 
 def repetitions(minutes: float) -> tuple[int, float]:

@@ -10,15 +10,15 @@ from typing import ClassVar, Self
 
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
 from benchmarks.fuzzing.mutate import mutated
-from companion.guardian import heartbeat as words
-from companion.guardian.heartbeat import Beat
+from companion.guardian import heartbeat
+from companion.guardian.heartbeat import Heartbeat
 from companion.model.types import OperatorCommand
 from companion.recorder.client import RecorderClient
 from tests.analysis.synthetic_flight import synthetic_flight
 
 _SIZE_MAX_BYTES = 4000
 _TICK = next(iter(synthetic_flight()))
-_BEAT = Beat(
+_BEAT = Heartbeat(
     tick=7, t_s=1.5, origin_s=100.0, mission_t_s=0.5, lifting=True, pilot=False, goodbye=False, mocap_refused=False,
     autopilot_system=1, own_system=1, own_component=191, local_port=14540, pose_stamp_s=1.49, position_world_m=(1.0, 2.0, 3.0),
 )  # fmt: skip
@@ -30,7 +30,12 @@ class ChannelsTarget(Target):
     name: ClassVar[str] = "channels"
 
     def __init__(self) -> None:
-        self._beats = [words.pack(_BEAT), words.READY, words.PROBLEM + b"no mocap", words.ADOPT]
+        self._beats = [
+            heartbeat.pack(_BEAT),
+            heartbeat.READY,
+            heartbeat.PROBLEM + b"no mocap",
+            heartbeat.RECORDER_CHANNEL,
+        ]
         self._tidings = [
             b'{"error": "recorder: log.mcap: No space left on device"}',
             b'{"samples": 1}',
@@ -57,10 +62,10 @@ class ChannelsTarget(Target):
 
     def feed(self, data: bytes) -> None:
         if data[:1] == b"\0":
-            beat = words.unpack(data[1:])
+            beat = heartbeat.unpack(data[1:])
             if beat is not None and not all(map(math.isfinite, (beat.t_s, beat.origin_s, *beat.position_world_m))):
                 raise Wrong(f"a beat that is not finite: {beat}")
-            if words.unpack(words.pack(_BEAT)) != _BEAT:
+            if heartbeat.unpack(heartbeat.pack(_BEAT)) != _BEAT:
                 raise Wrong("a valid beat behind it is not understood")
         elif len(data) > 1:
             self._hear(data[1:])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from companion.guardian.client import GuardianClient
-from companion.guardian.heartbeat import Beat
+from companion.guardian.heartbeat import Heartbeat
 from companion.model.flight_stage import PILOT_FLIES
 from companion.model.types import AutopilotRequest, AutopilotStatus, Inputs, LinkIdentity, Outputs, PhaseKind
 from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
@@ -32,7 +32,7 @@ class Heartbeats:
         self._pose_stamp_s = float("-inf")
         self._position_world_m = (0.0, 0.0, 0.0)
 
-    def of(self, inputs: Inputs, outputs: Outputs) -> Beat:
+    def of(self, inputs: Inputs, outputs: Outputs) -> Heartbeat:
         """Return the heartbeat of a tick; call it in every tick."""
         ids = {event.id for event in outputs.events}
         self._pilot = self._pilot or PILOT_TOOK_OVER.id in ids or outputs.phase == PILOT_FLIES
@@ -44,7 +44,7 @@ class Heartbeats:
         # PX4 reports once a second that it is armed: from the request on it may be.
         may_lift = armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR
         link = self._identity
-        return Beat(
+        return Heartbeat(
             tick=inputs.tick,
             t_s=inputs.t_s,
             origin_s=self._origin_s,
@@ -75,7 +75,7 @@ class FlightGuard:
     def __init__(self, client: GuardianClient, identity: LinkIdentity, origin_s: float) -> None:
         self._client = client
         self._heartbeats = Heartbeats(identity, origin_s)
-        self._last: Beat | None = None
+        self._last: Heartbeat | None = None
 
     @property
     def ready(self) -> bool:
@@ -91,12 +91,12 @@ class FlightGuard:
     def tick(self, inputs: Inputs, outputs: Outputs) -> None:
         """Send the heartbeat at the end of a tick, after its setpoint."""
         self._last = self._heartbeats.of(inputs, outputs)
-        self._client.beat(self._last)
+        self._client.send_heartbeat(self._last)
 
     def still_here(self) -> None:
         """Send a heartbeat after the last tick while this process performs a landing itself."""
         if self._last is not None:
-            self._client.beat(self._last)
+            self._client.send_heartbeat(self._last)
 
     def goodbye(self, now: AutopilotStatus | None) -> None:
         """Sign off from the guardian. While PX4 is armed nothing is sent: the guardian takes over once this process has ended.
@@ -106,4 +106,4 @@ class FlightGuard:
         """
         if self._last is not None and not (now is not None and now.armed):
             self._last = dataclasses.replace(self._last, goodbye=True)
-            self._client.beat(self._last)
+            self._client.send_heartbeat(self._last)

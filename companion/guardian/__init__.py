@@ -1,5 +1,5 @@
-"""The guardian: a hot standby that lands the vehicle when the flight process hangs or dies.
+"""The guardian: a standby process that lands the vehicle when the flight process hangs or dies.
 
-`process` is what runs as `python -m companion.guardian`; `client` is the flight process's side. The guardian imports no more than it
-needs (no asyncio, numpy, pydantic or MAVSDK), so that it is small, starts at once and shares little that could fail with the flight.
+`process` runs as `python -m companion.guardian`; `client` is the flight process's side. The guardian imports neither asyncio, numpy,
+pydantic nor MAVSDK: it stays small, starts fast and shares little code with the flight that could fail in both.
 """

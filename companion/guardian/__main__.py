@@ -1,4 +1,4 @@
-"""`python -m companion.guardian`: started by the launcher."""
+"""Entry point of `python -m companion.guardian`, which the launcher starts."""
 
 from __future__ import annotations
 

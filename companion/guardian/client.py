@@ -1,4 +1,4 @@
-"""The flight process's side of the guardian: one datagram per tick out, "ready" in. No call waits, except `wait_ready`."""
+"""The flight process's side of the guardian: sends a heartbeat per tick and receives READY. Only `wait_ready` waits."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import asyncio
 import contextlib
 import socket
 
-from companion.guardian import heartbeat as words
-from companion.guardian.heartbeat import Beat
+from companion.guardian import heartbeat
+from companion.guardian.heartbeat import Heartbeat
 from companion.io.protocols import DeviceError
 from companion.runtime.clock import Clock
 
 READY_TIMEOUT_S = 10.0
 SILENT_S = 1.0
-"""A guardian that says nothing for this long is as good as dead."""
+"""The guardian counts as gone after this long without a message."""
 _LISTEN_PERIOD_S = 0.02
 
 
 class GuardianClient:
-    """The guardian, seen from the flight process.
+    """Connection to the guardian, used by the flight process.
 
     Args:
         channel: one end of the SOCK_SEQPACKET pair whose other end the guardian inherited.
@@ -35,39 +35,41 @@ class GuardianClient:
 
     @property
     def ready(self) -> bool:
-        """It said within the last second that it could take over."""
+        """Whether the guardian reported READY within the last second."""
         return not self._gone and self._ready_s is not None and self._clock() - self._ready_s < SILENT_S
 
-    def beat(self, beat: Beat) -> None:
-        """Tell of one tick."""
-        self._send(words.pack(beat))
+    def send_heartbeat(self, beat: Heartbeat) -> None:
+        """Send the heartbeat of one tick."""
+        self._send(heartbeat.pack(beat))
 
     def share_recorder(self, descriptor: int) -> None:
-        """Give the guardian the recorder's channel: the log goes on when this process cannot."""
+        """Send the descriptor of the recorder's channel, so that the guardian can log when this process cannot."""
         with contextlib.suppress(OSError):
-            socket.send_fds(self._channel, [words.ADOPT], [descriptor], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            socket.send_fds(
+                self._channel, [heartbeat.RECORDER_CHANNEL], [descriptor], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+            )
 
     def listen(self) -> None:
-        """Take in what the guardian has said."""
+        """Read all messages that the guardian has sent."""
         while not self._gone:
             try:
-                datagram = self._channel.recv(words.MAX_BYTES)
+                datagram = self._channel.recv(heartbeat.MAX_BYTES)
             except (BlockingIOError, InterruptedError):
                 return
             except OSError:
                 datagram = b""
-            if datagram[:1] == words.READY:
+            if datagram[:1] == heartbeat.READY:
                 self._ready_s, self._problem = self._clock(), None
-            elif datagram[:1] == words.PROBLEM:
+            elif datagram[:1] == heartbeat.PROBLEM:
                 self._ready_s, self._problem = None, datagram[1:].decode("utf-8", "replace")
             elif not datagram:
                 self._gone = True
 
     async def wait_ready(self, timeout_s: float = READY_TIMEOUT_S) -> None:
-        """Until the guardian could take over.
+        """Wait until the guardian reports READY.
 
         Raises:
-            DeviceError: it could not within the time; nothing takes off without it.
+            DeviceError: the guardian's process ended, or it was not ready within the timeout. The flight must not take off.
         """
         deadline_s = self._clock() + timeout_s
         while True:
@@ -75,9 +77,9 @@ class GuardianClient:
             if self.ready:
                 return
             if self._gone:
-                raise DeviceError("guardian: expected it to stand by, found that its process ended; see guardian.log")
+                raise DeviceError("guardian: its process ended before it was ready; see guardian.log")
             if self._clock() > deadline_s:
-                found = self._problem or "it says nothing; see guardian.log"
+                found = self._problem or "it sends no message; see guardian.log"
                 raise DeviceError(f"guardian: not ready within {timeout_s:g} s: {found}")
             await asyncio.sleep(_LISTEN_PERIOD_S)
 
@@ -87,6 +89,6 @@ class GuardianClient:
         try:
             self._channel.send(datagram, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
         except BlockingIOError:
-            pass  # it does not read: `ready` tells
+            pass  # it does not read: `ready` becomes false
         except OSError:
             self._gone = True

@@ -1,7 +1,7 @@
-"""What flight process and guardian tell each other, as bytes: datagrams on a SOCK_SEQPACKET pair. Pure.
+"""Datagrams between the flight process and the guardian, on a SOCK_SEQPACKET pair. Pure.
 
-Flight to guardian: a `Beat` per control tick, and once the recorder's channel (`ADOPT`, a descriptor rides along). Guardian to
-flight: `READY`, or `PROBLEM` and a line for people, ten times a second.
+Flight to guardian: a `Heartbeat` per control tick, and once `RECORDER_CHANNEL` with the descriptor of the recorder's channel
+attached. Guardian to flight, ten times a second: `READY`, or `PROBLEM` followed by one line of text.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 from companion.model.types import Vec3
 
-BEAT, ADOPT, READY, PROBLEM = b"B", b"A", b"R", b"P"
-"""First byte of a datagram."""
+HEARTBEAT, RECORDER_CHANNEL, READY, PROBLEM = b"B", b"A", b"R", b"P"
+"""Datagram types, given by the first byte."""
 READY_PERIOD_S = 0.1
-HANGS = "the flight process hangs"
-"""How the text of `guardian_took_over` begins when it did not die by itself."""
+HANG_TEXT = "the flight process hangs"
+"""First words of the `guardian_took_over` text when the flight process hung; other texts mean that it died."""
 MAX_BYTES = 1024
 
 _LIFTING, _PILOT, _GOODBYE, _MOCAP_REFUSED = 1, 2, 4, 8
@@ -26,46 +26,48 @@ _NO_PEER = (bytes(4), 0)
 
 
 @dataclass(frozen=True, slots=True)
-class Beat:
-    """One control tick, as far as the guardian must know it."""
+class Heartbeat:
+    """State of one control tick that the guardian needs to take over."""
 
     tick: int
     t_s: float
-    """On the flight clock."""
+    """Flight clock."""
     origin_s: float
-    """`time.monotonic` at zero of the flight clock: the time base of the poses that go to PX4."""
+    """`time.monotonic` at zero of the flight clock: the time base of the poses sent to PX4."""
     mission_t_s: float
-    """Seconds since take-off was commanded; 0 before."""
+    """Time since take-off was commanded, 0 before."""
     lifting: bool
-    """The rotors turn, or may."""
+    """The rotors turn, or may be about to."""
     pilot: bool
-    """A pilot took over."""
+    """A pilot has taken over."""
     goodbye: bool
-    """The last one: the flight ends as it should."""
+    """This is the last heartbeat: the flight ends normally."""
     mocap_refused: bool
-    """The flight process does not believe motion capture and lands for that: its poses are neither for PX4 nor to judge by."""
+    """The flight process rejects motion capture and lands without it. Its poses must not go to PX4 and must not be used to judge the
+    landing.
+    """
     autopilot_system: int
     """MAVLink system id of PX4."""
     own_system: int
     own_component: int
-    """MAVLink ids that the companion speaks with."""
+    """MAVLink system and component id of the companion."""
     local_port: int
-    """UDP port that the companion speaks from; 0: not known, or no UDP."""
+    """UDP port that the companion sends from; 0 if it is unknown or the link is not UDP."""
     pose_stamp_s: float
-    """Of the last motion-capture pose with the body in view that was believed, on the flight clock; -inf: none yet."""
+    """Flight clock of the newest accepted motion-capture pose; -inf if there was none."""
     position_world_m: Vec3
-    """Of that pose."""
+    """Position of that pose."""
     peer: tuple[str, int] | None = None
-    """IPv4 address and UDP port of PX4, proved by the flight process; None: not UDP."""
+    """IPv4 address and UDP port of PX4, confirmed by the flight process; None if the link is not UDP."""
 
 
-def pack(beat: Beat) -> bytes:
-    """A beat as a datagram."""
+def pack(beat: Heartbeat) -> bytes:
+    """Encode a heartbeat as a datagram."""
     flags = _LIFTING * beat.lifting | _PILOT * beat.pilot | _GOODBYE * beat.goodbye
     flags |= _MOCAP_REFUSED * beat.mocap_refused
     host, port = _NO_PEER if beat.peer is None else (socket.inet_aton(beat.peer[0]), beat.peer[1])
     return _BEAT.pack(
-        BEAT,
+        HEARTBEAT,
         flags,
         beat.autopilot_system,
         beat.own_system,
@@ -82,15 +84,15 @@ def pack(beat: Beat) -> bytes:
     )
 
 
-def unpack(datagram: bytes) -> Beat | None:
-    """The beat in a datagram; None if it is none, or not a sane one."""
-    if len(datagram) != _BEAT.size or datagram[:1] != BEAT:
+def unpack(datagram: bytes) -> Heartbeat | None:
+    """Decode a heartbeat; None if the datagram is another one or holds a value that is not finite."""
+    if len(datagram) != _BEAT.size or datagram[:1] != HEARTBEAT:
         return None
     _, flags, autopilot, system, component, local_port, host, port, tick, *times, x, y, z = _BEAT.unpack(datagram)
     t_s, origin_s, mission_t_s, pose_stamp_s = times
     if not all(map(math.isfinite, (t_s, origin_s, mission_t_s, x, y, z))) or math.isnan(pose_stamp_s):
         return None
-    return Beat(
+    return Heartbeat(
         tick=tick,
         t_s=t_s,
         origin_s=origin_s,

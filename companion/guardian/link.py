@@ -1,4 +1,4 @@
-"""The guardian's MAVLink link: the address that the flight process held, spoken to with pymavlink's codec. No call waits."""
+"""The guardian's MAVLink link, on the address that the flight process used; encoded with pymavlink. No call waits."""
 
 from __future__ import annotations
 
@@ -32,41 +32,42 @@ _COVARIANCE_FROM_PARAMS = [math.nan] + [0.0] * 20
 
 
 class Wire(Protocol):
-    """Bytes to and from PX4."""
+    """Byte transport to PX4."""
 
     @property
     def ready(self) -> bool:
-        """It is known where PX4 is."""
+        """Whether PX4's address is known."""
 
     @property
     def lost(self) -> bool:
-        """The connection has ended: it wakes every wait and carries nothing."""
+        """Whether the connection has ended. A lost wire wakes every wait and carries nothing."""
 
     def fileno(self) -> int:
-        """What to wait on."""
+        """Return the descriptor to wait on."""
 
     def send(self, data: bytes) -> None:
-        """Send one message; what cannot leave is lost."""
+        """Send one message; drop it if the transport does not take it."""
 
     def receive(self) -> list[bytes]:
-        """Everything that waits."""
+        """Return all data that has arrived."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the transport."""
 
 
 class UdpWire:
-    """UDP. Bound to where PX4 sends (`udpin`), or sending to it (`udpout`), from the port that the flight process spoke from.
+    """UDP transport, bound where PX4 sends to (`udpin`) or sending to PX4 (`udpout`) from the port that the flight process used.
 
-    PX4 keeps the first partner of a UDP link, so the old port matters. Once PX4's address is known the socket is connected to it: the
-    kernel then drops datagrams of every other sender. After REPIN_SILENCE_S without a datagram it is disconnected, and connected to the
-    next sender of a HEARTBEAT of PX4's system at the same IPv4 address: a router that restarts sends from another port.
+    PX4 keeps the first partner of a UDP link, so the port must stay the same. Once PX4's address is known the socket is connected to
+    it and the kernel drops datagrams of all other senders. After REPIN_SILENCE_S without a datagram the socket is disconnected, then
+    connected to the next sender of a HEARTBEAT of PX4's system id at the same IPv4 address: a router that restarts sends from
+    another port.
 
     Args:
-        local: address to bind; None: any.
-        remote: PX4's address; None: the sender of the first valid HEARTBEAT of an autopilot.
-        beside: the killed flight process still holds the port. It does not read any more: of sockets that are connected to PX4 the
-            kernel gives the datagrams to the newest (measured, Linux 6.18).
+        local: address to bind; None for any.
+        remote: PX4's address; None to take the sender of the first valid HEARTBEAT of an autopilot.
+        beside: the killed flight process still holds the port. It reads no more: among sockets connected to PX4 the kernel delivers
+            datagrams to the newest (measured, Linux 6.18).
     """
 
     lost = False
@@ -78,7 +79,7 @@ class UdpWire:
         self._connected = False
         self._heard_s = 0.0
         self.system: int | None = None
-        """MAVLink system of PX4; None: any, until it is known."""
+        """MAVLink system id of PX4; None accepts any."""
         self.ready = False
         """PX4's address is known."""
         try:
@@ -88,23 +89,23 @@ class UdpWire:
             if local is not None:
                 self._socket.bind(local)
             if remote is not None:
-                self._pin(remote)
+                self._connect(remote)
         except OSError:
             self._socket.close()
             raise
 
     def fileno(self) -> int:
-        """The socket."""
+        """Return the socket's descriptor."""
         return self._socket.fileno()
 
     def send(self, data: bytes) -> None:
-        """To PX4, once it is known where it is."""
+        """Send to PX4; do nothing before its address is known."""
         if self._remote is not None:
             with contextlib.suppress(OSError):
                 self._socket.sendto(data, self._remote)
 
     def receive(self) -> list[bytes]:
-        """Datagrams of PX4's address; before it is known, what proves it and nothing else."""
+        """Return datagrams from PX4's address; before it is known, only the HEARTBEAT that identifies it."""
         # Disconnecting would take an unbound socket's port away from it.
         if self._connected and self._bound and time.monotonic() - self._heard_s > REPIN_SILENCE_S:
             disconnect_udp(self._socket)
@@ -117,32 +118,32 @@ class UdpWire:
                 break
             except OSError:  # an ICMP error of an earlier send
                 continue
-            if not self._connected and self._proves(data, sender):
-                self._pin(sender)
+            if not self._connected and self._is_from_px4(data, sender):
+                self._connect(sender)
             if sender == self._remote:
                 self._heard_s = time.monotonic()
                 found.append(data)
         return found
 
     def close(self) -> None:
-        """Close it."""
+        """Close the socket."""
         self._socket.close()
 
-    def _proves(self, data: bytes, sender: tuple[str, int]) -> bool:
-        """Whether the datagram shows that PX4 is at its sender."""
+    def _is_from_px4(self, data: bytes, sender: tuple[str, int]) -> bool:
+        """Whether the datagram identifies its sender as PX4."""
         if self._remote is not None and sender[0] != self._remote[0]:
             return False
         heard = autopilot_heartbeat(data)
         return heard is not None and (self.system is None or heard.system == self.system)
 
-    def _pin(self, remote: tuple[str, int]) -> None:
+    def _connect(self, remote: tuple[str, int]) -> None:
         before, self._remote = self._remote, remote
         self._socket.connect(remote)
         self._heard_s = time.monotonic()
         self._connected = self.ready = True
         if before is not None and remote != before:
             _LOG.warning(
-                "PX4 was silent at %s:%d for %g s and is heard at port %d; it is heard there alone now",
+                "PX4 sent nothing from %s:%d for %g s and now sends from port %d; the link uses that port",
                 *before,
                 REPIN_SILENCE_S,
                 remote[1],
@@ -150,7 +151,7 @@ class UdpWire:
 
 
 class TcpWire:
-    """A TCP client."""
+    """TCP client transport."""
 
     ready = True
 
@@ -160,16 +161,16 @@ class TcpWire:
         self._socket.setblocking(False)
 
     def fileno(self) -> int:
-        """The socket."""
+        """Return the socket's descriptor."""
         return self._socket.fileno()
 
     def send(self, data: bytes) -> None:
-        """What does not fit into the send buffer is lost; the receiver finds the next message by itself."""
+        """Send what fits into the send buffer; the receiver resynchronises on the next message."""
         with contextlib.suppress(OSError):
             self._socket.send(data)
 
     def receive(self) -> list[bytes]:
-        """What waits. An end of the stream or an error of the connection loses the link."""
+        """Return the data that has arrived. End of stream or an error marks the wire as lost."""
         try:
             data = self._socket.recv(_MAX_BYTES)
         except (BlockingIOError, InterruptedError):
@@ -180,25 +181,25 @@ class TcpWire:
         return [data] if data else []
 
     def close(self) -> None:
-        """Close it."""
+        """Close the socket."""
         self._socket.close()
 
 
 class SerialWire:
-    """A serial port, 8N1."""
+    """Serial transport, 8N1."""
 
     ready = True
 
     def __init__(self, path: str, baud: int, flow_control: bool) -> None:
-        import serial  # only here: the other links do not need it
+        import serial  # imported here because the other links do not need it
 
         self.lost = False
-        # exclusive: flock, as the flight process holds it on the same device
+        # exclusive: takes the same flock as the flight process
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, rtscts=flow_control, exclusive=True)
         self._errors = (OSError, serial.SerialException)
 
     def fileno(self) -> int:
-        """The port."""
+        """Return the port's descriptor."""
         number: int = self._port.fileno()
         return number
 
@@ -208,7 +209,7 @@ class SerialWire:
             self._port.write(data)
 
     def receive(self) -> list[bytes]:
-        """What waits. A port that is readable without data (unplugged, hung up) loses the link."""
+        """Return the data that has arrived. A port that is readable without data (unplugged, hung up) is lost."""
         try:
             data = self._port.read(_MAX_BYTES)
         except self._errors:
@@ -217,35 +218,35 @@ class SerialWire:
         return [data] if data else []
 
     def close(self) -> None:
-        """Close it."""
+        """Close the port."""
         with contextlib.suppress(*self._errors):
             self._port.close()
 
 
 def address_problem(address: str) -> str | None:
-    """Why the guardian could not take this link over; None: it could. To be asked before take-off."""
+    """Return why the guardian cannot take over this link, or None if it can. Checked before take-off."""
     if _NET.fullmatch(address) or _SERIAL.fullmatch(address):
         return None
-    return f"autopilot {address}: the guardian can take over udpin, udpout, tcpout and serial only; use one of them"
+    return f"autopilot {address}: the guardian cannot take over this link; expected udpin, udpout, tcpout or serial"
 
 
 def is_udp(address: str) -> bool:
-    """The link may be opened beside a flight process that has been killed and has not ended: it has one reader less, and no writer."""
+    """Whether the address is a UDP link. A UDP link can be opened while the killed flight process still holds it."""
     net = _NET.fullmatch(address)
     return net is not None and net[1] in ("udpin", "udpout")
 
 
 def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None, *, beside: bool = False) -> Wire:
-    """Open the link that the flight process has let go of.
+    """Open the link that the flight process has released.
 
     Args:
-        address: as in `devices.autopilot.address`.
-        local_port: of the flight process's UDP socket, 0 if not known.
-        peer: PX4's UDP address as the flight process proved it; None: not known.
-        beside: the killed flight process still holds it; only for a link of which `is_udp` is true.
+        address: value of `devices.autopilot.address`.
+        local_port: UDP port of the flight process; 0 if unknown.
+        peer: PX4's UDP address as the flight process confirmed it; None if unknown.
+        beside: the killed flight process still holds the link; only for UDP links (`is_udp`).
 
     Raises:
-        OSError: it is not free (the flight process may still hold it), or not there.
+        OSError: the link does not exist, or another process holds it.
     """
     net = _NET.fullmatch(address)
     if net is not None:
@@ -258,17 +259,17 @@ def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None
         return TcpWire((host, port))
     port_of = _SERIAL.fullmatch(address)
     if port_of is None:
-        raise OSError(f"{address} is no address that the guardian knows")
+        raise OSError(f"{address}: unknown link type")
     return SerialWire(port_of[2], int(port_of[3]), port_of[1] == "serial_flowcontrol")
 
 
 class Link:
-    """MAVLink 2 over a wire, as the companion speaks it.
+    """MAVLink 2 over a wire, with the identity of the companion.
 
     Args:
-        wire: open.
+        wire: an open wire.
         own: system and component id of the companion.
-        autopilot_system: PX4's.
+        autopilot_system: system id of PX4.
     """
 
     def __init__(self, wire: Wire, own: tuple[int, int], autopilot_system: int) -> None:
@@ -285,7 +286,7 @@ class Link:
         return decoder
 
     def receive(self) -> list[Message]:
-        """Messages of PX4 itself that wait; nothing that comes in can raise."""
+        """Return PX4's messages that have arrived. Malformed data is dropped and never raises."""
         found: list[Message] = []
         if isinstance(self.wire, UdpWire):
             self.wire.system = self._autopilot_system
@@ -296,7 +297,7 @@ class Link:
                 self._decoder = self._new_decoder()
                 continue
             if isinstance(self.wire, UdpWire) and self._decoder.buf_len():
-                self._decoder = self._new_decoder()  # a cut datagram must not swallow the ones after it
+                self._decoder = self._new_decoder()  # a truncated datagram must not consume the ones after it
             for message in parsed:
                 source = (message.get_srcSystem(), message.get_srcComponent())
                 if message.get_type() != "BAD_DATA" and source == (
@@ -307,21 +308,21 @@ class Link:
         return found
 
     def send(self, message: Message) -> None:
-        """One message."""
+        """Send one message."""
         data = message.pack(self._encoder)
         self._encoder.seq = (self._encoder.seq + 1) % 256
         self.wire.send(data)
 
-    def heartbeat(self) -> None:
-        """HEARTBEAT, as MAVSDK sends it for a companion computer."""
+    def send_heartbeat(self) -> None:
+        """Send HEARTBEAT with the fields that MAVSDK uses for a companion computer."""
         self.send(
             mavlink.MAVLink_heartbeat_message(
                 mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_UNINIT, 3
             )
         )
 
-    def vision(self, pose: MocapPose) -> None:
-        """VISION_POSITION_ESTIMATE with the fields and the time base of the flight process.
+    def send_vision(self, pose: MocapPose) -> None:
+        """Send VISION_POSITION_ESTIMATE with the fields and time base of the flight process.
 
         Raises:
             ValueError: the pose is not finite.
@@ -335,20 +336,20 @@ class Link:
         )
         self.poses_sent += 1
 
-    def request(self, request: AutopilotRequest) -> None:
-        """The command of a request."""
-        self._command(*messages.command(request))
+    def send_request(self, request: AutopilotRequest) -> None:
+        """Send the MAVLink command of a request."""
+        self._send_command(*messages.command(request))
 
-    def ask_for(self, message_id: int) -> None:
-        """MAV_CMD_REQUEST_MESSAGE: one message now, instead of when it is due."""
-        self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), 0.0)
+    def request_message(self, message_id: int) -> None:
+        """Send MAV_CMD_REQUEST_MESSAGE: PX4 sends the message once, at once."""
+        self._send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), 0.0)
 
-    def set_rate(self, message_id: int, rate_hz: float) -> None:
-        """MAV_CMD_SET_MESSAGE_INTERVAL."""
-        self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz)
+    def request_rate(self, message_id: int, rate_hz: float) -> None:
+        """Send MAV_CMD_SET_MESSAGE_INTERVAL."""
+        self._send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz)
 
-    def stand_still(self, t_s: float, yaw_rad: float) -> None:
-        """SET_ATTITUDE_TARGET: level at `yaw_rad` (world ENU), no thrust. Only for a vehicle that stands."""
+    def send_zero_thrust(self, t_s: float, yaw_rad: float) -> None:
+        """Send SET_ATTITUDE_TARGET: level at `yaw_rad` (world ENU) without thrust. Only for a vehicle on the ground."""
         q = attitude_ned_frd_from_enu_flu(quat_from_euler_zyx(0.0, 0.0, yaw_rad))
         target, component = self._autopilot_system, messages.MAV_COMP_ID_AUTOPILOT1
         self.send(
@@ -357,7 +358,7 @@ class Link:
             )
         )
 
-    def _command(self, command: int, param1: float, param2: float) -> None:
+    def _send_command(self, command: int, param1: float, param2: float) -> None:
         target, component = self._autopilot_system, messages.MAV_COMP_ID_AUTOPILOT1
         self.send(
             mavlink.MAVLink_command_long_message(target, component, command, 0, param1, param2, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -1,7 +1,7 @@
-"""The guardian's own motion capture: a second NatNet client, on plain sockets.
+"""The guardian's motion-capture client: a second NatNet client on plain sockets.
 
-In standby it only keeps its place at the server and looks at a frame now and then; in charge every frame counts. Parsing and frames
-are those of the flight (`companion.io.mocap.natnet`, `companion.io.mocap.pose`).
+In standby it keeps its connection to the server and reads only the newest frame. After a takeover it reads every frame. Parser and
+frame conversion are those of the flight (`companion.io.mocap.natnet`, `companion.io.mocap.pose`).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ _MAX_BYTES = 65535
 
 
 class MocapProblem(Exception):
-    """Motion capture cannot be received: one line for the user."""
+    """Motion capture cannot be received; one line for the user."""
 
 
 class MocapClient:
-    """Receives the vehicle's rigid body; no call waits.
+    """Receives poses of the vehicle's rigid body; no call waits.
 
     Args:
-        settings: addresses and body.
+        settings: addresses and rigid body.
 
     Raises:
-        MocapProblem: a name does not resolve, or a socket cannot be had.
+        MocapProblem: a host name does not resolve, or a socket cannot be opened.
     """
 
     def __init__(self, settings: MocapSettings) -> None:
@@ -44,9 +44,9 @@ class MocapClient:
         try:
             self._server = (socket.gethostbyname(settings.server), settings.command_port)
         except OSError:
-            raise MocapProblem(f"{where}: the name cannot be resolved; put an IPv4 address") from None
+            raise MocapProblem(f"{where}: the host name cannot be resolved; use an IPv4 address") from None
         self.sockets: list[socket.socket] = []
-        """What to wait on."""
+        """Sockets to wait on."""
         try:
             self._command = self._open(settings.interface, 0)
             if settings.transport == "multicast":
@@ -63,12 +63,12 @@ class MocapClient:
         self._heard_s = float("-inf")
         self._spoke_s = float("-inf")
         self.tracked_s = float("-inf")
-        """When (by `time.monotonic`) a frame with the body in view came last."""
-        self.trouble: str | None = None
-        """What was wrong with a datagram; the newest."""
+        """`time.monotonic` of the newest frame in which the body was tracked."""
+        self.problem: str | None = None
+        """Why the newest invalid datagram was rejected."""
 
-    def serve(self, now_s: float) -> None:
-        """Ask the server to go on; call it every few hundredths of a second."""
+    def keep_connected(self, now_s: float) -> None:
+        """Send connect requests and keep-alives when they are due; call every 10 to 50 ms."""
         known = self._version is not None
         if now_s - self._spoke_s < (KEEP_ALIVE_PERIOD_S if known else CONNECT_PERIOD_S):
             return
@@ -80,11 +80,11 @@ class MocapClient:
             self._send(natnet.encode_request(Message.KEEP_ALIVE))
 
     def poses(self, now_s: float, origin_s: float = 0.0) -> list[MocapPose]:
-        """Read everything that waits; poses of the body in order, stamped `now_s - origin_s`."""
+        """Read all waiting datagrams; return the body's poses in order, stamped `now_s - origin_s`."""
         return [pose for datagram in self._datagrams() if (pose := self._pose(datagram, now_s, origin_s)) is not None]
 
-    def glance(self, now_s: float) -> None:
-        """Read everything that waits, look at the newest frame only: standby."""
+    def poll_newest(self, now_s: float) -> None:
+        """Read all waiting datagrams and parse only the newest frame (standby)."""
         newest = None
         for datagram in self._datagrams():
             newest = datagram
@@ -92,7 +92,7 @@ class MocapClient:
             self._pose(newest, now_s, 0.0)
 
     def close(self) -> None:
-        """Take leave of the server."""
+        """Disconnect from the server and close the sockets."""
         if self._settings.transport == "unicast" and self.sockets:
             self._send(natnet.encode_message(Message.DISCONNECT))
         for opened in self.sockets:
@@ -113,7 +113,7 @@ class MocapClient:
             self._command.sendto(datagram, self._server)
 
     def _datagrams(self) -> list[bytes]:
-        """Frames that wait; what else comes is dealt with."""
+        """Return the waiting frames; handle other messages."""
         frames: list[bytes] = []
         for opened in self.sockets:
             for _ in range(_MAX_DATAGRAMS):
@@ -135,22 +135,22 @@ class MocapClient:
     def _take_server_info(self, datagram: bytes) -> None:
         info = natnet.parse_server_info(datagram)
         if isinstance(info, Malformed):
-            self.trouble = info.reason
+            self.problem = info.reason
         elif info.version in VERSIONS:
             self._version = VERSIONS[info.version]
             self._clock_frequency_hz = info.clock_frequency_hz
         else:
-            self.trouble = f"the server speaks NatNet {info.version}, expected {' or '.join(VERSIONS)}"
+            self.problem = f"the server speaks NatNet {info.version}, expected {' or '.join(VERSIONS)}"
 
     def _pose(self, datagram: bytes, now_s: float, origin_s: float) -> MocapPose | None:
         if self._version is None:
             return None
         frame = natnet.parse_frame(datagram, self._version, self._settings.rigid_body_id, self._clock_frequency_hz)
         if isinstance(frame, Malformed):
-            self.trouble = frame.reason
+            self.problem = frame.reason
             return None
         if self._streams.update(frame.number, frame.body, now_s):
-            self.trouble = "two servers at one address: frame numbers come in two sequences"
+            self.problem = "two servers at one address: frame numbers arrive in two sequences"
             return None
         if not natnet.is_newer(frame.number, self._last_number, now_s - self._heard_s):
             return None

@@ -1,4 +1,4 @@
-"""When silence is a stall, and which poses can be true. Pure; time is an argument."""
+"""Detection of a stalled flight process, and of implausible poses. Pure; time is an argument."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ import math
 from companion.model.types import Vec3
 
 AWAKE_STEP_MAX_S = 0.02
-"""A round of the guardian's loop (10 ms) counts for no more than this: what it slept through proves nothing."""
+"""One round of the guardian's loop (10 ms) counts as silence for at most this long: time in which the guardian itself was not scheduled
+is no evidence.
+"""
 JUMP_M = 0.5
 SPEED_MAX_M_S = 4.0
 
 
 class StallWatch:
-    """How long the flight process has been silent, in time during which the guardian itself was awake.
+    """Measures the flight process's silence, counting only time in which the guardian itself was running.
 
     Args:
         timeout_s: silence that means a stall.
@@ -25,26 +27,26 @@ class StallWatch:
         self.silent_s = 0.0
 
     def update(self, now_s: float, heard: bool) -> bool:
-        """One round of the loop; True: the flight process hangs."""
+        """Update after one round of the loop; return whether the flight process hangs."""
         step_s = 0.0 if self._last_s is None else min(now_s - self._last_s, AWAKE_STEP_MAX_S)
         self._last_s = now_s
         self.silent_s = 0.0 if heard else self.silent_s + step_s
         return self.silent_s > self._timeout_s
 
 
-class Plausible:
-    """Keeps a pose from PX4 that the vehicle cannot have come to: another body, a mirrored solution.
+class PoseFilter:
+    """Rejects poses that the vehicle cannot have reached: another body, or a mirrored solution.
 
-    The distance allowed grows with the time since the last pose believed, so nothing is shut out for good.
+    The allowed distance grows with the time since the last accepted pose, so no position stays rejected for good.
     """
 
     def __init__(self, stamp_s: float, position_world_m: Vec3) -> None:
-        """Start from the last pose that the flight process believed; `stamp_s` -inf: there was none."""
+        """Start from the last pose that the flight process accepted; `stamp_s` is -inf if there was none."""
         self._stamp_s = stamp_s
         self._position_world_m = position_world_m
 
     def check(self, stamp_s: float, position_world_m: Vec3) -> bool:
-        """Whether a tracked pose can be true; if so it is the one to measure from."""
+        """Whether a tracked pose is plausible; an accepted pose becomes the new origin of the check."""
         allowed_m = JUMP_M + SPEED_MAX_M_S * (stamp_s - self._stamp_s)
         if not math.dist(position_world_m, self._position_world_m) <= allowed_m:
             return False

@@ -1,4 +1,4 @@
-"""What PX4 says, as the records that the rest of the companion knows. Pure: messages in, records out."""
+"""PX4's messages as the companion's records. Pure."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Px4State:
-    """The newest of each message that matters."""
+    """Holds the newest message of each kind that the landing needs."""
 
     def __init__(self) -> None:
         self.refusal: str | None = None
-        """Why the last command was not accepted; None after one that was."""
+        """Why PX4 rejected the newest command; None if it accepted it."""
         self._heartbeat: tuple[float, bool, FlightMode, int] | None = None
         self._landed = 0
         self._position: tuple[float, Vec3, Vec3] = (-math.inf, _ZERO, _ZERO)
@@ -28,7 +28,9 @@ class Px4State:
         self._imu: tuple[float, Vec3] = (-math.inf, _ZERO)
 
     def take(self, t_s: float, message: Any) -> None:
-        """One decoded message that arrived at `t_s` on the flight clock. A state with a value that is not finite has not arrived."""
+        """Update with one decoded message that arrived at `t_s` (flight clock). A state message with a value that is not finite is
+        ignored.
+        """
         m = message
         match m.get_type():
             case "HEARTBEAT":
@@ -47,15 +49,17 @@ class Px4State:
                 self.refusal = None if m.result == 0 else f"MAV_CMD {m.command} {messages.result_text(m.result)}"
 
     def status(self) -> AutopilotStatus | None:
-        """None before the first heartbeat."""
+        """Return the autopilot's status, or None before the first HEARTBEAT."""
         if self._heartbeat is None:
             return None
         stamp_s, armed, mode, system = self._heartbeat
         return AutopilotStatus(stamp_s, armed, mode, messages.landed_state(self._landed), None, None, system)
 
     def vehicle(self) -> VehicleState | None:
-        """None before the first attitude. That alone tells that the vehicle is flipped, so nothing else is waited for: the stamp of a
-        position or an IMU sample that never came is -inf.
+        """Return the vehicle's state, or None before the first attitude.
+
+        Attitude alone shows whether the vehicle is flipped, so no other message is awaited: a position or IMU sample that never
+        arrived has the stamp -inf.
         """
         if self._attitude is None:
             return None
@@ -63,11 +67,11 @@ class Px4State:
 
     @property
     def pilot(self) -> bool:
-        """PX4 is armed in a mode that people chose."""
+        """Whether PX4 is armed in a mode that a pilot selects."""
         return people_fly(self.status())
 
     def yaw_rad(self) -> float | None:
-        """Heading in the world (ENU)."""
+        """Return the heading in the world (ENU), or None if it is unknown."""
         if self._attitude is None or not any(self._attitude[1]):
             return None
         return euler_zyx_from_quat(attitude_enu_flu_from_ned_frd(self._attitude[1]))[2]

@@ -1,4 +1,4 @@
-"""What the guardian takes from the effective configuration, which the launcher has checked already."""
+"""The guardian's part of the effective configuration, which the launcher has already checked."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class MocapSettings:
-    """`devices.mocap` of the vehicle file; keys as there."""
+    """`devices.mocap` of the vehicle file, with the same keys."""
 
     server: str
     interface: str
@@ -24,10 +24,10 @@ class MocapSettings:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The few things that the guardian must know."""
+    """Settings of the guardian."""
 
     autopilot_address: str
-    """As MAVSDK writes it: udpin://0.0.0.0:14540, ..."""
+    """Address in MAVSDK's notation, such as udpin://0.0.0.0:14540."""
     mocap: MocapSettings
     clearance_m: float
     """`airframe.ground_clearance_m`."""
@@ -38,7 +38,7 @@ class Settings:
 
 
 def read_settings(path: Path) -> Settings:
-    """Settings from `config.json` of the flight's folder."""
+    """Read the settings from `config.json` in the flight's folder."""
     vehicle = json.loads(path.read_text(encoding="utf-8"))["vehicle"]
     devices = vehicle["devices"]
     mocap = devices["mocap"]

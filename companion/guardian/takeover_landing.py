@@ -1,7 +1,7 @@
-"""The guardian in charge: motion capture goes on flowing to PX4, PX4 lands, and the guardian finishes what PX4 cannot.
+"""The landing after a takeover: motion capture keeps flowing to PX4, PX4 lands, the guardian disarms if PX4 cannot.
 
-The landing itself is the companion's own (`companion.mission.autopilot_landing`): the same rules, other inputs. Pure but for the link
-that it sends on; time is an argument.
+The rules are those of the companion's own landing on PX4 (`companion.mission.autopilot_landing`). Pure except for the link that it
+sends on; time is an argument.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.guardian.heartbeat import Beat
+from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
-from companion.guardian.monitors import Plausible
+from companion.guardian.monitors import PoseFilter
 from companion.guardian.px4 import Px4State
 from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.model.types import (
@@ -30,21 +30,21 @@ from companion.model.types import (
 
 HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1
-"""PX4 says its mode once a second; asked for, at once."""
+"""PX4 sends its mode once a second on its own; the guardian requests it more often."""
 LINK_TIMEOUT_S = 1.0
-"""On a `udpin` link PX4, which streams all the time, is heard before it is spoken to; after this nobody is waited for."""
+"""On a `udpin` link PX4 is heard before anything can be sent to it; after this timeout the landing starts without having heard it."""
 MODE_TIMEOUT_S = 0.15
-"""Whether a pilot flies is asked first; without an answer for this long PX4 is told to land."""
+"""PX4's mode is requested first, because a pilot may fly; without an answer for this long PX4 is commanded to land."""
 REPEAT_S = 0.25
-"""A command is given again until the status shows it done."""
+"""A command is repeated at this period until the status shows its effect."""
 ZERO_THRUST_PERIOD_S = 0.02
 LINK_FRESH_S = 2.5
 TOUCH_DOWN = "touchdown"
-"""What the landing says when it feels the floor."""
+"""Text of `LandingStep` at touchdown."""
 DISARMED_AFTER_S = 1.5
-"""PX4 says once a second whether it is armed; an older word does not count."""
-ROUNDS = 4
-"""Landings of 30 s each that are watched before the vehicle counts as lost, as long as PX4 answers."""
+"""PX4 reports once a second whether it is armed; a status from before the takeover is ignored for this long."""
+ATTEMPTS_MAX = 4
+"""Landing attempts of 30 s each, as long as PX4 is heard, before the vehicle counts as lost."""
 _STREAMS = (
     (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50.0),
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 50.0),
@@ -54,8 +54,8 @@ _STREAMS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """Something for people: log, summary and display."""
+class Notice:
+    """An event for the log, the summary and the display."""
 
     t_s: float
     id: str
@@ -64,165 +64,176 @@ class Told:
     text: str
 
 
-Tell = Callable[[Told], None]
+Notify = Callable[[Notice], None]
 
 
-class Charge:
-    """From the take-over to the disarm.
+class TakeoverLanding:
+    """Controls the vehicle from the takeover to the disarm.
 
     Args:
-        beat: the flight process's last word.
-        clearance_m: height of the body's origin when the vehicle stands.
+        last_heartbeat: newest heartbeat of the flight process.
+        clearance_m: height of the body's origin when the vehicle stands on the ground.
         tilt_max_rad: `safety.tilt_abort_deg`.
-        link: open.
-        t_s: now, on the flight clock.
-        tell: takes what people must know.
+        link: an open link.
+        t_s: flight clock now.
+        notify: called with each notice.
     """
 
-    def __init__(self, beat: Beat, clearance_m: float, tilt_max_rad: float, link: Link, t_s: float, tell: Tell) -> None:
+    def __init__(
+        self, last_heartbeat: Heartbeat, clearance_m: float, tilt_max_rad: float, link: Link, t_s: float, notify: Notify
+    ) -> None:
         self._clearance_m = clearance_m
         self._tilt_max_rad = tilt_max_rad
         self._link = link
-        self._tell = tell
+        self._notify = notify
         self._px4 = Px4State()
-        self._plausible = Plausible(beat.pose_stamp_s, beat.position_world_m)
+        self._pose_filter = PoseFilter(last_heartbeat.pose_stamp_s, last_heartbeat.position_world_m)
         self._start_s = t_s
         self._spoken_s: float | None = None
-        self._pilot = beat.pilot
-        self._mocap_refused = beat.mocap_refused
-        self._pose_s = beat.pose_stamp_s
-        """Of the newest pose that PX4 has had, by the flight process or by the guardian."""
+        self._pilot = last_heartbeat.pilot
+        self._mocap_refused = last_heartbeat.mocap_refused
+        self._pose_s = last_heartbeat.pose_stamp_s
+        """Stamp of the newest pose that PX4 received, from the flight process or the guardian."""
         self._landing: AutopilotLanding | None = None
-        self._rounds = 0
-        self._tick = beat.tick
+        self._attempts = 0
+        self._tick = last_heartbeat.tick
         self._pose: MocapPose | None = None
         self._pose_sent_s: float | None = None
         self._heartbeat_s = self._asked_s = self._zero_s = float("-inf")
         self._request = AutopilotRequest.NONE
         self._requested_s = float("-inf")
-        self._told: set[str] = set()
+        self._notified: set[str] = set()
         self.overturned = False
-        """The vehicle was flipped or tipped over, and its rotors were to be stopped for that."""
+        """The vehicle was flipped or tipped over, and its rotors were commanded to stop."""
         self.landed: bool | None = None
-        """Set at the end: the vehicle stands disarmed (or stands, and nobody answers), or nothing more can be done."""
+        """None while the landing runs. True: the vehicle stands and is disarmed (or stands, and PX4 does not answer). False: no landing
+        could be confirmed.
+        """
 
     @property
     def pose(self) -> MocapPose | None:
-        """Newest pose that went to PX4."""
+        """Newest pose that was sent to PX4."""
         return self._pose
 
     def status(self) -> AutopilotStatus | None:
-        """What PX4 said last about itself."""
+        """Return PX4's newest status, or None if it was never heard."""
         return self._px4.status()
 
     def take_poses(self, poses: Iterable[MocapPose]) -> None:
-        """Motion capture: pass on at once what can be true; nothing if the flight process landed because it did not believe it."""
+        """Send plausible poses to PX4 at once; send none if the flight process landed because it rejected motion capture."""
         for pose in poses:
             if not pose.tracking_valid:
                 continue
             if self._mocap_refused:
-                text = "motion capture was not believed by the flight process; held back from PX4, which lands on its own estimate"
-                self._say(pose.stamp_s, "guardian_mocap", Severity.WARNING, text)
+                text = "the flight process rejected motion capture; no pose is sent to PX4, which lands on its own estimate"
+                self._notify_once(pose.stamp_s, "guardian_mocap", Severity.WARNING, text)
                 continue
-            if not self._plausible.check(pose.stamp_s, pose.position_world_m):
-                self._say(pose.stamp_s, "guardian_mocap", Severity.WARNING, "motion capture jumps; held back from PX4")
+            if not self._pose_filter.check(pose.stamp_s, pose.position_world_m):
+                self._notify_once(
+                    pose.stamp_s,
+                    "guardian_mocap",
+                    Severity.WARNING,
+                    "motion capture jumps; the pose is not sent to PX4",
+                )
                 continue
-            self._link.vision(pose)
+            self._link.send_vision(pose)
             self._pose = pose
             self._pose_s = max(self._pose_s, pose.stamp_s)
 
     def take_messages(self, t_s: float, messages: Iterable[Any]) -> None:
-        """What PX4 says."""
+        """Process messages from PX4."""
         for message in messages:
             self._px4.take(t_s, message)
 
     def link_reopened(self) -> None:
-        """Ask for the streams again with the next step: PX4 may have restarted, or the port is a new one to it."""
+        """Request the message streams again in the next step: PX4 may have restarted, or the port is new to it."""
         self._spoken_s = None
 
     def step(self, t_s: float) -> None:
-        """Every hundredth of a second."""
+        """Run one step; call every 10 ms."""
         if self._spoken_s is None:
             if not self._link.wire.ready and t_s - self._start_s < LINK_TIMEOUT_S:
                 return
             self._spoken_s = t_s
             for message_id, rate_hz in _STREAMS:
-                self._link.set_rate(message_id, rate_hz)
+                self._link.request_rate(message_id, rate_hz)
         if t_s - self._heartbeat_s >= HEARTBEAT_PERIOD_S:
             self._heartbeat_s = t_s
-            self._link.heartbeat()
+            self._link.send_heartbeat()
         if t_s - self._asked_s >= ASK_PERIOD_S:
             self._asked_s = t_s
-            self._link.ask_for(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
+            self._link.request_message(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
         status = self._px4.status()
         if status is None and t_s - self._spoken_s < MODE_TIMEOUT_S:
             return
-        self._mind_the_pilot(t_s)
+        self._check_pilot(t_s)
         if self._landing is None:
-            self._rounds += 1
+            self._attempts += 1
             self._landing = AutopilotLanding(
                 t_s, self._clearance_m, self._tilt_max_rad, self._pilot, pose_s=self._pose_s
             )
         self._tick += 1
         step = self._landing.step(self._inputs(t_s, status))
         self.overturned = self.overturned or self._landing.overturned
-        self._carry_out(t_s, status, step)
+        self._apply(t_s, status, step)
 
-    def begin_again(self, t_s: float) -> None:
-        """The landing met an error of its own: a new one begins with the next step. If none gets anywhere, PX4 is told all the same."""
+    def restart(self, t_s: float) -> None:
+        """Start a new landing after an internal error. If no landing has begun by itself, PX4 is still commanded to land."""
         self._landing = None
         status = self._px4.status()
         if not self._pilot and status is not None and status.mode is not FlightMode.LAND and status.armed:
-            self._ask(t_s, AutopilotRequest.LAND)
+            self._send_request(t_s, AutopilotRequest.LAND)
         disarmed = status is not None and not status.armed and t_s - self._start_s > DISARMED_AFTER_S
-        if disarmed or t_s - self._start_s > ROUNDS * TIMEOUT_S:
+        if disarmed or t_s - self._start_s > ATTEMPTS_MAX * TIMEOUT_S:
             self.landed = disarmed
 
-    def _mind_the_pilot(self, t_s: float) -> None:
+    def _check_pilot(self, t_s: float) -> None:
         if not self._pilot and self._px4.pilot:
             self._pilot = True
             self._landing = None
         if self._pilot:
-            text = "a pilot flies: motion capture goes on, nothing else is sent"
-            self._say(t_s, "guardian_pilot", Severity.WARNING, text)
+            text = "a pilot flies: only motion capture is sent to PX4"
+            self._notify_once(t_s, "guardian_pilot", Severity.WARNING, text)
 
-    def _carry_out(self, t_s: float, status: AutopilotStatus | None, step: LandingStep) -> None:
+    def _apply(self, t_s: float, status: AutopilotStatus | None, step: LandingStep) -> None:
         mode = status.mode if status is not None else FlightMode.UNKNOWN
         if mode is FlightMode.LAND and not self._pilot:
-            self._say(t_s, "guardian_land", Severity.WARNING, "PX4 lands")
+            self._notify_once(t_s, "guardian_land", Severity.WARNING, "PX4 lands")
         if step.text == TOUCH_DOWN:
-            self._say(t_s, "guardian_touchdown", Severity.INFO, step.text)
+            self._notify_once(t_s, "guardian_touchdown", Severity.INFO, step.text)
         elif step.text is not None and not step.ended:
-            self._say(t_s, "guardian_landing", Severity.WARNING, step.text)
+            self._notify_once(t_s, "guardian_landing", Severity.WARNING, step.text)
         if step.zero_thrust and t_s - self._zero_s >= ZERO_THRUST_PERIOD_S:
             self._zero_s = t_s
-            self._link.stand_still(t_s, self._px4.yaw_rad() or 0.0)
+            self._link.send_zero_thrust(t_s, self._px4.yaw_rad() or 0.0)
         if step.request is not AutopilotRequest.NONE and not (
             step.request is AutopilotRequest.LAND and mode is FlightMode.LAND
         ):
-            self._ask(t_s, step.request)
+            self._send_request(t_s, step.request)
         if step.ended:
             self._end(t_s, status, step)
 
-    def _ask(self, t_s: float, request: AutopilotRequest) -> None:
+    def _send_request(self, t_s: float, request: AutopilotRequest) -> None:
         if request is self._request and t_s - self._requested_s < REPEAT_S:
             return
         if request is self._request and self._px4.refusal is not None:
-            text = f"PX4 refuses {request.value}: {self._px4.refusal}"
-            self._say(t_s, "guardian_refused", Severity.WARNING, text)
+            text = f"PX4 rejected {request.value}: {self._px4.refusal}"
+            self._notify_once(t_s, "guardian_refused", Severity.WARNING, text)
         self._request, self._requested_s = request, t_s
-        self._link.request(request)
+        self._link.send_request(request)
 
     def _end(self, t_s: float, status: AutopilotStatus | None, step: LandingStep) -> None:
         if step.landed:
-            self._say(t_s, "guardian_landed", Severity.INFO, step.text or "the vehicle stands and is disarmed")
+            self._notify_once(
+                t_s, "guardian_landed", Severity.INFO, step.text or "the vehicle is on the ground and disarmed"
+            )
             self.landed = True
             return
         heard = status is not None and t_s - status.heartbeat_stamp_s < LINK_FRESH_S
-        if heard and self._rounds < ROUNDS:
-            self._landing = None  # PX4 is there: go on as long as that is so
+        if heard and self._attempts < ATTEMPTS_MAX:
+            self._landing = None  # PX4 answers: try again
             return
-        self._say(t_s, "guardian_lost_vehicle", Severity.CRITICAL, step.text or "no landing could be confirmed")
+        self._notify_once(t_s, "guardian_lost_vehicle", Severity.CRITICAL, step.text or "no landing could be confirmed")
         self.landed = False
 
     def _inputs(self, t_s: float, status: AutopilotStatus | None) -> Inputs:
@@ -238,8 +249,8 @@ class Charge:
             recorder_dropped=0,
         )
 
-    def _say(self, t_s: float, event_id: str, severity: Severity, text: str) -> None:
-        """Once per id and text."""
-        if event_id + text not in self._told:
-            self._told.add(event_id + text)
-            self._tell(Told(t_s, event_id, severity, SafetyAction.AUTOPILOT_LAND, text))
+    def _notify_once(self, t_s: float, event_id: str, severity: Severity, text: str) -> None:
+        """Report an event, once per id and text."""
+        if event_id + text not in self._notified:
+            self._notified.add(event_id + text)
+            self._notify(Notice(t_s, event_id, severity, SafetyAction.AUTOPILOT_LAND, text))

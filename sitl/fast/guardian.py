@@ -13,11 +13,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.vehicle import Vehicle
 from companion.flight.heartbeat import Heartbeats
-from companion.guardian.heartbeat import Beat
+from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.monitors import StallWatch
 from companion.guardian.process import PERIOD_S
-from companion.guardian.takeover_landing import Charge, Tell, Told
+from companion.guardian.takeover_landing import Notice, Notify, TakeoverLanding
 from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Outputs, SafetyAction, Severity
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver
@@ -113,7 +113,7 @@ class FastGuardian:
         self._vehicle = vehicle
         self._px4 = px4
         self._watch = StallWatch(vehicle.safety.guardian_timeout_s)
-        self._beat: Beat | None = None
+        self._beat: Heartbeat | None = None
         system = px4.params.integer("MAV_SYS_ID")
         self._heartbeats = Heartbeats(LinkIdentity(system, *_OWN, local_port=0), origin_s=0.0)
         self._round_s = 0.0
@@ -138,38 +138,38 @@ class FastGuardian:
             else f"the flight process hangs (silent for {self._watch.silent_s * 1e3:.0f} ms)"
         )
         text = f"{reason}; the guardian has taken over"
-        self._tell(Told(t_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+        self._notify(Notice(t_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
         return True
 
     def take_over(self, t_s: float) -> Landing:
         """In charge from now on."""
         assert self._beat is not None
-        return Landing(self._beat, self._vehicle, self._px4, t_s, self._tell)
+        return Landing(self._beat, self._vehicle, self._px4, t_s, self._notify)
 
-    def _tell(self, told: Told) -> None:
-        self.events.append(Event(told.t_s, told.id, told.severity, told.action, told.text))
+    def _notify(self, notice: Notice) -> None:
+        self.events.append(Event(notice.t_s, notice.id, notice.severity, notice.action, notice.text))
 
 
 class Landing:
     """The guardian in charge."""
 
-    def __init__(self, beat: Beat, vehicle: Vehicle, px4: Px4Stub, t_s: float, tell: Tell) -> None:
+    def __init__(self, beat: Heartbeat, vehicle: Vehicle, px4: Px4Stub, t_s: float, notify: Notify) -> None:
         self._wire = MemoryWire(px4)
         self._link = Link(self._wire, _OWN, beat.autopilot_system)
         clearance_m, tilt_max_rad = vehicle.airframe.ground_clearance_m, math.radians(vehicle.safety.tilt_abort_deg)
-        self._charge = Charge(beat, clearance_m, tilt_max_rad, self._link, t_s, tell)
+        self._landing = TakeoverLanding(beat, clearance_m, tilt_max_rad, self._link, t_s, notify)
         self._round_s = float("-inf")
 
     @property
     def landed(self) -> bool | None:
-        """As `Charge.landed`."""
-        return self._charge.landed
+        """As `TakeoverLanding.landed`."""
+        return self._landing.landed
 
     def step(self, t_s: float, poses: list[MocapPose]) -> None:
         """To be called in every step of the physics."""
-        self._charge.take_poses(poses)
+        self._landing.take_poses(poses)
         if t_s - self._round_s >= PERIOD_S - 1e-9:
             self._round_s = t_s
             self._wire.pump(t_s)
-            self._charge.take_messages(t_s, self._link.receive())
-            self._charge.step(t_s)
+            self._landing.take_messages(t_s, self._link.receive())
+            self._landing.step(t_s)

@@ -83,7 +83,7 @@ def test_without_a_guardian_nothing_takes_off(tmp_path: Path) -> None:
         sandbox.assert_nobody_left()
         summary = read_summary(sandbox.cwd / "out")
     assert ended.code == EXIT_REFUSED, ended.err
-    assert "guardian: expected it to stand by, found that its process ended" in ended.err
+    assert "guardian: its process ended before it was ready" in ended.err
     assert summary["outcome"] == "refused"
 
 

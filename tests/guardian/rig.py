@@ -17,9 +17,9 @@ from typing import Any, Self
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.loader import load_flight
-from companion.guardian import heartbeat as words
-from companion.guardian.heartbeat import Beat
-from companion.launcher.launcher import with_devices
+from companion.guardian import heartbeat
+from companion.guardian.heartbeat import Heartbeat
+from companion.launcher.launcher import replace_device_settings
 from companion.model.codec import unpack_plain
 from companion.model.types import Quat, Vec3
 from companion.runtime import ipc
@@ -117,7 +117,7 @@ class Rig:
                 "command_port": self.cameras.port,
             },
         }
-        data = json.loads(with_devices(config, devices).model_dump_json())
+        data = json.loads(replace_device_settings(config, devices).model_dump_json())
         data["vehicle"]["safety"]["guardian_timeout_s"] = self._timeout_s
         path = self._folder / "config.json"
         path.write_text(json.dumps(data), encoding="utf-8")
@@ -143,7 +143,7 @@ class Rig:
             self.guardian = subprocess.Popen(
                 [
                     *(sys.executable, "-m", "companion.guardian", "--config", str(path), "--pidfd", str(pidfd)),
-                    *("--beats", str(theirs.fileno()), "--channel", str(channel.fileno())),
+                    *("--heartbeats", str(theirs.fileno()), "--channel", str(channel.fileno())),
                 ],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -152,7 +152,7 @@ class Rig:
             )
         os.close(pidfd)
         with recorder:
-            socket.send_fds(self.beats, [words.ADOPT], [recorder.fileno()])
+            socket.send_fds(self.beats, [heartbeat.RECORDER_CHANNEL], [recorder.fileno()])
         return self
 
     def __exit__(
@@ -182,7 +182,7 @@ class Rig:
         """One tick of the flight process."""
         self.tick += 1
         t_s = time.monotonic() - self.origin_s
-        beat = Beat(
+        beat = Heartbeat(
             tick=self.tick,
             t_s=t_s,
             origin_s=self.origin_s,
@@ -199,7 +199,7 @@ class Rig:
             position_world_m=POSITION_M,
             peer=self.peer.address,
         )
-        self.beats.send(words.pack(beat))
+        self.beats.send(heartbeat.pack(beat))
 
     def beat_until_ready(self, **kind: bool) -> None:
         """Ticks until the guardian says that it could take over; ends with a tick of this kind."""
@@ -207,7 +207,7 @@ class Rig:
         def ready() -> bool:
             self.beat(**kind)
             try:
-                return bool(self.beats.recv(words.MAX_BYTES) == words.READY)
+                return bool(self.beats.recv(heartbeat.MAX_BYTES) == heartbeat.READY)
             except BlockingIOError:
                 return False
 

@@ -12,7 +12,7 @@ import pytest
 from companion.config.loader import load_flight
 from companion.core.flight_core import FlightCore
 from companion.flight.heartbeat import FlightGuard, Heartbeats
-from companion.guardian import heartbeat as words
+from companion.guardian import heartbeat
 from companion.guardian.client import SILENT_S, GuardianClient
 from companion.io.protocols import DeviceError
 from companion.model.types import (
@@ -59,7 +59,7 @@ def test_ready_is_a_word_of_the_last_second(pair: Pair, clock: Clock) -> None:
     client, guardian = pair
     client.listen()
     assert not client.ready
-    guardian.send(words.READY)
+    guardian.send(heartbeat.READY)
     client.listen()
     assert client.ready
     clock.now_s += SILENT_S
@@ -69,8 +69,8 @@ def test_ready_is_a_word_of_the_last_second(pair: Pair, clock: Clock) -> None:
 
 def test_a_problem_ends_readiness_and_is_told(pair: Pair) -> None:
     client, guardian = pair
-    guardian.send(words.READY)
-    guardian.send(words.PROBLEM + "mocap: ärger".encode())
+    guardian.send(heartbeat.READY)
+    guardian.send(heartbeat.PROBLEM + "mocap: ärger".encode())
     client.listen()
     assert not client.ready
     with pytest.raises(DeviceError, match=r"guardian: not ready within -1 s: mocap: ärger"):
@@ -79,11 +79,11 @@ def test_a_problem_ends_readiness_and_is_told(pair: Pair) -> None:
 
 def test_a_dead_guardian_is_noticed_and_costs_nothing(pair: Pair) -> None:
     client, guardian = pair
-    guardian.send(words.READY)
+    guardian.send(heartbeat.READY)
     guardian.close()
     client.listen()
     assert not client.ready
-    client.beat(_beat())
+    client.send_heartbeat(_beat())
     with pytest.raises(DeviceError, match="its process ended"):
         asyncio.run(client.wait_ready())
 
@@ -91,12 +91,12 @@ def test_a_dead_guardian_is_noticed_and_costs_nothing(pair: Pair) -> None:
 def test_a_guardian_that_does_not_read_never_blocks_the_flight(pair: Pair) -> None:
     client, guardian = pair
     for _ in range(20_000):  # far beyond what the socket holds
-        client.beat(_beat())
-    assert words.unpack(guardian.recv(words.MAX_BYTES)) == _beat()
+        client.send_heartbeat(_beat())
+    assert heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) == _beat()
 
 
-def _beat() -> words.Beat:
-    return words.Beat(1, 2.0, 3.0, 0.0, True, False, False, False, 1, 1, 195, 14540, 1.9, (0.0, 0.0, 1.0))
+def _beat() -> heartbeat.Heartbeat:
+    return heartbeat.Heartbeat(1, 2.0, 3.0, 0.0, True, False, False, False, 1, 1, 195, 14540, 1.9, (0.0, 0.0, 1.0))
 
 
 def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
@@ -133,7 +133,7 @@ def test_when_the_rotors_may_turn(
     client, guardian = pair
     guard = FlightGuard(client, LinkIdentity(1, 1, 195, 14540, ("10.0.0.7", 14580)), 77.0)
     guard.tick(inputs(armed=armed), dataclasses.replace(waiting, request=request_, phase_kind=kind))
-    beat = words.unpack(guardian.recv(words.MAX_BYTES))
+    beat = heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES))
     assert beat is not None
     assert beat.lifting is lifting
     assert (beat.tick, beat.t_s, beat.origin_s) == (9, 5.0, 77.0)
@@ -149,7 +149,7 @@ def test_a_pilot_stays_one_and_a_pose_that_is_not_believed_is_not_passed_on(pair
     guard.tick(inputs(tracking=False), dataclasses.replace(waiting, events=(event,)))
     guard.tick(inputs(), dataclasses.replace(waiting, mocap_trusted=False))
     guard.goodbye(inputs().status)
-    beats = [words.unpack(guardian.recv(words.MAX_BYTES)) for _ in range(3)]
+    beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(3)]
     assert [beat is not None and (beat.pilot, beat.goodbye, beat.pose_stamp_s) for beat in beats] == [
         (True, False, float("-inf")),
         (True, False, float("-inf")),
@@ -164,7 +164,7 @@ def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiti
     guard.tick(inputs(armed=True), dataclasses.replace(waiting, phase_kind=PhaseKind.DONE))
     guard.goodbye(inputs(armed=True).status)
     guard.goodbye(inputs(armed=False).status)
-    beats = [words.unpack(guardian.recv(words.MAX_BYTES)) for _ in range(2)]
+    beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(2)]
     assert [beat is not None and (beat.goodbye, beat.lifting) for beat in beats] == [(False, True), (True, True)]
 
 

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guardian import heartbeat as words
-from companion.guardian.heartbeat import Beat
-from companion.guardian.monitors import JUMP_M, SPEED_MAX_M_S, Plausible, StallWatch
+from companion.guardian import heartbeat
+from companion.guardian.heartbeat import Heartbeat
+from companion.guardian.monitors import JUMP_M, SPEED_MAX_M_S, PoseFilter, StallWatch
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 byte = st.integers(0, 255)
 beats = st.builds(
-    Beat,
+    Heartbeat,
     tick=st.integers(0, 2**32 - 1),
     t_s=finite,
     origin_s=finite,
@@ -35,19 +35,19 @@ beats = st.builds(
 
 
 @given(beats)
-def test_a_beat_comes_through_bit_for_bit(beat: Beat) -> None:
-    assert words.unpack(words.pack(beat)) == beat
+def test_a_beat_comes_through_bit_for_bit(beat: Heartbeat) -> None:
+    assert heartbeat.unpack(heartbeat.pack(beat)) == beat
 
 
 @given(beats)
-def test_a_beat_is_a_few_dozen_bytes(beat: Beat) -> None:
-    assert len(words.pack(beat)) < 100
+def test_a_beat_is_a_few_dozen_bytes(beat: Heartbeat) -> None:
+    assert len(heartbeat.pack(beat)) < 100
 
 
 @given(st.binary(max_size=200))
 def test_nothing_that_comes_in_raises(datagram: bytes) -> None:
-    words.unpack(datagram)
-    words.unpack(words.BEAT + datagram)
+    heartbeat.unpack(datagram)
+    heartbeat.unpack(heartbeat.HEARTBEAT + datagram)
 
 
 @given(
@@ -55,14 +55,14 @@ def test_nothing_that_comes_in_raises(datagram: bytes) -> None:
     st.integers(0, 60),
     st.sampled_from([b"\x00\x00\x00\x00\x00\x00\xf8\x7f", b"\x00\x00\x00\x00\x00\x00\xf0\x7f"]),
 )
-def test_a_beat_that_is_not_finite_is_none(beat: Beat, where: int, poison: bytes) -> None:
+def test_a_beat_that_is_not_finite_is_none(beat: Heartbeat, where: int, poison: bytes) -> None:
     """NaN or infinity in any double, but for a pose that never was."""
-    data = bytearray(words.pack(beat))
+    data = bytearray(heartbeat.pack(beat))
     start = len(data) - 8 * (1 + where % 7)
     data[start : start + 8] = poison
     stamp = len(data) - 32
     infinite_stamp = start == stamp and poison[6:] == b"\xf0\x7f"
-    assert infinite_stamp or words.unpack(bytes(data)) is None
+    assert infinite_stamp or heartbeat.unpack(bytes(data)) is None
 
 
 def silent_after(watch: StallWatch, period_s: float, rounds: int) -> list[bool]:
@@ -91,7 +91,7 @@ def test_what_the_guardian_slept_through_proves_nothing() -> None:
 
 
 def test_a_pose_that_cannot_be_true_is_not_believed() -> None:
-    plausible = Plausible(10.0, (1.0, 2.0, 1.5))
+    plausible = PoseFilter(10.0, (1.0, 2.0, 1.5))
     assert plausible.check(10.005, (1.01, 2.0, 1.5))
     assert not plausible.check(10.010, (1.01 + JUMP_M + 0.1, 2.0, 1.5))
     assert plausible.check(10.015, (1.02, 2.0, 1.5)), "the jump has not become the place to measure from"
@@ -101,9 +101,9 @@ def test_a_pose_that_cannot_be_true_is_not_believed() -> None:
 
 
 def test_the_first_pose_is_believed_if_there_was_none() -> None:
-    assert Plausible(-math.inf, (0.0, 0.0, 0.0)).check(3.0, (5.0, -7.0, 2.0))
+    assert PoseFilter(-math.inf, (0.0, 0.0, 0.0)).check(3.0, (5.0, -7.0, 2.0))
 
 
-@pytest.mark.parametrize("kind", [words.ADOPT, words.READY, words.PROBLEM])
+@pytest.mark.parametrize("kind", [heartbeat.RECORDER_CHANNEL, heartbeat.READY, heartbeat.PROBLEM])
 def test_other_datagrams_are_no_beats(kind: bytes) -> None:
-    assert words.unpack(kind) is None
+    assert heartbeat.unpack(kind) is None

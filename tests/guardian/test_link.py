@@ -131,11 +131,11 @@ def test_px4_that_a_router_moved_to_another_port_is_heard_there(
         monkeypatch.setattr("companion.guardian.link.REPIN_SILENCE_S", 0.05)
         wait_until(lambda: from_all_but_px4() == [1], lambda: "PX4 is not heard at its new port")
         moved.settimeout(DEADLINE_S)
-        link.heartbeat()
+        link.send_heartbeat()
         assert moved.recv(1000)
-        assert [f"is heard at port {moved.getsockname()[1]}" in record.getMessage() for record in caplog.records] == [
-            True
-        ]
+        assert [
+            f"now sends from port {moved.getsockname()[1]}" in record.getMessage() for record in caplog.records
+        ] == [True]
 
 
 def test_udpin_is_not_to_be_had_while_the_flight_holds_it() -> None:
@@ -230,7 +230,7 @@ def test_only_px4_itself_is_listened_to_and_noise_does_no_harm() -> None:
         px4.bind(("127.0.0.1", 0))
         with opened(f"udpout://127.0.0.1:{px4.getsockname()[1]}") as wire:
             link = Link(wire, (1, 195), 1)
-            link.heartbeat()
+            link.send_heartbeat()
             _, ours = px4.recvfrom(1000)
             cut = heartbeat()[:-5]
             for data in (
@@ -272,8 +272,8 @@ def test_it_says_what_mavsdk_says() -> None:
             link = Link(wire, (own[0], own[1]), system)
             wait_until(lambda: bool(link.receive()), lambda: "PX4 is not heard")
             before = len(peer.of("HEARTBEAT"))
-            link.heartbeat()
-            link.vision(POSE)
+            link.send_heartbeat()
+            link.send_vision(POSE)
             peer.wait_for("VISION_POSITION_ESTIMATE", 2)
             peer.wait_for("HEARTBEAT", before + 1)
         for name in ("VISION_POSITION_ESTIMATE", "HEARTBEAT"):

@@ -33,7 +33,7 @@ if "companion.guardian" in sys.orig_argv:
     import atexit, json
     import companion.guardian.process as process
 
-    class Counting(process.Charge):
+    class Counting(process.TakeoverLanding):
         rounds = steps = 0
 
         def take_messages(self, *arguments):
@@ -44,7 +44,7 @@ if "companion.guardian" in sys.orig_argv:
             Counting.steps += 1
             super().step(*arguments)
 
-    process.Charge = Counting
+    process.TakeoverLanding = Counting
     atexit.register(lambda: open({file!r}, "w").write(json.dumps([Counting.rounds, Counting.steps])))
     if {immortal}:
         process.FlightProcess.kill = lambda self: None
@@ -172,7 +172,7 @@ def test_over_udp_it_lands_beside_a_killed_flight_process_that_does_not_end(
         rig.land_as_told()
         assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
         assert rig.flight.poll() is None, "it has not ended"
-        assert "though that was killed and has not ended" in rig.log.read_text()
+        assert "the flight process was killed but has not ended" in rig.log.read_text()
         assert "guardian_no_link" not in rig.events
         assert rig.events[-1] == "guardian_landed", "it hears PX4"
 
@@ -184,12 +184,12 @@ def test_of_two_streams_of_motion_capture_at_one_address_none_is_passed_on() -> 
             seen: list[MocapPose] = []
 
             def read() -> bool:
-                client.serve(time.monotonic())
+                client.keep_connected(time.monotonic())
                 seen.extend(client.poses(time.monotonic()))
                 return len(seen) > 10
 
-            wait_until(read, lambda: f"no poses: {client.trouble}")
-            assert client.trouble is None
+            wait_until(read, lambda: f"no poses: {client.problem}")
+            assert client.problem is None
             ours = client.sockets[0].getsockname()
             number = 1_000_000
 
@@ -200,6 +200,6 @@ def test_of_two_streams_of_motion_capture_at_one_address_none_is_passed_on() -> 
                 forger.sendto(encode_frame("4.1", number, 1.0, (body,), None, {}), ours)
                 seen.clear()
                 read()
-                return client.trouble is not None and "two servers at one address" in client.trouble and not seen
+                return client.problem is not None and "two servers at one address" in client.problem and not seen
 
-            wait_until(forged, lambda: f"{client.trouble}, {seen[-1:]}")
+            wait_until(forged, lambda: f"{client.problem}, {seen[-1:]}")

@@ -38,7 +38,7 @@ def test_a_clean_end_of_the_flight_ends_it_quietly(tmp_path: Path) -> None:
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.flight.poll() is None, "it was not its business to end it"
         assert (rig.events, rig.result) == ([], None)
-        assert rig.log.read_text().startswith(f"heard {rig.tick} beats, 0 missed, silent for ")
+        assert rig.log.read_text().startswith(f"heard {rig.tick} heartbeats, 0 missed, silent for ")
         assert rig.peer.received == []
 
 
@@ -49,7 +49,7 @@ def test_ticks_that_it_did_not_hear_of_are_counted(tmp_path: Path) -> None:
         rig.beat()
         rig.beat(goodbye=True)
         assert rig.guardian.wait(DEADLINE_S) == 0
-        assert rig.log.read_text().startswith(f"heard {rig.tick - 3} beats, 3 missed, ")
+        assert rig.log.read_text().startswith(f"heard {rig.tick - 3} heartbeats, 3 missed, ")
 
 
 @pytest.mark.parametrize("ticks", [True, False])
@@ -241,7 +241,7 @@ def test_it_is_not_ready_without_a_body_of_its_own(tmp_path: Path) -> None:
                 said.append(rig.beats.recv(1024))
             except BlockingIOError:
                 return False
-            return b"sees no rigid body" in said[-1]
+            return b"tracks no rigid body" in said[-1]
 
         wait_until(blind, lambda: f"{said} {rig.log.read_text()}")
 
@@ -273,10 +273,10 @@ _BUGS = """
 import sys
 
 if "companion.guardian" in sys.orig_argv:
-    import companion.guardian.takeover_landing as charge
+    import companion.guardian.takeover_landing as takeover_landing
     import companion.guardian.mocap as mocap
 
-    class Breaking(charge.{broken}):
+    class Breaking(takeover_landing.{broken}):
         def {method}(self, *arguments):
             Breaking.calls += 1
             if {when}:
@@ -284,7 +284,7 @@ if "companion.guardian" in sys.orig_argv:
             return super().{method}(*arguments)
 
     Breaking.calls = 0
-    charge.{broken} = Breaking
+    takeover_landing.{broken} = Breaking
 """
 
 
@@ -294,7 +294,7 @@ if "companion.guardian" in sys.orig_argv:
         ("AutopilotLanding", "step", "Breaking.calls == 5", "the landing"),
         ("AutopilotLanding", "step", "True", "the landing"),
         ("Px4State", "take", "arguments[1].get_type() != 'HEARTBEAT'", "PX4's messages"),
-        ("Plausible", "check", "Breaking.calls < 50", "motion capture"),
+        ("PoseFilter", "check", "Breaking.calls < 50", "motion capture"),
     ],
     ids=["once", "always", "messages", "poses"],
 )

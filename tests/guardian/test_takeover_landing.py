@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.guardian.heartbeat import Beat
+from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
-from companion.guardian.takeover_landing import Charge, Told
+from companion.guardian.takeover_landing import Notice, TakeoverLanding
 from companion.mission.autopilot_landing import TIMEOUT_S
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.model.types import MocapPose, Quat, Vec3
@@ -55,8 +55,8 @@ class Wire:
         return [m for m in self.sent if m.get_type() == "VISION_POSITION_ESTIMATE"]
 
 
-def beat(*, mocap_refused: bool = False, pose_stamp_s: float = START_S - 0.1) -> Beat:
-    return Beat(
+def beat(*, mocap_refused: bool = False, pose_stamp_s: float = START_S - 0.1) -> Heartbeat:
+    return Heartbeat(
         tick=1,
         t_s=START_S - 0.1,
         origin_s=0.0,
@@ -77,12 +77,12 @@ def beat(*, mocap_refused: bool = False, pose_stamp_s: float = START_S - 0.1) ->
 class Landing:
     """A guardian in charge of a vehicle that PX4 lands."""
 
-    def __init__(self, last: Beat) -> None:
+    def __init__(self, last: Heartbeat) -> None:
         self.wire = Wire()
-        self.told: list[Told] = []
+        self.notices: list[Notice] = []
         self.t_s = START_S
         link = Link(self.wire, (1, 191), 1)
-        self.charge = Charge(last, STANDING_M, TILT_MAX_RAD, link, START_S, self.told.append)
+        self.takeover = TakeoverLanding(last, STANDING_M, TILT_MAX_RAD, link, START_S, self.notices.append)
 
     def run(
         self,
@@ -110,10 +110,10 @@ class Landing:
             if mocap:
                 number = round(self.t_s / STEP_S)
                 position: Vec3 = (0.0, 0.0, height_m)
-                self.charge.take_poses([MocapPose(self.t_s, None, number, position, attitude, True, 0.0)])
-            self.charge.take_messages(self.t_s, [heartbeat, *said])
-            if self.charge.landed is None:
-                self.charge.step(self.t_s)
+                self.takeover.take_poses([MocapPose(self.t_s, None, number, position, attitude, True, 0.0)])
+            self.takeover.take_messages(self.t_s, [heartbeat, *said])
+            if self.takeover.landed is None:
+                self.takeover.step(self.t_s)
 
     @property
     def forced(self) -> bool:
@@ -155,7 +155,7 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
     assert not landing.forced
     landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
     assert landing.forced
-    assert "tipped over on the floor: FORCE_DISARM is requested at once" in [told.text for told in landing.told]
+    assert "tipped over on the floor: FORCE_DISARM is requested at once" in [notice.text for notice in landing.notices]
 
 
 def test_poses_that_the_flight_process_did_not_believe_are_neither_passed_on_nor_judged_by() -> None:
@@ -164,8 +164,8 @@ def test_poses_that_the_flight_process_did_not_believe_are_neither_passed_on_nor
     landing.run(10.0, attitude=ON_ITS_ROTORS)
     assert landing.wire.poses == []
     assert not landing.forced, "only motion capture says so low that it is tipped over"
-    assert landing.charge.pose is None
-    assert [told.id for told in landing.told].count("guardian_mocap") == 1
+    assert landing.takeover.pose is None
+    assert [notice.id for notice in landing.notices].count("guardian_mocap") == 1
     believed = Landing(beat(pose_stamp_s=START_S - 5.0))
     believed.run(10.0, attitude=ON_ITS_ROTORS)
     assert believed.wire.poses and believed.forced
@@ -178,7 +178,7 @@ def test_a_height_by_dead_reckoning_is_vouched_for_once_and_not_anew_in_each_rou
     assert not landing.zero_thrust
     landing.run(10.0, mocap=False)
     assert not landing.zero_thrust
-    assert landing.charge.landed is None
+    assert landing.takeover.landed is None
 
 
 def test_a_height_by_dead_reckoning_counts_from_the_last_pose_on_whoever_passed_it_on() -> None:
