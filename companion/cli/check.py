@@ -26,7 +26,7 @@ from companion.cli.campaign import wide_console
 from companion.config.loader import FlightConfig
 from companion.io.devices import open_what_opens
 from companion.io.protocols import DeviceError
-from companion.launcher.launcher import with_devices
+from companion.launcher.launcher import replace_device_settings
 from companion.launcher.sitl_process import SitlProcess
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
@@ -118,7 +118,7 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
             line("the simulated world starts")
             world = SitlProcess(config, scratch, px4=task.sitl == "px4")
             stack.callback(world.stop)
-            config = with_devices(config, world.devices(line.world))
+            config = replace_device_settings(config, world.devices(line.world))
         line("recorder")
         known = Observations(
             0.0,

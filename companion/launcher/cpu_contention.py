@@ -1,6 +1,7 @@
-"""Is the computer too busy for a flight? Judged by how long its processes were ready to run and had no core.
+"""Detection of a computer that is too busy for a flight, by how long its processes were ready to run without a core.
 
-A computer whose cores are taken by other programs looks like bad devices: answers come late or not at all. The scheduler knows better.
+A computer whose cores are taken by other programs looks like failing devices: answers arrive late or not at all. The scheduler's
+statistics show the cause.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from companion.model.rows import Level
 from companion.model.types import SafetyAction, Severity
 
 WAIT_MAX = 0.15
-"""Share of the time: a process that waits longer than this for a core answers too late."""
+"""Share of the time; a process that waits longer than this for a core answers too late."""
 WAIT_LATE_MAX, LATE_S = 0.05, 0.005
-"""The same where ticks come a whole period late."""
+"""The same limit when ticks are late by `LATE_S` or more."""
 WINDOW_S, SAMPLE_S = 3.0, 0.5
 CAUSED_BY_LATENESS = frozenset({
     "mocap_lost", "mocap_too_late", "vehicle_state_lost", "heartbeat_lost", "offboard_left", "arm_lost",
@@ -26,24 +27,24 @@ CAUSED_BY_LATENESS = frozenset({
     "mocap.rate", "mocap.latency", "mocap.lost", "px4.heartbeat", "px4.rates", "px4.lag", "px4.vision", "px4.steady",
     "arm.reads", "force.rate",
 })  # fmt: skip
-"""Landings and refusals that a busy computer may bring about: ids of events and of rows of the preflight."""
+"""Landings and refusals that a busy computer may cause: ids of events and of preflight rows."""
 ADVICE = "close other programs, or permit real-time priority: docs/raspberry-pi.md, Real time"
 
-Waited = Mapping[int, float]
-"""By thread id: seconds for which it was ready to run and had no core, since it began."""
+CoreWaits = Mapping[int, float]
+"""By thread id: seconds that the thread was ready to run without a core, since it started."""
 
 
 @dataclass(frozen=True, slots=True)
-class CoreWait:
+class ProcessWait:
     """How long one process waited for a core."""
 
     process: str
-    """In words."""
+    """Name of the process, for the message."""
     share: float
-    """Of the time, 0 to 1, of the thread that waited longest."""
+    """Share of the time, 0 to 1, of the thread that waited longest."""
 
 
-def busy_line(waits: Sequence[CoreWait], late_s: float) -> str | None:
+def contention_message(waits: Sequence[ProcessWait], late_s: float) -> str | None:
     """Return one line for the operator if the computer is too busy, else None.
 
     Args:
@@ -59,14 +60,14 @@ def busy_line(waits: Sequence[CoreWait], late_s: float) -> str | None:
     return f"this computer is too busy ({', '.join(figures)}); {ADVICE}"
 
 
-def core_wait(process: str, before: Waited, now: Waited, elapsed_s: float) -> CoreWait:
-    """Return the longest wait of the threads that were there all the time."""
+def longest_wait(process: str, before: CoreWaits, now: CoreWaits, elapsed_s: float) -> ProcessWait:
+    """Return the longest wait among the threads that existed during the whole interval."""
     waited_s = max((now[thread] - before[thread] for thread in before.keys() & now.keys()), default=0.0)
-    return CoreWait(process, waited_s / elapsed_s)
+    return ProcessWait(process, waited_s / elapsed_s)
 
 
-def waited(pid: int) -> Waited:
-    """Read /proc/PID/task/*/schedstat, second field; empty for a process that is gone, and on a kernel that does not count."""
+def read_core_waits(pid: int) -> CoreWaits:
+    """Read the second field of /proc/PID/task/*/schedstat; empty if the process is gone or the kernel keeps no statistics."""
     found = {}
     with contextlib.suppress(OSError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -75,43 +76,43 @@ def waited(pid: int) -> Waited:
     return found
 
 
-class Crowding:
-    """Watches the processes of one flight from outside and judges when something happens that lateness may have caused.
+class CpuContention:
+    """Samples the waits of a flight's processes and evaluates them when an event occurs that lateness may have caused.
 
     Args:
-        pids: by the process's name in words.
-        read: the waits of one process's threads.
+        pids: process ids by the process's name.
+        read: returns the waits of one process's threads.
     """
 
-    def __init__(self, pids: Mapping[str, int], read: Callable[[int], Waited] = waited) -> None:
+    def __init__(self, pids: Mapping[str, int], read: Callable[[int], CoreWaits] = read_core_waits) -> None:
         self._pids = pids
         self._read = read
-        self._samples: deque[tuple[float, dict[str, Waited]]] = deque()
+        self._samples: deque[tuple[float, dict[str, CoreWaits]]] = deque()
         self._late_s: deque[tuple[float, float]] = deque()
-        self.line: str | None = None
-        """What was judged at the first event or refused row that lateness may have caused; None: not busy, or no such event."""
+        self.message: str | None = None
+        """The first contention message; None if the computer was not busy, or no such event occurred."""
 
     def sample(self, now_s: float) -> None:
-        """Read the waits; to be called often, reads every `SAMPLE_S`."""
+        """Read the waits, at most every `SAMPLE_S`; call often."""
         if self._samples and now_s - self._samples[-1][0] < SAMPLE_S:
             return
         self._samples.append((now_s, {name: self._read(pid) for name, pid in self._pids.items()}))
         while now_s - self._samples[0][0] > WINDOW_S:
             self._samples.popleft()
 
-    def take(self, message: Mapping[str, Any], now_s: float) -> str | None:
-        """Take a message of flight or guardian; returns the line when it is first known."""
+    def on_message(self, message: Mapping[str, Any], now_s: float) -> str | None:
+        """Process a message of the flight or the guardian; return the contention message when it is first known, else None."""
         kind = message.get("type")
         if kind == "status":
             self._late_s.append((now_s, message["lateness_ms"] * 1e-3))
             while now_s - self._late_s[0][0] > WINDOW_S:
                 self._late_s.popleft()
-        elif self.line is None and _late(message):
-            self.line = busy_line(self._waits(now_s), self._late_p99_s())
-            return self.line
+        elif self.message is None and _late(message):
+            self.message = contention_message(self._waits(now_s), self._late_p99_s())
+            return self.message
         return None
 
-    def _waits(self, now_s: float) -> list[CoreWait]:
+    def _waits(self, now_s: float) -> list[ProcessWait]:
         if not self._samples:
             return []
         then_s, before = self._samples[0]
@@ -119,7 +120,7 @@ class Crowding:
         newest = self._samples[-1][1]
         # A process that refuses the flight ends at once: its last sample counts then.
         return [
-            core_wait(name, before[name], self._read(pid) or newest[name], elapsed_s)
+            longest_wait(name, before[name], self._read(pid) or newest[name], elapsed_s)
             for name, pid in self._pids.items()
         ]
 

@@ -1,4 +1,4 @@
-"""The guardian as a child process of the launcher: started beside the flight, heard, and ended for sure."""
+"""The guardian as a child process of the launcher."""
 
 from __future__ import annotations
 
@@ -16,38 +16,45 @@ from companion.runtime import ipc
 from companion.runtime.subprocesses import holds_traceback, how_it_ended, last_line, remove_file, terminate, write_text
 
 SILENT_S = 5.0
-"""In charge it speaks twice a second; silent for this long it hangs itself."""
+"""After a takeover the guardian reports twice a second; silent for this long it counts as hung."""
 
 
 class GuardianProcess:
-    """Started once the flight process exists, so that it can hold that one process and no other.
+    """A running guardian, started after the flight process so that it can hold that process's pidfd.
 
     Args:
         config_path: effective configuration.
         out: folder of the flight.
-        flight_pid: of the flight process, a child that is not reaped yet.
-        beats: the guardian's end of the socket to the flight process; closed here.
-        shared: descriptors that the guardian holds open for the world's sake.
+        flight_pid: id of the flight process, a child that has not been reaped.
+        heartbeats: the guardian's end of the socket to the flight process; closed here.
+        shared: descriptors that the guardian keeps open for the simulated world.
     """
 
     def __init__(
-        self, config_path: Path, out: Path, flight_pid: int, beats: socket.socket, shared: Sequence[int]
+        self, config_path: Path, out: Path, flight_pid: int, heartbeats: socket.socket, shared: Sequence[int]
     ) -> None:
         self.log = out / "guardian.log"
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.setblocking(False)
         pidfd = os.pidfd_open(flight_pid)
         try:
-            with theirs, beats, open(self.log, "wb") as log:
+            with theirs, heartbeats, open(self.log, "wb") as log:
                 self.process = subprocess.Popen(
                     [
                         *(sys.executable, "-m", "companion.guardian", "--config", str(config_path)),
-                        *("--beats", str(beats.fileno()), "--channel", str(theirs.fileno()), "--pidfd", str(pidfd)),
+                        *(
+                            "--heartbeats",
+                            str(heartbeats.fileno()),
+                            "--channel",
+                            str(theirs.fileno()),
+                            "--pidfd",
+                            str(pidfd),
+                        ),
                     ],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
-                    pass_fds=(beats.fileno(), theirs.fileno(), pidfd, *shared),
+                    pass_fds=(heartbeats.fileno(), theirs.fileno(), pidfd, *shared),
                     start_new_session=True,
                 )
         except BaseException:
@@ -55,28 +62,28 @@ class GuardianProcess:
             raise
         finally:
             os.close(pidfd)
-        self._number = out / "guardian.pid"
-        write_text(self._number, str(self.process.pid))
+        self._pid_file = out / "guardian.pid"
+        write_text(self._pid_file, str(self.process.pid))
         self.events: list[ipc.Message] = []
         self.result: ipc.Message | None = None
         self.open = True
-        """It has not closed its end of the channel."""
+        """The guardian has not closed its end of the channel."""
         self._heard_s = time.monotonic()
 
     @property
     def took_over(self) -> bool:
-        """It has taken the vehicle."""
+        """Whether the guardian has taken over the vehicle."""
         return bool(self.events)
 
     @property
     def outcome(self) -> Outcome | None:
-        """How the flight ended that it took over; None: it did not."""
+        """Outcome of a flight that the guardian took over; None if it did not."""
         if not self.took_over:
             return None
         return outcome_of(self.result)
 
-    def listen(self) -> list[ipc.Message]:
-        """What it has said since the last call; never waits."""
+    def receive(self) -> list[ipc.Message]:
+        """Return the messages since the last call; never waits."""
         heard: list[ipc.Message] = []
         while self.open:
             try:
@@ -95,22 +102,22 @@ class GuardianProcess:
         return heard
 
     def hangs(self) -> bool:
-        """In charge and silent."""
+        """Whether the guardian has taken over and is silent."""
         return self.open and self.took_over and time.monotonic() - self._heard_s > SILENT_S
 
-    def end(self, patience_s: float) -> None:
-        """Make sure that it is gone. After the flight's end it leaves by itself."""
+    def stop(self, patience_s: float) -> None:
+        """Wait for the guardian to exit, then end it. After the flight it exits by itself."""
         terminate(self.process, patience_s)
-        remove_file(self._number)
-        self.listen()
+        remove_file(self._pid_file)
+        self.receive()
         self.channel.close()
 
     def kill(self) -> None:
-        """At once: there is nothing left that it could land."""
+        """Kill the guardian at once."""
         self.process.kill()
 
-    def trouble(self) -> str | None:
-        """One line about a guardian that failed; None: it did not."""
+    def failure(self) -> str | None:
+        """Return one line about a guardian that failed, or None."""
         code = self.process.returncode
         if code not in (0, 1):
             return f"guardian: the guardian process {how_it_ended(code)}{last_line(self.log)}; see {self.log}"
@@ -119,7 +126,7 @@ class GuardianProcess:
         return None
 
     def summary_events(self) -> list[dict[str, Any]]:
-        """Its events as summary.json lists events."""
+        """Return its events as summary.json lists events."""
         return [
             {
                 "t_s": event["flight_t_s"],
@@ -131,7 +138,11 @@ class GuardianProcess:
 
 
 def outcome_of(result: ipc.Message | None) -> Outcome:
-    """How a flight ended that the guardian took over, by its `guardian_result`; None: it reported none."""
+    """Return the outcome of a flight that the guardian took over.
+
+    Args:
+        result: its `guardian_result` message; None if it sent none.
+    """
     if result is None or not result["landed"]:
         return Outcome.LOST
     return Outcome.CRASHED if result["overturned"] else Outcome.ABORTED

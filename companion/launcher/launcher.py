@@ -1,7 +1,7 @@
-"""What the user started: brings the processes of a flight up, watches them, outlives them, and says how it ended.
+"""The parent process of a flight: starts the processes, watches them, and determines the outcome.
 
 launcher --starts--> sitl (with --sitl), flight --starts--> recorder
-         --starts--> guardian, which ends the flight process and lands when that hangs or dies
+         --starts--> guardian, which kills a hung flight process and lands the vehicle
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from companion.config.loader import FlightConfig
-from companion.guardian.heartbeat import HANGS
-from companion.launcher.cpu_contention import Crowding
+from companion.guardian.heartbeat import HANG_TEXT
+from companion.launcher.cpu_contention import CpuContention
 from companion.launcher.guardian_process import GuardianProcess
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_CODES
@@ -41,31 +41,32 @@ from companion.runtime.subprocesses import (
 )
 
 SITL_SETTLE_TIMEOUT_S = 40.0
-"""After the flight process is gone: how long the world may take to come to rest."""
-SILENT_FLIGHT_S = 5.0
-"""A flight process that says nothing for this long hangs, and the guardian has not seen to it: on the ground that is not its business,
-and it may be dead itself. Killed, the flight process leaves PX4 to its own offboard-loss landing."""
-GUARDIAN_LEAVE_TIMEOUT_S = 5.0
-"""After the flight process is gone: a guardian that is not needed leaves at once."""
+"""Time for the simulated world to come to rest after the flight process is gone."""
+FLIGHT_SILENT_TIMEOUT_S = 5.0
+"""A flight process that sends nothing for this long hangs, and the guardian has not acted: it does not act on the ground, and may be
+dead. Once the flight process is killed, PX4 lands by its own offboard-loss failsafe.
+"""
+GUARDIAN_EXIT_TIMEOUT_S = 5.0
+"""Time for a guardian that is not needed to exit after the flight process is gone."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
 
 OnMessage = Callable[[ipc.Message], None]
 Sitl = Literal["stub", "px4"]
-"""Who stands for the autopilot in the simulated world."""
+"""Autopilot of the simulated world."""
 
 
 @dataclass
 class FlightResult:
-    """What is known after the flight."""
+    """Outcome of a flight and what is known about it."""
 
     outcome: Outcome
     recorder: dict[str, Any] | None = None
     world: dict[str, Any] = field(default_factory=dict)
-    """SITL truth: payload_kg, caught, crashed, ..."""
+    """Truth of the simulated world: payload_kg, caught, crashed, ..."""
     events: tuple[dict[str, Any], ...] = ()
-    """What the flight process told, as summary.json lists events; the log has them too, unless its recorder died."""
+    """Events that the flight process reported, as summary.json lists them. The log holds them too, unless the recorder died."""
     guardian_events: tuple[dict[str, Any], ...] = ()
-    """What the guardian did, as summary.json lists events; empty: it was not needed."""
+    """Events of the guardian, as summary.json lists them; empty if it did not take over."""
     lines: tuple[str, ...] = ()
     """For the user: why the flight was refused, or which process failed and where its log is."""
 
@@ -77,7 +78,7 @@ class FlightResult:
 
 @contextlib.contextmanager
 def landing_signals(land: Callable[[], None]) -> Iterator[None]:
-    """While inside: SIGINT, SIGTERM and SIGHUP call `land`, and end nothing."""
+    """Context in which SIGINT, SIGTERM and SIGHUP call `land` instead of ending the process."""
     handlers = {number: signal.signal(number, lambda *_: land()) for number in _LAND_SIGNALS}
     try:
         yield
@@ -87,13 +88,13 @@ def landing_signals(land: Callable[[], None]) -> Iterator[None]:
 
 
 class Launcher:
-    """One flight from start to end, seen from outside.
+    """Runs one flight.
 
     Args:
-        config: checked configuration; with SITL the device addresses are replaced by the world's.
-        out: folder for everything that the flight leaves; exists already.
-        sitl: fly in the simulated world; "px4": with a real PX4 in it, True or "stub": with the stub.
-        on_message: called with every message of the flight process, for the display; those of the world have a "source" of "sitl".
+        config: checked configuration; with SITL the device addresses are replaced by the simulated world's.
+        out: existing folder for all files of the flight.
+        sitl: False for hardware; True or "stub" for the simulated world with the PX4 stub; "px4" with a real PX4.
+        on_message: called with every message of the flight process, for the display; messages of the world have "source": "sitl".
     """
 
     def __init__(self, config: FlightConfig, out: Path, *, sitl: bool | Sitl, on_message: OnMessage) -> None:
@@ -101,33 +102,32 @@ class Launcher:
         self._out = out
         self._sitl_kind = sitl
         self._on_message = on_message
-        self._stop_asked = False
+        self._stop_requested = False
         self._channel: socket.socket | None = None
         self._result: dict[str, Any] | None = None
         self._refused: list[str] | None = None
-        self._grave: list[tuple[int, str]] = []
-        """Events that end a flight, by tick; the first ones are the cause, the others what followed from it."""
+        self._critical_events: list[tuple[int, str]] = []
+        """Tick and text of events that end a flight; those of the first tick are the cause, later ones its consequences."""
         self._events: list[dict[str, Any]] = []
-        self._px4: list[str] = []
-        """What PX4 said since the flight began."""
+        self._px4_texts: list[str] = []
+        """Texts of PX4 since the flight began."""
         self._failures: list[str] = []
         self._recorder_pid: int | None = None
         self._guardian: GuardianProcess | None = None
-        self._crowding = Crowding({})
+        self._cpu_contention = CpuContention({})
         self._flying = False
-        """Ticking, and not over yet: messages come ten times a second."""
+        """The flight process ticks and sends ten messages a second; false after the flight is over."""
 
-    def ask_to_land(self) -> None:
-        """Ctrl-C: land; asking again changes nothing."""
-        self._stop_asked = True
+    def request_landing(self) -> None:
+        """Request a landing (Ctrl-C); repeated requests change nothing."""
+        self._stop_requested = True
         if self._channel is not None:
             ipc.send(self._channel, {"type": "land"})
 
     def run(self) -> FlightResult:
-        """Fly. To be called inside of `landing_signals(launcher.ask_to_land)`.
+        """Run the flight; call inside of `landing_signals(launcher.request_landing)`.
 
-        From here on this process is off the cores of `computer.cpus`, and with it all that it starts; the flight process alone goes
-        there by itself.
+        This process and its children leave the cores of `computer.cpus`; only the flight process returns to them.
 
         Raises:
             LaunchError: a process of the flight could not be started.
@@ -138,18 +138,19 @@ class Launcher:
             config = self._config
             if self._sitl_kind:
                 sitl = SitlProcess(config, self._out, px4=self._sitl_kind == "px4")
-                config = with_devices(config, sitl.devices(self._on_world_message, lambda: self._stop_asked))
+                config = replace_device_settings(
+                    config, sitl.devices(self._on_world_message, lambda: self._stop_requested)
+                )
             path = self._out / "config.json"
             write_text(path, config.model_dump_json(indent=1))
             # TMPDIR of the flight process: MAVSDK keeps folders there, and leaves them when it is killed.
             with scratch_folder(self._out) as tmp:
-                outcome = Outcome.ABORTED if self._stop_asked else self._fly(path, sitl, tmp)
+                outcome = Outcome.ABORTED if self._stop_requested else self._fly(path, sitl, tmp)
         except LaunchError:
-            if not self._stop_asked:
+            if not self._stop_requested:
                 raise
-            outcome = (
-                Outcome.ABORTED
-            )  # a child that has not left the terminal's process group yet takes its Ctrl-C, too
+            # A child that has not left the terminal's process group yet receives the Ctrl-C, too.
+            outcome = Outcome.ABORTED
         finally:
             if sitl is not None:
                 sitl.stop()
@@ -158,7 +159,7 @@ class Launcher:
             outcome = Outcome.CRASHED
         recorder = self._result.get("recorder") if self._result else None
         events = tuple(self._guardian.summary_events()) if self._guardian is not None else ()
-        return FlightResult(outcome, recorder, world, tuple(self._events), events, self._lines(outcome))
+        return FlightResult(outcome, recorder, world, tuple(self._events), events, self._user_lines(outcome))
 
     def _on_world_message(self, message: dict[str, Any]) -> None:
         self._on_message({**message, "source": "sitl"})
@@ -166,31 +167,24 @@ class Launcher:
     def _fly(self, config_path: Path, sitl: SitlProcess | None, tmp: Path) -> Outcome:
         log_path = self._out / "flight.log"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        beats_out, beats_in = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        # Flight and guardian hold the world's standard input open as well: the world stays until all are gone. Should this process
-        # be killed, the flight lands and hears that it has landed.
+        heartbeats_out, heartbeats_in = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # Flight and guardian also keep the world's standard input open, so that the world runs until all have exited. If this process
+        # is killed, the flight process can still land and see that it has landed.
         shared = () if sitl is None or sitl.process.stdin is None else (sitl.process.stdin.fileno(),)
-        with ours, beats_in:
+        with ours, heartbeats_in:
             ours.setblocking(False)
-            with theirs, beats_out, open(log_path, "wb") as log:
+            with theirs, heartbeats_out, open(log_path, "wb") as log:
                 process = subprocess.Popen(
                     [
-                        *(
-                            sys.executable,
-                            "-m",
-                            "companion.flight.main",
-                            "--config",
-                            str(config_path),
-                            "--out",
-                            str(self._out),
-                        ),
-                        *("--channel", str(theirs.fileno()), "--guardian", str(beats_out.fileno())),
+                        *(sys.executable, "-m", "companion.flight.main"),
+                        *("--config", str(config_path), "--out", str(self._out)),
+                        *("--channel", str(theirs.fileno()), "--guardian", str(heartbeats_out.fileno())),
                         *(("--sitl",) if sitl is not None else ()),
                     ],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
-                    pass_fds=(theirs.fileno(), beats_out.fileno(), *shared),
+                    pass_fds=(theirs.fileno(), heartbeats_out.fileno(), *shared),
                     start_new_session=True,
                     env={**os.environ, "TMPDIR": str(tmp), **(sitl.flight_environment if sitl is not None else {})},
                 )
@@ -198,27 +192,27 @@ class Launcher:
             try:
                 write_text(self._out / "flight.pid", str(process.pid))
                 if sitl is not None:
-                    sitl.tell_flight(process.pid)
+                    sitl.send_flight_pid(process.pid)
                 pids = {
                     "flight process": process.pid,
                     **({"simulated world": sitl.process.pid} if sitl is not None else {}),
                 }
-                self._crowding = Crowding(pids)
-                self._guardian = guardian = GuardianProcess(config_path, self._out, process.pid, beats_in, shared)
-                if self._stop_asked:
-                    self.ask_to_land()
+                self._cpu_contention = CpuContention(pids)
+                self._guardian = guardian = GuardianProcess(config_path, self._out, process.pid, heartbeats_in, shared)
+                if self._stop_requested:
+                    self.request_landing()
                 self._watch(process, ours, guardian, sitl)
             finally:
                 self._channel = None
                 terminate(process, patience_s=30.0 if self._result is None else 10.0)
                 remove_file(self._out / "flight.pid")
                 if self._guardian is not None:
-                    self._guardian.end(GUARDIAN_LEAVE_TIMEOUT_S)
+                    self._guardian.stop(GUARDIAN_EXIT_TIMEOUT_S)
         self._await_recorder()
-        return self._judge(process.returncode, log_path, sitl)
+        return self._determine_outcome(process.returncode, log_path, sitl)
 
-    def _judge(self, code: int, log_path: Path, sitl: SitlProcess | None) -> Outcome:
-        """The outcome of a flight process that is gone, by what it said and how it ended."""
+    def _determine_outcome(self, code: int, log_path: Path, sitl: SitlProcess | None) -> Outcome:
+        """Return the outcome after the flight process is gone, from its messages and its exit code."""
         guardian = self._guardian
         expected: int | None
         if self._refused is not None:
@@ -228,53 +222,53 @@ class Launcher:
         elif self._result is not None and code >= 0:
             outcome = Outcome(self._result["outcome"])
             expected = EXIT_CODES[outcome]
-        elif self._recorder_pid is None and self._stop_asked and -code in _LAND_SIGNALS:
-            outcome, expected = Outcome.ABORTED, code  # as in `run`
+        elif self._recorder_pid is None and self._stop_requested and -code in _LAND_SIGNALS:
+            outcome, expected = Outcome.ABORTED, code  # Ctrl-C reached it directly, as in `run`
         elif self._recorder_pid is None:
-            outcome, expected = Outcome.REFUSED, None  # it never began: nothing can have been armed
+            outcome, expected = Outcome.REFUSED, None  # it never started, so nothing was armed
         else:
             outcome, expected = Outcome.LOST, None
         if sitl is not None and sitl.ended:
-            self._failures.append(sitl.epitaph())
+            self._failures.append(sitl.exit_summary())
         elif guardian is not None and guardian.took_over:
-            self._failures.append(self._after_take_over(guardian, code, log_path))
+            self._failures.append(self._takeover_summary(guardian, code, log_path))
         elif code != expected:
             self._failures.append(
                 f"flight: the flight process {how_it_ended(code)}{last_line(log_path)}; see {log_path}"
             )
         elif holds_traceback(log_path):
             self._failures.append(f"flight: an internal error was logged{last_line(log_path)}; see {log_path}")
-        trouble = guardian.trouble() if guardian is not None and (sitl is None or not sitl.ended) else None
+        trouble = guardian.failure() if guardian is not None and (sitl is None or not sitl.ended) else None
         if trouble is not None:
             self._failures.append(trouble)
-        # A flight that was given up without a word from PX4 may still be landing.
+        # Without an answer from PX4 the vehicle may still be landing.
         if outcome in (Outcome.LOST, Outcome.ABORTED) and sitl is not None:
             sitl.wait_at_rest(time.monotonic() + SITL_SETTLE_TIMEOUT_S)
         return outcome
 
     @staticmethod
-    def _after_take_over(guardian: GuardianProcess, code: int, log_path: Path) -> str:
-        """One line: what became of the flight process, and of the vehicle."""
+    def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path) -> str:
+        """Return one line: what happened to the flight process, and to the vehicle."""
         vehicle = {
             Outcome.ABORTED: "the guardian landed the vehicle",
-            Outcome.CRASHED: "the vehicle was flipped or tipped over, the guardian had its rotors stopped",
+            Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",
         }.get(guardian.outcome or Outcome.LOST, "the guardian could not confirm a landing")
-        hung = guardian.events[0]["text"].startswith(HANGS)
+        hung = guardian.events[0]["text"].startswith(HANG_TEXT)
         what = "hung and was killed" if hung else f"{how_it_ended(code)}{last_line(log_path)}"
         return f"flight: the flight process {what}; {vehicle}; see {log_path}"
 
-    def _lines(self, outcome: Outcome) -> tuple[str, ...]:
+    def _user_lines(self, outcome: Outcome) -> tuple[str, ...]:
         if outcome is not Outcome.REFUSED:
             return tuple(self._failures)
         reasons = self._refused
         if reasons is None:
-            said = "; ".join(dict.fromkeys(self._px4))
+            said = "; ".join(dict.fromkeys(self._px4_texts))
             reasons = [
                 f"{text}; PX4 said: {said}" if said and "PX4" in text else text
-                for tick, text in self._grave
-                if tick == self._grave[0][0]
+                for tick, text in self._critical_events
+                if tick == self._critical_events[0][0]
             ]
-        busy = () if self._crowding.line is None else (self._crowding.line,)
+        busy = () if self._cpu_contention.message is None else (self._cpu_contention.message,)
         return (*reasons, *busy, *self._failures)
 
     def _watch(
@@ -284,7 +278,7 @@ class Launcher:
         guardian: GuardianProcess,
         sitl: SitlProcess | None,
     ) -> None:
-        """Pass on what the flight and the guardian say, until both have closed their channels; see to one that hangs."""
+        """Forward the messages of flight and guardian until both have closed their channels; kill one that hangs."""
         flight_open = True
         heard_s = flight_open_s = time.monotonic()
         while flight_open or guardian.open:
@@ -293,43 +287,43 @@ class Launcher:
             if sitl is not None:
                 for message in sitl.messages(0.0):
                     self._on_world_message(message)
-                if sitl.ended:  # there is nothing left that anybody could land
+                if sitl.ended:  # nothing is left to land
                     guardian.kill()
                     process.kill()
                     return
-            for message in guardian.listen():
+            for message in guardian.receive():
                 self._on_message(message)
-                self._look_for_crowding(message)
+                self._check_cpu_contention(message)
             now_s = time.monotonic()
-            self._crowding.sample(now_s)
+            self._cpu_contention.sample(now_s)
             if channel in readable:
                 heard_s = now_s
-                flight_open = self._hear(channel)
+                flight_open = self._receive(channel)
             elif flight_open and process.poll() is not None:
                 flight_open = False
-            elif flight_open and self._flying and not guardian.took_over and now_s - heard_s > SILENT_FLIGHT_S:
-                text = f"flight: the flight process said nothing for {SILENT_FLIGHT_S:g} s and was killed"
+            elif flight_open and self._flying and not guardian.took_over and now_s - heard_s > FLIGHT_SILENT_TIMEOUT_S:
+                text = f"flight: the flight process sent nothing for {FLIGHT_SILENT_TIMEOUT_S:g} s and was killed"
                 self._failures.append(text)
                 process.kill()
             if flight_open:
                 flight_open_s = now_s
             alone_s = now_s - flight_open_s
-            if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_LEAVE_TIMEOUT_S):
+            if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_EXIT_TIMEOUT_S):
                 self._failures.append("guardian: the guardian process hangs and was killed")
                 guardian.kill()
                 return
 
-    def _hear(self, channel: socket.socket) -> bool:
-        """Take what the flight has said; False: it has closed its channel."""
+    def _receive(self, channel: socket.socket) -> bool:
+        """Handle the waiting messages of the flight process; return False if it has closed its channel."""
         with contextlib.suppress(BlockingIOError):
             while True:
                 received = ipc.receive(channel)
                 if received is None:
                     return False
-                self._take(received)
+                self._handle(received)
         return True
 
-    def _take(self, message: ipc.Message) -> None:
+    def _handle(self, message: ipc.Message) -> None:
         kind = message.get("type")
         if kind == "result":
             self._result = message
@@ -340,19 +334,19 @@ class Launcher:
         elif kind == "status":
             self._flying = message["kind"] != PhaseKind.DONE.value
         elif kind == "event":
-            told = {key: message[key] for key in ("id", "severity", "action", "text")}
-            self._events.append({"t_s": message["flight_t_s"], "mission_t_s": message["t_s"], **told})
+            fields = {key: message[key] for key in ("id", "severity", "action", "text")}
+            self._events.append({"t_s": message["flight_t_s"], "mission_t_s": message["t_s"], **fields})
             ends = SafetyAction(message["action"]).rank >= SafetyAction.LAND.rank
             if ends or message["severity"] == Severity.CRITICAL.value:
-                self._grave.append((message["tick"], message["text"]))
+                self._critical_events.append((message["tick"], message["text"]))
         elif kind == "px4":
-            self._px4.append(message["text"])
+            self._px4_texts.append(message["text"])
         self._on_message(message)
-        self._look_for_crowding(message)
+        self._check_cpu_contention(message)
 
-    def _look_for_crowding(self, message: ipc.Message) -> None:
-        """What happened may be the doing of other programs: then the operator is told so beside it."""
-        text = self._crowding.take(message, time.monotonic())
+    def _check_cpu_contention(self, message: ipc.Message) -> None:
+        """Report a busy computer next to an event that lateness may have caused."""
+        text = self._cpu_contention.on_message(message, time.monotonic())
         if text is None:
             return
         self._on_message({"type": "busy", "text": text})
@@ -361,7 +355,9 @@ class Launcher:
         self._events.append({**stamps, **about, "text": text})
 
     def _await_recorder(self) -> None:
-        """The recorder closes the log after a flight process that was killed; it is no child of ours, so look at its pid."""
+        """Wait for the recorder to close the log of a flight process that was killed. It is no child of this process, so its pidfd is
+        polled.
+        """
         if self._recorder_pid is None or self._result is not None:
             return
         try:
@@ -375,8 +371,8 @@ class Launcher:
 _LAND_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def with_devices(config: FlightConfig, addresses: dict[str, dict[str, Any]]) -> FlightConfig:
-    """The configuration with some device settings replaced, checked again."""
+def replace_device_settings(config: FlightConfig, addresses: dict[str, dict[str, Any]]) -> FlightConfig:
+    """Return a validated copy of the configuration with some device settings replaced."""
     data = json.loads(config.model_dump_json())
     for device, settings in addresses.items():
         data["vehicle"]["devices"][device].update(settings)

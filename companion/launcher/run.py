@@ -1,4 +1,4 @@
-"""`companion fly` from the launcher's side: run it, show it, write down what came of it."""
+"""`companion fly` after its arguments are parsed: run the flight, display it, write summary and report."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from companion.runtime.ipc import Message
 from companion.runtime.subprocesses import LaunchError
 
 TICKS_MAX = 60_000
-"""Of a longer flight (5 minutes at 200 Hz) fewer ticks are graded and drawn: all ticks of an hour would take 6 GB."""
+"""A longer flight (over 5 minutes at 200 Hz) is evaluated and drawn with fewer ticks: one hour at full rate would need 6 GB."""
 
 
 def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
-    """Fly, then write summary and, if wanted, the report; returns the exit code."""
+    """Run a flight, write its summary and, if requested, its report; return the exit code."""
     where = config.vehicle.name if sitl is None else "SITL" if sitl == "stub" else "a real PX4 in SITL"
     title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
     display = FlightDisplay(console, title)
@@ -33,8 +33,8 @@ def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: C
             display.on_message(message)
 
     launcher = Launcher(config, out, sitl=sitl or False, on_message=on_message)
-    # A second Ctrl-C may come when a short flight is over already: it must not cost the summary.
-    with landing_signals(launcher.ask_to_land):
+    # A second Ctrl-C after the end of a short flight must not lose the summary.
+    with landing_signals(launcher.request_landing):
         with display:
             try:
                 result = launcher.run()
@@ -53,7 +53,7 @@ def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: C
             with console.status("writing the report"):
                 page = report_of(log, summary, out)
         except KeyboardInterrupt:
-            tell(f"report given up; make it with: companion report {out / 'flight.mcap'}")
+            tell(f"report cancelled; write it with: companion report {out / 'flight.mcap'}")
         except OSError as error:
             tell(f"{out}: the report cannot be written: {error.strerror}")
     print_result(console, summary, out, page)
@@ -61,7 +61,7 @@ def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: C
 
 
 def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[FlightLog | None, dict[str, Any]]:
-    """Read the log, if the flight left one; write summary.json."""
+    """Read the log, if there is one, and write summary.json."""
     log = None
     path = out / "flight.mcap"
     if path.exists():
@@ -86,13 +86,13 @@ def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[Fli
 
 
 def autopilot_of(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]:
-    """Who flew: kind (stub or px4), version, and what else the world knows; on the vehicle by what PX4 said."""
+    """Return the autopilot's kind (stub or px4), version and the world's details; on hardware, the version that PX4 reported."""
     firmware = None if log is None else log.metadata.get("autopilot", {}).get("firmware")
     return {"kind": "px4", "version": firmware, "firmware": firmware, **world.get("autopilot", {})}
 
 
 def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None:
-    """report.html with its plots; None without matplotlib, which a flight does not need."""
+    """Write report.html with its plots; return None without matplotlib, which a flight does not need."""
     try:
         from companion.analysis.report import write_report
     except ImportError:

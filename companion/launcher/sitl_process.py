@@ -18,22 +18,22 @@ from companion.runtime.subprocesses import LaunchError, how_it_ended, last_line,
 
 SITL_READY_TIMEOUT_S = 30.0
 PX4_READY_TIMEOUT_S = 700.0
-"""With a real PX4. The world keeps its own deadlines: of PX4's boot, and of a person who starts it by hand."""
+"""With a real PX4. The world has its own deadlines for PX4's boot and for a user who starts PX4 by hand."""
 PX4_FOLDER = "px4"
-"""In the flight's folder: what a real PX4 reads and writes."""
-SITL_LEAVE_TIMEOUT_S = 5.0
-"""The world ends by itself when the launcher leaves it and its rotors stand."""
-SITL_LAST_WORDS_TIMEOUT_S = 10.0
-"""After SIGTERM; a real PX4 takes its time to end."""
+"""Folder of a real PX4's files, below the flight's folder."""
+SITL_EXIT_TIMEOUT_S = 5.0
+"""The world exits by itself once the launcher has closed its input and its rotors stand still."""
+SITL_TERMINATE_TIMEOUT_S = 10.0
+"""Time to exit after SIGTERM; a real PX4 needs some seconds."""
 
 
 class SitlProcess:
-    """The simulated world as a child process.
+    """A running simulated world.
 
     Args:
-        config: of the flight.
+        config: configuration of the flight.
         out: folder of the flight.
-        px4: fly a real PX4 instead of the stub.
+        px4: use a real PX4 instead of the stub.
     """
 
     def __init__(self, config: FlightConfig, out: Path, *, px4: bool = False) -> None:
@@ -57,34 +57,34 @@ class SitlProcess:
         self.final: dict[str, Any] = {}
         self.at_rest = False
         self.flight_environment: dict[str, str] = {}
-        """What the flight process's environment needs for faults of its own that the world plants."""
+        """Environment variables of the flight process for faults that the world injects into it."""
         self.ended = False
-        """The world closed its end of the pipe: it is gone, or about to be."""
+        """The world has closed its end of the pipe: it has exited or is about to."""
 
     def devices(
         self,
         on_message: Callable[[dict[str, Any]], None] = lambda message: None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> dict[str, dict[str, Any]]:
-        """Addresses of the simulated devices, once they are open and the autopilot can be flown.
+        """Wait until the simulated devices are open and the autopilot can fly; return their addresses.
 
         Args:
-            on_message: called with what the world says until then (type "progress": a line for the user).
-            given_up: asked several times a second; True ends the wait.
+            on_message: called with the world's messages until then (type "progress": a line for the user).
+            given_up: polled several times a second; True cancels the wait.
 
         Raises:
-            LaunchError: the world ended, was not ready in time, or was given up.
+            LaunchError: the world ended, was not ready in time, or the wait was cancelled.
         """
         timeout_s = PX4_READY_TIMEOUT_S if self._px4 else SITL_READY_TIMEOUT_S
         deadline_s = time.monotonic() + timeout_s
         while not self.ended and time.monotonic() < deadline_s:
             if given_up():
-                raise LaunchError("sitl: given up while the simulated world was being prepared")
+                raise LaunchError("sitl: cancelled while the simulated world was starting")
             devices = self._ready(min(deadline_s, time.monotonic() + 0.2), on_message)
             if devices is not None:
                 return devices
         if self.ended:
-            raise LaunchError(self.epitaph())
+            raise LaunchError(self.exit_summary())
         raise LaunchError(f"sitl: the simulated world was not ready within {timeout_s:g} s; see {self.log}")
 
     def _ready(
@@ -100,15 +100,15 @@ class SitlProcess:
                 raise LaunchError(str(message["text"]))
         return None
 
-    def epitaph(self) -> str:
-        """One line about a world that ended by itself."""
+    def exit_summary(self) -> str:
+        """Return one line about a world that ended by itself."""
         terminate(self.process)
         if self._error is not None:
             return self._error
         return f"sitl: the simulated world {how_it_ended(self.process.returncode)}{last_line(self.log)}; see {self.log}"
 
     def messages(self, deadline_s: float) -> Iterator[dict[str, Any]]:
-        """JSON lines until the deadline (0: only what is there) or the end of the process."""
+        """Yield JSON lines until the deadline (0: only those that have arrived) or the end of the process."""
         if self.ended:
             return
         assert self.process.stdout is not None
@@ -118,7 +118,7 @@ class SitlProcess:
                 line, _, self._buffer = self._buffer.partition(b"\n")
                 with contextlib.suppress(ValueError):
                     message = json.loads(line)
-                    self._note(message)
+                    self._update(message)
                     yield message
             left_s = max(0.0, deadline_s - time.monotonic())
             if not select.select([fd], [], [], left_s)[0]:
@@ -129,7 +129,7 @@ class SitlProcess:
                 return
             self._buffer += data
 
-    def _note(self, message: dict[str, Any]) -> None:
+    def _update(self, message: dict[str, Any]) -> None:
         if message.get("type") == "final":
             self.final = message["world"]
         if message.get("type") == "error":
@@ -137,14 +137,14 @@ class SitlProcess:
         if message.get("type") == "at_rest":
             self.at_rest = bool(message["at_rest"])
 
-    def tell_flight(self, pid: int) -> None:
-        """Name the flight process to the world, which may be asked to kill or to stop it."""
+    def send_flight_pid(self, pid: int) -> None:
+        """Send the id of the flight process to the world, which may have to kill or stop it."""
         assert self.process.stdin is not None
-        with contextlib.suppress(OSError):  # a world that is gone is noticed elsewhere
+        with contextlib.suppress(OSError):  # a world that has exited is detected elsewhere
             os.write(self.process.stdin.fileno(), json.dumps({"type": "flight", "pid": pid}).encode() + b"\n")
 
     def wait_at_rest(self, deadline_s: float) -> None:
-        """Until the world's rotors stand, or the deadline."""
+        """Wait until the world's rotors stand still, or the deadline."""
         for _ in self.messages(0.0):
             pass
         while not self.at_rest and time.monotonic() < deadline_s and not self.ended:
@@ -152,18 +152,18 @@ class SitlProcess:
                 pass
 
     def stop(self) -> None:
-        """Ask for the end, take the last words, make sure. Does nothing after the first time."""
+        """Ask the world to exit, read its last messages, then end it. Repeated calls do nothing."""
         assert self.process.stdin is not None and self.process.stdout is not None
         if self.process.stdout.closed:
             return
         with contextlib.suppress(OSError):
             self.process.stdin.close()
-        self._listen(SITL_LEAVE_TIMEOUT_S)
+        self._read_for(SITL_EXIT_TIMEOUT_S)
         if not self.ended:
             self.process.terminate()
-            self._listen(SITL_LAST_WORDS_TIMEOUT_S)
+            self._read_for(SITL_TERMINATE_TIMEOUT_S)
         terminate(self.process)
 
-    def _listen(self, timeout_s: float) -> None:
+    def _read_for(self, timeout_s: float) -> None:
         for _ in self.messages(time.monotonic() + timeout_s):
             pass

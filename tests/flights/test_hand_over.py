@@ -15,7 +15,7 @@ import pytest
 from companion.config.loader import load_flight
 from companion.core.flight_core import FlightCore
 from companion.flight import main as app
-from companion.launcher.launcher import with_devices
+from companion.launcher.launcher import replace_device_settings
 from companion.model.types import Inputs, Outcome, Outputs
 from companion.preflight import run as before_arming
 from tests.support import HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
@@ -57,7 +57,7 @@ def test_an_internal_error_in_the_air_lands_by_px4(
     options = [word for word in set_options(**PATIENT, **LOW_HOVER) if word != "--set"]
     with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs, full_disk() as full:
         monkeypatch.setattr(sys, "stderr", full)
-        config = with_devices(load_flight(HOVER, overrides=options), world.devices)
+        config = replace_device_settings(load_flight(HOVER, overrides=options), world.devices)
         outcome = asyncio.run(app.fly(config, tmp_path, theirs))
         assert outcome is Outcome.ABORTED
         rest = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]

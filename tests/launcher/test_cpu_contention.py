@@ -9,7 +9,14 @@ from typing import Any
 
 import pytest
 
-from companion.launcher.cpu_contention import CAUSED_BY_LATENESS, CoreWait, Crowding, busy_line, core_wait, waited
+from companion.launcher.cpu_contention import (
+    CAUSED_BY_LATENESS,
+    CpuContention,
+    ProcessWait,
+    contention_message,
+    longest_wait,
+    read_core_waits,
+)
 from companion.preflight.judge import CHECKS
 from companion.safety.rules import RULES
 from tests.support import wait_until
@@ -27,24 +34,24 @@ from tests.support import wait_until
     ],
 )
 def test_the_line_comes_by_the_schedulers_figures(flight: float, world: float, late_s: float, busy: bool) -> None:
-    line = busy_line((CoreWait("flight process", flight), CoreWait("simulated world", world)), late_s)
+    line = contention_message((ProcessWait("flight process", flight), ProcessWait("simulated world", world)), late_s)
     assert (line is not None) is busy
 
 
 def test_the_line_says_how_long_who_waited_and_what_to_do() -> None:
-    assert busy_line((CoreWait("flight process", 0.123), CoreWait("simulated world", 0.4)), 0.0231) == (
+    assert contention_message((ProcessWait("flight process", 0.123), ProcessWait("simulated world", 0.4)), 0.0231) == (
         "this computer is too busy (flight process waited 12 % of the time for a core, simulated world waited 40 % of the time for a "
         "core, ticks are 23 ms late); close other programs, or permit real-time priority: docs/raspberry-pi.md, Real time"
     )
 
 
 def test_nothing_is_said_where_the_kernel_does_not_count() -> None:
-    assert busy_line((), 1.0) is None
-    assert core_wait("flight process", {}, {}, 3.0) == CoreWait("flight process", 0.0)
+    assert contention_message((), 1.0) is None
+    assert longest_wait("flight process", {}, {}, 3.0) == ProcessWait("flight process", 0.0)
 
 
 def test_the_thread_that_waited_longest_speaks_for_its_process() -> None:
-    wait = core_wait("flight process", {1: 10.0, 2: 5.0, 3: 1.0}, {1: 10.3, 2: 6.5, 4: 99.0}, 3.0)
+    wait = longest_wait("flight process", {1: 10.0, 2: 5.0, 3: 1.0}, {1: 10.3, 2: 6.5, 4: 99.0}, 3.0)
     assert wait.share == pytest.approx(0.5)
 
 
@@ -73,23 +80,23 @@ ROW: dict[str, Any] = {"id": "arm.reads", "ok": False, "level": "refuse"}
 )
 def test_it_is_judged_when_something_happens_that_lateness_may_cause(message: dict[str, Any], judged: bool) -> None:
     waited_s = iter([1.0, 2.2])
-    crowding = Crowding({"flight process": 7}, lambda pid: {pid: next(waited_s)})
-    crowding.sample(10.0)
-    line = crowding.take(message, 13.0)
+    monitor = CpuContention({"flight process": 7}, lambda pid: {pid: next(waited_s)})
+    monitor.sample(10.0)
+    line = monitor.on_message(message, 13.0)
     assert (line is not None) is judged
-    assert crowding.line == line
+    assert monitor.message == line
     if line is not None:
         assert "flight process waited 40 % of the time" in line
-        assert crowding.take(message, 13.1) is None, "once is enough"
+        assert monitor.on_message(message, 13.1) is None, "once is enough"
 
 
 def test_a_process_that_has_ended_is_judged_by_its_last_sample() -> None:
     """A device that does not open ends the flight process as it reports it."""
     reads = iter([{7: 1.0}, {7: 2.2}, {}])
-    crowding = Crowding({"flight process": 7}, lambda pid: next(reads))
-    crowding.sample(10.0)
-    crowding.sample(13.0)
-    line = crowding.take({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, 13.0)
+    monitor = CpuContention({"flight process": 7}, lambda pid: next(reads))
+    monitor.sample(10.0)
+    monitor.sample(13.0)
+    line = monitor.on_message({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, 13.0)
     assert line is not None
     assert "flight process waited 40 % of the time" in line
 
@@ -101,9 +108,11 @@ def test_programs_that_share_a_core_are_seen_to_wait() -> None:
     programs = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
     pid = programs[0].pid
     try:
-        wait_until(lambda: sum(waited(pid).values()) > 0.5, lambda: f"it never waited: {waited(pid)}", 60.0)
+        wait_until(
+            lambda: sum(read_core_waits(pid).values()) > 0.5, lambda: f"it never waited: {read_core_waits(pid)}", 60.0
+        )
     finally:
         for program in programs:
             program.kill()
             program.wait()
-    assert waited(pid) == {}, "it is gone"
+    assert read_core_waits(pid) == {}, "it is gone"

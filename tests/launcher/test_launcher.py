@@ -263,6 +263,6 @@ def test_a_flight_process_that_hangs_in_the_air_is_ended_without_a_guardian(sand
         ended = running.end()
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_LOST
-    assert "flight: the flight process said nothing for 5 s and was killed" in ended.err
+    assert "flight: the flight process sent nothing for 5 s and was killed" in ended.err
     assert "guardian: the guardian process hangs and was killed" in ended.err
     assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"
