@@ -1,4 +1,4 @@
-"""`companion install`: make a computer the vehicle's, say what that changes, and take it back."""
+"""`companion install`: prepare the vehicle's computer for flights, show the changes, and revert them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from typing import Any
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight
 from companion.install import apply
-from companion.install.adapters import adapters, choose
+from companion.install.adapters import adapters, choose_adapters
 from companion.install.apply import Changes
 from companion.install.plan import Plan, Settings, isolation, plan
-from companion.install.record import PATH as RECORD
-from companion.install.record import inside, load
+from companion.install.record import RECORD_PATH, load, under_root
 from companion.install.state import InstallError
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
@@ -29,70 +28,71 @@ from companion.runtime.console import tell
 USER = "companion"
 MISSION = "/etc/companion/mission.yaml"
 PROGRAM = "/opt/companion/.venv/bin/companion"
-"""Of an image that is prepared elsewhere (--root); on the computer itself it is the one that runs."""
+"""Program in an image that is prepared elsewhere (--root); on the running system it is the program that runs."""
 _NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 _SERIAL = re.compile(r"[A-Za-z0-9._:+-]{1,64}")
 _HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-"""Folders that the service does not see (ProtectHome, PrivateTmp)."""
+"""Folders that the service cannot see (ProtectHome, PrivateTmp)."""
 
 
 def add_parser(commands: Any) -> None:
     """Add `install` to the sub-parsers of `companion`."""
     install = commands.add_parser(
         "install",
-        help="on the vehicle's computer: service, adapters' names and latency, limits, full clock; and --undo",
-        description="Install companion as a systemd service that waits on the ground for an operator's start, with what its timing "
-        "needs; say what is changed, and take it back exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: it cannot be done, "
-        "nothing was changed; 4: given up.",
+        help="set up the vehicle's computer: service, adapter names and latency, limits, full clock; or undo that",
+        description="Install companion as a systemd service that waits on the ground for an operator's START, with the settings that "
+        "its timing needs; show what is changed, and undo it exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
+        "nothing was changed; 4: cancelled.",
     )
     what = install.add_mutually_exclusive_group(required=True)
     what.add_argument("--systemd", action="store_true", help="install")
-    what.add_argument("--undo", action="store_true", help="put everything back as it was before the first --systemd")
+    what.add_argument("--undo", action="store_true", help="restore everything as it was before the first --systemd")
     install.add_argument(
-        "--dry-run", action="store_true", help="only say what would be done, every file with its content"
+        "--dry-run", action="store_true", help="only show what would be done, with the content of every file"
     )
-    install.add_argument("--yes", action="store_true", help="do not ask")
-    install.add_argument("--json", action="store_true", help="print it as JSON, nothing else; with --yes or --dry-run")
+    install.add_argument("--yes", action="store_true", help="do not ask for confirmation")
+    install.add_argument("--json", action="store_true", help="print only JSON; needs --yes or --dry-run")
     install.add_argument(
-        "--user", default=USER, metavar="NAME", help=f"who flies (default: {USER}); made if it is not there"
+        "--user",
+        default=USER,
+        metavar="NAME",
+        help=f"user of the service (default: {USER}); created if it does not exist",
     )
     install.add_argument(
-        "--mission", default=MISSION, metavar="FILE", help=f"what the service flies (default: {MISSION})"
+        "--mission", default=MISSION, metavar="FILE", help=f"mission of the service (default: {MISSION})"
     )
     install.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     install.add_argument(
-        "--arm-serial", metavar="SERIAL", help="of the arm's U2D2 (default: the one that is plugged in)"
+        "--arm-serial", metavar="SERIAL", help="serial number of the arm's U2D2 (default: the one that is plugged in)"
     )
     install.add_argument(
-        "--force-serial", metavar="SERIAL", help="of the force sensor's USB adapter (default: likewise)"
+        "--force-serial",
+        metavar="SERIAL",
+        help="serial number of the force sensor's USB adapter (default: the one that is plugged in)",
     )
-    install.add_argument(
-        "--at-boot", action="store_true", help="the service starts with the computer, and waits on the ground"
-    )
-    install.add_argument("--program", metavar="FILE", help="the companion that the service starts (default: this one)")
+    install.add_argument("--at-boot", action="store_true", help="start the service at boot; it waits on the ground")
+    install.add_argument("--program", metavar="FILE", help="companion executable of the service (default: this one)")
     install.add_argument(
         "--root",
         type=Path,
         default=Path("/"),
         metavar="DIR",
-        help="a system's files below DIR: they alone are changed, nothing is run",
+        help="change the files of a system below DIR only, and run no command",
     )
     install.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan, show, ask, do; returns the exit code."""
+    """Plan, show, ask and apply; returns the exit code."""
     root = Path(os.path.abspath(arguments.root))
     if not root.is_dir():
-        tell(f"companion install: --root {arguments.root}: expected a folder with a system in it, found none")
+        tell(f"companion install: --root {arguments.root}: expected a folder that holds a system")
         return EXIT_BAD_INPUT
     if arguments.json and not (arguments.yes or arguments.dry_run):
-        tell("companion install: --json asks no questions: expected --yes or --dry-run with it")
+        tell("companion install: --json cannot ask: add --yes or --dry-run")
         return EXIT_BAD_INPUT
     if root == Path("/") and os.geteuid() != 0 and not arguments.dry_run:
-        tell(
-            f"companion install: changes files of root: sudo {os.path.abspath(sys.argv[0])} install ...; --dry-run needs no sudo"
-        )
+        tell(f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; --dry-run does not")
         return EXIT_REFUSED
     try:
         with _terminable():
@@ -101,14 +101,14 @@ def run(arguments: argparse.Namespace) -> int:
         tell(f"companion install: {error}")
         return EXIT_REFUSED
     except (KeyboardInterrupt, EOFError):
-        tell("companion install: given up")
+        tell("companion install: cancelled")
         return EXIT_ABORTED
 
 
 def _install(arguments: argparse.Namespace, root: Path) -> int:
     settings, told = _settings(arguments, root)
     wanted = plan(settings)
-    found = apply.changes(root, wanted, load(root))
+    found = apply.pending_changes(root, wanted, load(root))
     live = root == Path("/")
     if arguments.dry_run:
         if arguments.json:
@@ -118,15 +118,15 @@ def _install(arguments: argparse.Namespace, root: Path) -> int:
         return EXIT_OK
     if not arguments.json:
         print("\n".join([*told, *(line for _, line in _summary(wanted, found, live))]), flush=True)
-    if not arguments.yes and not _agreed("Do this?"):
-        tell("companion install: given up; nothing was changed")
+    if not arguments.yes and not _agreed("Apply these changes?"):
+        tell("companion install: cancelled; nothing was changed")
         return EXIT_ABORTED
     say = (lambda _: None) if arguments.json else print
     changed = apply.install(root, wanted, settings.user, say)
     if arguments.json:
         print(json.dumps(_as_json(wanted, found, live, done=changed), indent=1))
     elif not changed:
-        print("nothing to do: everything is as it is to be")
+        print("nothing to do: everything is installed")
     else:
         print("\n".join(["", *_afterwards(settings, live), *isolation(os.cpu_count() or 1)]))
     return EXIT_OK
@@ -139,15 +139,15 @@ def _undo(arguments: argparse.Namespace, root: Path) -> int:
         if arguments.json:
             print(json.dumps({"schema_version": 1, "done": False, "files": paths}, indent=1))
         elif record is None:
-            print(f"nothing to undo: there is no {RECORD}")
+            print(f"nothing to undo: {RECORD_PATH} does not exist")
         else:
             for path, entry in record.entries.items():
-                print(f"{'takes away' if entry.before.absent else 'puts back '} {path}")
+                print(f"{'removes ' if entry.before.absent else 'restores'} {path}")
             for user in record.users:
-                print(f"takes away the user {user}")
+                print(f"removes the user {user}")
         return EXIT_OK
-    if not arguments.yes and not _agreed(f"Put {len(paths)} files back as they were?"):
-        tell("companion install: given up; nothing was changed")
+    if not arguments.yes and not _agreed(f"Restore {len(paths)} files as they were?"):
+        tell("companion install: cancelled; nothing was changed")
         return EXIT_ABORTED
     apply.undo(root, (lambda _: None) if arguments.json else print)
     if arguments.json:
@@ -156,7 +156,7 @@ def _undo(arguments: argparse.Namespace, root: Path) -> int:
 
 
 def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tuple[str, ...]]:
-    """What is wanted, checked, and lines about how it was found.
+    """Return the checked settings, and lines that explain how they were found.
 
     Raises:
         ConfigError: the command line or a file is wrong.
@@ -164,12 +164,12 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
 
     live = root == Path("/")
     if _NAME.fullmatch(arguments.user) is None or arguments.user == "root":
-        raise ConfigError([f"--user {arguments.user!r:.60}: expected a user's name like {USER}, and not root"])
+        raise ConfigError([f"--user {arguments.user!r:.60}: expected a user name such as {USER}, not root"])
     for option in ("arm_serial", "force_serial"):
         given = getattr(arguments, option)
         if given is not None and _SERIAL.fullmatch(given) is None:
             raise ConfigError(
-                [f"--{option.replace('_', '-')} {given!r:.80}: expected a serial number, as udevadm info tells it"]
+                [f"--{option.replace('_', '-')} {given!r:.80}: expected a serial number as udevadm info prints it"]
             )
     program = arguments.program or (str(Path(sys.prefix) / "bin/companion") if live else PROGRAM)
     files = {"--program": program, "--mission": arguments.mission, "--vehicle": arguments.vehicle}
@@ -178,39 +178,41 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
             files[option] = _seen_by_the_service(option, file, root)
     mission, vehicle = files["--mission"], files["--vehicle"]
     assert mission is not None and files["--program"] is not None
-    seen = None if vehicle is None else inside(root, vehicle)
-    config = load_flight(inside(root, mission), seen, overrides=["mission.start.takeoff=by_operator"], hardware=True)
+    seen = None if vehicle is None else under_root(root, vehicle)
+    config = load_flight(
+        under_root(root, mission), seen, overrides=["mission.start.takeoff=by_operator"], hardware=True
+    )
     mqtt = config.vehicle.ground.mqtt
     if mqtt is None or not mqtt.commands:
         key = "vehicle.ground.mqtt is null" if mqtt is None else "vehicle.ground.mqtt.commands is false"
         raise ConfigError(
-            [f"{vehicle or mission}: the service waits for an operator's start, but nobody could command it: {key}"]
+            [f"{vehicle or mission}: the service waits for an operator's START, but commands are not possible: {key}"]
         )
-    arm, force, told = choose(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
+    arm, force, told = choose_adapters(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
     return Settings(arguments.user, files["--program"], mission, vehicle, arm, force, arguments.at_boot), told
 
 
 def _seen_by_the_service(option: str, file: str, root: Path) -> str:
-    """The path on the vehicle's computer, absolute.
+    """Return the absolute path on the vehicle's computer.
 
     Raises:
-        ConfigError: the service could not read it there.
+        ConfigError: the service could not read the file there.
     """
     path = os.path.abspath(file)
     if any(ord(c) < 32 for c in path):
-        raise ConfigError([f"{option} {file!r:.80}: expected a name without control characters"])
+        raise ConfigError([f"{option} {file!r:.80}: expected a path without control characters"])
     if any(path.startswith(f"{folder}/") for folder in _HIDDEN):
         raise ConfigError(
             [
-                f"{option} {path}: the service does not see {'/'.join(path.split('/')[:2])}; copy it below /etc/companion or /opt"
+                f"{option} {path}: the service cannot see {'/'.join(path.split('/')[:2])}; copy the file below /etc/companion or /opt"
             ]
         )
-    here = inside(root, path)
+    here = under_root(root, path)
     if option == "--program" and root != Path("/"):
         return path
     if not here.is_file():
         raise ConfigError(
-            [f"{option} {here}: no such file; copy a mission and its vehicle file there, or name another"]
+            [f"{option} {here}: no such file; copy a mission and its vehicle file there, or give another path"]
         )
     for part in (here.resolve(), *here.resolve().parents):
         wanted = stat.S_IROTH if part == here.resolve() else stat.S_IXOTH
@@ -220,14 +222,14 @@ def _seen_by_the_service(option: str, file: str, root: Path) -> str:
 
 
 def _summary(wanted: Plan, found: Changes, live: bool) -> Iterator[tuple[str, str]]:
-    """What will be done: paths ("" for a command), each with its line."""
+    """Yield each path ("" for a command) with a line about what will be done."""
     to_do = set(found.to_do)
     why = {item.path: f": {item.why}" for item in wanted.items}
     for path, entry in found.entries.items():
         if path not in to_do:
-            verb = "is there "
+            verb = "unchanged"
         elif entry.after.absent:
-            verb = "takes off"
+            verb = "removes  "
         else:
             verb = "writes   " if found.now[path].absent else "replaces "
         yield path, f"{verb} {path}{why.get(path, '')}"
@@ -236,17 +238,17 @@ def _summary(wanted: Plan, found: Changes, live: bool) -> Iterator[tuple[str, st
 
 
 def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
-    """The same, every file with its content."""
+    """Yield the summary with the content of every file."""
     content = {item.path: item.content if item.link is None else f"-> {item.link}" for item in wanted.items}
     for path, line in _summary(wanted, found, live):
         yield line
         yield from (f"    {text}".rstrip() for text in (content.get(path) or "").splitlines())
-    yield f"writes    {RECORD}: what was there before, for --undo"
+    yield f"writes    {RECORD_PATH}: previous contents, for --undo"
     yield "Nothing was changed."
 
 
 def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
-    """What is left to people."""
+    """Yield the steps that are left to the user."""
     arm, force = (
         ("/dev/companion-arm" if settings.arm_serial else None),
         ("/dev/companion-force" if settings.force_serial else None),
@@ -254,10 +256,10 @@ def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
     if arm or force:
         yield f"Vehicle file: {', '.join(f'devices.{k}.port: {v}' for k, v in (('arm', arm), ('force', force)) if v)}"
     if live:
-        yield "Log in again before you fly from a shell: limits and groups are those of the login."
-    boot = "; and at boot" if settings.at_boot else ""
-    yield f"It starts with: systemctl start companion{boot}. Then it waits for an operator's start."
-    yield "It stops with: systemctl stop companion; in the air that lands. Take it all back: companion install --undo"
+        yield "Log in again before you fly from a shell: limits and groups are set at login."
+    boot = ", and at boot" if settings.at_boot else ""
+    yield f"It starts with: systemctl start companion{boot}. Then it waits for an operator's START."
+    yield "It stops with: systemctl stop companion; in the air it lands first. To undo everything: companion install --undo"
 
 
 def _as_json(wanted: Plan, found: Changes, live: bool, *, done: bool) -> dict[str, Any]:
@@ -271,7 +273,7 @@ def _as_json(wanted: Plan, found: Changes, live: bool, *, done: bool) -> dict[st
             for item in wanted.items
         ],
         "taken_away": [path for path, entry in found.entries.items() if path in to_do and entry.after.absent],
-        "commands": [list(command.words) for command in wanted.commands] if live else [],
+        "commands": [list(command.argv) for command in wanted.commands] if live else [],
     }  # fmt: skip
 
 
@@ -281,7 +283,7 @@ def _agreed(question: str) -> bool:
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """While inside: SIGTERM and SIGHUP are as Ctrl-C: what was begun is put back."""
+    """Context in which SIGTERM and SIGHUP act as Ctrl-C, so that unfinished changes are rolled back."""
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt

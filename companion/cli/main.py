@@ -16,7 +16,7 @@ from companion.cli.planning_progress import PlanningProgress
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.schema import schema_json
-from companion.install.extras import lacking
+from companion.install.extras import missing_extra
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell, terminal_console
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         return EXIT_BAD_INPUT
     arguments.command_line = shlex.join(["companion", *words])
-    missing = lacking(arguments)
+    missing = missing_extra(arguments)
     if missing is not None:
         tell(missing)
         return EXIT_REFUSED

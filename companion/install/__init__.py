@@ -1,9 +1,9 @@
-"""What `companion install` puts on the vehicle's computer, and takes away again.
+"""`companion install`: changes to the vehicle's computer, and their removal.
 
-texts.py      the files' contents
+templates.py  contents of the installed files
 adapters.py   USB serial adapters that are plugged in, from /sys
 plan.py       settings -> files and commands; pure
-state.py      what stands at a path: read, write, put back
-record.py     /var/lib/companion/installed.json: what stood there before, and what was put there
+state.py      content of a path: read, write, compare
+record.py     /var/lib/companion/installed.json: content before and after the installation
 apply.py      install and undo
 """

@@ -1,4 +1,4 @@
-"""USB serial adapters that are plugged in, as /sys tells of them."""
+"""USB serial adapters that are plugged in, read from /sys."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 FTDI = "0403"
 U2D2 = "6014"
-"""Product of the FT232H in a U2D2 (ROBOTIS); the force sensor's USB-RS485 adapter has another (6001, FT232R; 6015, FT-X)."""
+"""Product id of the FT232H in a U2D2 (ROBOTIS). The force sensor's USB-RS485 adapter has another one (6001 FT232R, 6015 FT-X)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,21 +16,21 @@ class Adapter:
     """One USB serial port."""
 
     tty: str
-    """Its name under /dev, today."""
+    """Current name under /dev."""
     vendor: str
     product: str
-    """USB ids, four hexadecimal digits."""
+    """USB vendor and product id, four hexadecimal digits each."""
     serial: str
-    """Of the chip; empty: it has none."""
+    """Serial number of the chip; empty if it has none."""
     name: str
-    """What the chip calls itself."""
+    """Product name that the chip reports."""
 
     def __str__(self) -> str:
         return f"/dev/{self.tty} ({self.vendor}:{self.product} {self.name or 'without a name'}, serial {self.serial or 'none'})"
 
 
 def adapters(sysfs: Path = Path("/sys")) -> tuple[Adapter, ...]:
-    """All USB serial ports, in the order of their names."""
+    """Return all USB serial ports, sorted by name."""
     found = []
     for tty in sorted((sysfs / "class/tty").glob("tty[UA][SC][BM]*")):
         device = next((folder for folder in tty.resolve().parents if (folder / "idVendor").is_file()), None)
@@ -42,20 +42,20 @@ def adapters(sysfs: Path = Path("/sys")) -> tuple[Adapter, ...]:
     return tuple(found)
 
 
-def choose(
+def choose_adapters(
     found: Sequence[Adapter], arm_serial: str | None, force_serial: str | None
 ) -> tuple[str | None, str | None, tuple[str, ...]]:
-    """Serial numbers of the arm's and of the force sensor's adapter, and a line of why for each.
+    """Return the serial numbers of the arm's and the force sensor's adapter, and one line of explanation for each.
 
-    What was given is taken as it is. Else the only FTDI adapter of the right kind that is left: a U2D2 for the arm, another for the
-    force sensor. None: nothing fits, or more than one does.
+    A serial number that was given is used as it is. Otherwise the only remaining FTDI adapter of the right kind is chosen: a U2D2
+    for the arm, another one for the force sensor. None if no adapter fits, or several do.
     """
-    told = []
+    reasons = []
     chosen: dict[str, str | None] = {"arm": arm_serial, "force": force_serial}
     for which, given in (("arm", arm_serial), ("force", force_serial)):
         if given is not None:
             there = any(adapter.serial == given for adapter in found)
-            told.append(f"{which}: serial {given}, as given{'' if there else '; it is not plugged in now'}")
+            reasons.append(f"{which}: serial {given}, as given{'' if there else '; it is not plugged in'}")
             continue
         fits = [
             adapter
@@ -67,16 +67,16 @@ def choose(
         ]
         if len(fits) == 1:
             chosen[which] = fits[0].serial
-            told.append(f"{which}: {fits[0]}, the only one of its kind")
+            reasons.append(f"{which}: {fits[0]}, the only one of its kind")
         elif fits:
-            told.append(
-                f"{which}: no stable name: {', '.join(map(str, fits))} would fit; say which with --{which}-serial"
+            reasons.append(
+                f"{which}: no stable name: several adapters fit ({', '.join(map(str, fits))}); choose one with --{which}-serial"
             )
         else:
-            told.append(
+            reasons.append(
                 f"{which}: no stable name: no adapter of its kind is plugged in; plug it in, or give --{which}-serial"
             )
-    return chosen["arm"], chosen["force"], tuple(told)
+    return chosen["arm"], chosen["force"], tuple(reasons)
 
 
 def _text(path: Path) -> str:

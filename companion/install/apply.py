@@ -1,7 +1,7 @@
-"""Install and undo: files below a root, commands only where that root is this computer's own.
+"""Install and undo: change files below a root folder, and run commands only if that root is the running system's.
 
-Every change is in the record before it is made. So an installation that fails puts everything back at once, and `undo` puts back one
-that was cut off (power).
+Every change is recorded before it is made. A failed installation is rolled back at once, and `undo` also reverts one that a loss of
+power interrupted.
 """
 
 from __future__ import annotations
@@ -17,113 +17,113 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.install.plan import PERFORMANCE, SERVICE, Command, Plan
-from companion.install.record import PATH, Entry, Record, inside, load, save
-from companion.install.state import InstallError, State, put, read
-from companion.install.templates import STATE
+from companion.install.record import RECORD_PATH, Entry, Record, load, save, under_root
+from companion.install.state import InstallError, PathState, read_state, write_state
+from companion.install.templates import STATE_DIRECTORY
 
 GROUP = "dialout"
 COMMAND_TIMEOUT_S = 60.0
-HOME = f"/var/lib/{STATE}"
-"""Of the service's user: flight logs, and in .config the operators' keys that the vehicle has made."""
+HOME = f"/var/lib/{STATE_DIRECTORY}"
+"""Home of the service's user: flight logs, and in .config the operator keys that the vehicle created."""
 _TOOLS = "/usr/sbin:/sbin:/usr/bin:/bin"
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What an installation would do, or did."""
+    """Changes that an installation would make, or made."""
 
     entries: Mapping[str, Entry]
-    """All of the record's, by path."""
-    now: Mapping[str, State]
-    """What stands there at the moment."""
+    """All entries of the record, by path."""
+    now: Mapping[str, PathState]
+    """Present content of each path."""
     folders: tuple[str, ...]
-    """That are to be made, outermost first."""
+    """Folders to create, outermost first."""
 
     @property
     def to_do(self) -> tuple[str, ...]:
-        """Paths that are not yet as they are to be."""
-        return tuple(path for path, entry in self.entries.items() if not self.now[path].same(entry.after))
+        """Paths whose content differs from the wanted one."""
+        return tuple(path for path, entry in self.entries.items() if not self.now[path].matches(entry.after))
 
 
-def changes(root: Path, plan: Plan, record: Record | None) -> Changes:
-    """Look; nothing is changed.
+def pending_changes(root: Path, plan: Plan, record: Record | None) -> Changes:
+    """Compare the plan with the file system; changes nothing.
 
     Raises:
-        InstallError: a file is in the way, or somebody has changed one since it was installed.
+        InstallError: a path is blocked, or a file was changed by someone else since it was installed.
     """
     old = record or Record()
     entries, now = {}, {}
     for item in plan.items:
-        state = State(
+        state = PathState(
             content=None if item.content is None else item.content.encode(),
             link=item.link,
             mode=item.mode if item.link is None else 0,
         )
-        found = now[item.path] = read(inside(root, item.path))
+        found = now[item.path] = read_state(under_root(root, item.path))
         entries[item.path] = Entry(before=_before(item.path, found, old), after=state)
     for path, entry in old.entries.items():
-        if path not in entries:  # an earlier installation wanted it
-            found = now[path] = read(inside(root, path))
+        if path not in entries:  # only an earlier installation needed it
+            found = now[path] = read_state(under_root(root, path))
             entries[path] = Entry(before=_before(path, found, old), after=entry.before)
     folders: list[str] = []
-    for path in (*entries, PATH):
+    for path in (*entries, RECORD_PATH):
         missing = [
             folder
             for folder in Path(path).parents
-            if not inside(root, str(folder)).is_dir() and str(folder) not in folders
+            if not under_root(root, str(folder)).is_dir() and str(folder) not in folders
         ]
         folders += [str(folder) for folder in reversed(missing)]
     return Changes(entries, now, tuple(folders))
 
 
-def _before(path: str, found: State, old: Record) -> State:
+def _before(path: str, found: PathState, old: Record) -> PathState:
     entry = old.entries.get(path)
     if entry is None:
         return found
-    if not found.same(entry.after) and not found.same(entry.before):
+    if not found.matches(entry.after) and not found.matches(entry.before):
         raise InstallError(changed_by_others(path))
     return entry.before
 
 
 def changed_by_others(path: str) -> str:
-    """One line."""
-    return f"{path}: was changed since companion install wrote it; put that back, or move the file away, then try again"
+    """Return the message for a file that was changed after the installation."""
+    return f"{path}: was changed since companion install wrote it; restore it or move the file away, then try again"
 
 
-def install(root: Path, plan: Plan, user: str, tell: Tell) -> bool:
-    """Make everything as planned; False: there was nothing to do.
+def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
+    """Carry out the plan; return False if there was nothing to do.
 
     Raises:
-        InstallError: it could not be done; everything is as it was before.
+        InstallError: the installation failed and was rolled back.
     """
     record = load(root)
-    found = changes(root, plan, record)
+    found = pending_changes(root, plan, record)
     live = root == Path("/")
     old = record or Record()
-    if record is not None and record.complete and not found.to_do and not (live and _missing(user)):
+    if record is not None and record.complete and not found.to_do and not (live and _user_missing(user)):
         return False
     made = Record(
         entries=found.entries,
         folders=(*old.folders, *found.folders),
-        users=(*old.users, *([user] if live and not _exists(user) else [])),
-        joined=(*old.joined, *([user] if live and _exists(user) and not _in_group(user) else [])),
+        users=(*old.users, *([user] if live and not _user_exists(user) else [])),
+        joined=(*old.joined, *([user] if live and _user_exists(user) and not _user_in_group(user) else [])),
     )
     try:
         for folder in found.folders:
-            inside(root, folder).mkdir(mode=0o755)
+            under_root(root, folder).mkdir(mode=0o755)
         save(root, made)
         for path in found.to_do:
-            put(inside(root, path), found.entries[path].after)
-            tell(f"{'took away' if found.entries[path].after.absent else 'wrote'} {path}")
+            write_state(under_root(root, path), found.entries[path].after)
+            report(f"{'removed' if found.entries[path].after.absent else 'wrote'} {path}")
         if live:
             for command in plan.commands:
-                _run(command, tell)
-        kept = {path: entry for path, entry in found.entries.items() if not entry.before.same(entry.after)}
+                _run(command, report)
+        kept = {path: entry for path, entry in found.entries.items() if not entry.before.matches(entry.after)}
         save(root, replace(made, entries=kept, complete=True))
     except (OSError, InstallError, KeyboardInterrupt) as error:
-        trouble = _put_back(
+        trouble = _roll_back(
             root,
             found,
             record,
@@ -133,19 +133,21 @@ def install(root: Path, plan: Plan, user: str, tell: Tell) -> bool:
             raise
         why = error if isinstance(error, InstallError) else f"{error.filename}: {error.strerror}"
         if trouble:
-            raise InstallError(f"{why}; could not be put back: {trouble}; then: companion install --undo") from None
+            raise InstallError(
+                f"{why}; not restored: {trouble}; correct that, then run: companion install --undo"
+            ) from None
         raise InstallError(f"{why}; everything is as it was before") from None
     return True
 
 
-def _put_back(root: Path, found: Changes, record: Record | None, made: Record) -> str:
-    """As it was before this installation, which made these users; returns what could not be put back."""
+def _roll_back(root: Path, found: Changes, record: Record | None, made: Record) -> str:
+    """Restore the state before this installation, which created the users in `made`; return what could not be restored."""
     trouble = []
     for path in reversed(found.to_do):
         try:
-            put(inside(root, path), found.now[path])
+            write_state(under_root(root, path), found.now[path])
         except OSError as error:
-            if not inside(root, path).parent.is_dir() and found.now[path].absent:
+            if not under_root(root, path).parent.is_dir() and found.now[path].absent:
                 continue  # its folder could not be made
             trouble.append(f"{path}: {error.strerror}")
     if trouble:
@@ -153,19 +155,19 @@ def _put_back(root: Path, found: Changes, record: Record | None, made: Record) -
     _remove_users(made, lambda _: None)
     with contextlib.suppress(OSError):
         if record is None:
-            inside(root, PATH).unlink(missing_ok=True)
+            under_root(root, RECORD_PATH).unlink(missing_ok=True)
         else:
             save(root, record)
     _remove_folders(root, found.folders)
     return ""
 
 
-def undo(root: Path, tell: Tell) -> bool:
-    """Take everything back; False: nothing is installed.
+def undo(root: Path, report: Report) -> bool:
+    """Revert the installation; return False if nothing is installed.
 
     Raises:
-        InstallError: somebody changed a file since, or the service runs: nothing was touched. Or: it stopped half way; doing it again
-            goes on from there.
+        InstallError: a file was changed by someone else or the service runs, and nothing was reverted; or the undo stopped half way,
+            and running it again continues.
     """
     record = load(root)
     if record is None:
@@ -173,84 +175,85 @@ def undo(root: Path, tell: Tell) -> bool:
     live = root == Path("/")
     back = []
     for path, entry in record.entries.items():
-        now = read(inside(root, path))
-        if not now.same(entry.before):
-            if not now.same(entry.after):
+        now = read_state(under_root(root, path))
+        if not now.matches(entry.before):
+            if not now.matches(entry.after):
                 raise InstallError(changed_by_others(path))
             back.append(path)
     if live:
-        if _active(SERVICE):
-            raise InstallError(f"{SERVICE} runs; systemctl stop companion first (in the air it lands)")
+        if _service_active(SERVICE):
+            raise InstallError(f"{SERVICE} is running; first: systemctl stop companion (in the air it lands)")
         if PERFORMANCE in " ".join(back):
-            _run(Command(("systemctl", "stop", PERFORMANCE), "puts the clock back"), tell)
+            _run(Command(("systemctl", "stop", PERFORMANCE), "restores the clock"), report)
     try:
         for path in reversed(back):
-            put(inside(root, path), record.entries[path].before)
-            tell(f"{'took away' if record.entries[path].before.absent else 'put back'} {path}")
-        _disown(root, record, tell)
+            write_state(under_root(root, path), record.entries[path].before)
+            report(f"{'removed' if record.entries[path].before.absent else 'restored'} {path}")
+        _take_ownership(root, record, report)
         if live:
-            _remove_users(record, tell)
-            for words in (("udevadm", "control", "--reload"), ("systemctl", "daemon-reload")):
-                _run(Command(words, ""), tell)
-        inside(root, PATH).unlink()
+            _remove_users(record, report)
+            for argv in (("udevadm", "control", "--reload"), ("systemctl", "daemon-reload")):
+                _run(Command(argv, ""), report)
+        under_root(root, RECORD_PATH).unlink()
     except OSError as error:
-        raise InstallError(f"{error.filename}: {error.strerror}; mend that, then: companion install --undo") from None
+        raise InstallError(
+            f"{error.filename}: {error.strerror}; correct that, then run: companion install --undo"
+        ) from None
     for folder in _remove_folders(root, record.folders):
-        tell(f"kept {folder}: something else is in it")
+        report(f"kept {folder}: it is not empty")
     return True
 
 
-def _disown(root: Path, record: Record, tell: Tell) -> None:
-    """Leave nothing to the id of a user who is deleted: the system may give that id to somebody else.
+def _take_ownership(root: Path, record: Record, report: Report) -> None:
+    """Leave no file to the id of a deleted user: the system may assign that id to another user.
 
-    The service's keys are deleted, its logs belong to whoever undoes the installation (root) from now on. A home that belongs to a
-    user who stays is not touched.
+    The service's keys are deleted; its logs are given to the user who runs the undo (root). The home of a user who is kept is not
+    touched.
 
     Raises:
         OSError: a file cannot be deleted or given to another owner.
     """
-    home = inside(root, HOME)
+    home = under_root(root, HOME)
     if not record.users or home.is_symlink() or not home.is_dir():
         return
-    if _name_of(home.stat().st_uid) not in (None, *record.users):
+    if _user_name(home.stat().st_uid) not in (None, *record.users):
         return
     config = home / ".config"
     if config.is_symlink():
         config.unlink()
     elif config.exists():
         shutil.rmtree(config)
-        tell(f"took away {HOME}/.config: the service's keys")
+        report(f"removed {HOME}/.config: the service's keys")
     owner, group = os.geteuid(), os.getegid()
-    for _, folders, files, folder_fd in os.fwalk(
-        home
-    ):  # follows no symbolic link: what is in there was written by the service
+    # fwalk follows no symbolic link: the service wrote what is in there.
+    for _, folders, files, folder_fd in os.fwalk(home):
         os.fchown(folder_fd, owner, group)
         for name in (*folders, *files):
             os.chown(name, owner, group, dir_fd=folder_fd, follow_symlinks=False)
 
 
-def _name_of(user_id: int) -> str | None:
+def _user_name(user_id: int) -> str | None:
     try:
         return pwd.getpwuid(user_id).pw_name
     except KeyError:
         return None
 
 
-def _remove_users(record: Record, tell: Tell) -> None:
+def _remove_users(record: Record, report: Report) -> None:
     for user in record.users:
-        if _exists(user):
-            _run(Command(("userdel", user), "takes the user away"), tell)
+        if _user_exists(user):
+            _run(Command(("userdel", user), "removes the user"), report)
     for user in record.joined:
-        if _exists(user) and _in_group(user):
-            _run(Command(("gpasswd", "-d", user, GROUP), "out of the group"), tell)
+        if _user_exists(user) and _user_in_group(user):
+            _run(Command(("gpasswd", "-d", user, GROUP), "removes the user from the group"), report)
 
 
 def _remove_folders(root: Path, folders: tuple[str, ...]) -> list[str]:
-    """Innermost first; returns those that are not empty."""
+    """Remove empty folders, innermost first; return those that are not empty."""
     kept = []
     for folder in reversed(folders):
         try:
-            inside(root, folder).rmdir()
+            under_root(root, folder).rmdir()
         except FileNotFoundError:
             continue
         except OSError:
@@ -258,11 +261,11 @@ def _remove_folders(root: Path, folders: tuple[str, ...]) -> list[str]:
     return kept
 
 
-def _missing(user: str) -> bool:
-    return not _exists(user) or not _in_group(user)
+def _user_missing(user: str) -> bool:
+    return not _user_exists(user) or not _user_in_group(user)
 
 
-def _exists(user: str) -> bool:
+def _user_exists(user: str) -> bool:
     try:
         pwd.getpwnam(user)
     except KeyError:
@@ -270,7 +273,7 @@ def _exists(user: str) -> bool:
     return True
 
 
-def _in_group(user: str) -> bool:
+def _user_in_group(user: str) -> bool:
     try:
         group = grp.getgrnam(GROUP)
     except KeyError:
@@ -278,7 +281,7 @@ def _in_group(user: str) -> bool:
     return user in group.gr_mem or pwd.getpwnam(user).pw_gid == group.gr_gid
 
 
-def _active(unit: str) -> bool:
+def _service_active(unit: str) -> bool:
     tool = shutil.which("systemctl", path=_TOOLS)
     if tool is None:
         return False
@@ -293,26 +296,26 @@ def _active(unit: str) -> bool:
     return ended.stdout.strip() in ("active", "activating", "deactivating", "reloading")
 
 
-def _run(command: Command, tell: Tell) -> None:
-    """Run one.
+def _run(command: Command, report: Report) -> None:
+    """Run a command.
 
     Raises:
-        InstallError: it failed, and it is needed.
+        InstallError: a required command failed.
     """
-    tool = shutil.which(command.words[0], path=_TOOLS)
+    tool = shutil.which(command.argv[0], path=_TOOLS)
     why = ""
     if tool is None:
         why = "no such program"
     else:
         try:
             ended = subprocess.run(
-                [tool, *command.words[1:]],
+                [tool, *command.argv[1:]],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 encoding="utf-8",
                 errors="replace",
                 timeout=COMMAND_TIMEOUT_S,
-                env={**os.environ, "LC_ALL": "C", "PATH": _TOOLS},
+                env={**os.environ, "LC_ALL": "C", "RECORD_PATH": _TOOLS},
                 check=False,
             )
             if ended.returncode != 0:
@@ -320,8 +323,8 @@ def _run(command: Command, tell: Tell) -> None:
         except (OSError, subprocess.TimeoutExpired) as error:
             why = str(error)
     if not why:
-        tell(f"ran {command}")
+        report(f"ran {command}")
     elif command.needed:
         raise InstallError(f"{command}: {why}")
     else:
-        tell(f"did not work, the next boot does it: {command}: {why}")
+        report(f"failed, the next boot does the same: {command}: {why}")

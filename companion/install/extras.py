@@ -1,4 +1,4 @@
-"""Which extra of the package a command needs that a flight-only installation lacks."""
+"""Extras of the package that a command needs and a flight-only installation lacks."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from collections.abc import Callable
 
 _WORLD = ("mujoco", "sitl")
 _NEEDS = {"sitl": _WORLD, "compare": _WORLD, "robustness": _WORLD, "faults": _WORLD}
-"""Command: package, and the extra that brings it. Commands with parts say it themselves (`monitor`, `broker init`)."""
+"""By command: the package, and the extra that installs it. `monitor` and `broker init` check their own."""
 
 
-def _here(package: str) -> bool:
+def _installed(package: str) -> bool:
     return importlib.util.find_spec(package) is not None
 
 
-def lacking(arguments: argparse.Namespace, here: Callable[[str], bool] = _here) -> str | None:
-    """One line: what the command needs and is not installed; None: it has all.
+def missing_extra(arguments: argparse.Namespace, here: Callable[[str], bool] = _installed) -> str | None:
+    """Return one line if the command needs a package that is not installed, else None.
 
     Args:
-        arguments: of the command, parsed.
-        here: whether a package can be imported.
+        arguments: parsed arguments of the command.
+        here: returns whether a package can be imported.
     """
     what, needs = f"companion {arguments.command}", _NEEDS.get(arguments.command)
     if needs is None and getattr(arguments, "sitl", None):

@@ -1,4 +1,4 @@
-"""What is to be installed: settings in, files and commands out. Pure."""
+"""Plan of an installation: settings in, files and commands out. Pure."""
 
 from __future__ import annotations
 
@@ -15,87 +15,87 @@ _SYSUSERS = "/etc/sysusers.d/companion.conf"
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the user wants. Paths are those on the vehicle's computer."""
+    """Settings of the installation. Paths are those on the vehicle's computer."""
 
     user: str
     program: str
-    """The `companion` that the service starts."""
+    """The `companion` executable that the service starts."""
     mission: str
     vehicle: str | None
     arm_serial: str | None
-    """Serial numbers of the USB adapters; None: no stable name for it."""
+    """Serial number of the arm's USB adapter; None for no stable device name."""
     force_serial: str | None
     at_boot: bool
-    """The service starts with the computer."""
+    """The service starts at boot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A file or a symbolic link that is to be there."""
+    """A file or symbolic link to install."""
 
     path: str
-    """On the vehicle's computer, absolute."""
+    """Absolute path on the vehicle's computer."""
     why: str
     content: str | None = None
     link: str | None = None
-    """Where a symbolic link points; then there is no content."""
+    """Target of a symbolic link, which has no content."""
     mode: int = 0o644
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A program that is run, as root, on the computer itself."""
+    """A command to run as root on the vehicle's computer."""
 
-    words: tuple[str, ...]
+    argv: tuple[str, ...]
     why: str
     needed: bool = False
-    """Without it nothing of the rest makes sense: if it fails, all is put back. Else the next boot does the same."""
+    """If the command fails, the installation is rolled back. A command that is not needed is made up for by the next boot."""
 
     def __str__(self) -> str:
-        return " ".join(self.words)
+        return " ".join(self.argv)
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Everything that an installation does."""
+    """All files and commands of an installation."""
 
     items: tuple[Item, ...]
     commands: tuple[Command, ...]
 
 
 def plan(settings: Settings) -> Plan:
-    """Files first, in this order, then commands."""
+    """Return the plan: files in this order, then commands."""
     unit = templates.service(settings.user, settings.program, settings.mission, settings.vehicle)
     rules = templates.udev_rules(settings.arm_serial, settings.force_serial)
     items = [
-        Item(_SYSUSERS, "the service's user, without a login, in dialout", templates.sysusers(settings.user)),
+        Item(_SYSUSERS, "user of the service, without a login, in dialout", templates.sysusers(settings.user)),
         Item("/etc/modules-load.d/companion.conf", "drivers of USB serial ports, from boot on", templates.modules()),
         Item("/etc/udev/rules.d/99-companion.rules", "latency timer 1 ms, stable names", rules),
-        Item("/etc/security/limits.d/companion.conf", "real time for people in dialout", templates.limits()),
+        Item("/etc/security/limits.d/companion.conf", "real-time limits for the group dialout", templates.limits()),
         Item(f"{_UNITS}/{PERFORMANCE}", "full clock", templates.performance_service()),
-        Item(f"{_UNITS}/{SERVICE}", "the flight, waiting for an operator's start", unit),
+        Item(f"{_UNITS}/{SERVICE}", "the flight; it waits for an operator's START", unit),
         Item(f"{_AT_BOOT}/{PERFORMANCE}", "full clock from boot on", link=f"{_UNITS}/{PERFORMANCE}"),
     ]
     if settings.at_boot:
-        items.append(Item(f"{_AT_BOOT}/{SERVICE}", "the flight waits from boot on", link=f"{_UNITS}/{SERVICE}"))
+        items.append(Item(f"{_AT_BOOT}/{SERVICE}", "starts the service at boot", link=f"{_UNITS}/{SERVICE}"))
     return Plan(
         items=tuple(items),
         commands=(
-            Command(("systemd-sysusers", _SYSUSERS), "makes the user", needed=True),
+            Command(("systemd-sysusers", _SYSUSERS), "creates the user", needed=True),
             Command(("modprobe", "-a", "ftdi_sio", "cdc_acm"), "loads the drivers"),
-            Command(("udevadm", "control", "--reload"), "reads the rules"),
+            Command(("udevadm", "control", "--reload"), "reloads the rules"),
             Command(
                 ("udevadm", "trigger", "--action=add", "--subsystem-match=usb-serial", "--subsystem-match=tty"),
-                "applies them to what is plugged in",
+                "applies them to connected adapters",
             ),
-            Command(("systemctl", "daemon-reload"), "reads the units"),
+            Command(("systemctl", "daemon-reload"), "reloads the units"),
             Command(("systemctl", "restart", PERFORMANCE), "full clock now"),
         ),
     )
 
 
 def isolation(cores: int) -> tuple[str, ...]:
-    """A suggestion in words for computers with more than two cores; nothing of it is ever done by the program."""
+    """Return advice on reserving cores, for computers with more than two; the program never reserves any itself."""
     if cores < 3:
         return ()
     rest, own = f"0-{cores - 3}" if cores > 3 else "0", f"{cores - 2},{cores - 1}"
@@ -103,5 +103,5 @@ def isolation(cores: int) -> tuple[str, ...]:
         f"Cores: nothing is reserved. Should the report show late ticks, keep cores {own} for the flight:",
         f"  vehicle file                                   computer: {{cpus: [{own.replace(',', ', ')}]}}",
         f"  /etc/systemd/system.conf.d/50-cores.conf       [Manager] CPUAffinity={rest}",
-        "isolcpus= does the same as the second, but only with real-time scheduling: nothing balances threads between isolated cores.",
+        "isolcpus= can replace CPUAffinity, but only with real-time scheduling: threads are not balanced between isolated cores.",
     )

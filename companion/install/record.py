@@ -1,6 +1,6 @@
-"""What an installation changed, kept on the computer itself, so that it can be taken back exactly.
+"""Record of an installation, kept on the vehicle's computer so that it can be reverted exactly.
 
-Written before anything is changed (`complete` false), and again when all of it is done.
+It is written before the first change (`complete` is false) and again after the last.
 """
 
 from __future__ import annotations
@@ -13,58 +13,58 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from companion.install.state import InstallError, State, put
+from companion.install.state import InstallError, PathState, write_state
 
-PATH = "/var/lib/companion/installed.json"
+RECORD_PATH = "/var/lib/companion/installed.json"
 SCHEMA_VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One path."""
+    """Content of one path before and after the installation."""
 
-    before: State
-    after: State
+    before: PathState
+    after: PathState
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One installation, with everything that later ones changed of it."""
+    """One installation, including later changes to it."""
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
     """By path on the vehicle's computer."""
     folders: tuple[str, ...] = ()
-    """Folders that were not there before, outermost first."""
+    """Folders that the installation created, outermost first."""
     users: tuple[str, ...] = ()
-    """Users that were not there before."""
+    """Users that the installation created."""
     joined: tuple[str, ...] = ()
-    """Users who were there, but not in dialout."""
+    """Existing users that the installation added to the group dialout."""
     complete: bool = False
 
 
-def inside(root: Path, path: str) -> Path:
-    """Where a path of the vehicle's computer is, seen from here."""
+def under_root(root: Path, path: str) -> Path:
+    """Return the location of a path of the vehicle's computer below `root`."""
     return root / path.lstrip("/")
 
 
 def load(root: Path) -> Record | None:
-    """The record; None: nothing is installed.
+    """Read the record, or return None if nothing is installed.
 
     Raises:
-        InstallError: it is not one, or not one that may be trusted.
+        InstallError: the file is not a valid record, or users other than root can change it.
     """
-    path = inside(root, PATH)
+    path = under_root(root, RECORD_PATH)
     try:
         found = path.lstat()
         if not stat.S_ISREG(found.st_mode) or found.st_uid not in (0, os.geteuid()) or found.st_mode & 0o022:
-            raise InstallError(f"{path}: expected a file that only its owner, root, can change; it is not trusted")
+            raise InstallError(f"{path}: expected a file that only root can change; it is not trusted")
         data = json.loads(path.read_text(encoding="utf-8"))
         if data["schema_version"] != SCHEMA_VERSION:
             raise InstallError(
                 f"{path}: schema_version {data['schema_version']}, expected {SCHEMA_VERSION}; use the companion that wrote it"
             )
         entries = {
-            str(name): Entry(State.from_json(entry["before"]), State.from_json(entry["after"]))
+            str(name): Entry(PathState.from_json(entry["before"]), PathState.from_json(entry["after"]))
             for name, entry in data["files"].items()
         }
         folders, users, joined = (tuple(map(str, data[key])) for key in ("folders", "users", "joined"))
@@ -74,11 +74,11 @@ def load(root: Path) -> Record | None:
     except OSError as error:
         raise InstallError(f"{path}: cannot be read: {error.strerror}; is this root?") from None
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise InstallError(f"{path}: is no record of an installation; it was changed by hand") from None
+        raise InstallError(f"{path}: is not a valid record of an installation; it was changed by hand") from None
 
 
 def save(root: Path, record: Record) -> None:
-    """Write it.
+    """Write the record.
 
     Raises:
         OSError: it cannot be written.
@@ -93,4 +93,6 @@ def save(root: Path, record: Record) -> None:
             name: {"before": e.before.as_json(), "after": e.after.as_json()} for name, e in record.entries.items()
         },
     }
-    put(inside(root, PATH), State(content=(json.dumps(data, indent=1) + "\n").encode(), mode=0o600))
+    write_state(
+        under_root(root, RECORD_PATH), PathState(content=(json.dumps(data, indent=1) + "\n").encode(), mode=0o600)
+    )

@@ -1,4 +1,4 @@
-"""What stands at a path: read it, put it there, compare."""
+"""Content of a path: a file, a symbolic link or nothing. Read, write and compare it."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from companion.runtime.files import write_whole
 
 
 class InstallError(Exception):
-    """It cannot be done; one line. What had been done is put back already, unless the line says otherwise."""
+    """The installation failed; one line. Changes have been rolled back unless the line says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    """A file, a symbolic link, or nothing at all."""
+class PathState:
+    """A file, a symbolic link, or nothing."""
 
     content: bytes | None = None
     link: str | None = None
     mode: int = 0
     """Permission bits of a file."""
     owner: tuple[int, int] | None = None
-    """User and group id of a file that was there before; None: whoever installs."""
+    """User and group id of a file that existed before; None for the user who installs."""
 
     @property
     def absent(self) -> bool:
-        """Nothing stands there."""
+        """Whether nothing exists at the path."""
         return self.content is None and self.link is None
 
-    def same(self, other: State) -> bool:
-        """Equal as far as both say it."""
+    def matches(self, other: PathState) -> bool:
+        """Whether both are equal; an unknown owner equals any."""
         owners = self.owner is None or other.owner is None or self.owner == other.owner
         return owners and (self.content, self.link, self.mode) == (other.content, other.link, other.mode)
 
     def as_json(self) -> dict[str, Any] | None:
-        """None for nothing."""
+        """Return JSON data; None if nothing exists."""
         if self.absent:
             return None
         if self.link is not None:
@@ -51,44 +51,46 @@ class State:
         return {**content, "mode": f"{self.mode:04o}", "owner": self.owner}
 
     @staticmethod
-    def from_json(data: dict[str, Any] | None) -> State:
-        """What `as_json` made.
+    def from_json(data: dict[str, Any] | None) -> PathState:
+        """Parse the data that `as_json` returned.
 
         Raises:
-            KeyError, TypeError, ValueError: it did not make this.
+            KeyError, TypeError, ValueError: the data is invalid.
         """
         if data is None:
-            return State()
+            return PathState()
         if "link" in data:
-            return State(link=str(data["link"]))
+            return PathState(link=str(data["link"]))
         content = data["text"].encode() if "text" in data else base64.b64decode(data["base64"], validate=True)
         owner = data["owner"]
-        return State(
+        return PathState(
             content=content, mode=int(data["mode"], 8), owner=None if owner is None else (int(owner[0]), int(owner[1]))
         )
 
 
-def read(path: Path) -> State:
-    """What stands there.
+def read_state(path: Path) -> PathState:
+    """Return the content of a path.
 
     Raises:
-        InstallError: neither a file nor a link; or it cannot be read.
+        InstallError: the path is neither a file nor a link, or cannot be read.
     """
     try:
         found = path.lstat()
         if stat.S_ISLNK(found.st_mode):
-            return State(link=os.readlink(path))
+            return PathState(link=os.readlink(path))
         if not stat.S_ISREG(found.st_mode):
-            raise InstallError(f"{path}: expected a file or nothing, found something else; move it away")
-        return State(content=path.read_bytes(), mode=stat.S_IMODE(found.st_mode), owner=(found.st_uid, found.st_gid))
+            raise InstallError(f"{path}: expected a file, a link or nothing; move it away")
+        return PathState(
+            content=path.read_bytes(), mode=stat.S_IMODE(found.st_mode), owner=(found.st_uid, found.st_gid)
+        )
     except FileNotFoundError:
-        return State()
+        return PathState()
     except OSError as error:
         raise InstallError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def put(path: Path, state: State) -> None:
-    """Bring a path to a state, whole or not at all, also through a loss of power.
+def write_state(path: Path, state: PathState) -> None:
+    """Write, replace or remove a path, whole or not at all, also through a loss of power.
 
     Raises:
         OSError: it cannot be done; the path is as it was.

@@ -1,29 +1,29 @@
-"""Contents of the files that are installed. Pure.
+"""Contents of the installed files. Pure.
 
-Sources: systemd.exec(5), systemd.service(5), systemd.kill(5), systemd.resource-control(5), sysusers.d(5), modules-load.d(5), udev(7),
-limits.conf(5).
+Sources: systemd.exec(5), systemd.service(5), systemd.kill(5), systemd.resource-control(5), sysusers.d(5), modules-load.d(5),
+udev(7), limits.conf(5).
 """
 
 from __future__ import annotations
 
 STOP_TIMEOUT_S = 180
-"""For a landing: the retreat along the tether, PX4's landing and its confirmation take a minute at most; then as long again twice."""
+"""Time for a landing: return along the tether, PX4's landing and its confirmation take one minute at most; tripled for margin."""
 RTPRIO = 60
-"""Of the guardian; the flight asks for less."""
-STATE = "companion/fly"
-"""Below /var/lib. The folder above it holds the record that `--undo` trusts, so that one belongs to root."""
+"""Real-time priority limit: that of the guardian; the flight process uses less."""
+STATE_DIRECTORY = "companion/fly"
+"""Below /var/lib. Its parent folder holds the record that `--undo` trusts, so that folder belongs to root."""
 _GOVERNORS = "/sys/devices/system/cpu/cpufreq/policy*/scaling_governor"
-_HEAD = "# Written by companion install; companion install --undo takes it away."
+_HEAD = "# Written by companion install; companion install --undo removes it."
 
 
 def exec_word(text: str) -> str:
-    """One word of a systemd command line: its quotes, specifiers and variables escaped."""
+    """Return one word of a systemd command line with quotes, specifiers and variables escaped."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
     return f'"{escaped}"' if any(c in text for c in " \t\"'\\;") else escaped
 
 
 def service(user: str, program: str, mission: str, vehicle: str | None) -> str:
-    """companion.service."""
+    """Return companion.service."""
     words = [program, "fly", mission, *(("--vehicle", vehicle) if vehicle is not None else ()), "--wait-for-start"]
     return f"""{_HEAD}
 [Unit]
@@ -36,29 +36,29 @@ Type=exec
 ExecStart={" ".join(map(exec_word, [*words, "--no-report"]))}
 User={user}
 SupplementaryGroups=dialout
-StateDirectory={STATE}
+StateDirectory={STATE_DIRECTORY}
 StateDirectoryMode=0750
-WorkingDirectory=/var/lib/{STATE}
-Environment=HOME=/var/lib/{STATE} PYTHONUNBUFFERED=1
+WorkingDirectory=/var/lib/{STATE_DIRECTORY}
+Environment=HOME=/var/lib/{STATE_DIRECTORY} PYTHONUNBUFFERED=1
 
-# A flight that ended is never begun again by a machine: a person looks first.
+# A flight that ended is never restarted automatically: an operator checks the vehicle first.
 Restart=no
 # SIGTERM goes to the launcher alone, which lands; to all at once it would end the guardian and cut the log. And when the launcher
 # itself is gone, nobody kills the flight that still lands, or its guardian.
 KillMode=process
 KillSignal=SIGTERM
 TimeoutStopSec={STOP_TIMEOUT_S}
-# 4: given up and landed, or never lifted; what systemctl stop asks for.
+# 4: aborted and landed, or never took off; the result of systemctl stop.
 SuccessExitStatus=4
 OOMPolicy=continue
 OOMScoreAdjust=-900
 
-# The processes ask for SCHED_FIFO and locked memory themselves, thread by thread; here is the permission.
+# The processes request SCHED_FIFO and locked memory themselves, per thread; this permits it.
 LimitRTPRIO={RTPRIO}
 LimitMEMLOCK=infinity
 Nice=-5
 
-# Serial ports and pseudo-terminals; nothing else of /dev. No filter of system calls: it would kill in the air.
+# Serial ports and pseudo-terminals, nothing else of /dev. No system call filter: it would kill the process in the air.
 DevicePolicy=closed
 DeviceAllow=char-ttyUSB rw
 DeviceAllow=char-ttyACM rw
@@ -86,10 +86,10 @@ WantedBy=multi-user.target
 
 
 def performance_service(governors: str = _GOVERNORS, memory: str = "/run/companion-performance/before") -> str:
-    """companion-performance.service: every core at full clock; stopped, it puts back what was.
+    """Return companion-performance.service: it runs every core at full clock, and restores the previous governors when stopped.
 
     Args:
-        governors, memory: for tests; where the governors are told, and where to remember what they were.
+        governors, memory: paths of the governor files, and of the file that keeps their previous values; for tests.
     """
     start = (
         f'for g in {governors}; do echo "$$(cat $$g) $$g"; done > {memory} && '
@@ -115,10 +115,10 @@ WantedBy=multi-user.target
 
 
 def udev_rules(arm_serial: str | None, force_serial: str | None) -> str:
-    """Rules for the two USB serial adapters, both with FTDI's chips."""
+    """Return the rules for the two USB serial adapters, both with FTDI chips."""
     lines = [
         _HEAD,
-        "# An answer waits in the adapter for this long; the driver's default of 16 ms costs three ticks per cycle of the arm's bus.",
+        "# The adapter holds an answer for this long; the driver's default of 16 ms costs three ticks per cycle of the arm's bus.",
         'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"',
     ]
     for name, what, serial in (
@@ -126,7 +126,7 @@ def udev_rules(arm_serial: str | None, force_serial: str | None) -> str:
         ("companion-force", "the force sensor's adapter", force_serial),
     ):
         if serial is None:
-            lines.append(f"# No name for {what}: it was not plugged in, and no serial number was given.")
+            lines.append(f"# No stable name for {what}: it was not plugged in, and no serial number was given.")
         else:
             lines.append(
                 f'ACTION!="remove", SUBSYSTEM=="tty", ATTRS{{idVendor}}=="0403", ATTRS{{serial}}=="{serial}", '
@@ -136,15 +136,15 @@ def udev_rules(arm_serial: str | None, force_serial: str | None) -> str:
 
 
 def limits() -> str:
-    """For people of the group dialout who fly from a shell; a service has its own limits."""
+    """Return limits for users of the group dialout who fly from a shell; a service has its own limits."""
     return f"{_HEAD}\n@dialout - rtprio {RTPRIO}\n@dialout - memlock unlimited\n"
 
 
 def modules() -> str:
-    """Loaded at boot: a service's DeviceAllow knows only drivers that are there when it starts."""
+    """Return the drivers to load at boot: a service's DeviceAllow only covers drivers that are loaded when it starts."""
     return f"{_HEAD}\nftdi_sio\ncdc_acm\n"
 
 
 def sysusers(user: str) -> str:
-    """The service's user, without a login, and its group for serial ports."""
-    return f'{_HEAD}\nu {user} - "companion flight service" /var/lib/{STATE}\nm {user} dialout\n'
+    """Return the service's user, without a login, in the group of the serial ports."""
+    return f'{_HEAD}\nu {user} - "companion flight service" /var/lib/{STATE_DIRECTORY}\nm {user} dialout\n'

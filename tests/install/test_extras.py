@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from companion.cli.main import _normalised, _parser
-from companion.install.extras import lacking
+from companion.install.extras import missing_extra
 
 EXTRAS = ("mujoco", "joblib", "dask", "distributed", "matplotlib", "aiohttp", "cryptography")
 
@@ -31,11 +31,11 @@ EXTRAS = ("mujoco", "joblib", "dask", "distributed", "matplotlib", "aiohttp", "c
 )
 def test_what_lacks_the_world_says_so(words: str, what: str | None) -> None:
     arguments = _parser().parse_args(_normalised(words.split()))
-    said = lacking(arguments, here=lambda package: False)
+    said = missing_extra(arguments, here=lambda package: False)
     assert said == (
         None if what is None else f"{what}: the simulated world needs mujoco: pip install 'companion[sitl]'"
     )
-    assert lacking(arguments, here=lambda package: True) is None
+    assert missing_extra(arguments, here=lambda package: True) is None
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ import pytest
 
 from companion.cli.main import main
 from companion.install import apply
-from companion.install.record import PATH
-from companion.install.state import State, put
+from companion.install.record import RECORD_PATH
+from companion.install.state import PathState, write_state
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.support import ROOT
 
@@ -83,14 +83,14 @@ def test_installed_and_undone_leaves_every_byte_as_it_was(root: Path) -> None:
     after = tree(root)
     changed = {path for path in after if after[path] != before.get(path) and after[path][0] != "folder"}
     assert changed == {
-        RULES, UNIT, PATH.lstrip("/"), "etc/modules-load.d/companion.conf", "etc/security/limits.d/companion.conf",
+        RULES, UNIT, RECORD_PATH.lstrip("/"), "etc/modules-load.d/companion.conf", "etc/security/limits.d/companion.conf",
         "etc/sysusers.d/companion.conf", "etc/systemd/system/companion-performance.service",
         "etc/systemd/system/multi-user.target.wants/companion.service",
         "etc/systemd/system/multi-user.target.wants/companion-performance.service",
     }  # fmt: skip
     assert 'ATTRS{serial}=="FT4THVLI", SYMLINK+="companion-arm"' in after[RULES][2].decode()
     assert after[RULES][1] == 0o644
-    assert after[PATH.lstrip("/")][1] == 0o600
+    assert after[RECORD_PATH.lstrip("/")][1] == 0o600
     assert undo(root) == EXIT_OK
     assert tree(root) == before
 
@@ -153,13 +153,13 @@ class PowerLossError(BaseException):
 def fail_at_the_third_file(monkeypatch: pytest.MonkeyPatch, failure: BaseException) -> None:
     written: list[Path] = []
 
-    def until_then(path: Path, state: State) -> None:
+    def until_then(path: Path, state: PathState) -> None:
         written.append(path)
         if len(written) == 3:
             raise failure
-        put(path, state)
+        write_state(path, state)
 
-    monkeypatch.setattr(apply, "put", until_then)
+    monkeypatch.setattr(apply, "write_state", until_then)
 
 
 def test_a_full_disk_half_way_leaves_everything_as_it_was(
@@ -222,17 +222,17 @@ def test_a_folder_that_others_use_by_now_is_kept(root: Path, capsys: pytest.Capt
     (root / "var/lib/companion/fly").mkdir()
     assert undo(root) == EXIT_OK
     assert (root / "var/lib/companion/fly").is_dir()
-    assert not (root / PATH.lstrip("/")).exists()
+    assert not (root / RECORD_PATH.lstrip("/")).exists()
     assert "kept /var/lib/companion" in capsys.readouterr().out
 
 
 def test_a_record_that_others_could_write_is_not_trusted(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert install(root) == EXIT_OK
-    (root / PATH.lstrip("/")).chmod(0o666)
+    (root / RECORD_PATH.lstrip("/")).chmod(0o666)
     assert undo(root) == EXIT_REFUSED
     assert "not trusted" in capsys.readouterr().err
-    (root / PATH.lstrip("/")).chmod(0o600)
-    (root / PATH.lstrip("/")).write_text("{}")
+    (root / RECORD_PATH.lstrip("/")).chmod(0o600)
+    (root / RECORD_PATH.lstrip("/")).write_text("{}")
     assert undo(root) == EXIT_REFUSED
     assert "no record" in capsys.readouterr().err
 
@@ -243,7 +243,7 @@ def test_keys_go_with_the_user_who_is_deleted_and_stay_with_one_who_stays(
 ) -> None:
     """A user id that is free is given to the next user: no key of an operator may wait for that one."""
     assert install(root) == EXIT_OK
-    path = root / PATH.lstrip("/")
+    path = root / RECORD_PATH.lstrip("/")
     record = json.loads(path.read_text())
     record["users"] = [pwd.getpwuid(os.geteuid()).pw_name] if goes else []
     path.write_text(json.dumps(record))

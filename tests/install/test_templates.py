@@ -12,7 +12,7 @@ import pytest
 
 from companion.cli.main import _normalised, _parser
 from companion.install import templates
-from companion.install.adapters import adapters, choose
+from companion.install.adapters import adapters, choose_adapters
 from companion.runtime.realtime import FLIGHT_PRIORITY, GUARDIAN_PRIORITY
 
 PROGRAM = str(Path(sys.prefix) / "bin/companion")
@@ -127,18 +127,18 @@ def test_adapters_are_found_and_told_apart(tmp_path: Path) -> None:
     (tmp_path / "class/tty/ttyS0").mkdir()
     found = adapters(tmp_path)
     assert [(a.tty, a.serial) for a in found] == [("ttyACM0", "0"), ("ttyUSB0", "A10M"), ("ttyUSB1", "FT4THVLI")]
-    assert choose(found, None, None)[:2] == ("FT4THVLI", "A10M")
-    assert choose(found, "X", None)[:2] == ("X", "A10M")
-    assert "not plugged in" in choose(found, "X", None)[2][0]
+    assert choose_adapters(found, None, None)[:2] == ("FT4THVLI", "A10M")
+    assert choose_adapters(found, "X", None)[:2] == ("X", "A10M")
+    assert "not plugged in" in choose_adapters(found, "X", None)[2][0]
 
 
 def test_adapters_that_cannot_be_told_apart_are_not_guessed(tmp_path: Path) -> None:
     plug(tmp_path, "ttyUSB0", "6014", "FT1")
     plug(tmp_path, "ttyUSB1", "6014", "FT2")
-    arm, force, (about_arm, about_force) = choose(adapters(tmp_path), None, None)
+    arm, force, (about_arm, about_force) = choose_adapters(adapters(tmp_path), None, None)
     assert (arm, force) == (None, None)
     assert "FT1" in about_arm
     assert "--arm-serial" in about_arm
     assert "--force-serial" in about_force
-    assert choose(adapters(tmp_path), "FT2", None)[0] == "FT2"
+    assert choose_adapters(adapters(tmp_path), "FT2", None)[0] == "FT2"
     assert adapters(tmp_path / "nothing") == ()
