@@ -1,4 +1,4 @@
-"""`companion check`: everything that a flight would look at before it arms, for people or scripts. Nothing moves, nothing is armed."""
+"""`companion check`: run every check that a flight runs before it arms. Nothing moves, nothing is armed."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ GROUPS = {
     "mission": "Mission",
     "machine": "Computer",
 }
-"""Headings, by the first part of a row's id."""
+"""Headings by the first part of a row's id."""
 _MARK_WIDTH, _TITLE_WIDTH, _WIDTH_MAX, _GAP = 4, 34, 160, 2
 _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 
@@ -61,7 +61,7 @@ Plans = Callable[[FlightConfig], list[str]]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What was asked for."""
+    """The command's arguments."""
 
     config: FlightConfig
     mission: str
@@ -71,11 +71,11 @@ class Task:
 
 
 def run(arguments: argparse.Namespace, config: FlightConfig, problems: Plans) -> int:
-    """The command.
+    """Run the command and return the exit code.
 
     Args:
-        arguments: parsed.
-        config: loaded from them.
+        arguments: parsed arguments.
+        config: configuration loaded from them.
         problems: why the mission cannot be flown as written.
     """
     found = problems(config)
@@ -110,7 +110,11 @@ def _plan_only(arguments: argparse.Namespace, config: FlightConfig, found: list[
 
 
 def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> list[Row]:
-    """Raises: LaunchError: the simulated world does not start."""
+    """Return the rows of all checks.
+
+    Raises:
+        LaunchError: the simulated world does not start.
+    """
     config = task.config
     with contextlib.ExitStack() as stack:
         line = stack.enter_context(_Line(people))
@@ -134,7 +138,7 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
 
 
 async def _unless_interrupted(look: Coroutine[Any, Any, list[Row]]) -> list[Row] | None:
-    """None after Ctrl-C, whatever became of the cancellation on its way through the devices that were being opened."""
+    """Return the result, or None after Ctrl-C, whatever the devices that were being opened made of the cancellation."""
     interrupted = asyncio.Event()
     loop = asyncio.get_running_loop()
     looking = asyncio.ensure_future(look)
@@ -166,7 +170,7 @@ async def _look(task: Task, config: FlightConfig, known: Observations, line: _Li
 
 
 def _recorder(config: FlightConfig, scratch: Path) -> str:
-    """Empty: a recorder process could open a log. Else why not."""
+    """Return why a recorder process could not open a log; empty if it could."""
     try:
         recorder = RecorderProcess.start(
             scratch / "check.mcap", config_json=config.model_dump_json(), epoch_offset_ns=time.time_ns()
@@ -177,7 +181,7 @@ def _recorder(config: FlightConfig, scratch: Path) -> str:
 
 
 class _Line:
-    """In a terminal, one line that says what is being looked at; elsewhere nothing."""
+    """Progress display: one line with the current subject in a terminal, nothing elsewhere."""
 
     def __init__(self, people: Console) -> None:
         self._status = people.status("companion check") if people.is_terminal else None
@@ -195,20 +199,20 @@ class _Line:
             self._status.update(f"companion check: {escape(text)}")
 
     def world(self, message: dict[str, Any]) -> None:
-        """What the simulated world says while it starts: perhaps that it waits for somebody."""
+        """Show a message of the simulated world while it starts."""
         if message.get("type") == "progress":
             if self._status is None:
                 tell(f"companion check: {message['text']}")
             self(str(message["text"]))
 
     def stop(self) -> None:
-        """Make room for something else."""
+        """Remove the line."""
         if self._status is not None:
             self._status.stop()
 
 
 def show(console: Console, rows: list[Row], task: Task) -> None:
-    """For people: one table per device, what to do under what is wrong, and the verdict."""
+    """Print one table per device, what to do below each row that fails, and the verdict."""
     where = " (SITL)" if task.sitl is not None else ""
     console.print(Text(f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}'", style="bold"))
     for prefix, heading in GROUPS.items():
@@ -246,7 +250,7 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
 
 
 def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, header: bool = False) -> Table:
-    """One row; all of them have the same columns, so that they stand below each other. What needs no comparison takes both."""
+    """Return one row of the table. All rows have the same columns; a row without an expected value uses both."""
     width = min(console.width, _WIDTH_MAX)
     title_width = min(_TITLE_WIDTH, width // 3)
     left = max(20, width - _MARK_WIDTH - title_width - 4 * _GAP)
@@ -264,7 +268,7 @@ def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, he
 
 
 def _under(row: Row) -> Padding:
-    """What to do, and why, under a row that is not ok."""
+    """Return what to do, and why, for a row that does not pass."""
     table = Table.grid(padding=(0, 1, 0, 0))
     if row.fix:
         table.add_row("->", Text(row.fix, style="bold"))

@@ -1,4 +1,4 @@
-"""`companion hover fit`: the hover thrust that a flight's log tells, beside the one that was flown with."""
+"""`companion hover fit`: fit the hover thrust to a flight's log and compare it with the configured one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.runtime.console import tell
 
 _DIGITS = 4
-"""Of a hover thrust that is printed or put into a file: 0.01 % of full thrust."""
+"""Digits of a printed or written hover thrust: 0.01 % of full thrust."""
 
 
 def add_parser(commands: Any) -> None:
@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit, print; returns the exit code."""
+    """Fit and print; returns the exit code."""
     try:
         log = FlightLog.read(arguments.log)
         fit = fit_hover_thrust(log)
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def jsonable(fit: HoverFit) -> dict[str, Any]:
-    """For scripts; None where a value is not known. Thrust is normalised, 0 to 1."""
+    """Return the result for scripts; None where a value is not known. Thrust is normalised, 0 to 1."""
     slope = fit.slope
     return {
         "hover_thrust": fit.hover_thrust,
@@ -65,7 +65,7 @@ def jsonable(fit: HoverFit) -> dict[str, Any]:
 
 
 def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
-    """For people."""
+    """Return the result as text."""
     at = f" at {fit.voltage_mean_v:.2f} V" if fit.slope else ""
     told = [
         f"hover thrust      {fit.hover_thrust:.{_DIGITS}f} ± {fit.standard_error:.{_DIGITS}f} (standard error){at}, "
@@ -96,7 +96,7 @@ def _battery(fit: HoverFit) -> str:
 
 
 def _relative(value: float | None, fit: HoverFit) -> float | None:
-    """By how much a value differs from the fitted one; positive: it is larger."""
+    """Return the relative difference of a value to the fitted one; positive if it is larger."""
     return None if value is None else value / fit.hover_thrust - 1.0
 
 

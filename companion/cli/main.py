@@ -1,4 +1,4 @@
-"""The commands: fly, check, schema, sitl, compare, robustness, faults, hover, report, replay."""
+"""The command `companion`: parses the command line and calls the module of the command."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ _WITH_MODULES = (
     ),
     *("broker", "report"),
 )
-"""Commands whose parsers stand beside what they do, in `companion.NAME_command`."""
+"""Commands with a parser of their own, in `companion.cli.NAME`."""
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse, with one line per mistake and no abbreviations."""
+    """argparse with one line per error and no abbreviations."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _normalised(argv: list[str]) -> list[str]:
-    """`--sitl` without a value becomes `--sitl=stub`; `--set a=1 b=2` becomes one `--set` each."""
+    """Convert `--sitl` without a value to `--sitl=stub`, and `--set a=1 b=2` to one `--set` each."""
     out: list[str] = []
     in_set = False
     for word in argv:
@@ -103,7 +103,9 @@ def _normalised(argv: list[str]) -> list[str]:
 
 
 def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
-    """All commands; if the first word of a command line names one, no others: to load them all takes half a second."""
+    """Return the parser of all commands, or of the one named by the first word of a command line, because loading all takes half a
+    second.
+    """
     parser = _Parser(
         prog="companion", description="Flies an aerial manipulator on PX4 with adaptive impedance control."
     )
@@ -244,7 +246,7 @@ def _fly(arguments: argparse.Namespace) -> int:
 
 
 def _nobody_could_start(config: FlightConfig) -> list[str]:
-    """Why a flight that waits for its start would wait for ever, one line; empty: it would not."""
+    """Return why a flight with `--wait-for-start` could never be started, as one line; empty if it could."""
     if config.mission.start.takeoff != "by_operator":
         return []
     mqtt = config.vehicle.ground.mqtt

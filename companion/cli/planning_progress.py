@@ -1,4 +1,4 @@
-"""What a person sees while a mission is planned and checked: nothing, or, if that takes long, a bar in the terminal."""
+"""Progress bar while a mission is planned and checked. It appears in a terminal if that takes long."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from companion.runtime.clock import Clock
 from companion.runtime.console import console_on
 
 SHOW_AFTER_S = 1.0
-"""What is over by then needs no bar."""
+"""Time after which the bar appears."""
 
 
 class PlanningProgress:
-    """Told the share of the planning that is done, as `companion.mission.check.check_mission` wants it.
+    """Progress callback for `companion.mission.check.check_mission`.
 
     Args:
-        console: where the bar goes; None: standard error. Without a terminal there is none.
+        console: where the bar is drawn; None for standard error. Without a terminal there is no bar.
         now_s: a clock.
     """
 
@@ -51,7 +51,7 @@ class PlanningProgress:
             self._progress.stop()
 
     def __call__(self, share: float) -> None:
-        """So much is done, 0 to 1."""
+        """Show the completed share, 0 to 1."""
         if not self._visible or self._now_s() - self._start_s < SHOW_AFTER_S:
             return
         self._progress.update(self._task, completed=share)

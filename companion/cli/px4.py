@@ -1,4 +1,4 @@
-"""`companion px4 params`: compare the connected PX4's parameters with a file, or bring them to it."""
+"""`companion px4 params`: compare the connected PX4's parameters with a file, or write the file's values to PX4."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compare, perhaps write, print; returns the exit code.
+    """Compare, write if requested, and print; returns the exit code.
 
     Raises:
         ConfigError: the parameter or the vehicle file is wrong.
@@ -108,7 +108,7 @@ async def _armed(autopilot: MavsdkAutopilot) -> bool:
 
 
 def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str) -> str | None:
-    """Keep the old values; None, or why nothing may be written."""
+    """Save the old values; returns None, or why nothing may be written."""
     heading = [f"Values of {firmware} before {source} was written.", ""]
     text = params_file.text({difference.name: difference.px4 for difference in differences}, heading)
     try:
@@ -136,7 +136,7 @@ def _print(
 
 
 def jsonable(comparison: Comparison, result: WriteResult | None, backup: Path | None) -> dict[str, Any]:
-    """For scripts. `reboot` is null where it is not known; `written` is absent of a comparison alone."""
+    """Return the result for scripts. `reboot` is null where it is not known; a comparison has no `written`."""
     done: dict[str, Any] = {}
     ok = comparison.same
     if result is not None:
@@ -159,7 +159,7 @@ def jsonable(comparison: Comparison, result: WriteResult | None, backup: Path | 
 
 
 def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
-    """For people."""
+    """Return the result as text."""
     told = [
         f"{d.name:16}  {value_text(d.px4):>12} -> {value_text(d.file)}{'  (after a reboot)' if d.reboot else ''}"
         for d in (comparison.differences if result is None else result.written)
