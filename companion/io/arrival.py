@@ -1,4 +1,4 @@
-"""When the kernel received a datagram, which may be well before a busy process reads it."""
+"""Time at which the kernel received a datagram, which may be well before a busy process reads it."""
 
 from __future__ import annotations
 
@@ -14,24 +14,26 @@ _SO_TIMESTAMPNS: Final = 35  # <asm-generic/socket.h>: of x86 and ARM; Python ha
 _TIMESPEC: Final = struct.Struct("=qq")
 STAMP_ROOM_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 _WAITED_MAX_S = 0.1
-"""More than this counts as no wait: the wall clock may have been set meanwhile, and no good frame may look lost for that."""
+"""A longer wait counts as none: the wall clock may have been set meanwhile, and no valid frame may be taken for stale because
+of that.
+"""
 
 
 def stamp_arrivals(opened: socket.socket) -> None:
-    """Ask the kernel to note when datagrams arrive (SO_TIMESTAMPNS); where it cannot, `arrived_s` is when they are read."""
+    """Make the kernel timestamp datagrams on arrival (SO_TIMESTAMPNS). Where it cannot, `arrived_s` returns the time of the read."""
     with contextlib.suppress(OSError):
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
 
 def arrived_s(notes: list[tuple[int, int, bytes]], clock: Clock) -> float:
-    """When a datagram that has just been read had arrived, on `clock`.
+    """Return the arrival of a datagram that has just been read, on `clock`.
 
     Args:
-        notes: the ancillary data of `recvmsg`, with room for `STAMP_ROOM_BYTES`.
+        notes: ancillary data of `recvmsg`, with room for `STAMP_ROOM_BYTES`.
         clock: the flight clock.
 
     Returns:
-        Now, if the kernel noted nothing, or did so by a wall clock that has been set since.
+        The current time if there is no kernel timestamp, or if the wall clock has been set since.
     """
     now_s = clock()
     for level, kind, data in notes:

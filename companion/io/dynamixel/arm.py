@@ -1,4 +1,4 @@
-"""The arm edge: one thread owns the servo bus, the event loop only hands over and takes back."""
+"""Driver of the arm: one thread owns the servo bus, the event loop exchanges data with it."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ _CLOSE_TIMEOUT_S = 2.0
 _KEEPALIVES_PER_WATCHDOG = 3.0
 _FIRST_READ_S = 0.002
 _SMOOTHING, _DEVIATIONS = 0.05, 2.0
-"""Of the time that a read takes: as TCP does with round trips (RFC 6298), somewhat slower."""
+"""Estimate of the duration of a read, as TCP estimates round trips (RFC 6298), somewhat slower."""
 
 _T = TypeVar("_T")
 
 _WRITE = object()
 _STOP = object()
 _NOW = object()
-"""The read that was to begin later is wanted at once."""
+"""Job that starts a scheduled read at once."""
 
 
 @dataclass(slots=True)
 class _Read:
-    """One read; the bus thread tells by assignment how far it is, and wakes the event loop only for somebody who waits."""
+    """One read. The bus thread reports its progress by assignment and wakes the event loop only if a caller waits."""
 
     at_s: float
     begun: bool = False
@@ -50,15 +50,15 @@ class _Read:
 class DynamixelArm:
     """Two XM430-W210-T in current mode behind the `Arm` protocol.
 
-    While nobody asks for a read the thread reads on its own, often enough that the servos' bus watchdogs stay quiet; a torque that
-    is not renewed within `device.watchdog_ms` is taken back to 0. The watchdogs themselves are for the case that the whole
-    process stops. One that tripped is restarted, and shown once as `WATCHDOG_ERROR` in `ArmState.hardware_error`; a servo with a
-    hardware error of its own is left alone.
+    Without read requests the thread reads by itself, often enough that the servos' bus watchdogs do not trip. A torque that is not
+    renewed within `device.watchdog_ms` is set to 0. The watchdogs themselves cover the case that the whole process stops. A tripped one
+    is restarted and reported once as `WATCHDOG_ERROR` in `ArmState.hardware_error`; a servo with a hardware error of its own is not
+    restarted.
 
     Args:
         device: port, baud rate, watchdog.
         arm: joints and torque constant.
-        clock: the flight clock; stamps come from it.
+        clock: the flight clock, source of all stamps.
     """
 
     def __init__(self, device: ArmDevice, arm: Arm, clock: Clock) -> None:
@@ -66,7 +66,7 @@ class DynamixelArm:
         self._arm = arm
         self._clock = clock
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
-        """`_Read`, or one of the marks above."""
+        """Queue of `_Read`, or one of the marks above."""
         self._goals: deque[Pair] = deque(maxlen=1)
         self._goal_handed_s = 0.0
         self._state: ArmState | None = None
@@ -113,39 +113,39 @@ class DynamixelArm:
         await self._shut_down()
 
     def latest(self) -> ArmState | None:
-        """Newest joint state."""
+        """Return the newest joint state."""
         return self._state
 
     @property
     def servos(self) -> tuple[ServoReport, ...]:
-        """Both servos as they were when the edge had been opened."""
+        """Return the state of both servos when the driver had been opened."""
         return self._servos
 
     @property
     def problem(self) -> str:
-        """What the port itself said when it last failed; empty while it has not."""
+        """Return the port's error when it last failed; empty if it has not."""
         return self._problem
 
     @property
     def read_takes_s(self) -> float:
-        """Time within which most reads are done."""
+        """Return the time within which most reads complete, s."""
         return self._read_s + _DEVIATIONS * self._read_deviation_s
 
     def begin_read(self, at_s: float = 0.0) -> None:
-        """Have the bus thread read, without waiting for it; nothing new is begun while an earlier read is under way.
+        """Start a read in the bus thread without waiting for it. Nothing is started while an earlier read is in progress.
 
         Args:
-            at_s: when, flight clock; what is past is now.
+            at_s: start on the flight clock; a past time means now.
         """
         if self._reading is None or self._reading.done:
             self._reading = _Read(at_s)
             self._jobs.put(self._reading)
 
     async def read(self, timeout_s: float) -> ArmState | None:
-        """Wait for the read that was begun, or for one that is begun now; the newest state, whose `read_failures` counts the misses up
-        to now.
+        """Wait for the read in progress, or for one that starts now, and return the newest state, whose `read_failures` counts all
+        failed reads.
 
-        A read that takes longer than `timeout_s` goes on in the bus thread and the next call waits for that one.
+        A read that takes longer than `timeout_s` continues in the bus thread, and the next call waits for it.
         """
         if self._reading is None:
             self.begin_read()
@@ -164,13 +164,13 @@ class DynamixelArm:
         return self._state
 
     def write_torque(self, torque_nm: Vec2) -> Vec2:
-        """Hand one command to the bus thread.
+        """Pass one command to the bus thread.
 
         Args:
             torque_nm: joint torques, paper's signs.
 
         Returns:
-            What will be sent, after rounding to current counts and clipping, N m.
+            The torques that will be sent, after rounding to current counts and clipping, N m.
 
         Raises:
             ValueError: a torque is not finite.
@@ -274,7 +274,7 @@ class DynamixelArm:
         return goal
 
     def _read_once(self, bus: ArmBus) -> bool:
-        """Read, publish the state; True if a bus watchdog had tripped."""
+        """Read and publish the state; returns whether a bus watchdog had tripped."""
         asked_s = self._clock()
         try:
             pair = bus.read()

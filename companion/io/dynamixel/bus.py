@@ -1,6 +1,6 @@
-"""The conversation with the arm's two servos, blocking: check and set up, one read and one write per cycle, let go.
+"""Blocking communication with the arm's two servos: check and set up, one read and one write per cycle, release.
 
-Everything here runs in the one thread that owns the bus. The real dynamixel-sdk speaks on the wire.
+Everything here runs in the one thread that owns the bus. The dynamixel-sdk implements the protocol.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
 
 _FLIGHT_REPLY_TIMEOUT_MS = 8.0
-"""In flight: an absent servo costs no more than this."""
+"""Reply timeout in flight, the longest delay caused by an absent servo."""
 _USB_LATENCY_MAX_MS = 4
 _ERROR_NUMBER = 0x7F
 
@@ -31,7 +31,7 @@ class ArmBus:
     Args:
         device: port, baud rate, watchdog.
         arm: joints and torque constant.
-        aborted: asked between steps of `open`; True gives up.
+        aborted: called between the steps of `open`; True aborts it.
     """
 
     def __init__(self, device: ArmDevice, arm: Arm, aborted: Callable[[], bool] = lambda: False) -> None:
@@ -46,13 +46,13 @@ class ArmBus:
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
         self._touched = False
         self.reports: tuple[ServoReport, ...] = ()
-        """Identity and settings of both servos as `open` left them, read back."""
+        """Identity and settings of both servos, read back at the end of `open`."""
 
     def open(self, timeout_s: float) -> tuple[JointScale, JointScale]:
         """Open the port, check both servos, set them up and switch torque on with goal current 0.
 
         Raises:
-            DeviceError: anything is not as it must be; one line.
+            DeviceError: anything is not as required; one line.
         """
         self._deadline_s = time.monotonic() + timeout_s
         self._open_port()
@@ -78,7 +78,7 @@ class ArmBus:
         return scales[0], scales[1]
 
     def read(self) -> tuple[Block, Block] | None:
-        """One sync read; None if not both servos answered in time, set up as `open` left them.
+        """Perform one sync read. Returns None unless both servos answered in time and still have the settings of `open`.
 
         Raises:
             OSError: the port is gone.
@@ -99,7 +99,7 @@ class ArmBus:
         return blocks[0], blocks[1]
 
     def write_currents(self, counts: Pair) -> None:
-        """One sync write of the goal currents; the protocol has no answer to it.
+        """Perform one sync write of the goal currents, which has no reply.
 
         Raises:
             OSError: the port is gone.
@@ -113,7 +113,7 @@ class ArmBus:
         )
 
     def restart_watchdogs(self) -> None:
-        """Clear tripped bus watchdogs and start them again, with goal current 0. Nothing is reported: the next read tells.
+        """Clear tripped bus watchdogs and restart them with goal current 0. The next read shows the result.
 
         Raises:
             OSError: the port is gone.
@@ -125,7 +125,7 @@ class ArmBus:
             self._try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
 
     def close(self) -> None:
-        """Goal current 0, torque off, watchdog off, port closed; as much of it as the bus still allows. Never raises."""
+        """Set goal current 0, switch torque and watchdog off and close the port, as far as the bus still works. Never raises."""
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
         try:
             if self._touched and self._port.is_open:

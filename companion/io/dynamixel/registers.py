@@ -1,4 +1,4 @@
-"""XM430-W210-T: control table, units, and the SDK's serial port made fit for a control loop. No protocol logic: that is the SDK's.
+"""XM430-W210-T: control table, units, and the SDK's serial port adapted to a control loop. The SDK implements the protocol.
 
 Source: ROBOTIS e-manual, XM430-W210 control table.
 """
@@ -25,7 +25,7 @@ WATCHDOG_UNIT_MS = 20
 RETURN_DELAY_UNIT_US = 2
 VOLTAGE_UNIT_V = 0.1
 WATCHDOG_TRIPPED = 0xFF
-"""Register 98 after the bus watchdog let go."""
+"""Value of register 98 after the bus watchdog has tripped."""
 
 COUNTS_PER_TURN = 4096
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
@@ -74,16 +74,16 @@ _BLOCK = struct.Struct("<iBiBhB")
 _POLL_MS = 1.0
 _NOISE_PATIENCE = 20.0
 _NOISE_BYTES = 4096
-"""More than all answers to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
+"""More bytes than the replies to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
 
 HARDWARE_ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 WATCHDOG_ERROR = 0x80
-"""Set by the companion in `ArmState.hardware_error`, in a bit that register 70 does not use: the bus watchdog had let go."""
+"""Bit that the companion sets in `ArmState.hardware_error` after the bus watchdog has tripped; register 70 does not use it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One servo's answer to a cycle's read, in register units."""
+    """One servo's data in the read of a cycle, in register units."""
 
     position_count: int
     hardware_error: int
@@ -99,7 +99,7 @@ class Block:
 
 
 def hardware_error_text(error: int) -> str:
-    """Names of the bits of register 70 (and of `WATCHDOG_ERROR`), for people."""
+    """Return the names of the bits of register 70 (and of `WATCHDOG_ERROR`)."""
     names = [HARDWARE_ERROR_NAMES.get(bit, f"bit {bit}") for bit in range(7) if error >> bit & 1]
     if error & WATCHDOG_ERROR:
         names.append("bus watchdog")
@@ -112,27 +112,27 @@ class JointScale:
 
     sign: int
     zero_count: int
-    """Present position at joint angle 0, whole turns of the encoder included."""
+    """Present position at joint angle 0, including whole turns of the encoder."""
     torque_nm_per_count: float
     current_max_counts: int
 
     def angle_rad(self, position_count: int) -> float:
-        """Joint angle."""
+        """Return the joint angle, rad."""
         return self.sign * (position_count - self.zero_count) * RAD_PER_COUNT
 
     def velocity_rad_s(self, velocity_count: int) -> float:
-        """Joint velocity."""
+        """Return the joint velocity, rad/s."""
         return self.sign * velocity_count * RAD_S_PER_COUNT
 
     def torque_nm(self, current_count: int) -> float:
-        """Joint torque of a current."""
+        """Return the joint torque of a current, N m."""
         return self.sign * current_count * self.torque_nm_per_count
 
     def current_counts(self, torque_nm: float) -> int:
-        """Goal current for a joint torque, rounded and clipped.
+        """Return the goal current for a joint torque, rounded and clipped.
 
         Raises:
-            ValueError: torque is not finite.
+            ValueError: the torque is not finite.
         """
         if not math.isfinite(torque_nm):
             raise ValueError(f"joint torque {torque_nm} is not a number that a servo could follow")
@@ -141,7 +141,7 @@ class JointScale:
 
 
 def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: int) -> JointScale:
-    """Scale of a joint whose servo has the given current limit (register 38).
+    """Return the scale of a joint whose servo has the given current limit (register 38).
 
     Raises:
         ValueError: the current limit is below what `torque_max_nm` needs.
@@ -157,10 +157,10 @@ def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: 
 
 
 def turn_offset_counts(joint: Joint, position_count: int) -> int:
-    """Whole turns to add to `zero_count` so that the joint angle comes to lie within its walls.
+    """Return the whole turns to add to `zero_count` so that the joint angle lies within its limits, or 0 if no turn fits.
 
-    The encoder knows the angle within one turn only; which turn it is, the servo forgets when it is switched off. A joint with
-    less than a turn between its walls is unambiguous all the same. 0 if no turn fits.
+    The encoder measures the angle within one turn; the servo loses the number of turns when it is switched off. A joint with less than
+    a turn between its limits is unambiguous all the same.
     """
     low_deg, high_deg = joint.angle_deg
     if high_deg - low_deg >= 360.0:
@@ -173,23 +173,23 @@ def turn_offset_counts(joint: Joint, position_count: int) -> int:
 
 
 class ServoPort(PortHandler):  # type: ignore[misc]
-    """The SDK's port with a serial timeout (as it is, it busy-polls with the GIL held), a lock, and a packet timeout of its own.
+    """The SDK's port with a serial timeout (the original busy-polls while holding the GIL), a lock, and its own packet timeout.
 
-    An answer is overdue when the time is up and most of that time was really spent waiting at the port: a process that was not
-    scheduled for a while looks at the port again before it gives a servo up.
+    A reply times out when the time is over and the process has spent most of it waiting at the port: a process that was not scheduled
+    for a while reads the port again before it gives up.
     """
 
     is_open: bool
     _waited_ms = 0.0
     _taken_bytes = 0
     reply_timeout_ms = 100.0
-    """Longest wait for an answer, beside the time of its bytes."""
+    """Longest wait for a reply, in addition to the transmission time of its bytes."""
 
     def setupPort(self, cflag_baud: int) -> bool:
-        """Open at `self.baudrate` (the SDK calls this).
+        """Open the port at `self.baudrate` (called by the SDK).
 
         Raises:
-            DeviceError: no such port, busy, not permitted, not a serial port.
+            DeviceError: the port does not exist, is busy, is not permitted, or is not a serial port.
         """
         if self.is_open:
             self.closePort()
@@ -211,28 +211,28 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         return True
 
     def closePort(self) -> None:
-        """Close; does nothing on a closed port."""
+        """Close the port. A second call has no effect."""
         if self.is_open:
             self.is_open = False
             self.ser.close()
 
     def getCurrentTime(self) -> float:
-        """Monotonic ms; the SDK's own follows the wall clock, which NTP may set."""
+        """Return monotonic time, ms; the SDK's own follows the wall clock, which NTP may set."""
         return time.monotonic() * 1e3
 
     def setPacketTimeout(self, packet_length: int) -> None:
-        """Start to wait for `packet_length` bytes."""
+        """Start the timeout for `packet_length` bytes."""
         self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + self.reply_timeout_ms)
 
     def setPacketTimeoutMillis(self, msec: float) -> None:
-        """Start to wait for `msec`."""
+        """Start a timeout of `msec`."""
         self.packet_start_time = self.getCurrentTime()
         self.packet_timeout = msec
         self._waited_ms = 0.0
         self._taken_bytes = 0
 
     def readPort(self, length: int) -> bytes:
-        """Up to `length` bytes, after at most 1 ms.
+        """Return up to `length` bytes, after at most 1 ms.
 
         Raises:
             OSError: the port is gone.
@@ -247,7 +247,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         return data
 
     def isPacketTimeout(self) -> bool:
-        """The answer is overdue."""
+        """Return whether the reply has timed out."""
         elapsed_ms = self.getTimeSinceStart()
         if elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > _NOISE_BYTES:
             return True  # a line that never falls silent
@@ -255,7 +255,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
 
 
 def _open_failure(port: str, error: Exception) -> str:
-    """Why a port did not open and what to do, in one line."""
+    """Return why a port did not open and what to do, in one line."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not Path(port).exists():
         found = sorted(p.device for p in list_ports.comports())
@@ -269,7 +269,7 @@ def _open_failure(port: str, error: Exception) -> str:
 
 
 def usb_latency_ms(port: str, sysfs: Path = Path("/sys/class/tty")) -> int | None:
-    """Latency timer of the FTDI chip behind a port, ms; None if the port has none (a pty, a native UART)."""
+    """Return the latency timer of the FTDI chip behind a port, ms, or None if the port has none (a pty, a native UART)."""
     try:
         return int((sysfs / Path(port).resolve().name / "device" / "latency_timer").read_text())
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The force-torque edge: Robotous RFT60-HA01 on a serial port."""
+"""Driver of the force-torque sensor Robotous RFT60-HA01 on a serial port."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ class ForceHealth:
 
     samples: int
     skipped_bytes: int
-    """Bytes that belonged to no packet."""
+    """Bytes that belong to no packet."""
     bad_sums: int
     lost: str | None
-    """Why the port is not read any more; None while it is."""
+    """Why the port is no longer read; None while it is."""
 
 
 class RobotousForceTorque:
     """RFT60-HA01 in continuous output; implements `companion.io.protocols.ForceTorque`.
 
-    The port is read from the event loop: 200 packets/s of 19 bytes need no thread. Samples are as measured, in the sensor frame; bias
-    is removed by whoever uses them. When the sensor falls silent or the port vanishes `latest()` grows old; nothing is raised.
+    The port is read from the event loop: 200 packets/s of 19 bytes need no thread. Samples are raw, in the sensor frame; the user of a
+    sample removes the bias. When the sensor falls silent or the port vanishes, `latest()` becomes stale and nothing is raised.
 
     Args:
-        device: port, rate and the force beyond which a sample counts as overloaded.
+        device: port, rate and the force above which a sample counts as overloaded.
         clock: the flight clock.
-        answer_timeout_s: for each answer of the sensor, and for the first samples.
+        answer_timeout_s: timeout of each reply of the sensor, and of the first samples.
     """
 
     def __init__(self, device: ForceDevice, clock: Clock, *, answer_timeout_s: float = 2.0) -> None:
@@ -70,18 +70,18 @@ class RobotousForceTorque:
         self.firmware = ""
 
     def latest(self) -> ForceSample | None:
-        """Newest sample, as measured; never blocks."""
+        """Return the newest raw sample; never blocks."""
         return self._latest
 
     def health(self) -> ForceHealth:
-        """Counters, for logs and preflight."""
+        """Return the counters, for logs and preflight."""
         return ForceHealth(self._samples, self._scanner.skipped_bytes, self._scanner.bad_sums, self._lost)
 
     async def tare_samples(self, duration_s: float) -> list[ForceSample]:
-        """The samples of the next `duration_s` (counted at the configured rate), for the caller to average.
+        """Return the samples of the next `duration_s` (counted at the configured rate), for the caller to average.
 
         Raises:
-            DeviceError: they did not come within twice the time and a second.
+            DeviceError: they did not arrive within twice the time plus one second.
         """
         count = max(1, math.ceil(duration_s * self._device.rate_hz))
         deadline_s = 2.0 * duration_s + 1.0
@@ -94,10 +94,10 @@ class RobotousForceTorque:
         return samples
 
     async def __aenter__(self) -> Self:
-        """Open the port, identify the sensor, set its rate, start continuous output, see the first samples.
+        """Open the port, identify the sensor, set its rate, start continuous output, wait for the first samples.
 
         Raises:
-            DeviceError: no such port, port in use, silent or other device, first samples missing.
+            DeviceError: the port does not exist or is in use, the device is silent or another one, or no samples arrive.
         """
         self._serial = self._open()
         try:
@@ -169,8 +169,8 @@ class RobotousForceTorque:
         return rft.RATE_CODES.get((await self._ask(Command.GET_RATE))[1])
 
     async def _ask(self, command: Command, parameter: int = 0, repeat_s: float | None = None) -> bytes:
-        """One question, one answer. The first question of all is repeated: half a command of an earlier run may sit in the sensor
-        and swallow it.
+        """Send one request and return its reply. The first request is repeated, because half a command of an earlier run may be in the
+        sensor's buffer and corrupt it.
         """
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + self._answer_timeout_s
@@ -261,7 +261,7 @@ class RobotousForceTorque:
             collector.add(sample)
 
     async def _collect(self, count: int, deadline_s: float) -> list[ForceSample]:
-        """The next `count` samples, or fewer at the deadline or when the port is lost."""
+        """Return the next `count` samples, or fewer at the deadline or when the port is lost."""
         collector = _Collector(count)
         self._collectors.append(collector)
         if self._lost is not None:
@@ -275,7 +275,7 @@ class RobotousForceTorque:
         return collector.samples
 
     def _lose(self, reason: str) -> None:
-        """The port is gone: stop reading it (a dead descriptor is readable for ever) and wake who waits."""
+        """Stop reading a lost port (a dead descriptor is always readable) and wake the waiting callers."""
         if self._lost is not None or self._serial is None:
             return
         self._lost = f"the port was lost ({reason})"
@@ -296,7 +296,7 @@ class RobotousForceTorque:
 
 
 class _Collector:
-    """Takes samples until it has enough."""
+    """Collector of a number of samples."""
 
     def __init__(self, count: int) -> None:
         self._count = count

@@ -1,9 +1,9 @@
-"""Robotous RFT60-HA01 serial protocol, pure: bytes in, records out.
+"""Serial protocol of the Robotous RFT60-HA01, pure: bytes in, records out.
 
-Source: Robotous RFT series manual 1.8, section 3, and the vendor's packet definitions. 115200 8N1.
-Command 11 bytes `55 | data 8 | sum | AA`, response 19 bytes `55 | data 16 | sum | AA`; sum is that of the data modulo 256 and data byte
-0 the command id. Fx..Tz are big-endian int16 in data bytes 1-12 (dividers 50 per N, 2000 per N m), data byte 13 holds overload bits.
-While it streams the sensor executes STOP and SET_BIAS only; neither of the two is answered.
+Source: Robotous RFT series manual 1.8, section 3, and the vendor's packet definitions. 115200 8N1. A command has 11 bytes `55 | data 8
+| sum | AA`, a response 19 bytes `55 | data 16 | sum | AA`; sum is the sum of the data modulo 256, data byte 0 is the command id. Fx..Tz
+are big-endian int16 in data bytes 1-12 (50 counts per N, 2000 counts per N m), data byte 13 holds overload bits. While streaming the
+sensor executes STOP and SET_BIAS only and answers neither.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Command(IntEnum):
 
 
 RATE_CODES: Final[dict[int, int]] = {0: 200, 1: 10, 2: 20, 3: 50, 4: 100, 5: 200, 6: 333}
-"""Output rate code -> Hz, as far as 115200 baud carries them; 0 is the factory default."""
+"""Output rate code -> Hz, limited to what 115200 baud can carry; 0 is the factory default."""
 
 COMMAND_IDS: Final = frozenset(int(command) for command in Command)
 
@@ -76,7 +76,7 @@ class Wrench:
 
 
 def encode_command(command: Command, parameter: int = 0) -> bytes:
-    """A command packet; `parameter` (0 to 255) is data byte 1."""
+    """Return a command packet; `parameter` (0 to 255) is data byte 1."""
     return pack(bytes((command, parameter)), COMMAND_BYTES)
 
 
@@ -94,7 +94,7 @@ def pack(data: bytes, packet_bytes: int) -> bytes:
 
 
 def encode_wrench(command: Command, wrench: Wrench) -> bytes:
-    """A response packet of READ_ONCE or START: rounded to counts, saturated at int16."""
+    """Return a response packet of READ_ONCE or START: rounded to counts, saturated at int16."""
     counts = [_count(value, FORCE_PER_N) for value in wrench.force_n]
     counts += [_count(value, TORQUE_PER_NM) for value in wrench.torque_nm]
     return pack(bytes((command,)) + _WRENCH.pack(*counts, wrench.overload_bits & 0xFF), RESPONSE_BYTES)
@@ -105,7 +105,7 @@ def _count(value: float, per_unit: float) -> int:
 
 
 def decode_wrench(data: bytes) -> Wrench:
-    """N and N m from the 16 data bytes of a READ_ONCE or START response."""
+    """Return N and N m from the 16 data bytes of a READ_ONCE or START response."""
     fx, fy, fz, tx, ty, tz, bits = _WRENCH.unpack_from(data, 1)
     return Wrench(
         (fx / FORCE_PER_N, fy / FORCE_PER_N, fz / FORCE_PER_N),
@@ -115,7 +115,7 @@ def decode_wrench(data: bytes) -> Wrench:
 
 
 def decode_text(data: bytes) -> str:
-    """Name, serial number or firmware version: printable ASCII from data byte 1 on."""
+    """Return name, serial number or firmware version: printable ASCII from data byte 1 on."""
     text = data[1:].partition(b"\0")[0].decode("ascii", "replace")
     return "".join(character if character.isprintable() else "?" for character in text).strip()
 
@@ -123,8 +123,8 @@ def decode_text(data: bytes) -> str:
 class PacketScanner:
     """Finds packets in a byte stream; resynchronises on SOP, length, sum, EOP and a known command id.
 
-    Payloads may hold SOP and EOP: a candidate that fails any test is given up by one byte only, so that the packet which starts inside
-    it is still found. State is the unfinished tail (less than one packet) and three counters.
+    Payloads may contain SOP and EOP: a candidate that fails any test is skipped by one byte only, so that a packet which starts inside
+    it is still found. The state is the unfinished tail (less than one packet) and three counters.
     """
 
     def __init__(self, packet_bytes: int) -> None:
@@ -134,10 +134,10 @@ class PacketScanner:
         self.skipped_bytes = 0
         """Bytes that belong to no packet."""
         self.bad_sums = 0
-        """Candidates that were framed by SOP and EOP but failed the sum."""
+        """Candidates framed by SOP and EOP with a wrong sum."""
 
     def feed(self, received: bytes) -> list[bytes]:
-        """Data fields (packet without SOP, sum, EOP) that are complete now, in order."""
+        """Return the data fields (packet without SOP, sum, EOP) that are now complete, in order."""
         stream = self._tail + received
         size = self._packet_bytes
         fields: list[bytes] = []

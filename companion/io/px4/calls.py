@@ -1,4 +1,4 @@
-"""Blocking calls into MAVSDK, off the event loop, one at a time, each with a deadline and a name."""
+"""Blocking calls into MAVSDK outside of the event loop, one at a time, each with a deadline and a name."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any, TypeVar
 from companion.io.px4.link import device_error
 
 NATIVE_CALL_DEADLINE_S = 5.0
-"""MAVSDK sends a command or parameter request up to six times, 0.5 s apart."""
+"""MAVSDK sends a command or parameter request up to six times at intervals of 0.5 s."""
 
 _T = TypeVar("_T")
 
 
 class NativeCalls:
-    """One worker thread for one link."""
+    """One worker thread per link."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -24,7 +24,7 @@ class NativeCalls:
         self._last: Future[Any] | None = None
 
     async def run(self, expected: str, deadline_s: float, call: Callable[..., _T], *args: Any) -> _T:
-        """Run a blocking native call; `expected` says in words what for.
+        """Run a blocking native call; `expected` names its purpose for the error text.
 
         Raises:
             DeviceError: it did not return within `deadline_s`.
@@ -39,6 +39,6 @@ class NativeCalls:
             raise device_error(self._address, expected, found, "check the link") from None
 
     def finish(self, deadline_s: float) -> bool:
-        """Take no more calls and wait for the one under way. False: it hangs, and MAVSDK must not be destroyed under it."""
+        """Accept no more calls and wait for the one in progress. Returns False if it hangs; MAVSDK must not be destroyed then."""
         self._worker.shutdown(wait=False, cancel_futures=True)
         return self._last is None or not wait([self._last], deadline_s).not_done

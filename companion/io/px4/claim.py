@@ -1,4 +1,6 @@
-"""Both ends of the link to PX4: the near end is held by one process alone, the far end is one address that has proved to be PX4."""
+"""Exclusive use of the link to PX4: only this process holds the near end, and the far end is the one address that has proved
+to be PX4.
+"""
 
 from __future__ import annotations
 
@@ -33,13 +35,14 @@ _CALL_PERIOD_S = 1.0
 
 
 class LinkClaim:
-    """What this process holds of a link beside MAVSDK's own descriptor.
+    """This process's hold on a link, besides MAVSDK's own descriptor.
 
-    A serial port is locked with flock on the device itself, so every name of the device counts, and pyserial's `exclusive` meets the
-    same lock. A `udpin` port is bound without SO_REUSEADDR, and only then shared with MAVSDK, which sets that option and would join any
-    program on the port. MAVSDK's socket is connected to PX4's address once that is proved; from then on the kernel gives datagrams of
-    every other sender to the socket held here. When PX4 is silent there for REPIN_SILENCE_S and another port of the same IPv4 address
-    sends a HEARTBEAT of its system, MAVSDK's socket is connected to that one: a router that restarts sends from another port.
+    A serial port is locked with flock on the device itself, so that every name of the device counts and pyserial's `exclusive`
+    conflicts with the same lock. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets that option
+    and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is proved; from then on the kernel
+    delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and another port of the same
+    IPv4 address sends a HEARTBEAT of its system, MAVSDK's socket is connected to that port, because a restarted router sends from
+    another one.
 
     Args:
         address: as in `devices.autopilot.address`, checked.
@@ -70,7 +73,8 @@ class LinkClaim:
             self._port.setblocking(False)
 
     async def find_px4(self, timeout_s: float) -> None:
-        """Wait on a `udpin` link for a valid HEARTBEAT of an autopilot, and keep its sender as PX4's address; resolve that of `udpout`.
+        """On a `udpin` link wait for a valid HEARTBEAT of an autopilot and store its sender as PX4's address; on `udpout` resolve the
+        address.
 
         Raises:
             DeviceError: no HEARTBEAT within `timeout_s`, or HEARTBEATs from two addresses while PX4 is not armed.
@@ -92,10 +96,10 @@ class LinkClaim:
 
     @contextlib.asynccontextmanager
     async def calling(self, own: tuple[int, int]) -> AsyncIterator[None]:
-        """Send PX4 a HEARTBEAT from the port of a `udpin` link, at once and each second, until MAVSDK has heard PX4.
+        """Send PX4 a HEARTBEAT from the port of a `udpin` link, at once and every second, until MAVSDK has received one from PX4.
 
-        PX4 on Ethernet may broadcast until it has heard a partner (MAV_x_BROADCAST), and MAVSDK's connected socket gets no broadcasts.
-        More than one, as PX4 takes no partner in the first 3 s after it has opened its port.
+        PX4 on Ethernet may broadcast until it has received a partner's message (MAV_x_BROADCAST), and MAVSDK's connected socket
+        receives no broadcasts. Several are needed, because PX4 accepts no partner in the first 3 s after it has opened its port.
 
         Args:
             own: system and component id of MAVSDK.
@@ -108,7 +112,8 @@ class LinkClaim:
             await asyncio.wait([calls])  # the port may be closed next, and the loop
 
     def pin(self) -> int:
-        """Connect the UDP socket that MAVSDK opened since `find_px4` to PX4's address; its local port, 0 if the link is not UDP.
+        """Connect the UDP socket that MAVSDK opened since `find_px4` to PX4's address; returns its local port, 0 if the link is not
+        UDP.
 
         Raises:
             DeviceError: /proc does not show the socket.
@@ -127,10 +132,11 @@ class LinkClaim:
             raise device_error(self._address, "MAVSDK's socket in /proc", found, "mount /proc") from None
 
     def refuse_rivals(self) -> None:
-        """Read what other senders sent so far. PX4 that was found armed may be in the air: rivals are then left to `take_rival`.
+        """Read what other senders have sent so far. A PX4 that was found armed may be in the air; `take_rival` then handles other
+        senders.
 
         Raises:
-            DeviceError: one of them claims to be PX4, which was found not armed.
+            DeviceError: one of them claims to be PX4, which was found disarmed.
         """
         self._drain(silent=False)
         if self._rivals and not self._armed:
@@ -142,10 +148,10 @@ class LinkClaim:
         """Read one datagram of another sender, or all while PX4 is silent. Never waits.
 
         Args:
-            silent_s: since the newest message of PX4.
+            silent_s: time since the newest message of PX4.
 
         Returns:
-            A line for the log if there is a new sender that claims to be PX4, or PX4 is heard at another port from now on.
+            A line for the log if a new sender claims to be PX4, or if PX4 is received at another port from now on.
         """
         if silent_s > REPIN_SILENCE_S:
             self._drain(silent=True)
@@ -191,7 +197,7 @@ class LinkClaim:
         return True
 
     def _repin(self, datagram: bytes, sender: Peer) -> bool:
-        """Whether the datagram shows PX4 at another port of its address; MAVSDK hears that port alone from now on."""
+        """Return whether the datagram shows PX4 at another port of its address; MAVSDK then receives from that port only."""
         if self._mavsdk is None or self.peer is None or sender == self.peer or sender[0] != self.peer[0]:
             return False
         heard = autopilot_heartbeat(datagram)
@@ -230,7 +236,7 @@ class LinkClaim:
 
 
 def _lock(address: str, path: str) -> int:
-    """Descriptor that holds the lock; Python's descriptors are inherited by no child."""
+    """Return the descriptor that holds the lock. No child process inherits it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
     except OSError as error:

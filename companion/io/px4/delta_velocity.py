@@ -1,4 +1,4 @@
-"""Sum of an IMU's samples: the change of velocity that every one of them measured, none skipped and none counted twice. Pure."""
+"""Sum of an IMU's samples: the change of velocity over all samples, with none skipped and none counted twice. Pure."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import math
 from companion.model.types import Vec3
 
 GAP_MAX_S = 0.05
-"""A longer gap between two samples adds nothing to the sum: the motion in it was not measured."""
+"""A longer gap between two samples adds nothing to the sum, because the motion in it was not measured."""
 _REORDERED_MAX_S = 1.0
 _LOST_INTERVALS = 1.5
-"""After more than this many usual intervals at least one sample was lost."""
+"""After a gap of more than this many usual intervals at least one sample was lost."""
 _SMOOTHING = 1.0 / 16.0
-"""Share of a new sample in the means."""
+"""Weight of a new sample in the means."""
 
 
 class DeltaVelocity:
-    """Sums specific force times the sample's interval.
+    """Sum of specific force times the sample's interval.
 
-    PX4's HIGHRES_IMU carries `vehicle_imu.delta_velocity` divided by its interval, less EKF2's estimate of the accelerometer bias: the
-    mean over the interval that ends at `time_usec`, of every raw sample in it. So the sum over consecutive messages is the integral of
-    the specific force, and vibration has no alias in it. PX4 skips a sample when its MAVLink task comes late (1 in 28 of PX4 1.16 in
-    SITL). The mean of the samples before stands for a lost one, so that what aliases is the vibration in that one interval.
+    PX4's HIGHRES_IMU carries `vehicle_imu.delta_velocity` divided by its interval, minus EKF2's estimate of the accelerometer bias: the
+    mean over the interval that ends at `time_usec`, with every raw sample in it. The sum over consecutive messages is therefore the
+    integral of the specific force and contains no alias of vibration. PX4 skips a sample when its MAVLink task is late (1 in 28 of PX4
+    1.16 in SITL). The mean of the preceding samples replaces a lost one, so that only the vibration in that interval is aliased.
     """
 
     __slots__ = ("_interval_s", "_mean_m_s2", "boot_s", "sum_m_s")
@@ -35,7 +35,7 @@ class DeltaVelocity:
         self._mean_m_s2: Vec3 = (0.0, 0.0, 0.0)
 
     def add(self, boot_s: float, specific_force_m_s2: Vec3) -> None:
-        """Add a sample; a repeated, late or non-finite one changes nothing.
+        """Add a sample. A repeated, late or non-finite one is ignored.
 
         Args:
             boot_s: end of its interval, PX4's clock.

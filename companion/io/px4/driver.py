@@ -1,7 +1,7 @@
 """PX4 through MAVSDK's native binding.
 
-MAVSDK's callbacks come from C++ threads and do nothing but keep the newest values; frames are converted when the flight loop asks.
-The hot path (`send_attitude`, `send_vision`) is one synchronous native call each.
+MAVSDK's callbacks run in C++ threads and only store the newest values; frames are converted when the flight loop reads them. The hot
+path (`send_attitude`, `send_vision`) is one synchronous native call each.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from companion.runtime.clock import Clock
 
 _CONNECT_DEADLINE_S = 5.0
 _HEARTBEAT_DEADLINE_S = 5.0
-"""PX4 sends one a second."""
+"""PX4 sends one per second."""
 _CLOSE_DEADLINE_S = 4.0
 # One NaN: PX4 takes EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
 _COVARIANCE_FROM_PARAMS = Covariance([float("nan")])
@@ -62,14 +62,14 @@ _log = logging.getLogger(__name__)
 
 
 class MavsdkAutopilot:
-    """The `Autopilot` edge.
+    """Driver of PX4; implements the `Autopilot` protocol.
 
-    Attitude setpoints leave by the way that `devices.autopilot.setpoint_path` names: see `autopilot_setpoints`.
+    Attitude setpoints are sent by the path in `devices.autopilot.setpoint_path`; see `companion.io.px4.setpoints`.
 
     Args:
-        device: its address, and how setpoints go there.
+        device: address, and setpoint path.
         clock: the flight clock.
-        forwarding: a second connection is wanted, see `forward_to`.
+        forwarding: whether a second connection is needed, see `forward_to`.
     """
 
     def __init__(self, device: AutopilotDevice, clock: Clock, *, forwarding: bool = False) -> None:
@@ -96,10 +96,10 @@ class MavsdkAutopilot:
         self._claim: LinkClaim | None = None
 
     async def __aenter__(self) -> Self:
-        """Open the link, find PX4, ask for the streams, give PX4 a global origin if it has none and is not armed.
+        """Open the link, find PX4, request the streams, and set a global origin if PX4 has none and is not armed.
 
         Raises:
-            DeviceError: one line per way of failing; nothing is left open.
+            DeviceError: one line for each kind of failure; nothing stays open.
         """
         address = self._device.address
         check_address(address)
@@ -141,22 +141,22 @@ class MavsdkAutopilot:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Cut the wire at once, then let MAVSDK's threads end. No packet leaves after this; PX4 keeps its mode."""
+        """Close the connection at once, then let MAVSDK's threads end. No packet is sent after this; PX4 keeps its mode."""
         await self._close()
 
     def identity(self) -> LinkIdentity:
-        """Who speaks to whom on the open link."""
+        """Return the ids of both ends of the open link."""
         peer = self._claim.peer if self._claim is not None else None
         return LinkIdentity(self._system_id, *self._own_ids, self._local_port, peer)
 
     async def forward_to(self, port: int) -> int:
-        """Forward between PX4 and that UDP port of 127.0.0.1; the port of 127.0.0.1 that MAVSDK speaks from to it.
+        """Forward between PX4 and a UDP port of 127.0.0.1; returns the port of 127.0.0.1 from which MAVSDK sends to it.
 
-        MAVSDK takes what comes from there for as good as what comes from PX4: only `ground_relay` may be at the other end, and
-        nobody else is heard.
+        MAVSDK trusts messages from that connection as it trusts PX4's: only the relay (`companion.io.qgroundcontrol.relay`) may be at
+        the other end, and all other senders are ignored.
 
         Raises:
-            DeviceError: the connection cannot be opened, or not be kept to that one partner.
+            DeviceError: the connection cannot be opened, or not be restricted to that one partner.
         """
         self._require_open()
         assert self._forwarding, "made without forwarding"
@@ -174,26 +174,30 @@ class MavsdkAutopilot:
             raise device_error(address, "MAVSDK's socket in /proc", error.strerror or str(error), fix) from None
 
     def vehicle(self) -> VehicleState | None:
-        """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
+        """Return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps are arrival
+        times.
+        """
         return self._inbox.vehicle()
 
     def status(self) -> AutopilotStatus | None:
-        """Latest slow state; None before the first heartbeat. `heartbeat_stamp_s` is when the newest HEARTBEAT arrived."""
+        """Return the latest slow state, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
+        HEARTBEAT.
+        """
         return self._inbox.status()
 
     def estimator(self) -> EstimatorReport | None:
-        """Latest ESTIMATOR_STATUS, stamped on arrival; None before the first."""
+        """Return the latest ESTIMATOR_STATUS, stamped on arrival, or None before the first."""
         return self._inbox.estimator()
 
     def counts(self) -> StateCounts:
-        """Messages of the fast state since the link was opened."""
+        """Return the numbers of messages of the fast state since the link was opened."""
         return self._inbox.counts()
 
     def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
-        """Send SET_ATTITUDE_TARGET at once; None: from now on nothing leaves. False: nothing was sent.
+        """Send SET_ATTITUDE_TARGET at once; with None no more setpoints are sent. Returns False if nothing was sent.
 
         Raises:
-            ValueError: a value that must never leave (not finite, not a unit quaternion, thrust outside 0 to 1).
+            ValueError: an invalid value (not finite, not a unit quaternion, thrust outside 0 to 1).
         """
         if not self._open or self._setpoints is None:
             return False
@@ -203,7 +207,7 @@ class MavsdkAutopilot:
         return self._setpoints.send(setpoint, self._clock())
 
     def send_vision(self, pose: MocapPose) -> bool:
-        """Send VISION_POSITION_ESTIMATE at once. False: the link is closed or refused it.
+        """Send VISION_POSITION_ESTIMATE at once. Returns False if the link is closed or refused it.
 
         Raises:
             ValueError: the pose is not finite.
@@ -227,9 +231,9 @@ class MavsdkAutopilot:
         return True
 
     def request(self, request: AutopilotRequest) -> None:
-        """Send the request's command unless one of its kind is under way or was made a moment ago. Returns at once.
+        """Send the request's command unless one of its kind is in progress or was sent a moment ago. Returns at once.
 
-        LAND never waits for a command of another kind. Refusals come out of `take_messages`.
+        LAND never waits for a command of another kind. `take_messages` returns refusals.
         """
         if not self._open or not self._desk.claim(request, self._clock()):
             return
@@ -248,26 +252,28 @@ class MavsdkAutopilot:
             self._direct.send_command_async(command, answered)
 
     def _on_ack(self, message: Any, _: Any) -> None:
-        """COMMAND_ACK, on a thread of MAVSDK's."""
+        """Handle COMMAND_ACK, in a thread of MAVSDK."""
         if messages.answers_arming(message.fields_json):
             self._desk.answer_sent_once(messages.refusal(message.fields_json), self._clock())
 
     def take_messages(self) -> list[str]:
-        """Refusals and STATUSTEXTs since the last call, oldest first, a second sender that claims to be PX4, a new port of PX4."""
+        """Return, oldest first, all refusals and STATUSTEXTs since the last call, reports of a second sender that claims to be PX4, and
+        of a new port of PX4.
+        """
         texts = self._desk.take_messages(self._clock())
         rival = self._claim.take_rival(self._inbox.silent_s()) if self._claim is not None else None
         return texts if rival is None else [*texts, rival]
 
     async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
-        """Values of PX4's parameters by name, int or float as PX4 stores them; a name that PX4 does not have is left out.
+        """Return the values of PX4's parameters by name, int or float as PX4 stores them; a name that PX4 does not have is left out.
 
         Raises:
-            DeviceError: a name that cannot be one, or no answer within the deadline.
+            DeviceError: an invalid name, or no answer within the deadline.
         """
         return await self._transfer().read(names)
 
     async def read_param(self, name: str) -> float | int:
-        """Value of one PX4 parameter, int or float as PX4 stores it.
+        """Return the value of one PX4 parameter, int or float as PX4 stores it.
 
         Raises:
             DeviceError: no such name, or no answer within the deadline.
@@ -279,7 +285,7 @@ class MavsdkAutopilot:
         return values[name]
 
     async def write_param(self, name: str, value: float | int) -> float | int:
-        """Write one PX4 parameter and read it back; what PX4 now holds, a float in single precision.
+        """Write one PX4 parameter, read it back and return the value that PX4 now holds, a float in single precision.
 
         Raises:
             DeviceError: no such name, a value that PX4's type cannot hold, PX4 refused it, or holds another one afterwards.
@@ -287,9 +293,9 @@ class MavsdkAutopilot:
         return await self._transfer().write(name, value)
 
     async def ensure_origin(self) -> bool:
-        """Give PX4 the global origin of `autopilot_origin` unless it has one or is armed. True: PX4 says that it has one.
+        """Set PX4's global origin (`companion.io.px4.origin`) unless it has one or is armed. Returns whether PX4 reports an origin.
 
-        PX4 says so only while its position is valid; False right after boot means nothing yet.
+        PX4 reports one only while its position is valid, so False right after boot has no meaning.
 
         Raises:
             DeviceError: PX4 does not answer, or sends no heartbeat.
@@ -308,7 +314,7 @@ class MavsdkAutopilot:
         return status.armed
 
     async def firmware(self) -> str:
-        """PX4's version as it reports it, like `PX4 1.16.1 release (git 0123456789abcdef)`.
+        """Return PX4's version as it reports it, such as `PX4 1.16.1 release (git 0123456789abcdef)`.
 
         Raises:
             DeviceError: no AUTOPILOT_VERSION within the deadline.
@@ -334,15 +340,16 @@ class MavsdkAutopilot:
             raise device_error(self._device.address, "an open link", "a closed one", fix)
 
     def _on_heartbeat(self) -> None:
-        """A thread of MAVSDK's."""
+        """Handle HEARTBEAT, in a thread of MAVSDK."""
         assert self._loop is not None
         with contextlib.suppress(RuntimeError):  # the loop is closed: MAVSDK hung and was left behind
             self._loop.call_soon_threadsafe(self._show_ground_station)
 
     def _show_ground_station(self) -> None:
-        """Answer the heartbeat of a PX4 that is not armed as a ground station does: PX4 says why it refuses only where it sees one.
+        """Answer the heartbeat of a disarmed PX4 with a ground station's: PX4 reports the reasons of a refusal only if it sees one.
 
-        Not while it is armed: there the loss of the real one must be noticed, whatever NAV_DLL_ACT makes of it.
+        While PX4 is armed nothing is sent, because PX4 must notice the loss of the real ground station, whatever NAV_DLL_ACT makes of
+        it.
         """
         status = self._inbox.status()
         if self._open and status is not None and not status.armed:

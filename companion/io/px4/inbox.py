@@ -1,4 +1,4 @@
-"""What PX4 streams: the newest of each, kept by MAVSDK's threads, made into the companion's records when the flight loop asks."""
+"""Telemetry of PX4: MAVSDK's threads store the newest message of each kind, and the flight loop reads them as records."""
 
 from __future__ import annotations
 
@@ -24,19 +24,21 @@ from companion.runtime.clock import Clock
 from companion.runtime.native_threads import keep_interpreter_state
 
 POSITION_RATE_HZ = 200.0
-"""Asked of LOCAL_POSITION_NED; PX4 gives about 124 Hz."""
+"""Requested rate of LOCAL_POSITION_NED; PX4 delivers about 124 Hz."""
 ATTITUDE_RATE_HZ = 250.0
-"""Asked of ATTITUDE_QUATERNION, which carries the angular rates too."""
+"""Requested rate of ATTITUDE_QUATERNION, which also carries the angular rates."""
 IMU_RATE_HZ = 250.0
-"""Asked of HIGHRES_IMU."""
+"""Requested rate of HIGHRES_IMU."""
 LANDED_RATE_HZ = 10.0
-"""Asked of EXTENDED_SYS_STATE."""
+"""Requested rate of EXTENDED_SYS_STATE."""
 ESTIMATOR_RATE_HZ = 5.0
-"""Asked of ESTIMATOR_STATUS."""
+"""Requested rate of ESTIMATOR_STATUS."""
 
 
 class Inbox:
-    """Written by MAVSDK's threads, one assignment each; a tuple is replaced as a whole, so a reader never sees half of it."""
+    """Store written by MAVSDK's threads, one assignment each. A tuple is replaced as a whole, so a reader never sees a partial
+    update.
+    """
 
     def __init__(self, clock: Clock, desk: RequestDesk, after_heartbeat: Callable[[], None]) -> None:
         self._clock = clock
@@ -61,7 +63,7 @@ class Inbox:
         self._estimator_report: EstimatorReport | None = None
 
     def subscribe(self, telemetry: Telemetry, direct: MavlinkDirect) -> None:
-        """From now on everything that arrives is kept."""
+        """Store everything that arrives from now on."""
         self._telemetry = telemetry  # MAVSDK's plugin ends its subscriptions when nobody holds it any more
         telemetry.subscribe_position_velocity_ned(self._on_position)
         telemetry.subscribe_attitude_quaternion(self._on_attitude)
@@ -76,7 +78,9 @@ class Inbox:
         direct.subscribe_message("STATUSTEXT", self._on_status_text)
 
     def vehicle(self) -> VehicleState | None:
-        """Latest fused state; None before position, attitude, rates and IMU have all arrived. Stamps are arrival times."""
+        """Return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps are arrival
+        times.
+        """
         position, attitude, rates, imu = self._position, self._attitude, self._rates, self._imu
         if position is None or attitude is None or rates is None or imu is None:
             return None
@@ -95,7 +99,9 @@ class Inbox:
         return self._vehicle
 
     def status(self) -> AutopilotStatus | None:
-        """Latest slow state; None before the first heartbeat. `heartbeat_stamp_s` is when the newest HEARTBEAT arrived."""
+        """Return the latest slow state, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
+        HEARTBEAT.
+        """
         heartbeat = self._heartbeat
         if heartbeat is None:
             return None
@@ -115,7 +121,7 @@ class Inbox:
         )
 
     def estimator(self) -> EstimatorReport | None:
-        """Latest ESTIMATOR_STATUS, stamped on arrival; None before the first."""
+        """Return the latest ESTIMATOR_STATUS, stamped on arrival, or None before the first."""
         newest = self._estimator
         if newest is not None and newest is not self._estimator_read:
             self._estimator_read = newest
@@ -123,12 +129,12 @@ class Inbox:
         return self._estimator_report
 
     def silent_s(self) -> float:
-        """Time since the newest message of PX4; infinite before the first."""
+        """Return the time since the newest message of PX4, s; infinite before the first."""
         newest = (self._attitude, self._imu, self._position, self._heartbeat)
         return self._clock() - max((message[0] for message in newest if message is not None), default=-math.inf)
 
     def counts(self) -> StateCounts:
-        """Messages of the fast state since the link was opened."""
+        """Return the numbers of messages of the fast state since the link was opened."""
         return StateCounts(self._positions, self._attitudes, self._imus)
 
     # Callbacks: C++ threads, one message type in one thread. Nothing but an assignment, and one more in a count or a sum.
@@ -183,7 +189,7 @@ class Inbox:
 async def ask_for_streams(
     address: str, calls: NativeCalls, telemetry: Telemetry, direct: MavlinkDirect, system_id: int
 ) -> None:
-    """Ask PX4 for every stream that `Inbox` keeps, at its rate.
+    """Request every stream that `Inbox` stores, at its rate.
 
     Raises:
         DeviceError: PX4 refused one, or did not answer.
@@ -212,4 +218,4 @@ async def ask_for_streams(
 
 
 class _RefusedError(Exception):
-    """PX4 denied a command, with its reason in words."""
+    """PX4 denied a command; the text is its reason."""

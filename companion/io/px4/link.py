@@ -1,4 +1,4 @@
-"""Opening MAVSDK's connection to PX4: every way in which it can fail becomes one clear line."""
+"""Opening of MAVSDK's connection to PX4. Every kind of failure is one clear line."""
 
 from __future__ import annotations
 
@@ -34,18 +34,19 @@ _log_users = 0
 
 
 def device_error(address: str, expected: str, found: str, fix: str) -> DeviceError:
-    """The one line that a person gets."""
+    """Return the error with its one line for the user."""
     return DeviceError(f"autopilot {address}: expected {expected}, found {found}; {fix}")
 
 
 def no_heartbeat(address: str, timeout_s: float) -> DeviceError:
-    """No autopilot is heard."""
+    """Return the error for a link without an autopilot's heartbeat."""
     fix = "power the autopilot, check cable, baud or PX4's MAVLink target address and port"
     return device_error(address, f"a PX4 heartbeat within {timeout_s:g} s", "none", fix)
 
 
 def check_address(address: str) -> None:
-    """Look at the address before MAVSDK does: it shares a busy UDP port silently and reports bad ones without a reason.
+    """Check the address before MAVSDK uses it, because MAVSDK shares a busy UDP port silently and reports invalid ones without a
+    reason.
 
     Raises:
         DeviceError: syntax, port range, busy or foreign local address, serial port missing or not accessible.
@@ -65,23 +66,23 @@ def check_address(address: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class AddressParts:
-    """An address taken apart."""
+    """Parts of an address."""
 
     kind: str
     """udpin, udpout, tcpin, tcpout, serial or serial_flowcontrol."""
     host: str
-    """Path of the device on a serial link."""
+    """Host, or the path of the device on a serial link."""
     port: int
-    """Baud rate on a serial link."""
+    """Port, or the baud rate on a serial link."""
 
     @property
     def serial(self) -> bool:
-        """The link is a serial port."""
+        """Return whether the link is a serial port."""
         return self.kind in ("serial", "serial_flowcontrol")
 
 
 def parse_address(address: str) -> AddressParts:
-    """Parts of an address that `check_address` accepts.
+    """Return the parts of an address that `check_address` accepts.
 
     Raises:
         ValueError: `check_address` does not accept it.
@@ -127,12 +128,12 @@ def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> s
 
 
 def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> Any:
-    """Open the connection; the handle that `Mavsdk.remove_connection` takes. Blocks while a TCP connection is made.
+    """Open the connection and return the handle for `Mavsdk.remove_connection`. Blocks while a TCP connection is made.
 
     Args:
         mavsdk: the instance.
-        address: checked.
-        forwarding: what arrives goes out on the other connections that forward, and the other way round.
+        address: checked address.
+        forwarding: whether messages are forwarded to and from the other connections that forward.
 
     Raises:
         DeviceError: MAVSDK could not open it.
@@ -150,7 +151,7 @@ def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> An
 
 
 async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any:
-    """The MAVSDK system whose heartbeat comes first, if it is PX4.
+    """Return the first MAVSDK system with a heartbeat, if it is PX4.
 
     Raises:
         DeviceError: no heartbeat within `timeout_s`, or another autopilot's.
@@ -189,7 +190,7 @@ class UdpSocket:
 
 
 def udp_sockets() -> dict[int, UdpSocket]:
-    """UDP (IPv4) sockets of this process by inode; empty where /proc does not show them."""
+    """Return the UDP (IPv4) sockets of this process by inode; empty if /proc does not show them."""
     try:
         own = {link: int(name) for name in os.listdir("/proc/self/fd") if (link := _link_of(name)) is not None}
         table = Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]
@@ -204,16 +205,17 @@ def udp_sockets() -> dict[int, UdpSocket]:
 
 
 def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> tuple[socket.socket, int]:
-    """Let the one UDP socket that MAVSDK has opened since hear `peer` alone: the kernel drops datagrams of every other sender.
+    """Connect the one UDP socket that MAVSDK has opened since to `peer`: the kernel then drops datagrams of all other senders.
 
-    MAVSDK itself takes messages from every sender that finds its port, on a `udpout` connection too.
+    MAVSDK itself accepts messages from every sender, on a `udpout` connection as well.
 
     Args:
         before: inodes of `udp_sockets` before MAVSDK opened the connection.
         peer: IPv4 address and port.
 
     Returns:
-        A second descriptor of the socket, to connect it to another peer by, and its local port. The port is free once both are closed.
+        A second descriptor of the socket, by which it can be connected to another peer, and its local port. The port is free once both
+            descriptors are closed.
 
     Raises:
         OSError: the socket is not found, or cannot be connected.
@@ -244,7 +246,7 @@ def _log_native(level: Any, message: str, file: str | None, line: int) -> bool:
 
 
 def quiet_native_log() -> Callable[[], None]:
-    """Send MAVSDK's own log to the logger `companion.mavsdk` at DEBUG instead of the terminal. Returns the undo."""
+    """Redirect MAVSDK's log from the terminal to the logger `companion.mavsdk` at DEBUG. Returns a function that restores it."""
     global _log_users
     with _log_lock:
         _log_users += 1

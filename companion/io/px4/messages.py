@@ -1,6 +1,6 @@
-"""MAVLink as PX4 speaks it, to and from the companion's records. Pure: no socket, no MAVSDK, no clock.
+"""Conversion between PX4's MAVLink messages and the companion's records. Pure: no socket, no MAVSDK, no clock.
 
-Everything that changes frame between companion and PX4 is here: NED/FRD on the wire, world ENU / body FLU in the records.
+All conversions of frames between companion and PX4 are here: NED/FRD on the wire, world ENU / body FLU in the records.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ _COMMANDS: dict[AutopilotRequest, tuple[int, float, float]] = {
 
 
 def heartbeat_state(heartbeat_json: str) -> tuple[bool, FlightMode, int]:
-    """Armed flag, flight mode and MAV_STATE of a HEARTBEAT's fields (`base_mode`, `custom_mode`, `system_status`)."""
+    """Return armed flag, flight mode and MAV_STATE of a HEARTBEAT's fields (`base_mode`, `custom_mode`, `system_status`)."""
     fields = json.loads(heartbeat_json)
     base_mode = int(fields["base_mode"])
     armed = bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
@@ -89,7 +89,7 @@ def heartbeat_state(heartbeat_json: str) -> tuple[bool, FlightMode, int]:
 
 
 def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
-    """PX4's mode: main mode in bits 16-23 of `custom_mode`, sub mode in bits 24-31."""
+    """Return PX4's mode: main mode in bits 16-23 of `custom_mode`, sub mode in bits 24-31."""
     main, sub = (custom_mode >> 16) & 0xFF, (custom_mode >> 24) & 0xFF
     if not base_mode & _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or main == 0:
         return FlightMode.UNKNOWN
@@ -101,12 +101,12 @@ def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
 
 
 def landed_state(value: int) -> LandedState:
-    """EXTENDED_SYS_STATE.landed_state."""
+    """Return the landed state of EXTENDED_SYS_STATE.landed_state."""
     return _LANDED_STATES[value] if 0 <= value < len(_LANDED_STATES) else LandedState.UNKNOWN
 
 
 def battery(voltage_v: float, remaining_percent: float) -> tuple[float | None, float | None]:
-    """Voltage in V and remaining charge, 0 to 1; None where the autopilot does not know (NaN or negative)."""
+    """Return voltage in V and remaining charge, 0 to 1; None where the autopilot reports it as unknown (NaN or negative)."""
     voltage = voltage_v if math.isfinite(voltage_v) and voltage_v > 0.0 else None
     known = math.isfinite(remaining_percent) and remaining_percent >= 0.0
     return voltage, min(remaining_percent / 100.0, 1.0) if known else None
@@ -122,8 +122,8 @@ def vehicle_state(
     imu_stamp_s: float,
     specific_force_frd_m_s2: Vec3,
 ) -> VehicleState | None:
-    """LOCAL_POSITION_NED, ATTITUDE_QUATERNION and HIGHRES_IMU in the companion's frames; None if anything is not finite or the
-    quaternion has no direction.
+    """Return LOCAL_POSITION_NED, ATTITUDE_QUATERNION and HIGHRES_IMU in the companion's frames, or None if any value is not finite or
+    the quaternion is zero.
     """
     values = (*position_ned_m, *velocity_ned_m_s, *attitude_ned_frd, *rates_frd_rad_s, *specific_force_frd_m_s2)
     if not all(map(math.isfinite, values)):
@@ -145,7 +145,7 @@ def vehicle_state(
 
 
 def attitude_target_ned(setpoint: AttitudeSetpoint) -> Quat:
-    """Attitude FRD -> NED of a setpoint that may leave.
+    """Return the attitude FRD -> NED of a valid setpoint.
 
     Raises:
         ValueError: a value is not finite, the quaternion is not of unit norm, or thrust is outside 0 to 1.
@@ -161,13 +161,13 @@ def attitude_target_ned(setpoint: AttitudeSetpoint) -> Quat:
 
 
 def attitude_target_deg(setpoint: AttitudeSetpoint) -> Vec3:
-    """Roll, pitch, yaw (ZYX, FRD -> NED) in degrees of a setpoint that may leave; raises as `attitude_target_ned` does."""
+    """Return roll, pitch, yaw (ZYX, FRD -> NED) of a valid setpoint, deg; raises as `attitude_target_ned` does."""
     roll_rad, pitch_rad, yaw_rad = euler_zyx_from_quat(quat_normalize(attitude_target_ned(setpoint)))
     return math.degrees(roll_rad), math.degrees(pitch_rad), math.degrees(yaw_rad)
 
 
 def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> str:
-    """SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises as `attitude_target_ned` does."""
+    """Return SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises as `attitude_target_ned` does."""
     q = attitude_target_ned(setpoint)
     return (
         f'{{"time_boot_ms":{time_boot_ms & 0xFFFFFFFF},"target_system":{target_system},'
@@ -178,10 +178,10 @@ def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_s
 
 
 def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
-    """Position NED in m and roll, pitch, yaw (ZYX, FRD -> NED) in rad, as VISION_POSITION_ESTIMATE wants them.
+    """Return position NED (m) and roll, pitch, yaw (ZYX, FRD -> NED, rad) for VISION_POSITION_ESTIMATE.
 
     Raises:
-        ValueError: a value is not finite or the quaternion has no direction.
+        ValueError: a value is not finite or the quaternion is zero.
     """
     if not all(map(math.isfinite, (*pose.position_world_m, *pose.attitude_wxyz))):
         raise ValueError(f"mocap pose {pose.position_world_m}, {pose.attitude_wxyz} is not finite")
@@ -190,7 +190,7 @@ def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
 
 
 def command(request: AutopilotRequest) -> tuple[int, float, float]:
-    """MAV_CMD and its first two parameters, the others are 0: DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND (21).
+    """Return MAV_CMD and its first two parameters, the others are 0: DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND (21).
 
     Raises:
         KeyError: for `AutopilotRequest.NONE`, which is no command.
@@ -199,23 +199,23 @@ def command(request: AutopilotRequest) -> tuple[int, float, float]:
 
 
 def command_json(request: AutopilotRequest, target_system: int) -> str:
-    """COMMAND_LONG for a request, fields as `command` gives them; raises as `command` does."""
+    """Return COMMAND_LONG for a request with the fields of `command`; raises as `command` does."""
     return _command_json(*command(request), target_system)
 
 
 def request_message_json(message_id: int, target_system: int) -> str:
-    """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE (512): send that message once."""
+    """Return COMMAND_LONG MAV_CMD_REQUEST_MESSAGE (512), which requests a message once."""
     return _command_json(_REQUEST_MESSAGE, float(message_id), 0.0, target_system)
 
 
 def set_message_interval_json(message_id: int, rate_hz: float, target_system: int) -> str:
-    """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511): stream that message; PX4 takes the interval in us."""
+    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511), which requests a stream; PX4 takes the interval in us."""
     return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz, target_system)
 
 
 def estimator_report(fields_json: str, stamp_s: float) -> EstimatorReport:
-    """ESTIMATOR_STATUS. PX4 says NaN for the ratio of what it does not fuse, which becomes 0, and for an accuracy that it does not
-    know, which becomes infinite.
+    """Convert ESTIMATOR_STATUS. PX4 sends NaN for the ratio of a source that it does not fuse, which becomes 0, and for an unknown
+    accuracy, which becomes infinite.
     """
     fields = json.loads(fields_json)
 
@@ -248,7 +248,7 @@ def _command_json(number: int, param1: float, param2: float, target_system: int)
 
 
 def refusal(ack_json: str) -> str | None:
-    """Why a COMMAND_ACK is not an acceptance, in words; None when it is one."""
+    """Return why a COMMAND_ACK is a refusal, as text, or None if it is an acceptance."""
     result = int(json.loads(ack_json)["result"])
     return None if result == 0 else result_text(result)
 
@@ -259,5 +259,5 @@ def answers_arming(ack_json: str) -> bool:
 
 
 def result_text(result: int) -> str:
-    """A MAV_RESULT in words."""
+    """Return a MAV_RESULT as text."""
     return f"{_MAV_RESULTS.get(result, 'unknown result')} (MAV_RESULT {result})"

@@ -1,10 +1,10 @@
-"""A global origin for a vehicle that has no GPS.
+"""Global origin for a vehicle without GPS.
 
-PX4 counts its global position as valid only with an origin; HOLD, RETURN and LAND then work on motion capture alone. The origin is
-latitude 0, longitude 0, altitude 0, because that is where EKF2 without GPS has put local (0, 0, 0) by itself: nothing moves, whether
-vision is fused already or not. Any other place moves the local position, measured on PX4 1.16.1: with 47.4 deg N, 8.5 deg E and
-488 m given before the first vision, LOCAL_POSITION_NED is thousands of kilometres away until vision is fused and its z is wrong by
-488 m for ever after; given while vision is fused, the filter resets and its innovation ratio rises to 2.
+PX4 considers its global position valid only with an origin; HOLD, RETURN and LAND then work on motion capture alone. The origin is
+latitude 0, longitude 0, altitude 0, because EKF2 without GPS has placed local (0, 0, 0) there by itself: the local position does not
+move, whether vision is fused already or not. Any other origin moves it, measured on PX4 1.16.1: with 47.4 deg N, 8.5 deg E and 488 m
+set before the first vision, LOCAL_POSITION_NED is thousands of kilometres away until vision is fused, and its z keeps an error of 488
+m; set while vision is fused, the filter resets and its innovation ratio rises to 2.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ORIGIN_ALTITUDE_M = 0.0
 
 
 def set_origin_json(system_id: int) -> str:
-    """SET_GPS_GLOBAL_ORIGIN for that system. The altitude is in mm, the angles in 1e-7 deg."""
+    """Return SET_GPS_GLOBAL_ORIGIN for a system. The altitude is in mm, the angles in 1e-7 deg."""
     return json.dumps(
         {
             "target_system": system_id,
@@ -41,10 +41,10 @@ def set_origin_json(system_id: int) -> str:
 async def ensure_origin(
     address: str, calls: NativeCalls, direct: MavlinkDirect, system_id: int, armed: Callable[[], Awaitable[bool]]
 ) -> bool:
-    """Give PX4 an origin unless it has one or is armed. True: PX4 says that it has one.
+    """Set PX4's origin unless it has one or is armed. Returns whether PX4 reports an origin.
 
-    PX4 tells of its origin only while its position is valid, so right after boot, before any vision, the answer is False though the
-    origin was taken; to send the same one again changes nothing.
+    PX4 reports its origin only while its position is valid, so right after boot, before any vision, the result is False although the
+    origin was accepted. Sending the same origin again has no effect.
 
     Raises:
         DeviceError: PX4 does not answer at all.

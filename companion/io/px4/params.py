@@ -1,8 +1,8 @@
-"""PX4's parameters: many names at once, in a window of requests, and one value written and read back.
+"""PX4's parameters: reading of many names with a window of requests, and writing of one value with verification.
 
-PARAM_REQUEST_READ by name goes out through MavlinkDirect, several under way at a time, because MAVSDK's Param plugin asks one after the
-other and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer those). That PX4 lacks a parameter is concluded
-from its silence while it answers other requests that were sent after it, not from silence alone.
+PARAM_REQUEST_READ by name is sent through MavlinkDirect, several at a time, because MAVSDK's Param plugin requests one after the other
+and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer those). A parameter counts as absent if PX4 does not
+answer while it answers requests that were sent later.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from companion.px4.params_file import single
 from companion.runtime.clock import Clock
 
 WINDOW = 8
-"""Requests under way at once: their answers fit PX4's transmit buffer beside the telemetry."""
+"""Largest number of outstanding requests: their answers fit into PX4's transmit buffer beside the telemetry."""
 ANSWER_S = 0.4
-"""A request that was not answered by then is asked again."""
+"""Timeout after which a request is repeated."""
 ASKS = 4
-"""So often is a name asked for, while PX4 answers others, before it counts as absent."""
+"""Number of requests for a name, while PX4 answers others, after which it counts as absent."""
 READ_DEADLINE_S = 10.0
 ALWAYS_THERE = "MAV_SYS_ID"
-"""Asked along: its answer shows that PX4 has heard what was sent before."""
+"""Parameter of every PX4. Its answer shows that PX4 has received the requests sent before."""
 
 _NAME = re.compile(r"[A-Z0-9_]{1,16}")
 _REAL32 = 9
@@ -44,7 +44,7 @@ Value = float | int
 
 
 class ParamQueries:
-    """Which names to ask for now. Pure: the clock comes in, names come out."""
+    """Schedule of the requests. Pure: time is an argument, names are the result."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.answered: set[str] = set()
@@ -58,11 +58,13 @@ class ParamQueries:
 
     @property
     def done(self) -> bool:
-        """Every name is answered or absent."""
+        """Return whether every name is answered or absent."""
         return len(self.answered) + len(self.absent) == len(self._names)
 
     def due(self, now_s: float) -> list[str]:
-        """Names to ask for at `now_s`, ALWAYS_THERE last where a sign of life is due; none: look again a little later."""
+        """Return the names to request at `now_s`, with ALWAYS_THERE last if a sign of life is needed. Empty if there is nothing to
+        request yet.
+        """
         for name in [name for name, sent_s in self._sent_s.items() if now_s >= sent_s + ANSWER_S]:
             # Silence says something only if PX4 spoke since.
             self._unheard[name] += self._heard_s > self._sent_s.pop(name)
@@ -81,7 +83,7 @@ class ParamQueries:
         return asks
 
     def heard(self, name: str, now_s: float) -> None:
-        """PARAM_VALUE of `name` arrived."""
+        """Process a PARAM_VALUE of `name`."""
         self._heard_s = now_s
         if name in self._unheard:
             self._sent_s.pop(name, None)
@@ -92,9 +94,10 @@ class ParamQueries:
 
 
 def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
-    """Name and value of a PARAM_VALUE's fields, an int where PX4 stores one.
+    """Return name and value of a PARAM_VALUE's fields, an int where PX4 stores one.
 
-    PX4 puts the bytes of an INT32 where the float is; None where those make a NaN, which JSON cannot say (negative numbers).
+    PX4 puts the bytes of an INT32 in place of the float. The value is None where those are a NaN (negative numbers), which JSON cannot
+    represent.
     """
     name, wire = str(fields["param_id"]), fields["param_value"]
     if wire is None:
@@ -105,7 +108,7 @@ def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
 
 
 class ParamTransfer:
-    """Reads and writes over an open link."""
+    """Reads and writes on an open link."""
 
     def __init__(
         self, address: str, clock: Clock, calls: NativeCalls, direct: MavlinkDirect, param: Param, system_id: int
@@ -118,10 +121,10 @@ class ParamTransfer:
         self._system_id = system_id
 
     async def read(self, names: Iterable[str]) -> dict[str, Value]:
-        """Values by name, int or float as PX4 stores them; names that PX4 does not have are left out.
+        """Return values by name, int or float as PX4 stores them; names that PX4 does not have are left out.
 
         Raises:
-            DeviceError: a name that cannot be one, or no answer within the deadline.
+            DeviceError: an invalid name, or no answer within the deadline.
         """
         wanted = tuple(dict.fromkeys(names))
         for name in wanted:
@@ -165,7 +168,7 @@ class ParamTransfer:
         return values
 
     async def write(self, name: str, value: Value) -> Value:
-        """Write one value and read it back; what PX4 now holds.
+        """Write one value, read it back and return the value that PX4 now holds.
 
         Raises:
             DeviceError: no such name, a value that the type cannot hold, PX4 refused it, or holds another one afterwards.
@@ -210,7 +213,7 @@ class ParamTransfer:
         self._direct.send_message(MavlinkMessage("PARAM_REQUEST_READ", fields_json=json.dumps(fields)))
 
     async def _read_int(self, name: str) -> Value:
-        """An INT32 whose bytes are a NaN comes through MAVSDK's own plugin."""
+        """Read an INT32 whose bytes are a NaN through MAVSDK's own plugin."""
         try:
             value: Value = await self._calls.run(
                 f"PX4's parameter {name}", 2 * NATIVE_CALL_DEADLINE_S, self._param.get_param_int, name

@@ -1,7 +1,7 @@
-"""When a request of the core becomes a command on the wire. Pure: the clock comes in, nothing goes out.
+"""Schedule by which requests of the core become commands on the wire. Pure: time is an argument, nothing is sent here.
 
-The core repeats a request in every tick until the status shows it done. The desk turns that into one command at a time per kind of
-request, with pauses: a kind never waits for another, so LAND goes out while ARM hangs.
+The core repeats a request in every tick until the status shows it done. The queue turns that into one command at a time per kind of
+request, with pauses. A kind never waits for another, so LAND is sent while ARM hangs.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from companion.io.px4.texts import Texts
 from companion.model.types import AutopilotRequest
 
 SENT_ONCE = frozenset({AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM})
-"""Sent as one plain message: MAVSDK repeats a command for 2 s until it is answered, and what the core no longer requests must not
-stop rotors. The core requests again in every tick for as long as its rule holds."""
+"""Requests sent as one plain message: MAVSDK repeats a command for 2 s until it is answered, and a request that the core no longer
+makes must not stop rotors. The core repeats the request in every tick for as long as its rule holds.
+"""
 RETRY_S = 0.5
 """Least time between two commands of one kind."""
 SETTLE_S = 1.5
 """Pause after an accepted command: the heartbeat that shows it done comes once a second."""
 ANSWER_DEADLINE_S = 3.0
-"""MAVSDK gives a command up after about 2 s; past this its answer is lost and the request may be made again."""
+"""MAVSDK gives a command up after about 2 s; after this time its answer is lost and the request may be repeated."""
 _MESSAGES_KEPT = 200
 
 
@@ -35,7 +36,7 @@ class _Kind:
 
 
 class RequestDesk:
-    """Paces requests and keeps what the autopilot said. Safe from any thread."""
+    """Queue that paces requests and collects the autopilot's messages. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -44,7 +45,7 @@ class RequestDesk:
         self._texts = Texts()
 
     def claim(self, request: AutopilotRequest, now_s: float) -> bool:
-        """True: send this request's command now, and report by `answer`. `now_s` is on the flight clock."""
+        """Return whether to send this request's command now and to report its result by `answer`. `now_s` is on the flight clock."""
         if request is AutopilotRequest.NONE:
             return False
         with self._lock:
@@ -60,7 +61,7 @@ class RequestDesk:
             return True
 
     def answer(self, request: AutopilotRequest, refusal: str | None, now_s: float) -> None:
-        """The autopilot accepted (None) or refused, with the reason in words."""
+        """Report that the autopilot accepted (None) or refused, with the reason."""
         with self._lock:
             kind = self._kinds.get(request)
             if kind is None:
@@ -72,7 +73,7 @@ class RequestDesk:
                 self._messages.extend(self._texts.once(f"{request.name} refused: {refusal}", now_s))
 
     def answer_sent_once(self, refusal: str | None, now_s: float) -> None:
-        """A COMMAND_ACK to arming or disarming came: it answers the requests of `SENT_ONCE` that wait for one."""
+        """Report a COMMAND_ACK to arming or disarming, which answers the outstanding requests of `SENT_ONCE`."""
         for request in SENT_ONCE:
             with self._lock:
                 kind = self._kinds.get(request)
@@ -81,17 +82,17 @@ class RequestDesk:
                 self.answer(request, refusal, now_s)
 
     def hear(self, statustext: Mapping[str, Any], now_s: float) -> None:
-        """Keep what the autopilot said by itself, once it is complete (`Texts.take`)."""
+        """Store a complete message of the autopilot (`Texts.take`)."""
         with self._lock:
             self._messages.extend(self._texts.take(statustext, now_s))
 
     def pending(self) -> int:
-        """How many commands still wait for their answer."""
+        """Return the number of outstanding commands."""
         with self._lock:
             return sum(kind.pending for kind in self._kinds.values())
 
     def take_messages(self, now_s: float) -> list[str]:
-        """Everything said since the last call, oldest first; the newest 200 lines are kept."""
+        """Return all messages since the last call, oldest first; the newest 200 lines are kept."""
         with self._lock:
             self._messages.extend(self._texts.overdue(now_s))
             messages = list(self._messages)

@@ -1,7 +1,7 @@
-"""The two ways by which an attitude setpoint leaves through MAVSDK: MavlinkDirect (the default) and the Offboard plugin.
+"""The two paths of attitude setpoints through MAVSDK: MavlinkDirect (the default) and the Offboard plugin.
 
-Both send SET_ATTITUDE_TARGET once for each call, from the caller's thread. They differ in what happens when the caller falls silent:
-decision 1 (docs/decisions) says why the first is the default.
+Both send SET_ATTITUDE_TARGET once per call, from the caller's thread. They differ when the caller falls silent; decision 1
+(docs/decisions) explains the default.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ _log = logging.getLogger(__name__)
 
 
 class SetpointPath(Protocol):
-    """A way to PX4."""
+    """A path of setpoints to PX4."""
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
-        """Send at once. False: MAVSDK refused it.
+        """Send at once. Returns False if MAVSDK refused it.
 
         Raises:
-            ValueError: a value that must never leave; nothing was sent.
+            ValueError: an invalid value; nothing was sent.
         """
 
     def stop(self) -> None:
-        """From now on nothing leaves until the next `send`."""
+        """Send nothing until the next `send`."""
 
 
 def setpoint_path(kind: Literal["direct", "offboard"], system: Any, direct: MavlinkDirect) -> SetpointPath:
-    """The way that `devices.autopilot.setpoint_path` names, to a MAVSDK system."""
+    """Return the path of `devices.autopilot.setpoint_path` to a MAVSDK system."""
     if kind == "offboard":
         return OffboardSetpoints(system)
     return DirectSetpoints(direct, int(system.get_system_id()))
 
 
 class DirectSetpoints:
-    """Through MavlinkDirect. Nothing leaves unless the flight loop sends it: PX4's offboard-loss failsafe fires for a hung companion.
+    """Setpoints through MavlinkDirect. Only the flight loop's calls send: PX4's offboard-loss failsafe triggers for a hung companion.
 
-    The price was measured: 0.03 to 0.06 ms more from datagram to wire (p50; 0.1 ms at p99), of a tick of 5 ms.
-    benchmarks/wire_latency.py measures both.
+    The cost was measured: 0.03 to 0.06 ms more from datagram to wire (p50; 0.1 ms at p99), in a tick of 5 ms.
+    benchmarks/wire_latency.py measures both paths.
     """
 
     def __init__(self, direct: MavlinkDirect, system_id: int) -> None:
@@ -52,7 +52,7 @@ class DirectSetpoints:
         self._system_id = system_id
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
-        """SET_ATTITUDE_TARGET with the quaternion as it is, stamped with the flight clock."""
+        """Send SET_ATTITUDE_TARGET with the given quaternion, stamped with the flight clock."""
         fields = messages.attitude_target_json(setpoint, int(t_s * 1e3), self._system_id)
         try:
             self._direct.send_message(MavlinkMessage("SET_ATTITUDE_TARGET", fields_json=fields))
@@ -62,15 +62,15 @@ class DirectSetpoints:
         return True
 
     def stop(self) -> None:
-        """Nothing leaves by itself."""
+        """Do nothing, because this path sends nothing by itself."""
 
 
 class OffboardSetpoints:
-    """Through the Offboard plugin, which takes Euler angles and checks nothing.
+    """Setpoints through the Offboard plugin, which takes Euler angles and does not check values.
 
-    A thread of the plugin's repeats the last setpoint at 20 Hz until PX4's heartbeat says that it is not in OFFBOARD, the plugin is
-    destroyed or the process dies: PX4's offboard-loss failsafe does not see that Python hangs. The guardian does, and kills the
-    process. The plugin's own `start` and `stop` are never used: modes are the request desk's, and `stop` would command HOLD.
+    A thread of the plugin repeats the last setpoint at 20 Hz until PX4's heartbeat shows another mode than OFFBOARD, the plugin is
+    destroyed or the process dies: PX4's offboard-loss failsafe does not detect that Python hangs. The guardian does, and kills the
+    process. The plugin's own `start` and `stop` are never used: the request queue changes modes, and `stop` would command HOLD.
     """
 
     def __init__(self, system: Any) -> None:
@@ -78,7 +78,7 @@ class OffboardSetpoints:
         self._plugin: Any = None
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
-        """Roll, pitch, yaw and thrust; MAVSDK stamps it."""
+        """Send roll, pitch, yaw and thrust, stamped by MAVSDK."""
         del t_s
         attitude = Attitude(*messages.attitude_target_deg(setpoint), setpoint.thrust)
         if self._plugin is None:
@@ -91,7 +91,7 @@ class OffboardSetpoints:
         return True
 
     def stop(self) -> None:
-        """End the plugin and its thread's repeating with it."""
+        """Destroy the plugin, which ends the repetition by its thread."""
         if self._plugin is not None:
             self._plugin.destroy()
             self._plugin = None

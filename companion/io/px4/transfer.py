@@ -1,4 +1,4 @@
-"""What differs between a parameter file and a PX4, and bringing PX4 to the file. Talks to the autopilot edge, prints nothing."""
+"""Comparison of a parameter file with a PX4, and writing of the file's values to PX4. Prints nothing."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from companion.px4.wanted import BY_NAME, NO_VEHICLE
 
 
 class ParamLink(Protocol):
-    """What is needed of the autopilot edge."""
+    """The part of the autopilot driver that parameter transfer needs."""
 
     def status(self) -> AutopilotStatus | None:
-        """Latest slow state."""
+        """Return the latest slow state."""
 
     async def read_params(self, names: Iterable[str]) -> dict[str, Value]:
-        """Values by name; absent names are left out."""
+        """Return values by name; absent names are left out."""
 
     async def write_param(self, name: str, value: Value) -> Value:
-        """Write, read back; what PX4 now holds."""
+        """Write, read back and return the value that PX4 now holds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One parameter that PX4 holds otherwise than the file."""
+    """One parameter whose value in PX4 differs from the file's."""
 
     name: str
     px4: Value
@@ -36,13 +36,13 @@ class Difference:
 
     @property
     def reboot(self) -> bool | None:
-        """It takes effect after a reboot; None: not known of this one."""
+        """Return whether it takes effect after a reboot only, or None if that is not known."""
         wanted = BY_NAME.get(self.name)
         return None if wanted is None else wanted.reboot
 
     @property
     def type_problem(self) -> str | None:
-        """Why it cannot be written: the file says another type than PX4; None: it can."""
+        """Return why it cannot be written (the file has another type than PX4), or None if it can."""
         if isinstance(self.px4, int) is isinstance(self.file, int):
             return None
         names = ("a REAL32", "an INT32")
@@ -51,33 +51,35 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A file against a PX4."""
+    """Result of comparing a file with a PX4."""
 
     differences: tuple[Difference, ...]
     absent: tuple[str, ...]
-    """In the file, but PX4 does not have them; those of another version of PX4 (`Wanted.only`) do not count."""
+    """Parameters in the file that PX4 does not have, except those of another version of PX4 (`Wanted.only`)."""
     absent_port: tuple[str, ...]
-    """The same, of a serial port that this PX4 does not have: a simulator, or a board without TELEM2. Nothing is wrong with that."""
+    """The same for a serial port that this PX4 does not have (a simulator, or a board without TELEM2). This is not an error."""
     measured: tuple[Difference, ...] = ()
-    """Accepted values other than the file's, of what is measured on each installation: left as they are. Nothing is wrong with that."""
+    """Accepted values that differ from the file's because they are measured on each installation. They are kept; this is not
+    an error.
+    """
 
     @property
     def same(self) -> bool:
-        """PX4 is as the file says."""
+        """Return whether PX4 has the file's values."""
         return not self.differences and not self.absent
 
 
 @dataclass(frozen=True, slots=True)
 class WriteResult:
-    """What became of the writing."""
+    """Result of writing parameters."""
 
     written: tuple[Difference, ...]
     problem: str | None
-    """Why it ended early, one line; None: everything was written, and read back."""
+    """Why it ended early, as one line; None if everything was written and read back."""
 
 
 def compare(wanted: Mapping[str, Value], found: Mapping[str, Value]) -> Comparison:
-    """A file's values against PX4's. Pure."""
+    """Compare a file's values with PX4's. Pure."""
     differences: list[Difference] = []
     measured: list[Difference] = []
     absent, absent_port = [], []
@@ -96,7 +98,7 @@ def compare(wanted: Mapping[str, Value], found: Mapping[str, Value]) -> Comparis
 
 
 def _is_measured(difference: Difference) -> bool:
-    """Somebody measured what PX4 holds, and the file only has the project's value to begin with."""
+    """Return whether PX4's value was measured while the file has the project's initial value."""
     wanted = BY_NAME.get(difference.name)
     if wanted is None or not wanted.measured or wanted.value is None or wanted.limits is None:
         return False
@@ -106,7 +108,7 @@ def _is_measured(difference: Difference) -> bool:
 
 
 async def write(link: ParamLink, differences: Iterable[Difference]) -> WriteResult:
-    """Write each, verified by reading back; stops at the first that fails, and as soon as PX4 is armed."""
+    """Write each value and verify it by reading back; stops at the first failure, and as soon as PX4 is armed."""
     written: list[Difference] = []
     for difference in differences:
         status = link.status()

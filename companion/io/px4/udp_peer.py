@@ -1,4 +1,4 @@
-"""The peer of a connected UDP socket when it falls silent."""
+"""Release of a connected UDP socket whose peer has fallen silent."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import socket
 
 REPIN_SILENCE_S = 1.0
-"""PX4 may be looked for at another port of its address after so long without a datagram; it sends hundreds each second."""
+"""Silence after which PX4 may be searched at another port of its address; it sends hundreds of datagrams per second."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _ANY_PEER = bytes(16)
@@ -15,7 +15,7 @@ _ANY_PEER = bytes(16)
 
 
 def disconnect_udp(connected: socket.socket) -> None:
-    """Let the socket hear every sender again; it keeps a local port that it was bound to.
+    """Let the socket receive from every sender again. It keeps its local port.
 
     Raises:
         OSError: the kernel refuses.

@@ -1,6 +1,6 @@
-"""What flight process and relay say to each other: JSON objects. The relay faces the network, so nothing of it is decoded as code.
+"""Messages between flight process and relay: JSON objects. The relay faces the network, so nothing from it is decoded by `marshal`.
 
-`marshal` would be five times as fast, and its decoder is not made for data that may be forged. Here is one small message at 4 Hz.
+`marshal` would be five times as fast, but its decoder is not safe for forged data, and this is one small message at 4 Hz.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from typing import Any
 
 
 def pack(message: dict[str, Any]) -> bytes:
-    """One message as a packet."""
+    """Return one message as a packet."""
     return json.dumps(message).encode()
 
 
 def unpack(packet: bytes) -> dict[str, Any]:
-    """The message in a packet; empty if there is none in it. Never raises."""
+    """Return the message in a packet; empty if it is malformed. Never raises."""
     try:
         message = json.loads(packet)
     except (ValueError, RecursionError):

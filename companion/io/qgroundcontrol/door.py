@@ -1,8 +1,8 @@
-"""What a ground station may send to the vehicle, and what of it while PX4 is armed. Pure: frames in, frames out; time is an argument.
+"""Filter of messages from a ground station to the vehicle. Pure: frames in, frames out; time is an argument.
 
-While PX4 is armed an allow-list holds: what reads, and what ends or pauses the flight (LAND, HOLD, a pilot's mode, a disarm that PX4
-itself may refuse). Everything else waits until PX4 is disarmed: a forced disarm, a restart, flight termination, parameters, missions,
-files, RETURN (which climbs, on a tether), and whatever is not listed here.
+While PX4 is armed an allow-list applies: messages that read, and those that end or pause the flight (LAND, HOLD, a pilot's mode, a
+disarm that PX4 itself may refuse). Everything else is refused until PX4 is disarmed: a forced disarm, a restart, flight termination,
+parameters, missions, files, RETURN (which climbs, on a tether), and whatever is not listed here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from companion.io.qgroundcontrol.frames import (
 )
 
 HEARTBEAT_MAX_AGE_S = 3.0
-"""PX4 sends one a second. Without one PX4 counts as armed."""
+"""PX4 sends one heartbeat per second. Without a fresh one PX4 counts as armed."""
 
 ARMED_MESSAGES = frozenset(
     getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
@@ -50,12 +50,12 @@ _READING_COMMANDS = frozenset(
     }
 )
 _ALTCTL, _POSCTL, _AUTO, _STABILIZED = 2, 3, 4, 7
-"""PX4's main modes, as px4_custom_mode.h numbers them."""
+"""PX4's main modes as numbered in px4_custom_mode.h."""
 _LOITER, _LAND = 3, 6
 """PX4's sub-modes of AUTO."""
 _ARMED_MODES = frozenset({(_AUTO, _LOITER), (_AUTO, _LAND), (_POSCTL, 0), (_ALTCTL, 0), (_STABILIZED, 0)})
 _COMMAND_BYTES = 33
-"""Payload of COMMAND_LONG; that of COMMAND_INT is longer, with param1 to param4 at the same place."""
+"""Size of the payload of COMMAND_LONG; that of COMMAND_INT is longer, with param1 to param4 at the same place."""
 _SET_MODE_BYTES = 6
 
 
@@ -72,28 +72,28 @@ class ArmedState:
         self._arming_s = -math.inf
 
     def hear(self, datagram: bytes, now_s: float) -> None:
-        """Take in what MAVSDK forwards from PX4."""
+        """Process messages that MAVSDK forwards from PX4."""
         heard = autopilot_heartbeat(datagram)
         if heard is not None and heard.system == self._vehicle_system:
             self._disarmed_s = None if heard.armed else now_s
 
     def expect_arming(self, now_s: float) -> None:
-        """The companion asks PX4 to arm; the HEARTBEAT that shows it comes up to a second later."""
+        """Report that the companion requests arming; the HEARTBEAT that shows it arrives up to a second later."""
         self._arming_s = now_s
 
     def armed(self, now_s: float) -> bool:
-        """PX4 is armed, may be, or is not heard."""
+        """Return whether PX4 is armed, may be, or is not heard."""
         if self._disarmed_s is None or now_s - self._disarmed_s > HEARTBEAT_MAX_AGE_S:
             return True
         return now_s - self._arming_s <= HEARTBEAT_MAX_AGE_S
 
 
 class Door:
-    """What a ground station may say to the vehicle.
+    """Filter of a ground station's messages to the vehicle.
 
     Args:
-        vehicle_system: MAVLink system id of PX4, which is the companion's too.
-        while_armed: pass while PX4 is armed what passes while it is not, SERIAL_CONTROL excepted.
+        vehicle_system: MAVLink system id of PX4, which is also the companion's.
+        while_armed: while PX4 is armed pass everything that passes while it is not, except SERIAL_CONTROL.
         console: pass SERIAL_CONTROL while PX4 is not armed.
     """
 
@@ -101,14 +101,14 @@ class Door:
         self.state = ArmedState(vehicle_system)
         """Whether PX4 is armed."""
         self.refused: Counter[str] = Counter()
-        """How many were not let through, by the reason in words."""
+        """Number of refused messages by reason."""
         self._vehicle_system = vehicle_system
         self._while_armed, self._console = while_armed, console
         self._systems: set[int] = set()
         self._bucket = Bucket(UP_RATE_HZ, UP_BURST)
 
     def admit(self, datagram: bytes, now_s: float) -> list[bytes]:
-        """The frames to pass on, each as one datagram."""
+        """Return the frames to pass on, each as one datagram."""
         passed = []
         for frame in frames(datagram):
             reason = self._objection(frame, now_s)
@@ -137,7 +137,7 @@ class Door:
         return None if self._bucket.take(now_s) else f"more than {UP_RATE_HZ:g} messages a second"
 
     def _now(self, frame: Frame, armed: bool) -> str | None:
-        """Why the frame must wait, or never passes here."""
+        """Return why the frame is refused now, or always."""
         if frame.message_id == mavlink.MAVLINK_MSG_ID_SERIAL_CONTROL:
             if not self._console:
                 return "SERIAL_CONTROL, which ground.qgroundcontrol_console does not allow"
@@ -146,7 +146,7 @@ class Door:
 
 
 def objection_while_armed(frame: Frame) -> str | None:
-    """Why an intact frame of a ground station is refused while PX4 is armed; None if it may pass."""
+    """Return why an intact frame of a ground station is refused while PX4 is armed, or None if it may pass."""
     if frame.message_id not in ARMED_MESSAGES:
         return f"{frame.name} while PX4 is armed"
     if frame.message_id == mavlink.MAVLINK_MSG_ID_SET_MODE:
@@ -178,5 +178,5 @@ def _mode_allowed(base_mode: float, main_mode: float, sub_mode: float) -> bool:
 
 
 def _padded(frame: Frame, size: int) -> bytes:
-    """The payload's first `size` bytes; MAVLink 2 cuts zeros off the end."""
+    """Return the payload's first `size` bytes; MAVLink 2 truncates trailing zeros."""
     return frame.payload[:size].ljust(size, b"\0")

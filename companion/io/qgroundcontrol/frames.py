@@ -1,7 +1,7 @@
-"""MAVLink frames at the door to a ground station: cut out of datagrams, checked, let through or refused. Pure: no socket, no clock.
+"""MAVLink frames to and from a ground station: extracted from datagrams, checked, passed or refused. Pure: no socket, no clock.
 
-What comes from the ground passes only as whole frames with a right checksum, of a message that ground stations need, and never in
-the vehicle's own name: MAVSDK asks no message which connection it came by (`docs/qgroundcontrol.md`).
+A message from the ground passes only as a whole frame with a valid checksum, of a kind that ground stations need, and never with the
+vehicle's own ids, because MAVSDK does not distinguish the connections of messages (`docs/qgroundcontrol.md`).
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ _V1, _V2 = 0xFE, 0xFD
 _V1_HEADER_BYTES, _V2_HEADER_BYTES, _CHECKSUM_BYTES, _SIGNATURE_BYTES = 6, 10, 2, 13
 _FLAG_SIGNED = 1
 REQUEST_EVENT = 412
-"""By events.xml of MAVLink, which pymavlink's dialect does not contain; its CRC_EXTRA is 33."""
+"""From MAVLink's events.xml, which pymavlink's dialect does not contain; its CRC_EXTRA is 33."""
 _CRC_EXTRA: dict[int, int] = {number: message.crc_extra for number, message in mavlink.mavlink_map.items()}
 _CRC_EXTRA[REQUEST_EVENT] = 33
 _NAMES: dict[int, str] = {number: message.msgname for number, message in mavlink.mavlink_map.items()}
 
 UP_RATE_HZ = 100.0
 UP_BURST = 100
-"""Messages from the ground; a ground station with a joystick needs 60 a second."""
+"""Largest burst of messages from the ground; a ground station with a joystick needs 60 per second."""
 GROUND_SYSTEMS_MAX = 4
-"""MAVSDK keeps a record of every system id that it hears."""
+"""Largest number of system ids, because MAVSDK keeps a record of every one."""
 STREAM_RATE_HZ = 10.0
-"""Of each fast stream to the ground; the companion asks PX4 for up to 250 Hz."""
+"""Rate of each fast stream to the ground; the companion requests up to 250 Hz from PX4."""
 
 GROUND_MESSAGES = frozenset(
     getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
@@ -42,18 +42,20 @@ GROUND_MESSAGES = frozenset(
         *("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_ERASE", "LOG_REQUEST_END", "LOGGING_ACK"),
     )
 ) | {REQUEST_EVENT}
-"""What a ground station says in its own right. No setpoints, no estimates of the vehicle's pose, no sensor readings, no answers."""
+"""Messages that a ground station may send. Setpoints, estimates of the vehicle's pose, sensor readings and replies are not
+among them.
+"""
 REFUSED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 611, 43003})
-"""Would slow the streams that the flight lives on (511), or move the estimate: SET_GLOBAL_ORIGIN, EXTERNAL_POSITION_ESTIMATE."""
+"""Commands that would slow the streams of the flight (511), or move the estimate: SET_GLOBAL_ORIGIN, EXTERNAL_POSITION_ESTIMATE."""
 COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
 _COMMAND_OFFSET = 28
-"""Of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
+"""Offset of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
 _AUTOPILOT_OFFSET = 5
-"""Of the uint8 `autopilot` in the payload of HEARTBEAT."""
+"""Offset of the uint8 `autopilot` in the payload of HEARTBEAT."""
 _BASE_MODE_OFFSET = 6
-"""Of the uint8 `base_mode` in the payload of HEARTBEAT."""
+"""Offset of the uint8 `base_mode` in the payload of HEARTBEAT."""
 _PROOF_MAX_BYTES = 1500
-"""One Ethernet frame: the longest datagram that is searched for a HEARTBEAT; bridges put several messages into one."""
+"""Longest datagram that is searched for a HEARTBEAT: one Ethernet frame. Bridges put several messages into one datagram."""
 _PROOF_FRAMES_MAX = 32
 _PROOF_CHECKSUMS_MAX = 2
 
@@ -83,7 +85,7 @@ FAST_STREAMS = frozenset(
 
 
 class Bucket:
-    """So many at once, and so many a second in the long run."""
+    """Token bucket: limits a burst and the mean rate."""
 
     def __init__(self, rate_hz: float, burst: int) -> None:
         self._rate_hz = rate_hz
@@ -92,7 +94,7 @@ class Bucket:
         self._seen_s: float | None = None
 
     def take(self, now_s: float) -> bool:
-        """One more is allowed."""
+        """Return whether one more is allowed."""
         if self._seen_s is not None:
             self._left = min(self._burst, self._left + (now_s - self._seen_s) * self._rate_hz)
         self._seen_s = now_s
@@ -104,7 +106,7 @@ class Bucket:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One message as it is on the wire, whole, its checksum not looked at yet."""
+    """One whole message as on the wire, checksum not checked yet."""
 
     data: bytes
     message_id: int
@@ -114,42 +116,42 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """Of the message, or its number."""
+        """Return the name of the message, or its number."""
         return _NAMES.get(self.message_id, f"message {self.message_id}")
 
     @property
     def signed(self) -> bool:
-        """A MAVLink 2 signature follows the checksum."""
+        """Return whether a MAVLink 2 signature follows the checksum."""
         return self.data[0] == _V2 and bool(self.data[2] & _FLAG_SIGNED)
 
     @property
     def checksum(self) -> int:
-        """As it is in the frame."""
+        """Return the checksum in the frame."""
         return int(struct.unpack_from("<H", self.data, self._end)[0])
 
     def right_checksum(self, extra: int) -> int:
-        """As it must be, for the message's CRC_EXTRA."""
+        """Return the correct checksum for the message's CRC_EXTRA."""
         return _checksum(self.data[1 : self._end], extra)
 
     def intact(self) -> bool:
-        """The message is known and its checksum is right."""
+        """Return whether the message is known and its checksum is correct."""
         extra = _CRC_EXTRA.get(self.message_id)
         return extra is not None and self.checksum == self.right_checksum(extra)
 
     def numbered(self, sequence: int, extra: int) -> bytes:
-        """The same, which must not be signed, with another sequence number."""
+        """Return the same frame, which must not be signed, with another sequence number."""
         data = bytearray(self.data[: self._end])
         data[4 if data[0] == _V2 else 2] = sequence & 0xFF
         return bytes(data) + struct.pack("<H", _checksum(bytes(data[1:]), extra))
 
     @property
     def _end(self) -> int:
-        """Of the payload."""
+        """Return the end of the payload."""
         return len(self.data) - (_SIGNATURE_BYTES if self.signed else 0) - _CHECKSUM_BYTES
 
 
 def frames(datagram: bytes) -> Iterator[Frame | None]:
-    """The frames that a datagram is made of, in order; None, as the last, where the rest is none."""
+    """Return the frames in a datagram in order, followed by None if the rest is not a frame."""
     at = 0
     while at < len(datagram):
         frame = _frame_at(datagram, at)
@@ -161,17 +163,17 @@ def frames(datagram: bytes) -> Iterator[Frame | None]:
 
 @dataclass(frozen=True, slots=True)
 class AutopilotHeartbeat:
-    """What an autopilot (component 1) says of itself in HEARTBEAT."""
+    """Content of a HEARTBEAT of an autopilot (component 1)."""
 
     system: int
     armed: bool
 
 
 def autopilot_heartbeat(datagram: bytes) -> AutopilotHeartbeat | None:
-    """The HEARTBEAT of an autopilot with a right checksum in the datagram; None if there is none.
+    """Return the HEARTBEAT of an autopilot with a correct checksum in the datagram, or None if there is none.
 
-    Strangers choose what is read here, and the control loop waits for it: a datagram longer than one Ethernet frame is not looked at,
-    of the others only the first 32 frames and the first two checksums.
+    Unknown senders choose the content, and the control loop waits for this call: a datagram longer than one Ethernet frame is ignored,
+    of others only the first 32 frames and the first two checksums are checked.
     """
     if len(datagram) > _PROOF_MAX_BYTES:
         return None
@@ -184,7 +186,7 @@ def autopilot_heartbeat(datagram: bytes) -> AutopilotHeartbeat | None:
 
 
 def _of_autopilot(frame: Frame | None) -> bool:
-    """It says that it is an autopilot's HEARTBEAT; its checksum is not looked at."""
+    """Return whether the frame claims to be an autopilot's HEARTBEAT. The checksum is not checked."""
     if frame is None or frame.message_id != mavlink.MAVLINK_MSG_ID_HEARTBEAT:
         return False
     autopilot = int.from_bytes(frame.payload[_AUTOPILOT_OFFSET : _AUTOPILOT_OFFSET + 1], "little")
@@ -218,17 +220,17 @@ def _checksum(data: bytes, extra: int) -> int:
 
 
 def command_of(payload: bytes) -> int:
-    """MAV_CMD; MAVLink 2 cuts zeros off the end of a payload."""
+    """Return the MAV_CMD; MAVLink 2 truncates trailing zeros of a payload."""
     return int.from_bytes(payload[_COMMAND_OFFSET : _COMMAND_OFFSET + 2], "little")
 
 
 class Thinner:
-    """What of the vehicle's messages goes to the ground: everything but the companion's part of the talk, fast streams thinned out.
+    """Filter of the vehicle's messages to the ground: without the companion's own traffic, and with fast streams reduced.
 
-    The rest is numbered anew for each sender, as a ground station takes gaps in the numbers for losses of the link.
+    The rest is renumbered for each sender, because a ground station counts gaps in the numbers as losses of the link.
 
     Args:
-        own: system and component id that MAVSDK speaks with.
+        own: system and component id of MAVSDK.
     """
 
     def __init__(self, own: tuple[int, int]) -> None:
@@ -238,7 +240,7 @@ class Thinner:
         self._extras: dict[int, int | None] = dict(_CRC_EXTRA)
 
     def pick(self, datagram: bytes, now_s: float) -> list[bytes]:
-        """What to send of a datagram that MAVSDK forwarded."""
+        """Return what to send of a datagram that MAVSDK forwarded."""
         picked = []
         for frame in frames(datagram):
             if frame is None or (frame.system, frame.component) == self._own or not self._due(frame, now_s):
@@ -253,7 +255,9 @@ class Thinner:
         return picked
 
     def _extra(self, frame: Frame) -> int | None:
-        """CRC_EXTRA of the frame's message; of one that the dialect lacks by its first frame, as only one value makes its checksum."""
+        """Return CRC_EXTRA of the frame's message. For a message that the dialect lacks it is found from its first frame: only one
+        value matches the checksum.
+        """
         if frame.message_id not in self._extras:
             fits = (extra for extra in range(256) if frame.right_checksum(extra) == frame.checksum)
             self._extras[frame.message_id] = next(fits, None)

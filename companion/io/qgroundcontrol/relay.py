@@ -1,12 +1,12 @@
 """The process between MAVSDK and a MAVLink ground station: `python -m companion.io.qgroundcontrol.relay`.
 
 It holds three sockets: one to MAVSDK's second connection (loopback), one to the ground station, both connected, so that the kernel
-throws away what comes from anywhere else, and the channel to the flight process. A flood from the ground costs this process its
-time, not the flight. It ends when the channel does.
+drops datagrams from anywhere else, and the channel to the flight process. A flood from the ground costs this process time, not the
+flight. It ends with the channel.
 
-On the channel, JSON (`companion.io.qgroundcontrol.channel`): to the flight process `{"port": N}` once, or `{"error": text}`; later
-`{"text": text}`. From it `{"vehicle_port": N}` once; later `{"arming": true}` when it asks PX4 to arm,
-`{"texts": [[severity, text], ...]}`, `{"situation": text}`, `{"t_ms": N, "values": {...}}`, `{"bye": true}`.
+Messages on the channel are JSON (`companion.io.qgroundcontrol.channel`). To the flight process: `{"port": N}` once, or `{"error":
+text}`; later `{"text": text}`. From it: `{"vehicle_port": N}` once; later `{"arming": true}` when it requests arming, `{"texts":
+[[severity, text], ...]}`, `{"situation": text}`, `{"t_ms": N, "values": {...}}`, `{"bye": true}`.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ CHANNEL_MAX_BYTES = 65_536
 GONE = "flight process gone: guardian lands, link ends"
 _DATAGRAM_MAX_BYTES = 65535
 _ROUND_DATAGRAMS = 64
-"""Of one socket before the others have their turn."""
+"""Largest number of datagrams from one socket before the others are read."""
 _HEARTBEAT_S = 1.0
 _AWAY_S = 5.0
-"""A ground station that was silent so long is told again what is going on."""
+"""Silence of a ground station after which the current situation is sent again."""
 _REPORT_S = 5.0
-"""Between two lines about what was refused."""
+"""Time between two lines about refused messages."""
 
 
 class Relay:
-    """One vehicle and one ground station.
+    """Relay between one vehicle and one ground station.
 
     Args:
-        channel: to the flight process.
+        channel: channel to the flight process.
         vehicle: UDP, bound on loopback; connected once MAVSDK's port is known.
         ground: UDP, connected to the ground station.
-        door: what the ground station may say.
+        door: filter of the ground station's messages.
         vehicle_system: MAVLink system id of the vehicle.
-        own: system and component id that MAVSDK speaks with; the system is the vehicle's.
-        name: the ground station's address for people.
+        own: system and component id of MAVSDK; the system is the vehicle's.
+        name: the ground station's address for display.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Relay:
         for one in (channel, vehicle, ground):
             one.setblocking(False)
         self._open = False
-        """MAVSDK's port is known."""
+        """Whether MAVSDK's port is known."""
         self._bye = False
         self._door, self._thinner, self._texts = door, Thinner(own), Texts()
         self._encoder = mavlink.MAVLink(None, srcSystem=vehicle_system, srcComponent=COMPONENT)
@@ -79,7 +79,7 @@ class Relay:
         self._told: Counter[str] = Counter()
 
     def run(self) -> None:
-        """Until the flight process says goodbye or is gone."""
+        """Run until the flight process signs off or is gone."""
         waits = select.poll()
         for one in (self._channel, self._vehicle, self._ground):
             waits.register(one, select.POLLIN)
@@ -109,7 +109,7 @@ class Relay:
                 self._say(message)
 
     def _hear(self) -> bool:
-        """What the flight process says; False: the channel has ended."""
+        """Process messages of the flight process; returns False when the channel has ended."""
         for _ in range(_ROUND_DATAGRAMS):
             try:
                 data = self._channel.recv(CHANNEL_MAX_BYTES)
@@ -151,7 +151,7 @@ class Relay:
                     self._vehicle.send(frame)
 
     def _report(self, now_s: float) -> None:
-        """What was refused, a line for each new reason and then every so often how many."""
+        """Report refused messages: a line for each new reason, and the counts at intervals."""
         if self._door.refused == self._told or now_s < self._report_s:
             return
         self._report_s = now_s + _REPORT_S
@@ -174,7 +174,7 @@ class Relay:
 
 
 def _received(source: socket.socket) -> list[bytes]:
-    """What waits, up to a round's worth."""
+    """Return the waiting datagrams, up to one round's limit."""
     datagrams = []
     for _ in range(_ROUND_DATAGRAMS):
         try:

@@ -1,8 +1,9 @@
-"""QGroundControl, or any other MAVLink ground station: what PX4 says goes there, what the station says goes to PX4.
+"""Link to QGroundControl or any other MAVLink ground station: PX4's messages go there, the station's messages go to PX4.
 
-MAVSDK forwards between PX4's connection and a second one on loopback. It asks no message which connection it came by: a HEARTBEAT with
-PX4's ids that came from the ground would be PX4's to it. So the second connection ends at a process (`ground_relay`) that lets nothing
-of the kind through, and that also says the companion's own words: a call here costs the control tick one send on a local socket.
+MAVSDK forwards between PX4's connection and a second one on loopback. It does not distinguish the connections of messages: a HEARTBEAT
+with PX4's ids from the ground would count as PX4's. The second connection therefore ends at a process
+(`companion.io.qgroundcontrol.relay`) that blocks such messages and also sends the companion's own texts. A call here costs the control
+tick one send on a local socket.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from companion.io.qgroundcontrol.channel import pack, unpack
 from companion.model.types import AutopilotRequest, Inputs, LinkIdentity, Outputs
 
 VALUES_EVERY = 50
-"""Ticks: 4 Hz of a control loop of 200 Hz."""
+"""Ticks between values: 4 Hz at a control rate of 200 Hz."""
 _FORM = "udpout://HOST:14550"
 _ADDRESS = re.compile(r"udpout://(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>\d{1,5})")
 _RESOLVE_DEADLINE_S = 5.0
@@ -31,29 +32,29 @@ _START_DEADLINE_S = 10.0
 _END_DEADLINE_S = 2.0
 _MESSAGES_PER_CALL = 8
 _TEXT_MAX = 400
-"""Characters of a line from the relay; what is beyond is cut off."""
+"""Largest length of a line from the relay; the rest is truncated."""
 
 
 class Forwarder(Protocol):
-    """The autopilot edge, as far as a ground station needs it."""
+    """The part of the autopilot driver that a ground station needs."""
 
     def identity(self) -> LinkIdentity:
-        """Who speaks to whom on the link to PX4."""
+        """Return the ids of both ends of the link to PX4."""
 
     async def forward_to(self, port: int) -> int:
-        """Open MAVSDK's second connection to that UDP port of 127.0.0.1; the port it speaks from."""
+        """Open MAVSDK's second connection to a UDP port of 127.0.0.1; returns its own port."""
 
 
 def ground_error(address: str, expected: str, found: str, fix: str) -> DeviceError:
-    """The one line that a person gets."""
+    """Return the error with its one line for the user."""
     return DeviceError(f"ground.qgroundcontrol {address}: expected {expected}, found {found}; {fix}")
 
 
 def check_address(address: str) -> tuple[str, int]:
-    """Host, without brackets, and port.
+    """Return host, without brackets, and port.
 
     Raises:
-        DeviceError: it is none.
+        DeviceError: the address is invalid.
     """
     match = _ADDRESS.fullmatch(address)
     if match is None:
@@ -65,11 +66,11 @@ def check_address(address: str) -> tuple[str, int]:
 
 
 class GroundStation:
-    """The edge. Entered after the autopilot's, which must have been made with `forwarding`, and left before it.
+    """Driver of the link. Enter it after the autopilot's, which must have been made with `forwarding`, and leave it before.
 
     Args:
         address: `udpout://HOST:PORT`.
-        autopilot: open.
+        autopilot: open driver.
         while_armed: as `ground.qgroundcontrol_while_armed`.
         console: as `ground.qgroundcontrol_console`.
     """
@@ -83,26 +84,26 @@ class GroundStation:
         self._phase: str | None = None
         self._messages: list[str] = []
         self.vehicle_port = 0
-        """UDP port on loopback that MAVSDK's second connection has; 0: not open."""
+        """UDP port on loopback of MAVSDK's second connection; 0 if it is not open."""
 
     @property
     def relay_pid(self) -> int | None:
-        """The relay's process."""
+        """Return the relay's process id."""
         return self._process.pid if self._process is not None else None
 
     @property
     def line(self) -> str:
-        """What a person is to know when it is on: one line."""
+        """Return one line about the open link for the operator."""
         return (
             f"MAVLink goes to and from {self.address}: whoever speaks from there can change PX4's mode and, while it is disarmed, its"
             f" parameters{', and all of it in flight' if self._while_armed else ''}, but never what the companion knows"
         )
 
     async def __aenter__(self) -> Self:
-        """Find the host, start the relay, open MAVSDK's connection to it. Nobody has to be there.
+        """Resolve the host, start the relay, open MAVSDK's connection to it. The ground station need not be present.
 
         Raises:
-            DeviceError: the address is none, the host has none, or the relay does not start; nothing is left open.
+            DeviceError: the address or its host is invalid, or the relay does not start; nothing stays open.
         """
         host = await self._resolve(*check_address(self.address))
         try:
@@ -117,12 +118,12 @@ class GroundStation:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """The relay says nothing more. MAVSDK's connection ends with the autopilot's link."""
+        """Stop the relay's output. MAVSDK's connection ends with the autopilot's link."""
         self._send({"bye": True})
         await self._close()
 
     def tell(self, inputs: Inputs, outputs: Outputs) -> None:
-        """What one tick has to tell: events and phase changes at once, values at 4 Hz. Never waits; what does not fit is lost."""
+        """Send a tick's news: events and phase changes at once, values at 4 Hz. Never waits; what does not fit is dropped."""
         if self._channel is None:
             return
         texts = [words.event_text(event) for event in outputs.events]
@@ -146,7 +147,9 @@ class GroundStation:
             self._send(said)
 
     def take_messages(self) -> list[str]:
-        """Lines for people since the last call: a ground station came, messages were refused, the relay is gone. Never waits."""
+        """Return lines for the operator since the last call: a ground station appeared, messages were refused, the relay is gone. Never
+        waits.
+        """
         for _ in range(_MESSAGES_PER_CALL):
             if self._channel is None:
                 break
@@ -181,7 +184,7 @@ class GroundStation:
         return ip, port
 
     async def _start(self, ip: str, port: int) -> int:
-        """Start the relay; its UDP port on loopback."""
+        """Start the relay; returns its UDP port on loopback."""
         self._channel = ours = self._spawn(ip, port)
         try:
             async with asyncio.timeout(_START_DEADLINE_S):
@@ -197,7 +200,7 @@ class GroundStation:
         return relay_port
 
     def _spawn(self, ip: str, port: int) -> socket.socket:
-        """The channel to the relay, which is starting."""
+        """Start the relay's process and return the channel to it."""
         identity = self._autopilot.identity()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.setblocking(False)

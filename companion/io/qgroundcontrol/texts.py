@@ -1,6 +1,6 @@
-"""What the companion itself says to a MAVLink ground station: STATUSTEXT and NAMED_VALUE_FLOAT. Pure: no socket, no clock.
+"""The companion's own messages to a MAVLink ground station: STATUSTEXT and NAMED_VALUE_FLOAT. Pure: no socket, no clock.
 
-It speaks as component 191 (MAV_COMP_ID_ONBOARD_COMPUTER) of the vehicle, and to the ground alone: PX4 never hears it.
+They come from component 191 (MAV_COMP_ID_ONBOARD_COMPUTER) of the vehicle and go to the ground only; PX4 does not receive them.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction,
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
 TEXT_BYTES = 50
-"""Of STATUSTEXT.text."""
+"""Size of STATUSTEXT.text."""
 TEXT_MAX_BYTES = 4 * TEXT_BYTES
 TEXT_RATE_HZ = 5.0
 TEXT_BURST = 10
 TEXTS_WAITING_MAX = 20
 VALUE_NAMES = ("slack_m", "stop_slk_m", "e_p_m", "e_q_deg", "rho", "payload_kg", "progress")
-"""NAMED_VALUE_FLOAT.name, 10 characters at most."""
+"""Values of NAMED_VALUE_FLOAT.name, 10 characters at most."""
 
 _EMERGENCY, _CRITICAL, _WARNING, _NOTICE, _INFO = 0, 2, 4, 5, 6
 _SEVERITIES = {Severity.INFO: _INFO, Severity.WARNING: _WARNING, Severity.CRITICAL: _CRITICAL}
@@ -31,31 +31,31 @@ _OUTCOMES = {Outcome.COMPLETED: _NOTICE, Outcome.REFUSED: _WARNING, Outcome.ABOR
 
 FLOAT32_MAX = 3.4e38
 Text = tuple[int, str]
-"""MAV_SEVERITY and the words."""
+"""MAV_SEVERITY and the text."""
 
 
 def event_text(event: Event) -> Text:
-    """An event for people who look at the sky: what is done first, if anything is."""
+    """Return the text of an event, with the action first if there is one."""
     done = event.action.rank >= SafetyAction.HOLD.rank
     text = f"{event.action.value.replace('_', ' ').upper()}: {event.text}" if done else event.text
     return _SEVERITIES[event.severity], text
 
 
 def phase_text(phase: str) -> Text:
-    """A phase that has begun."""
+    """Return the text for the begin of a phase."""
     return _INFO, f"phase {phase}"
 
 
 def outcome_text(outcome: Outcome) -> Text:
-    """The end of the flight."""
+    """Return the text for the end of the flight."""
     return _OUTCOMES.get(outcome, _CRITICAL), f"flight {outcome.value}"
 
 
 def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
-    """By `VALUE_NAMES`; what is not known is left out.
+    """Return the known values by `VALUE_NAMES`.
 
-    Metres for the tether's slack, the slack where the vehicle could stop, and the position error; degrees for the angle between
-    attitude and setpoint; kg; rho of the control law; progress 0 to 1.
+    Metres for the tether's slack, the slack at the stopping position, and the position error; degrees for the angle between attitude
+    and setpoint; kg; rho of the control law; progress 0 to 1.
     """
     found = {"progress": outputs.progress}
     if (tether := outputs.tether) is not None:
@@ -71,7 +71,9 @@ def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
 
 
 class Texts:
-    """STATUSTEXTs, few enough for a slow link: 10 at once, then 5 a second, the gravest first; what is too much is counted and said."""
+    """STATUSTEXTs at a rate for a slow link: bursts of 10, then 5 per second, the most severe first. Dropped texts are counted and
+    reported.
+    """
 
     def __init__(self) -> None:
         self._waiting: deque[Text] = deque()
@@ -80,14 +82,14 @@ class Texts:
         self._number = 0
 
     def say(self, severity: int, text: str) -> None:
-        """Put one in line; when the line is full the least grave one leaves it, the oldest of those."""
+        """Queue a text. A full queue drops the least severe one, the oldest of those."""
         self._waiting.append((severity, text))
         if len(self._waiting) > TEXTS_WAITING_MAX:
             self._waiting.remove(max(self._waiting, key=lambda one: one[0]))
             self._left_out += 1
 
     def due(self, now_s: float) -> list[Any]:
-        """STATUSTEXT messages to send now."""
+        """Return the STATUSTEXT messages to send now."""
         messages: list[Any] = []
         while self._waiting and self._bucket.take(now_s):
             severity, text = min(self._waiting, key=lambda one: one[0])
@@ -99,7 +101,9 @@ class Texts:
         return messages
 
     def _chunks(self, severity: int, text: str) -> list[Any]:
-        """One message, or several with a common id that is not 0; one that fills its last chunk is ended by an empty one."""
+        """Return one message, or several with a common id other than 0. A text that fills its last chunk is followed by an
+        empty one.
+        """
         data = "".join(c if c.isascii() and c.isprintable() else "?" for c in " ".join(text.split())).encode()
         if len(data) > TEXT_MAX_BYTES:
             data = data[: TEXT_MAX_BYTES - 3] + b"..."
@@ -113,7 +117,7 @@ class Texts:
 
 
 def value_messages(time_boot_ms: int, named: Mapping[str, float]) -> list[Any]:
-    """NAMED_VALUE_FLOAT of each; what is no number of 32 bits is left out."""
+    """Return a NAMED_VALUE_FLOAT for each value that fits into 32 bits."""
     return [
         mavlink.MAVLink_named_value_float_message(time_boot_ms & 0xFFFFFFFF, name.encode(), value)
         for name, value in named.items()
@@ -122,7 +126,9 @@ def value_messages(time_boot_ms: int, named: Mapping[str, float]) -> list[Any]:
 
 
 def heartbeat_message() -> Any:
-    """MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE: no ground station makes a vehicle of its own of it."""
+    """Return a HEARTBEAT with MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE, which no ground station shows as a
+    vehicle.
+    """
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
     )
