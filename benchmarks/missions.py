@@ -28,7 +28,7 @@ from typing import Any
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.manipulator import Manipulator
 from companion.mission.check import check_mission
-from companion.mission.check_judge import TRACKING_M
+from companion.mission.sample_check import TRACKING_M
 from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 from companion.safety.governor import BODY_TOP_M

@@ -25,7 +25,7 @@ from companion.io.mocap.natnet import ServerInfo
 from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_ABORTED
 from companion.model.rows import refusals
-from companion.preflight.hand_test import judge as hand_judge
+from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test.run import HandResult
 from companion.runtime.clock import flight_clock
 from companion.runtime.console import console_on, tell
@@ -191,10 +191,10 @@ async def _carried(config: FlightConfig, console: Console, *, json: bool) -> Res
     if isinstance(outcome, str):
         if outcome == ENDED_BY_HAND:
             return None
-        return Result([hand_judge.ended(outcome, "companion mocap align")], {"alignment": None})
+        return Result([hand_test_evaluation.ended(outcome, "companion mocap align")], {"alignment": None})
     up_axis, start = config.vehicle.devices.mocap.up_axis, config.mission.start
     found = mocap_align.alignment(outcome, up_axis, math.radians(start.yaw_deg))
-    rows = hand_judge.rows(outcome, up_axis)
+    rows = hand_test_evaluation.rows(outcome, up_axis)
     world = mocap_align.world_row(found, start.yaw_tolerance_deg)
     changes = mocap_align.changes(found, up_axis) if refusals(rows) else {}
     rows += [world] if world is not None else []

@@ -14,8 +14,8 @@ from companion.model.types import AttitudeSetpoint, AutopilotRequest, AutopilotS
 from companion.runtime import ipc
 from companion.runtime.clock import Clock
 
-HAND_OVER_S = 30.0
-HAND_OVER_MIN_S = 1.5
+LANDING_TIMEOUT_S = 30.0
+STATUS_MIN_AGE_S = 1.5
 """PX4 says once a second whether it is armed; an older word does not count."""
 UNFLOWN_HOVER_THRUST = 0.5
 """Hover thrust for a vehicle that was found in the air: the core requires one, and its law never runs there."""
@@ -34,7 +34,9 @@ class Lander(Protocol):
         """Start a request."""
 
 
-async def hand_over(autopilot: Lander, channel: socket.socket, clock: Clock, guardian: FlightGuard | None) -> Outcome:
+async def land_without_core(
+    autopilot: Lander, channel: socket.socket, clock: Clock, guardian: FlightGuard | None
+) -> Outcome:
     """Ask PX4 to land, and watch; people who fly are left alone, for as long as they do. PX4 disarms by itself: COM_DISARM_LAND.
 
     Args:
@@ -44,15 +46,15 @@ async def hand_over(autopilot: Lander, channel: socket.socket, clock: Clock, gua
         guardian: told that this process is alive.
 
     Returns:
-        ABORTED once PX4 has disarmed, LOST if it has not within `HAND_OVER_S`.
+        ABORTED once PX4 has disarmed, LOST if it has not within `LANDING_TIMEOUT_S`.
     """
     # MAVSDK's Offboard plugin would go on repeating the last setpoint, and PX4's own failsafe would never act.
     with contextlib.suppress(Exception):  # whatever it is, LAND must be requested
         autopilot.send_attitude(None)
     start_s = clock()
-    while clock() - start_s < HAND_OVER_S:
+    while clock() - start_s < LANDING_TIMEOUT_S:
         now = autopilot.status()
-        if now is not None and not now.armed and clock() - start_s > HAND_OVER_MIN_S:
+        if now is not None and not now.armed and clock() - start_s > STATUS_MIN_AGE_S:
             return Outcome.ABORTED
         if people_fly(now):
             start_s = clock()

@@ -22,7 +22,7 @@ from companion.config.loader import FlightConfig
 from companion.core.flight_core import NOMINAL_DT_S, FlightCore
 from companion.flight.command_effect import effect_of
 from companion.flight.command_queue import GivenUp, Operator
-from companion.flight.fallback_landing import hand_over, unflown
+from companion.flight.fallback_landing import land_without_core, unflown
 from companion.flight.heartbeat import FlightGuard
 from companion.flight.startup import Checked, Refused, check_before_flight, with_hover_thrust
 from companion.flight.ticker import Ticker
@@ -309,7 +309,7 @@ async def fly(
             if not edges.found_armed:
                 raise
             print(error, file=sys.stderr)  # no log, but a landing
-            outcome = await hand_over(edges.autopilot, channel, clock, None)
+            outcome = await land_without_core(edges.autopilot, channel, clock, None)
             ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
             return outcome
         try:
@@ -335,7 +335,7 @@ async def fly(
                     sys.stderr.flush()
                 if guardian is not None and guardian.would_take_over:
                     os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
-                outcome = await hand_over(edges.autopilot, channel, clock, guardian)
+                outcome = await land_without_core(edges.autopilot, channel, clock, guardian)
             if guardian is not None and outcome is not Outcome.LOST:
                 guardian.goodbye(edges.autopilot.status())
         finally:

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.mission.check_judge import CATCH_NEAR_M, STOP, Judge, Violation
 from companion.mission.minsnap import Progress
 from companion.mission.plan import Plan
+from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck, Violation
 from companion.mission.segments import Segment
 from companion.model.frames import wrap_rad
 from companion.model.types import PhaseKind, Reference, Vec2, Vec3
@@ -58,7 +58,7 @@ def check_mission(
     plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad, progress)
     problems = check_start(mission, vehicle, position, yaw_rad, start_arm_rad)
     problems += [*_speed(mission, vehicle), *_whole(mission, vehicle, plan, phase_origins)]
-    judge = Judge(mission, vehicle)
+    samples = SampleCheck(mission, vehicle)
     told: dict[str, str] = {}
     where: dict[str, set[int]] = {}
     also: dict[str, list[str]] = {}
@@ -66,11 +66,11 @@ def check_mission(
     for segment in plan.segments:
         if segment.repetition != repetition:
             repetition = segment.repetition
-            judge.begin_repetition(repetition)
+            samples.begin_repetition(repetition)
         worst: dict[str, tuple[Violation, float, Reference]] = {}
         for t_s in _samples(segment):
             reference = plan.reference(t_s)
-            for violation in judge.violations(t_s, reference, plan.jerks(t_s), segment.kind):
+            for violation in samples.violations(t_s, reference, plan.jerks(t_s), segment.kind):
                 known = worst.get(violation.limit)
                 if known is None or violation.excess > known[0].excess:
                     worst[violation.limit] = (violation, t_s, reference)
@@ -91,7 +91,7 @@ def check_mission(
             )
     for limit, text in told.items():
         problems.append(text + (f" (also in {', '.join(also[limit])})" if also[limit] else ""))
-    turns = judge.turns_in_the_end(mission.repeat)
+    turns = samples.turns_in_the_end(mission.repeat)
     if "turns" not in told and turns > vehicle.tether.turns_max:
         problems.append(
             f"mission '{mission.name}': its {mission.repeat} repetitions wind up the tether: {turns:.2f} turns about anchor or vehicle "

@@ -139,7 +139,7 @@ def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iter
     poses = [pose for pose in observations.mocap if pose.tracking_valid]
     states = observations.vehicle
     if len(poses) < SAMPLES_MIN or len(states) < SAMPLES_MIN:
-        read = f"{len(poses)} tracked poses and {len(states)} states of PX4 to judge by"
+        read = f"{len(poses)} tracked poses and {len(states)} states of PX4"
         yield REST.bad(read, f"{SAMPLES_MIN} of each", "see motion capture and PX4's link")
         return
     rest = _rest(poses, states)

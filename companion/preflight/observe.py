@@ -81,7 +81,7 @@ async def observe(
         clock: the flight clock.
         out: folder of the flight's files, for the free disk space.
         param_names: PX4's parameters to read.
-        unsettled: called after the time, with the last `preflight_s`; see `companion.preflight.judge.unsettled`.
+        unsettled: called after the time, with the last `preflight_s`; see `companion.preflight.evaluation.unsettled`.
         tell: progress callback.
         known: facts from elsewhere: plan, recorder, mission length, hand test.
     """

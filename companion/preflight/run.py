@@ -12,7 +12,7 @@ from companion.config.loader import FlightConfig
 from companion.io.devices import Edges, SomeEdges
 from companion.model.observations import Observations
 from companion.model.rows import Row, refusals
-from companion.preflight import judge
+from companion.preflight import evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.observe import Tell, observe
 from companion.runtime.clock import Clock
@@ -49,12 +49,12 @@ async def preflight(
         config,
         clock,
         out=out,
-        param_names=judge.param_names(),
-        unsettled=lambda o: judge.unsettled(o, config),
+        param_names=evaluation.param_names(),
+        unsettled=lambda o: evaluation.unsettled(o, config),
         tell=tell,
         known=known,
     )
-    return judge.rows(seen, config)
+    return evaluation.rows(seen, config)
 
 
 def _hand_test(config: FlightConfig, natnet_version: str) -> tuple[str, str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from companion.flight.fallback_landing import hand_over
+from companion.flight.fallback_landing import land_without_core
 from companion.model.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, Outcome
 
 
@@ -39,6 +39,6 @@ def test_setpoints_end_before_landing_is_requested(breaks: bool) -> None:
     times_s = iter([0.0, *(10.0 * n for n in range(9))])
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
-        outcome = asyncio.run(hand_over(link, ours, lambda: next(times_s), None))
+        outcome = asyncio.run(land_without_core(link, ours, lambda: next(times_s), None))
     assert outcome is Outcome.LOST
     assert link.left[:2] == [None, AutopilotRequest.LAND]

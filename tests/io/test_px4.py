@@ -290,7 +290,7 @@ def test_offboard_arm_land_disarm_reach_px4_as_commands() -> None:
                 autopilot.request(AutopilotRequest.DISARM)
                 await eventually(lambda: len(peer.commands(ARM_DISARM)) == 2, "DISARM")
                 autopilot.request(AutopilotRequest.NONE)
-                await eventually(lambda: autopilot._desk.pending() == 0, "the answers")
+                await eventually(lambda: autopilot._requests.pending() == 0, "the answers")
             mode = peer.commands(DO_SET_MODE)[0]
             assert (mode.param1, mode.param2) == (1.0, 6.0)
             assert [command.param1 for command in peer.commands(ARM_DISARM)] == [1.0, 0.0]
@@ -336,7 +336,7 @@ def test_a_repeated_request_is_one_command_and_its_refusals_are_told_once_in_wor
                 assert clock() - start_s >= 1.0  # a lower bound: at most one command each 0.5 s
                 said: list[str] = []
                 await eventually(
-                    lambda: said.extend(autopilot.take_messages()) or autopilot._desk.pending() == 0,  # type: ignore[func-returns-value]
+                    lambda: said.extend(autopilot.take_messages()) or autopilot._requests.pending() == 0,  # type: ignore[func-returns-value]
                     "the answers",
                 )
                 said += autopilot.take_messages()

@@ -8,7 +8,7 @@ import math
 import pytest
 
 from companion.io.px4 import messages
-from companion.io.px4.requests import ANSWER_DEADLINE_S, RETRY_S, SETTLE_S, RequestDesk
+from companion.io.px4.requests import ANSWER_DEADLINE_S, RETRY_S, SETTLE_S, RequestQueue
 from companion.io.px4.texts import SAME_TEXT_S
 from companion.model.types import AttitudeSetpoint, AutopilotRequest, FlightMode, LandedState
 
@@ -75,67 +75,67 @@ def test_answers_in_words() -> None:
 
 
 def test_a_request_repeated_in_every_tick_is_one_command_until_it_is_answered() -> None:
-    desk = RequestDesk()
-    assert desk.claim(ARM, 0.0)
-    assert not any(desk.claim(ARM, tick * 0.005) for tick in range(1, 500))
-    assert desk.pending() == 1
-    desk.answer(ARM, "denied", 2.5)
-    assert desk.claim(ARM, 2.5)
-    assert desk.take_messages(2.5) == ["ARM refused: denied"]
-    assert desk.take_messages(2.5) == []
+    requests = RequestQueue()
+    assert requests.claim(ARM, 0.0)
+    assert not any(requests.claim(ARM, tick * 0.005) for tick in range(1, 500))
+    assert requests.pending() == 1
+    requests.answer(ARM, "denied", 2.5)
+    assert requests.claim(ARM, 2.5)
+    assert requests.take_messages(2.5) == ["ARM refused: denied"]
+    assert requests.take_messages(2.5) == []
 
 
 def test_a_refused_request_waits_half_a_second_from_command_to_command() -> None:
-    desk = RequestDesk()
-    assert desk.claim(ARM, 0.0)
-    desk.answer(ARM, "denied", 0.01)
-    assert not desk.claim(ARM, RETRY_S - 0.001)
-    assert desk.claim(ARM, RETRY_S)
+    requests = RequestQueue()
+    assert requests.claim(ARM, 0.0)
+    requests.answer(ARM, "denied", 0.01)
+    assert not requests.claim(ARM, RETRY_S - 0.001)
+    assert requests.claim(ARM, RETRY_S)
 
 
 def test_the_same_refusal_is_told_again_only_after_a_while() -> None:
-    desk = RequestDesk()
+    requests = RequestQueue()
     for t_s in (0.0, 1.0, SAME_TEXT_S):
-        assert desk.claim(ARM, t_s)
-        desk.answer(ARM, "denied", t_s)
-    assert desk.take_messages(SAME_TEXT_S) == ["ARM refused: denied"] * 2
+        assert requests.claim(ARM, t_s)
+        requests.answer(ARM, "denied", t_s)
+    assert requests.take_messages(SAME_TEXT_S) == ["ARM refused: denied"] * 2
 
 
 def test_an_accepted_request_waits_for_the_heartbeat_that_shows_it() -> None:
-    desk = RequestDesk()
-    assert desk.claim(ARM, 0.0)
-    desk.answer(ARM, None, 0.01)
-    assert not desk.claim(ARM, SETTLE_S)
-    assert desk.claim(ARM, 0.01 + SETTLE_S)
-    assert desk.take_messages(2.0) == []
+    requests = RequestQueue()
+    assert requests.claim(ARM, 0.0)
+    requests.answer(ARM, None, 0.01)
+    assert not requests.claim(ARM, SETTLE_S)
+    assert requests.claim(ARM, 0.01 + SETTLE_S)
+    assert requests.take_messages(2.0) == []
 
 
 def test_land_never_waits_for_another_kind() -> None:
-    desk = RequestDesk()
-    assert desk.claim(AutopilotRequest.OFFBOARD, 0.0)
-    assert desk.claim(ARM, 0.0)
-    assert desk.claim(LAND, 0.0)
-    assert not desk.claim(NONE, 0.0)
-    assert desk.pending() == 3
+    requests = RequestQueue()
+    assert requests.claim(AutopilotRequest.OFFBOARD, 0.0)
+    assert requests.claim(ARM, 0.0)
+    assert requests.claim(LAND, 0.0)
+    assert not requests.claim(NONE, 0.0)
+    assert requests.pending() == 3
 
 
 def test_a_lost_answer_does_not_block_the_request_for_ever() -> None:
-    desk = RequestDesk()
-    assert desk.claim(LAND, 0.0)
-    assert not desk.claim(LAND, ANSWER_DEADLINE_S - 0.001)
-    assert desk.claim(LAND, ANSWER_DEADLINE_S)
-    assert desk.take_messages(ANSWER_DEADLINE_S) == ["LAND: no answer within 3 s, asking again"]
+    requests = RequestQueue()
+    assert requests.claim(LAND, 0.0)
+    assert not requests.claim(LAND, ANSWER_DEADLINE_S - 0.001)
+    assert requests.claim(LAND, ANSWER_DEADLINE_S)
+    assert requests.take_messages(ANSWER_DEADLINE_S) == ["LAND: no answer within 3 s, asking again"]
 
 
 def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:
-    desk = RequestDesk()
+    requests = RequestQueue()
     for number in range(500):
-        desk.hear({"severity": 2, "text": str(number), "id": number, "chunk_seq": 0}, 0.0)
-    assert desk.take_messages(0.0) == [f"critical: {number}" for number in range(300, 500)]
+        requests.hear({"severity": 2, "text": str(number), "id": number, "chunk_seq": 0}, 0.0)
+    assert requests.take_messages(0.0) == [f"critical: {number}" for number in range(300, 500)]
 
 
 def test_a_text_that_may_go_on_is_told_when_messages_are_taken_later() -> None:
-    desk = RequestDesk()
-    desk.hear({"severity": 2, "text": "x" * 50, "id": 1, "chunk_seq": 0}, 0.0)
-    assert desk.take_messages(0.1) == []
-    assert desk.take_messages(1.0) == [f"critical: {'x' * 50}"]
+    requests = RequestQueue()
+    requests.hear({"severity": 2, "text": "x" * 50, "id": 1, "chunk_seq": 0}, 0.0)
+    assert requests.take_messages(0.1) == []
+    assert requests.take_messages(1.0) == [f"critical: {'x' * 50}"]

@@ -1,4 +1,4 @@
-"""What gets through the door to a ground station, message by message; frames come from pymavlink."""
+"""What passes the filters to and from a ground station, message by message; frames come from pymavlink."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from companion.io.qgroundcontrol.door import Door
-from companion.io.qgroundcontrol.frames import GROUND_SYSTEMS_MAX, STREAM_RATE_HZ, UP_BURST, UP_RATE_HZ, Thinner
+from companion.io.qgroundcontrol.frames import GROUND_SYSTEMS_MAX, STREAM_RATE_HZ, UP_BURST, UP_RATE_HZ, DownlinkFilter
 from companion.io.qgroundcontrol.texts import TEXTS_WAITING_MAX, VALUE_NAMES, Texts, event_text, value_messages, values
+from companion.io.qgroundcontrol.uplink_filter import UplinkFilter
 from companion.model.types import Event, SafetyAction, Severity
 from tests.analysis.synthetic_flight import synthetic_flight
 
@@ -41,10 +41,10 @@ def px4_heartbeat(*, armed: bool, system: int = VEHICLE) -> bytes:
     return packed(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, base_mode, 0, 4, 3), system, 1)
 
 
-def door_of(*, armed: bool, while_armed: bool = False, console: bool = False) -> Door:
-    door = Door(VEHICLE, while_armed=while_armed, console=console)
-    door.state.hear(px4_heartbeat(armed=armed), 0.0)
-    return door
+def uplink_of(*, armed: bool, while_armed: bool = False, console: bool = False) -> UplinkFilter:
+    uplink = UplinkFilter(VEHICLE, while_armed=while_armed, console=console)
+    uplink.state.hear(px4_heartbeat(armed=armed), 0.0)
+    return uplink
 
 
 def signed(message: Any) -> bytes:
@@ -65,9 +65,9 @@ def signed(message: Any) -> bytes:
     ],
 )
 def test_what_a_ground_station_says_passes_unchanged(data: bytes) -> None:
-    door = door_of(armed=False)
-    assert door.admit(data, 0.0) == [data]
-    assert not door.refused
+    uplink = uplink_of(armed=False)
+    assert uplink.admit(data, 0.0) == [data]
+    assert not uplink.refused
 
 
 def long(number: int, *params: float) -> Any:
@@ -132,11 +132,11 @@ _CONSOLE = mavlink.MAVLink_serial_control_message(10, 2, 0, 0, 6, [*b"reboot", *
 @pytest.mark.parametrize("name", _DANGEROUS)
 def test_what_may_stop_rotors_or_change_the_flight_waits_until_px4_is_disarmed(name: str, v1: bool) -> None:
     data = packed(_DANGEROUS[name], v1=v1)
-    door = door_of(armed=True)
-    assert door.admit(data, 0.1) == []
-    assert all(reason.endswith("while PX4 is armed") for reason in door.refused)
-    assert door_of(armed=True, while_armed=True).admit(data, 0.1) == [data], "asked for"
-    assert door_of(armed=False).admit(data, 0.1) == [data]
+    uplink = uplink_of(armed=True)
+    assert uplink.admit(data, 0.1) == []
+    assert all(reason.endswith("while PX4 is armed") for reason in uplink.refused)
+    assert uplink_of(armed=True, while_armed=True).admit(data, 0.1) == [data], "asked for"
+    assert uplink_of(armed=False).admit(data, 0.1) == [data]
 
 
 @pytest.mark.parametrize("v1", [False, True], ids=["MAVLink 2", "MAVLink 1"])
@@ -154,7 +154,7 @@ def test_what_may_stop_rotors_or_change_the_flight_waits_until_px4_is_disarmed(n
 )
 def test_what_lands_holds_or_reads_passes_while_px4_is_armed(message: Any, v1: bool) -> None:
     data = packed(message, v1=v1)
-    assert door_of(armed=True).admit(data, 0.1) == [data]
+    assert uplink_of(armed=True).admit(data, 0.1) == [data]
 
 
 @pytest.mark.parametrize(
@@ -171,26 +171,26 @@ def test_px4s_console_is_open_on_the_ground_alone_and_only_when_asked_for(
     armed: bool, while_armed: bool, console: bool, passes: bool
 ) -> None:
     data = packed(_CONSOLE)
-    door = door_of(armed=armed, while_armed=while_armed, console=console)
-    assert door.admit(data, 0.1) == ([data] if passes else [])
+    uplink = uplink_of(armed=armed, while_armed=while_armed, console=console)
+    assert uplink.admit(data, 0.1) == ([data] if passes else [])
 
 
 def test_px4_counts_as_armed_until_it_says_that_it_is_not_and_when_it_falls_silent() -> None:
     data = packed(_DANGEROUS["forced disarm"])
-    door = Door(VEHICLE)
-    assert door.admit(data, 0.0) == [], "nothing heard yet"
-    door.state.hear(px4_heartbeat(armed=False, system=7), 0.0)
-    door.state.hear(px4_heartbeat(armed=False)[:-1], 0.0)
-    assert door.admit(data, 0.1) == [], "another system's, and one that is cut"
-    door.state.hear(px4_heartbeat(armed=False), 0.2)
-    assert door.admit(data, 0.3) == [data]
-    assert door.admit(data, 3.3) == [], "silent for more than 3 s"
-    door.state.hear(px4_heartbeat(armed=False), 4.0)
-    door.state.expect_arming(4.1)
-    door.state.hear(px4_heartbeat(armed=False), 4.2)
-    assert door.admit(data, 4.3) == [], "the companion has asked for arming"
-    door.state.hear(px4_heartbeat(armed=False), 8.0)
-    assert door.admit(data, 8.1) == [data], "PX4 did not arm"
+    uplink = UplinkFilter(VEHICLE)
+    assert uplink.admit(data, 0.0) == [], "nothing heard yet"
+    uplink.state.hear(px4_heartbeat(armed=False, system=7), 0.0)
+    uplink.state.hear(px4_heartbeat(armed=False)[:-1], 0.0)
+    assert uplink.admit(data, 0.1) == [], "another system's, and one that is cut"
+    uplink.state.hear(px4_heartbeat(armed=False), 0.2)
+    assert uplink.admit(data, 0.3) == [data]
+    assert uplink.admit(data, 3.3) == [], "silent for more than 3 s"
+    uplink.state.hear(px4_heartbeat(armed=False), 4.0)
+    uplink.state.expect_arming(4.1)
+    uplink.state.hear(px4_heartbeat(armed=False), 4.2)
+    assert uplink.admit(data, 4.3) == [], "the companion has asked for arming"
+    uplink.state.hear(px4_heartbeat(armed=False), 8.0)
+    assert uplink.admit(data, 8.1) == [data], "PX4 did not arm"
 
 
 _QUAT = (1.0, 0.0, 0.0, 0.0)
@@ -208,10 +208,10 @@ _FORGED = [
 @pytest.mark.parametrize("system", [0, VEHICLE])
 @pytest.mark.parametrize("component", [1, 190, 195])
 def test_nothing_passes_in_the_vehicles_name(message: Any, system: int, component: int) -> None:
-    door = door_of(armed=False)
+    uplink = uplink_of(armed=False)
     for v1 in (False, True):
-        assert door.admit(packed(message, system, component, v1=v1), 0.0) == []
-    assert door.refused == {f"in the vehicle's name (system id {system})": 2}
+        assert uplink.admit(packed(message, system, component, v1=v1), 0.0) == []
+    assert uplink.refused == {f"in the vehicle's name (system id {system})": 2}
 
 
 @pytest.mark.parametrize(
@@ -232,9 +232,9 @@ def test_nothing_passes_in_the_vehicles_name(message: Any, system: int, componen
     ids=lambda message: message.get_type(),
 )
 def test_setpoints_estimates_sensors_and_the_flights_streams_are_not_the_grounds_to_touch(message: Any) -> None:
-    door = door_of(armed=False)
-    assert door.admit(packed(message), 0.0) == []
-    assert door.refused.total() == 1
+    uplink = uplink_of(armed=False)
+    assert uplink.admit(packed(message), 0.0) == []
+    assert uplink.refused.total() == 1
 
 
 def test_a_forged_frame_inside_of_another_or_behind_rubbish_does_not_get_out() -> None:
@@ -245,16 +245,16 @@ def test_a_forged_frame_inside_of_another_or_behind_rubbish_does_not_get_out() -
     )
     whole = bytes(broken)
     broken[-1] ^= 0xFF
-    door = door_of(armed=False)
+    uplink = uplink_of(armed=False)
     for data in (bytes(broken), whole[:-1], b"\x00" + forged, forged[:-1], bytes([0xFD, 40]) + forged, b""):
-        assert door.admit(data, 0.0) == []
+        assert uplink.admit(data, 0.0) == []
     # Whole, it is a file transfer whose content is its own affair; forged frames behind it are judged by themselves.
-    assert door.admit(whole + forged, 0.0) == [whole]
+    assert uplink.admit(whole + forged, 0.0) == [whole]
 
 
 def test_rubbish_of_every_kind_passes_nothing_and_breaks_nothing() -> None:
     random_bytes = random.Random(7)
-    door = door_of(armed=False)
+    uplink = uplink_of(armed=False)
     good = packed(_READ)
     for _ in range(3000):
         data = bytearray(random_bytes.choice((good, random_bytes.randbytes(random_bytes.randrange(300)))))
@@ -262,29 +262,29 @@ def test_rubbish_of_every_kind_passes_nothing_and_breaks_nothing() -> None:
             data[random_bytes.randrange(len(data))] ^= 1 << random_bytes.randrange(8)
         elif data:
             data[0] = random_bytes.choice((0xFD, 0xFE))
-        passed = door.admit(bytes(data), 0.0)
+        passed = uplink.admit(bytes(data), 0.0)
         # The checksum leaves out the start byte only, and a changed one starts no frame.
         assert passed == []
-    assert door.refused.total() >= 2900
+    assert uplink.refused.total() >= 2900
 
 
 def test_a_flood_is_cut_to_the_rate_and_counted() -> None:
-    door = door_of(armed=False)
+    uplink = uplink_of(armed=False)
     data = packed(_READ)
-    passed = sum(len(door.admit(data, i / 1000.0)) for i in range(10_000))
+    passed = sum(len(uplink.admit(data, i / 1000.0)) for i in range(10_000))
     assert passed == pytest.approx(UP_BURST + 10 * UP_RATE_HZ, abs=2)
-    assert door.refused == {"more than 100 messages a second": 10_000 - passed}
+    assert uplink.refused == {"more than 100 messages a second": 10_000 - passed}
 
 
 def test_many_system_ids_make_no_end_of_systems() -> None:
-    door = door_of(armed=False)
-    passed = [system for system in range(2, 256) if door.admit(packed(_HEARTBEAT, system), float(system))]
+    uplink = uplink_of(armed=False)
+    passed = [system for system in range(2, 256) if uplink.admit(packed(_HEARTBEAT, system), float(system))]
     assert passed == list(range(2, 2 + GROUND_SYSTEMS_MAX))
 
 
 def test_fast_streams_are_thinned_answers_are_not_and_the_numbers_have_no_gaps() -> None:
     px4 = mavlink.MAVLink(None, srcSystem=VEHICLE, srcComponent=1)
-    thinner, ground = Thinner((VEHICLE, 195)), mavlink.MAVLink(None)
+    downlink, ground = DownlinkFilter((VEHICLE, 195)), mavlink.MAVLink(None)
     heard: list[Any] = []
     for tick in range(1000):
         for message in (
@@ -293,9 +293,9 @@ def test_fast_streams_are_thinned_answers_are_not_and_the_numbers_have_no_gaps()
         ):
             data = message.pack(px4)
             px4.seq = (px4.seq + 1) % 256
-            for out in thinner.pick(data, tick * 0.005):
+            for out in downlink.pick(data, tick * 0.005):
                 heard += ground.parse_buffer(out) or []
-        assert thinner.pick(packed(_HEARTBEAT, VEHICLE, 195), tick * 0.005) == []
+        assert downlink.pick(packed(_HEARTBEAT, VEHICLE, 195), tick * 0.005) == []
     kinds = [message.get_type() for message in heard]
     assert kinds.count("PARAM_VALUE") == 1000
     assert kinds.count("ATTITUDE_QUATERNION") == pytest.approx(5 * STREAM_RATE_HZ, abs=1)
@@ -303,17 +303,17 @@ def test_fast_streams_are_thinned_answers_are_not_and_the_numbers_have_no_gaps()
 
 
 def test_a_stream_slower_than_the_limit_is_not_thinned() -> None:
-    thinner = Thinner((VEHICLE, 195))
+    downlink = DownlinkFilter((VEHICLE, 195))
     data = packed(mavlink.MAVLink_attitude_quaternion_message(1, *_QUAT, 0.0, 0.0, 0.0), VEHICLE, 1)
     rate_hz = 0.97 * STREAM_RATE_HZ
-    assert sum(len(thinner.pick(data, i / rate_hz)) for i in range(200)) == 200
+    assert sum(len(downlink.pick(data, i / rate_hz)) for i in range(200)) == 200
 
 
 def test_signed_frames_and_those_with_a_checksum_that_fits_nothing_keep_their_bytes() -> None:
-    thinner = Thinner((VEHICLE, 195))
+    downlink = DownlinkFilter((VEHICLE, 195))
     unknown = bytes([0xFD, 1, 0, 0, 77, VEHICLE, 1, 0xF0, 0xFF, 0x7F, 5, 0, 0])
     for data in (signed(_READ), unknown, unknown):
-        assert thinner.pick(data, 0.0) == [data]
+        assert downlink.pick(data, 0.0) == [data]
 
 
 def test_a_message_that_the_dialect_lacks_is_numbered_too() -> None:
@@ -325,8 +325,8 @@ def test_a_message_that_the_dialect_lacks_is_numbered_too() -> None:
         checksum = x25crc(data[1:] + bytes((extra,))).crc
         return data + struct.pack("<H", checksum)
 
-    thinner = Thinner((VEHICLE, 195))
-    assert [thinner.pick(frame(77 + 10 * i), 0.0) for i in range(3)] == [[frame(i)] for i in range(3)]
+    downlink = DownlinkFilter((VEHICLE, 195))
+    assert [downlink.pick(frame(77 + 10 * i), 0.0) for i in range(3)] == [[frame(i)] for i in range(3)]
 
 
 def _heard(messages: list[Any]) -> list[tuple[int, str]]:

@@ -17,7 +17,7 @@ from companion.launcher.cpu_contention import (
     longest_wait,
     read_core_waits,
 )
-from companion.preflight.judge import CHECKS
+from companion.preflight.evaluation import CHECKS
 from companion.safety.rules import RULES
 from tests.support import wait_until
 

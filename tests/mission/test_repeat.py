@@ -12,9 +12,9 @@ from pydantic import ValidationError
 from companion.config.loader import load_flight
 from companion.config.mission import Mission
 from companion.mission.check import check_mission
-from companion.mission.check_judge import Judge
 from companion.mission.course import Course
 from companion.mission.plan import Plan
+from companion.mission.sample_check import SampleCheck
 from companion.model.types import PhaseKind, Reference
 
 ROOT = Path(__file__).parents[2]
@@ -125,13 +125,13 @@ def test_a_thousand_repetitions_are_planned_as_two() -> None:
 
 def test_a_thousand_repetitions_are_checked_as_two(monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[float] = []
-    violations = Judge.violations
+    violations = SampleCheck.violations
 
-    def counting(judge: Judge, t_s: float, *rest: Any) -> Any:
+    def counting(judge: SampleCheck, t_s: float, *rest: Any) -> Any:
         judged.append(t_s)
         return violations(judge, t_s, *rest)
 
-    monkeypatch.setattr(Judge, "violations", counting)
+    monkeypatch.setattr(SampleCheck, "violations", counting)
     counts = []
     for repeat in (2, 1000):
         judged.clear()

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
-from companion.preflight import frames, judge
+from companion.preflight import evaluation, frames
 from companion.px4 import wanted
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel, ServoRefusal
@@ -56,7 +56,7 @@ def test_a_sound_world_may_fly_and_every_row_is_told(sandbox: Sandbox) -> None:
     assert not refusing(rows)
     # The simulated world has no port TELEM2, and nobody moves it by hand.
     params = {f"px4.param.{one.name}" for one in wanted.WANTED if not one.hardware and one.only in ("", "1.16")}
-    assert set(rows) == {check.id for check in judge.CHECKS} - {frames.HAND_TEST.id} | {"px4.firmware"} | params
+    assert set(rows) == {check.id for check in evaluation.CHECKS} - {frames.HAND_TEST.id} | {"px4.firmware"} | params
     assert all(row["read"] and row["why"] for row in rows.values())
 
 

@@ -13,7 +13,7 @@ from companion.model.frames import quat_rotate
 from companion.model.rows import Row, refusals
 from companion.model.types import MocapPose, Quat, Vec3
 from companion.preflight.axes import ALL, IDENTITY, MIRRORINGS, ROTATIONS, AxisMap
-from companion.preflight.hand_test import judge as hand_judge
+from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test.run import (
     SILENCE_MAX_S,
     STEP_TIMEOUT_S,
@@ -84,10 +84,10 @@ def felt_otherwise(course: Iterable[HandSample], turn: Callable[[Vec3], Vec3]) -
 @pytest.mark.parametrize("seed", range(8))
 def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
     measured = result(samples(f"seed={seed}"))
-    assert not failed(hand_judge.rows(measured, "z"))
+    assert not failed(hand_test_evaluation.rows(measured, "z"))
     # Far from the limits: what refuses is a wrong axis, not a shaking hand.
-    assert abs(hand_judge.yaw_offset_deg(measured.forward)) < 0.5 * hand_judge.YAW_MAX_DEG
-    assert hand_judge.best_axes(measured) == IDENTITY
+    assert abs(hand_test_evaluation.yaw_offset_deg(measured.forward)) < 0.5 * hand_test_evaluation.YAW_MAX_DEG
+    assert hand_test_evaluation.best_axes(measured) == IDENTITY
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -101,7 +101,7 @@ def test_a_biased_imu_and_slow_motion_capture_pass(seed: int) -> None:
             force, rate = (fx + 0.3, fy - 0.2, fz + 0.2), (wx + 0.02, wy - 0.02, wz + 0.03)
             vehicle = replace(vehicle, specific_force_body_m_s2=force, angular_rate_body_rad_s=rate)
         course.append(replace(sample, vehicle=vehicle))
-    assert not failed(hand_judge.rows(result(course), "z"))
+    assert not failed(hand_test_evaluation.rows(result(course), "z"))
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_a_biased_imu_and_slow_motion_capture_pass(seed: int) -> None:
     ],
 )
 def test_a_spoiled_frame_is_refused_and_named(spoiled: str, row: str, words: str) -> None:
-    refused = failed(hand_judge.rows(result(samples(spoiled)), "z"))
+    refused = failed(hand_test_evaluation.rows(result(samples(spoiled)), "z"))
     assert row in refused
     assert words in refused[row]
 
@@ -140,11 +140,11 @@ def test_a_spoiled_frame_is_refused_and_named(spoiled: str, row: str, words: str
 def test_a_body_that_is_off_by_twenty_degrees_is_told_with_its_angle() -> None:
     for off_deg in (-20, 20, 150):
         measured = result(samples(f"mocap_body_yaw_deg={off_deg}"))
-        assert hand_judge.yaw_offset_deg(measured.forward) == pytest.approx(off_deg, abs=5.0)
+        assert hand_test_evaluation.yaw_offset_deg(measured.forward) == pytest.approx(off_deg, abs=5.0)
 
 
 def test_a_z_up_stream_that_is_taken_for_y_up_is_named() -> None:
-    refused = failed(hand_judge.rows(result(samples('mocap_axes=["x","-z","y"]')), "y"))
+    refused = failed(hand_test_evaluation.rows(result(samples('mocap_axes=["x","-z","y"]')), "y"))
     assert refused["hand.lift"] == "the stream looks z-up: set devices.mocap.up_axis: z"
 
 
@@ -155,8 +155,8 @@ def test_each_of_the_48_body_frames_is_told_from_the_others(axes: AxisMap) -> No
         replace(sample, pose=exchanged(sample.pose, axes)) if sample.pose is not None else sample
         for sample in samples()
     )
-    assert hand_judge.best_axes(measured) == axes
-    assert bool(failed(hand_judge.rows(measured, "z"))) is (axes != IDENTITY)
+    assert hand_test_evaluation.best_axes(measured) == axes
+    assert bool(failed(hand_test_evaluation.rows(measured, "z"))) is (axes != IDENTITY)
 
 
 def exchanged(pose: MocapPose, axes: AxisMap) -> MocapPose:
@@ -179,7 +179,7 @@ def test_axis_maps_are_what_they_say() -> None:
 
 def test_px4_mounted_the_wrong_way_round_is_told_from_wrong_motion_capture() -> None:
     course = felt_otherwise(samples(), lambda v: (v[1], -v[0], v[2]))
-    refused = failed(hand_judge.rows(result(course), "z"))
+    refused = failed(hand_test_evaluation.rows(result(course), "z"))
     assert "hand.told" in refused
     assert "SENS_BOARD_ROT" in refused["hand.forward"]
 
@@ -191,7 +191,7 @@ def doubled(pose: MocapPose) -> MocapPose:
 
 def test_wrong_distances_are_told() -> None:
     course = [replace(s, pose=doubled(s.pose)) if s.pose is not None else s for s in samples()]
-    assert set(failed(hand_judge.rows(result(course), "z"))) == {"hand.scale"}
+    assert set(failed(hand_test_evaluation.rows(result(course), "z"))) == {"hand.scale"}
 
 
 # -- how it ends without a result ----------------------------------------------------------------------------------------
@@ -216,8 +216,8 @@ def test_it_ends_when_px4_does_not_say_whether_it_is_armed() -> None:
 
 def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
     for again, row in (
-        ("companion check --hand", hand_judge.ended("nobody lifted it")),
-        ("companion mocap align", hand_judge.ended("nobody lifted it", "companion mocap align")),
+        ("companion check --hand", hand_test_evaluation.ended("nobody lifted it")),
+        ("companion mocap align", hand_test_evaluation.ended("nobody lifted it", "companion mocap align")),
     ):
         assert (row.refuses, row.read, row.fix) == (True, "nobody lifted it", f"do it again: {again}")
 
@@ -262,9 +262,9 @@ def test_a_pause_in_the_middle_of_the_round_is_not_taken_for_the_floor() -> None
     course = tuple(Standing(world("hand=true")).samples(4.0 + 2 * ROUND_S + 6.0))
     view = ran(sample for sample in course if sample.t_s > 6.5)
     assert view.result is not None
-    assert not failed(hand_judge.rows(view.result, "z"))
+    assert not failed(hand_test_evaluation.rows(view.result, "z"))
 
 
 def test_the_docs_tell_every_row() -> None:
     page = (ROOT / "docs/hand-test.md").read_text(encoding="utf-8")
-    assert written(page, {"hand": checks_table(hand_judge.CHECKS)}) == page
+    assert written(page, {"hand": checks_table(hand_test_evaluation.CHECKS)}) == page

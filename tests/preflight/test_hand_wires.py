@@ -22,7 +22,7 @@ from companion.io.devices import SomeEdges, VisionValve, open_what_opens
 from companion.io.mocap.driver import NatNetMocap
 from companion.model.rows import Row
 from companion.model.types import AutopilotRequest, FlightMode
-from companion.preflight.hand_test import judge as hand_judge
+from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.hand_test.command import run_hand_test
 from companion.runtime.clock import flight_clock
@@ -127,7 +127,7 @@ def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: FlightConfig) -> 
 def test_a_whole_round_passes_and_is_kept(config: FlightConfig, tmp_path: Path) -> None:
     console, path = terminal(), tmp_path / "state" / "hand-tests.json"
     rows = asyncio.run(over_wires(config, console, path))
-    assert [row.id for row in rows] == [*(check.id for check in hand_judge.CHECKS), "hand.record"], rows
+    assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"], rows
     assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
     for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
         assert words in text_of(console)

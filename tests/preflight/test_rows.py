@@ -13,7 +13,7 @@ from companion.config.loader import FlightConfig
 from companion.model.observations import ForceStream, Observations, StateCounts
 from companion.model.rows import Level, Row
 from companion.model.types import VehicleState
-from companion.preflight import frames, judge, px4
+from companion.preflight import evaluation, frames, px4
 from tests.preflight import records as r
 from tests.support import ROOT
 from tools.docs.preflight import ROOMS, tables
@@ -213,7 +213,7 @@ def config_with(changes: Mapping[str, Any] | None) -> FlightConfig:
 
 
 def judged(case: Case) -> dict[str, Row]:
-    rows = judge.rows(replace(r.sound(), **case.seen), config_with(case.vehicle))
+    rows = evaluation.rows(replace(r.sound(), **case.seen), config_with(case.vehicle))
     assert len({row.id for row in rows}) == len(rows)
     return {row.id: row for row in rows}
 
@@ -223,11 +223,11 @@ def failed(rows: Mapping[str, Row]) -> set[str]:
 
 
 def test_a_sound_machine_passes_every_row() -> None:
-    rows = {row.id: row for row in judge.rows(r.sound(), r.config())}
+    rows = {row.id: row for row in evaluation.rows(r.sound(), r.config())}
     assert not failed(rows), [row.line() for row in rows.values() if not row.ok]
-    assert set(rows) >= {check.id for check in judge.CHECKS} - {frames.HAND_TEST.id}
+    assert set(rows) >= {check.id for check in evaluation.CHECKS} - {frames.HAND_TEST.id}
     assert all(row.read and row.why and not row.fix for row in rows.values())
-    assert judge.unsettled(r.sound(), r.config()) is None
+    assert evaluation.unsettled(r.sound(), r.config()) is None
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -245,7 +245,7 @@ def test_what_is_wrong_is_told_by_its_row(name: str) -> None:
 
 
 def test_every_row_can_fail() -> None:
-    here = {check.id for check in judge.CHECKS} - {check.id for check in frames.CHECKS}
+    here = {check.id for check in evaluation.CHECKS} - {check.id for check in frames.CHECKS}
     told = {case.row for case in CASES.values()}
     assert {row for row in told if not row.startswith(px4.PARAM_ID)} == (here - NEVER_BAD) | {px4.FIRMWARE_ID}
 
@@ -280,7 +280,7 @@ def test_a_missing_device_is_one_row_and_the_others_are_looked_at(device: str) -
         "force": {"force": (), "force_stream": None},
     }[device]
     seen = replace(r.sound(), **failure(device), **gone)  # type: ignore[arg-type]
-    rows = judge.rows(seen, r.config())
+    rows = evaluation.rows(seen, r.config())
     refusing = {row.id for row in rows if row.refuses}
     room = {"autopilot": "px4"}.get(device, device)
     assert refusing == {f"{room}.device"}
@@ -289,22 +289,22 @@ def test_a_missing_device_is_one_row_and_the_others_are_looked_at(device: str) -
 
 def test_waiting_is_worth_it_only_for_what_settles() -> None:
     young = replace(r.sound(), estimator=r.estimator(position_horizontal_accuracy_m=3.0))
-    waiting = judge.unsettled(young, r.config())
+    waiting = evaluation.unsettled(young, r.config())
     assert waiting is not None
-    assert (waiting.what, waiting.longest_s) == ("EKF2 fuses motion capture", judge.SETTLE_S)
+    assert (waiting.what, waiting.longest_s) == ("EKF2 fuses motion capture", evaluation.SETTLE_S)
     hopeless = replace(young, failures={"arm": "gone"})
-    waiting = judge.unsettled(hopeless, r.config())
-    assert waiting is not None and waiting.longest_s == judge.BEGIN_S
+    waiting = evaluation.unsettled(hopeless, r.config())
+    assert waiting is not None and waiting.longest_s == evaluation.BEGIN_S
     flat = replace(r.sound(), status=r.status(battery_remaining=0.1))
-    assert judge.unsettled(flat, r.config()) is None
+    assert evaluation.unsettled(flat, r.config()) is None
 
 
 def test_what_the_vehicle_file_does_not_ask_for_is_no_warning() -> None:
     unlocked = replace(r.sound(), machine=r.machine(memory_lock="memory not locked (8 kB)"))
-    rows = {row.id: row for row in judge.rows(unlocked, config_with({"computer.lock_memory": False}))}
+    rows = {row.id: row for row in evaluation.rows(unlocked, config_with({"computer.lock_memory": False}))}
     assert rows["machine.memory_lock"].ok
     assert "not asked for" in rows["machine.memory_lock"].read
-    own = {row.id: row for row in judge.rows(r.sound(), config_with({"computer.cpus": (2, 3)}))}["machine.cpus"]
+    own = {row.id: row for row in evaluation.rows(r.sound(), config_with({"computer.cpus": (2, 3)}))}["machine.cpus"]
     assert own.ok and (own.read, own.wanted) == ("computer.cpus 2-3", "among cores 0-3")
 
 
@@ -314,7 +314,7 @@ def test_a_row_is_one_line_with_read_wanted_and_fix() -> None:
 
 
 def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:
-    rows = judge.rows(Observations(0.0, 5.0), r.config())
+    rows = evaluation.rows(Observations(0.0, 5.0), r.config())
     assert {"px4.heartbeat", "px4.vision", "mocap.device", "force.device"} <= {row.id for row in rows if row.refuses}
 
 
@@ -323,5 +323,5 @@ def test_the_docs_tell_every_row() -> None:
     page = (ROOT / "docs/preflight.md").read_text(encoding="utf-8")
     assert written(page, tables()) == page
     told = {check.id for checks in ROOMS.values() for check in checks}
-    assert told == {check.id for check in judge.CHECKS}
+    assert told == {check.id for check in evaluation.CHECKS}
     assert all(f"| `{name}` |" in page for name in told)

@@ -1,6 +1,6 @@
 """From a finished hand test to the one setting that is wrong: up axis, the rigid body's yaw, the world's yaw, a mirrored stream. Pure.
 
-Measured by `companion.preflight.hand_test.run`, judged axis by axis by `companion.preflight.hand_test.judge`; this says which key
+Measured by `companion.preflight.hand_test.run`, judged axis by axis by `companion.preflight.hand_test.evaluation`; this says which key
 or which setting of Motive explains all of it.
 """
 
@@ -17,7 +17,7 @@ from companion.model.rows import Row
 from companion.model.types import Vec3
 from companion.preflight.axes import IDENTITY, Y_UP, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.judge import LEVEL_MAX_DEG, YAW_MAX_DEG, best_axes, yaw_offset_deg
+from companion.preflight.hand_test.evaluation import LEVEL_MAX_DEG, YAW_MAX_DEG, best_axes, yaw_offset_deg
 from companion.preflight.hand_test.motion import angle_rad
 from companion.preflight.hand_test.run import HandResult
 

@@ -38,7 +38,7 @@ from companion.io.px4.link import (
 )
 from companion.io.px4.origin import ensure_origin
 from companion.io.px4.params import ParamTransfer
-from companion.io.px4.requests import SENT_ONCE, RequestDesk
+from companion.io.px4.requests import SENT_ONCE, RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
 from companion.model.observations import EstimatorReport, StateCounts
 from companion.model.types import (
@@ -76,8 +76,8 @@ class MavsdkAutopilot:
         self._device = device
         self._forwarding = forwarding
         self._clock = clock
-        self._desk = RequestDesk()
-        self._inbox = Inbox(clock, self._desk, self._on_heartbeat)
+        self._requests = RequestQueue()
+        self._inbox = Inbox(clock, self._requests, self._on_heartbeat)
         self._calls = NativeCalls(device.address)
         self._mavsdk: Any = None
         self._connection: Any = None
@@ -235,7 +235,7 @@ class MavsdkAutopilot:
 
         LAND never waits for a command of another kind. `take_messages` returns refusals.
         """
-        if not self._open or not self._desk.claim(request, self._clock()):
+        if not self._open or not self._requests.claim(request, self._clock()):
             return
 
         def answered(result: Any, ack: Any, _: Any) -> None:
@@ -243,7 +243,7 @@ class MavsdkAutopilot:
                 reason = messages.refusal(ack.fields_json)
             else:
                 reason = f"no COMMAND_ACK ({result.name.lower().replace('_', ' ')})"
-            self._desk.answer(request, reason, self._clock())
+            self._requests.answer(request, reason, self._clock())
 
         command = MavlinkMessage("COMMAND_LONG", fields_json=messages.command_json(request, self._system_id))
         if request in SENT_ONCE:
@@ -254,13 +254,13 @@ class MavsdkAutopilot:
     def _on_ack(self, message: Any, _: Any) -> None:
         """Handle COMMAND_ACK, in a thread of MAVSDK."""
         if messages.answers_arming(message.fields_json):
-            self._desk.answer_sent_once(messages.refusal(message.fields_json), self._clock())
+            self._requests.answer_sent_once(messages.refusal(message.fields_json), self._clock())
 
     def take_messages(self) -> list[str]:
         """Return, oldest first, all refusals and STATUSTEXTs since the last call, reports of a second sender that claims to be PX4, and
         of a new port of PX4.
         """
-        texts = self._desk.take_messages(self._clock())
+        texts = self._requests.take_messages(self._clock())
         rival = self._claim.take_rival(self._inbox.silent_s()) if self._claim is not None else None
         return texts if rival is None else [*texts, rival]
 
@@ -388,7 +388,7 @@ class MavsdkAutopilot:
                     "autopilot %s: a call into MAVSDK hangs, left to the end of the process", self._device.address
                 )
                 return
-            while self._desk.pending() and time.monotonic() < deadline_s:
+            while self._requests.pending() and time.monotonic() < deadline_s:
                 time.sleep(0.02)
             if self._mavsdk is not None:
                 self._mavsdk.destroy()

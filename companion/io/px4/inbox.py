@@ -16,7 +16,7 @@ from companion.io.px4 import messages
 from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.px4.delta_velocity import DeltaVelocity
 from companion.io.px4.link import device_error
-from companion.io.px4.requests import RequestDesk
+from companion.io.px4.requests import RequestQueue
 from companion.model.frames import flu_from_frd
 from companion.model.observations import EstimatorReport, StateCounts
 from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
@@ -40,9 +40,9 @@ class Inbox:
     update.
     """
 
-    def __init__(self, clock: Clock, desk: RequestDesk, after_heartbeat: Callable[[], None]) -> None:
+    def __init__(self, clock: Clock, requests: RequestQueue, after_heartbeat: Callable[[], None]) -> None:
         self._clock = clock
-        self._desk = desk
+        self._requests = requests
         self._after_heartbeat = after_heartbeat
         self._position: tuple[float, Vec3, Vec3] | None = None
         self._attitude: tuple[float, Quat, int] | None = None
@@ -173,7 +173,7 @@ class Inbox:
 
     def _on_status_text(self, message: Any, _: Any) -> None:
         if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
-            self._desk.hear(json.loads(message.fields_json), self._clock())
+            self._requests.hear(json.loads(message.fields_json), self._clock())
 
     def _on_heartbeat(self, message: Any, _: Any) -> None:
         # A gimbal or camera behind the same system id has a heartbeat of its own.

@@ -35,7 +35,7 @@ class _Kind:
     not_before_s: float
 
 
-class RequestDesk:
+class RequestQueue:
     """Queue that paces requests and collects the autopilot's messages. Thread-safe."""
 
     def __init__(self) -> None:

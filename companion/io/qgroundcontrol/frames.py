@@ -84,7 +84,7 @@ FAST_STREAMS = frozenset(
 )
 
 
-class Bucket:
+class TokenBucket:
     """Token bucket: limits a burst and the mean rate."""
 
     def __init__(self, rate_hz: float, burst: int) -> None:
@@ -224,7 +224,7 @@ def command_of(payload: bytes) -> int:
     return int.from_bytes(payload[_COMMAND_OFFSET : _COMMAND_OFFSET + 2], "little")
 
 
-class Thinner:
+class DownlinkFilter:
     """Filter of the vehicle's messages to the ground: without the companion's own traffic, and with fast streams reduced.
 
     The rest is renumbered for each sender, because a ground station counts gaps in the numbers as losses of the link.

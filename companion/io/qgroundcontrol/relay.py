@@ -25,9 +25,9 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.qgroundcontrol.channel import pack, unpack
-from companion.io.qgroundcontrol.door import Door
-from companion.io.qgroundcontrol.frames import Thinner
+from companion.io.qgroundcontrol.frames import DownlinkFilter
 from companion.io.qgroundcontrol.texts import COMPONENT, Texts, heartbeat_message, value_messages
+from companion.io.qgroundcontrol.uplink_filter import UplinkFilter
 
 NICENESS = 10
 CHANNEL_MAX_BYTES = 65_536
@@ -49,7 +49,7 @@ class Relay:
         channel: channel to the flight process.
         vehicle: UDP, bound on loopback; connected once MAVSDK's port is known.
         ground: UDP, connected to the ground station.
-        door: filter of the ground station's messages.
+        uplink: filter of the ground station's messages.
         vehicle_system: MAVLink system id of the vehicle.
         own: system and component id of MAVSDK; the system is the vehicle's.
         name: the ground station's address for display.
@@ -60,7 +60,7 @@ class Relay:
         channel: socket.socket,
         vehicle: socket.socket,
         ground: socket.socket,
-        door: Door,
+        uplink: UplinkFilter,
         vehicle_system: int,
         own: tuple[int, int],
         name: str,
@@ -71,7 +71,7 @@ class Relay:
         self._open = False
         """Whether MAVSDK's port is known."""
         self._bye = False
-        self._door, self._thinner, self._texts = door, Thinner(own), Texts()
+        self._uplink, self._downlink, self._texts = uplink, DownlinkFilter(own), Texts()
         self._encoder = mavlink.MAVLink(None, srcSystem=vehicle_system, srcComponent=COMPONENT)
         self._situation: str | None = None
         self._beat_s = self._report_s = 0.0
@@ -91,8 +91,8 @@ class Relay:
                 break
             if self._vehicle.fileno() in ready:
                 for datagram in _received(self._vehicle):
-                    self._door.state.hear(datagram, now_s)
-                    for frame in self._thinner.pick(datagram, now_s):
+                    self._uplink.state.hear(datagram, now_s)
+                    for frame in self._downlink.pick(datagram, now_s):
                         self._to_ground(frame)
             if self._ground.fileno() in ready:
                 self._take_from_ground(now_s)
@@ -127,7 +127,7 @@ class Relay:
             self._vehicle.connect(("127.0.0.1", said["vehicle_port"]))
             self._open = True
         if "arming" in said:
-            self._door.state.expect_arming(time.monotonic())
+            self._uplink.state.expect_arming(time.monotonic())
         for severity, text in said.get("texts", ()):
             self._texts.say(severity, text)
         self._situation = said.get("situation", self._situation)
@@ -138,7 +138,7 @@ class Relay:
 
     def _take_from_ground(self, now_s: float) -> None:
         for datagram in _received(self._ground):
-            passed = self._door.admit(datagram, now_s)
+            passed = self._uplink.admit(datagram, now_s)
             if not passed or not self._open:
                 continue
             if self._heard_s is None:
@@ -152,11 +152,11 @@ class Relay:
 
     def _report(self, now_s: float) -> None:
         """Report refused messages: a line for each new reason, and the counts at intervals."""
-        if self._door.refused == self._told or now_s < self._report_s:
+        if self._uplink.refused == self._told or now_s < self._report_s:
             return
         self._report_s = now_s + _REPORT_S
-        new = self._door.refused - self._told
-        self._told = Counter(self._door.refused)
+        new = self._uplink.refused - self._told
+        self._told = Counter(self._uplink.refused)
         reasons = ", ".join(f"{count} {reason}" for reason, count in new.most_common(5))
         self._tell(f"ground station {self._name}: messages refused: {reasons}")
 
@@ -214,8 +214,8 @@ def main(argv: list[str] | None = None) -> int:
             channel.send(pack({"error": error.strerror or str(error)}))
             return 1
         channel.send(pack({"port": vehicle.getsockname()[1]}))
-        door = Door(a.system, while_armed=a.while_armed, console=a.console)
-        Relay(channel, vehicle, ground, door, a.system, (a.own[0], a.own[1]), a.name).run()
+        uplink = UplinkFilter(a.system, while_armed=a.while_armed, console=a.console)
+        Relay(channel, vehicle, ground, uplink, a.system, (a.own[0], a.own[1]), a.name).run()
     return 0
 
 

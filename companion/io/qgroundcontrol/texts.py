@@ -12,7 +12,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.io.qgroundcontrol.frames import Bucket
+from companion.io.qgroundcontrol.frames import TokenBucket
 from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Severity
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
@@ -77,7 +77,7 @@ class Texts:
 
     def __init__(self) -> None:
         self._waiting: deque[Text] = deque()
-        self._bucket = Bucket(TEXT_RATE_HZ, TEXT_BURST)
+        self._bucket = TokenBucket(TEXT_RATE_HZ, TEXT_BURST)
         self._left_out = 0
         self._number = 0
 

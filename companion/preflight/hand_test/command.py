@@ -25,7 +25,7 @@ from companion.io.devices import Edges, SomeEdges
 from companion.model.rows import Row, refusals
 from companion.model.types import AutopilotStatus, MocapPose, VehicleState
 from companion.preflight.checks import Check
-from companion.preflight.hand_test import judge as hand_judge
+from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.hand_test.run import TOLD, HandResult, HandSample, HandTest, HandView, Step
 
@@ -58,8 +58,8 @@ async def run_hand_test(
     """
     outcome = await perform(edges, config, console, json)
     if isinstance(outcome, str):
-        return [hand_judge.ended(outcome)]
-    rows = hand_judge.rows(outcome, config.vehicle.devices.mocap.up_axis)
+        return [hand_test_evaluation.ended(outcome)]
+    rows = hand_test_evaluation.rows(outcome, config.vehicle.devices.mocap.up_axis)
     if record is not None and edges.mocap is not None and not refusals(rows):
         info = edges.mocap.server_info
         setup = hand_record.Setup.of(config.vehicle, info.version if info is not None else "")

@@ -1,7 +1,7 @@
 """The guided hand test: the operator carries the machine, rotors off, and every axis of motion capture is compared with the IMU. Pure.
 
 The steps are: stand still, lift, forward, turn left. Each step is recognised by how far motion capture saw the machine move, whatever
-the direction, because the directions are what is tested. They are evaluated at the end (`companion.preflight.hand_test.judge`).
+the direction, because the directions are what is tested. They are evaluated at the end (`companion.preflight.hand_test.evaluation`).
 """
 
 from __future__ import annotations

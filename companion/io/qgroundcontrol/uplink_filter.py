@@ -21,8 +21,8 @@ from companion.io.qgroundcontrol.frames import (
     REQUEST_EVENT,
     UP_BURST,
     UP_RATE_HZ,
-    Bucket,
     Frame,
+    TokenBucket,
     autopilot_heartbeat,
     command_of,
     frames,
@@ -88,7 +88,7 @@ class ArmedState:
         return now_s - self._arming_s <= HEARTBEAT_MAX_AGE_S
 
 
-class Door:
+class UplinkFilter:
     """Filter of a ground station's messages to the vehicle.
 
     Args:
@@ -105,7 +105,7 @@ class Door:
         self._vehicle_system = vehicle_system
         self._while_armed, self._console = while_armed, console
         self._systems: set[int] = set()
-        self._bucket = Bucket(UP_RATE_HZ, UP_BURST)
+        self._bucket = TokenBucket(UP_RATE_HZ, UP_BURST)
 
     def admit(self, datagram: bytes, now_s: float) -> list[bytes]:
         """Return the frames to pass on, each as one datagram."""
@@ -142,10 +142,10 @@ class Door:
             if not self._console:
                 return "SERIAL_CONTROL, which ground.qgroundcontrol_console does not allow"
             return "SERIAL_CONTROL while PX4 is armed" if armed else None
-        return objection_while_armed(frame) if armed and not self._while_armed else None
+        return refusal_while_armed(frame) if armed and not self._while_armed else None
 
 
-def objection_while_armed(frame: Frame) -> str | None:
+def refusal_while_armed(frame: Frame) -> str | None:
     """Return why an intact frame of a ground station is refused while PX4 is armed, or None if it may pass."""
     if frame.message_id not in ARMED_MESSAGES:
         return f"{frame.name} while PX4 is armed"

@@ -49,7 +49,7 @@ class Violation:
     advice: str
 
 
-class Judge:
+class SampleCheck:
     """Check of consecutive instants of a plan against every limit.
 
     Raises:
