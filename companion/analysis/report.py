@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from companion.analysis.animation import movie_of, player_html
 from companion.analysis.log import FlightLog
 from companion.analysis.page import CLOSING, folded, opening, picture
 from companion.analysis.plots import Plot, write_plots
@@ -24,7 +25,9 @@ _STYLE = """
 td, th { padding: .22rem .5rem .22rem 0; text-align: left; } .card tr:last-child td { border-bottom: 0; }
 td.n, th.n { text-align: right; padding: .22rem .3rem .22rem 1rem; white-space: nowrap; }
 tr.warning td { background: #fff7e6; } tr.critical td { background: #fdeaf0; }
-@media print { .cards { grid-template-columns: 1fr 1fr; }
+#player canvas { width: 100%; aspect-ratio: 960 / 440; border: 1px solid var(--line); border-radius: .4rem; }
+#player div { display: flex; gap: .8rem; } #player input { flex: 1; } #player button { font: inherit; width: 5rem; }
+@media print { #player div { display: none; } .cards { grid-template-columns: 1fr 1fr; }
   .card, .badge { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
 """
 
@@ -58,6 +61,7 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
         opening(f"{mission}: {outcome}", _STYLE),
         f"<h1>{escape(str(mission))} <span class='badge {escape(outcome)}'>{escape(outcome)}</span></h1>",
         f"<p class='sub'>{escape(subtitle)}</p>",
+        _movie(log, summary),
         _results(summary, log.stride),
         "<h2>Plots</h2>" if plots else "",
         *(picture(plot.path, plot.title, escape(plot.caption)) for plot in plots),
@@ -77,6 +81,11 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
         CLOSING,
     ]
     return "\n".join(part for part in parts if part)
+
+
+def _movie(log: FlightLog, summary: dict[str, Any]) -> str:
+    movie = movie_of(log, summary["payload_kg"])
+    return "" if movie is None else player_html(movie)
 
 
 def _results(summary: dict[str, Any], stride: int) -> str:

@@ -46,6 +46,12 @@ def add_parser(commands: Any) -> None:
         help="several: where their time axes agree (default: the catch if all have one, else the take-off)",
     )
     report.add_argument(
+        "--gif",
+        type=Path,
+        metavar="FILE",
+        help="one log: also write the animation of report.html as a GIF, 800 pixels wide",
+    )
+    report.add_argument(
         "--json",
         action="store_true",
         help="print summary or comparison as JSON, nothing else; files are written only with --out",
@@ -74,6 +80,8 @@ def _problem(arguments: argparse.Namespace) -> str | None:
         return f"{len(arguments.log)} logs: expected at most {FLIGHTS_MAX}, more cannot be told apart in one picture"
     if arguments.align is not None and len(arguments.log) == 1:
         return "--align: there is one log; it is for two and more"
+    if arguments.gif is not None and len(arguments.log) > 1:
+        return f"--gif: expected one log, got {len(arguments.log)}"
     return None
 
 
@@ -148,6 +156,11 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
     flight = graded(path)
     if flight.note is not None:
         tell(flight.note)
+    if arguments.gif is not None:
+        problem = _write_gif(flight, arguments.gif)
+        if problem is not None:
+            tell(f"companion report: {problem}")
+            return EXIT_BAD_INPUT
     if arguments.json:
         _print(flight.summary)
         if arguments.out is None:
@@ -164,6 +177,22 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
     if not arguments.json:
         print(report)
     return EXIT_OK
+
+
+def _write_gif(flight: Graded, path: Path) -> str | None:
+    """Write the animation of a flight; return why that failed, or None."""
+    try:
+        from companion.analysis.animation import movie_of, write_gif
+    except ImportError:
+        return "--gif needs matplotlib: pip install 'companion[analysis]'"
+    movie = movie_of(flight.log, flight.summary["payload_kg"])
+    if movie is None:
+        return f"{flight.log.path}: the vehicle did not take off, or the log lacks its geometry; there is no animation"
+    try:
+        write_gif(movie, path)
+    except (OSError, ValueError) as error:
+        return f"{path}: cannot be written: {error}"
+    return None
 
 
 # Several flights

@@ -137,6 +137,10 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "replay of nothing": (("replay", "nofile.mcap"), (r"^nofile\.mcap: cannot be read: No such file",)),
     "replay of no log": (("replay", "mission.yaml"), (r"^mission\.yaml: ",)),
     "report of nothing": (("report", "nofile.mcap"), (r"^nofile\.mcap: cannot be read: No such file",)),
+    "animation of two flights": (
+        ("report", "a.mcap", "b.mcap", "--gif", "catch.gif"),
+        (r"^companion report: --gif: expected one log, got 2$",),
+    ),
     "schema of nothing": (("schema", "moon"), (r"^companion schema: .*'moon'.*'mission'",)),
     "a world of a bad mission": (("sitl", "nofile.yaml"), (r"^nofile\.yaml: no such file$",)),
 }

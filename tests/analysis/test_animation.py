@@ -1,0 +1,115 @@
+"""The animation of a flight: what it shows when, and how it is written."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from companion.analysis.animation import FRAMES_PER_S, Movie, movie_of, player_html, write_gif
+from companion.analysis.log import FlightLog
+from companion.analysis.scene import Camera, Pose, Scene
+from companion.config.loader import load_vehicle
+from companion.control.manipulator import Manipulator
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.types import Vec2
+from tests.analysis.synthetic_flight import CATCH_S, CONFIG, synthetic_flight
+from tests.ground.page_browser import chromium
+from tests.support import ROOT
+
+VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")
+WORLD = {"throw_velocity_m_s": [-2.0, 0.15, -1.5]}
+
+
+def flown(world: dict[str, Any] = WORLD, phase: str | None = None) -> FlightLog:
+    rows = list(synthetic_flight(rate_hz=50.0))
+    outputs = tuple(o if phase is None else replace(o, phase=phase) for _, o, _ in rows)
+    config = {**CONFIG, "vehicle": json.loads(VEHICLE.model_dump_json()), "world": world}
+    metadata = {"config": {"json": json.dumps(config)}}
+    return FlightLog(Path("flight.mcap"), tuple(r[0] for r in rows), outputs, tuple(r[2] for r in rows), metadata, True)
+
+
+@pytest.fixture(scope="module")
+def movie() -> Movie:
+    made = movie_of(flown(), 0.2)
+    assert made is not None
+    return made
+
+
+def texts(movie: Movie) -> list[list[str]]:
+    return [[shape.text for shape in frame.shapes if shape.text] for frame in movie.frames]
+
+
+def test_the_payload_is_thrown_and_then_caught(movie: Movie) -> None:
+    shown = [next((t.rpartition(", ")[2] for t in frame if "0.2 kg payload" in t), "") for frame in texts(movie)]
+    assert [text for k, text in enumerate(shown) if k == 0 or text != shown[k - 1]] == ["", "thrown", "caught", ""]
+    times = [float(text[4:-2]) for frame in texts(movie) for text in frame if text.startswith("t = ")]
+    assert times[shown.index("caught")] == pytest.approx(CATCH_S, abs=0.05)
+    assert shown[movie.still] == "thrown"
+    assert times == sorted(times)
+    assert 8.0 < len(times) / FRAMES_PER_S < 13.0
+
+
+def test_without_a_simulated_throw_the_payload_appears_in_the_net() -> None:
+    made = movie_of(flown(world={}))
+    assert made is not None
+    assert {t for frame in texts(made) for t in frame if "payload" in t} == {"payload, caught"}
+
+
+def test_a_log_without_geometry_has_no_animation() -> None:
+    assert movie_of(replace(flown(), metadata={"config": {"json": json.dumps(CONFIG)}})) is None
+
+
+@pytest.mark.parametrize("arm_rad", [(math.radians(165), math.radians(140)), (1.2, -0.1)])
+def test_the_net_is_where_the_control_law_has_it(arm_rad: Vec2) -> None:
+    attitude = quat_from_euler_zyx(0.1, -0.2, 2.0)
+    pose = Pose((1.0, -0.5, 1.2), attitude, arm_rad, (), False)
+    expected = np.add(
+        pose.position_world_m, quat_rotate(attitude, Manipulator(VEHICLE.arm, VEHICLE.tool).net_body_m(arm_rad))
+    )
+    assert Scene(json.loads(VEHICLE.model_dump_json())).net_world_m(pose) == pytest.approx(expected)
+
+
+def test_what_is_behind_the_camera_is_cut_off() -> None:
+    camera = Camera(np.zeros(3), yaw_rad=0.0, pitch_rad=0.0, distance_m=4.0, size_px=(600, 400))
+    line = camera.pixels(np.array([[-10.0, 1.0, 0.0], [10.0, 1.0, 0.0]]))
+    assert len(line) == 2
+    assert line[1] == pytest.approx(camera.pixels(np.array([[10.0, 1.0, 0.0]]))[0])
+    assert line[0][0] < line[1][0] < 300.0  # left of the middle, farther out where it is near
+
+
+def test_the_gif_has_every_frame(movie: Movie, tmp_path: Path) -> None:
+    write_gif(movie, tmp_path / "catch.gif", width_px=480)
+    with Image.open(tmp_path / "catch.gif") as gif:
+        assert (gif.size, gif.info["loop"]) == ((480, 220), 0)
+        assert (sum(1 for _ in ImageSequence.Iterator(gif)), gif.info["duration"]) == (len(movie.frames), 80)
+
+
+def test_a_browser_plays_it_whatever_a_phase_is_called(tmp_path: Path) -> None:
+    made = movie_of(flown(phase="</script><b>phase"))
+    assert made is not None
+    page = tmp_path / "page.html"
+    page.write_text(f"<!doctype html><meta charset='utf-8'>{player_html(made)}", encoding="utf-8")
+    assert re.search(r"""(?:src|href)=""", page.read_text(encoding="utf-8")) is None
+    with chromium() as browser:
+        tab = browser.new_page(reduced_motion="reduce")
+        wrong: list[str] = []
+        tab.on("pageerror", lambda error: wrong.append(str(error)))
+        tab.goto(page.as_uri())
+        assert tab.locator("b").count() == 0
+        slider = tab.locator("input")
+        assert slider.input_value() == str(made.still)
+        slider.fill(str(len(made.frames) - 1))
+        pixels = "document.querySelector('canvas').getContext('2d').getImageData(0, 0, 960, 440).data.buffer"
+        assert tab.evaluate(f"new Set(new Uint32Array({pixels})).size") > 50
+        tab.get_by_role("button", name="Play").click()
+        tab.get_by_role("button", name="Pause").wait_for()
+        tab.wait_for_function(f"document.querySelector('input').value < {len(made.frames) - 1}")
+        assert wrong == []
