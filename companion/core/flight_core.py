@@ -27,10 +27,11 @@ from companion.model.types import (
     Severity,
     Vec3,
 )
+from companion.safety.events import OPERATOR_START
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
-from companion.safety.monitors import Monitors, Situation
-from companion.safety.rules import OPERATOR_START
+from companion.safety.monitors import Monitors
+from companion.safety.situation import Situation
 from companion.safety.supervisor import (
     HOLD_EXPIRED,
     RESUME,
@@ -164,7 +165,7 @@ class FlightCore:
         self._watch_tether(i)
         if events:
             stages.events += events
-            stages.start_asked = any(event.id == OPERATOR_START.id for event in events)
+            stages.start_asked = any(event.id == OPERATOR_START for event in events)
         if inputs.command is _ASKED_TO_HOLD and stage in seq.BEFORE_LIFT:
             self._hold_on_ground(i)
         before = self._ladder

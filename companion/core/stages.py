@@ -19,9 +19,9 @@ from companion.model.flight_stage import Stage
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.negative_zero import without_negative_zero
 from companion.model.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, SafetyAction, Severity
-from companion.safety.monitors import unfused
+from companion.safety.events import CRASHED, PILOT_TOOK_OVER
+from companion.safety.mocap import unfused
 from companion.safety.rotor_stop import RotorStop
-from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
 from companion.safety.touchdown import Touchdown
 
 ARMED_SHOWN_S = 1.5
@@ -376,8 +376,8 @@ class FlightStages:
         if not seq.people_fly(i.status):
             return False
         text = "a pilot took over before PX4 was disarmed; nothing is sent any more"
-        if not any(event.id == PILOT_TOOK_OVER.id for event in self.events):
-            self.tell(i, PILOT_TOOK_OVER.id, Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text)
+        if not any(event.id == PILOT_TOOK_OVER for event in self.events):
+            self.tell(i, PILOT_TOOK_OVER, Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text)
         self.finish(Outcome.ABORTED)
         self.enter(Stage.AUTOPILOT_LAND, i, pilot_flies=True)
         return True
@@ -385,7 +385,7 @@ class FlightStages:
     def _crash(self, i: Inputs, text: str) -> None:
         """Reported once: the ladder may have done so, by the rule of the same id."""
         if self.outcome is not Outcome.CRASHED:
-            self.tell(i, CRASHED.id, Severity.CRITICAL, SafetyAction.TERMINATE, text)
+            self.tell(i, CRASHED, Severity.CRITICAL, SafetyAction.TERMINATE, text)
             self.finish(Outcome.CRASHED)
 
     def _autopilot_land(self, i: Inputs) -> AutopilotRequest:

@@ -8,10 +8,10 @@ from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
 from companion.model.flight_stage import PILOT_FLIES
 from companion.model.types import AutopilotRequest, AutopilotStatus, Inputs, LinkIdentity, Outputs, PhaseKind
-from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
+from companion.safety.events import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
 
 _IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
-_REFUSALS = frozenset(rule.id for rule in (MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS))
+_REFUSALS = frozenset({MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS})
 """Events after which PX4 lands because motion capture is rejected."""
 
 
@@ -35,7 +35,7 @@ class Heartbeats:
     def of(self, inputs: Inputs, outputs: Outputs) -> Heartbeat:
         """Return the heartbeat of a tick; call it in every tick."""
         ids = {event.id for event in outputs.events}
-        self._pilot = self._pilot or PILOT_TOOK_OVER.id in ids or outputs.phase == PILOT_FLIES
+        self._pilot = self._pilot or PILOT_TOOK_OVER in ids or outputs.phase == PILOT_FLIES
         self._lands_without_mocap = self._lands_without_mocap or not ids.isdisjoint(_REFUSALS)
         mocap = inputs.mocap
         if mocap is not None and mocap.tracking_valid and outputs.mocap_trusted:

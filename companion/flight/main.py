@@ -48,7 +48,7 @@ from companion.runtime import ipc
 from companion.runtime.clock import Clock, flight_clock
 from companion.runtime.event_loop import run
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
-from companion.safety.rules import REATTACHED
+from companion.safety.events import REATTACHED
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.002
@@ -179,15 +179,15 @@ class Flight:
         """Return whether a PX4 that was armed when its link was opened still is. If not there is nothing to land and no
         mission to fly.
         """
-        goes_on = any(event.id == REATTACHED.id for event in outputs.events)
+        goes_on = any(event.id == REATTACHED for event in outputs.events)
         lines = [f"landing without it: {line}" for line in self._edges.failures]
         if not goes_on:
             lines = [
                 "PX4 was armed when the companion started, and has disarmed since; nothing was lifted: start again to fly"
             ]
         for text in lines:
-            self._tell(0, outputs, Event(outputs.t_s, REATTACHED.id, Severity.WARNING, SafetyAction.WARN, text))
-            self._recorder.client.text(outputs.t_s, Severity.WARNING, REATTACHED.id, text)
+            self._tell(0, outputs, Event(outputs.t_s, REATTACHED, Severity.WARNING, SafetyAction.WARN, text))
+            self._recorder.client.text(outputs.t_s, Severity.WARNING, REATTACHED, text)
         return goes_on
 
     def _report(self, tick: int, outputs: Outputs, sent: Sent) -> None:

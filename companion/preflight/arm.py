@@ -10,7 +10,7 @@ from companion.model.observations import Observations, ServoReport
 from companion.model.rows import Row
 from companion.model.types import ArmState
 from companion.preflight.checks import Check
-from companion.safety.monitors_arm import error_text
+from companion.safety.arm import error_text
 
 DEVICE = Check(
     "arm.device", "arm bus", "the port opens, both servos answer and take their settings", "no arm, no flight"

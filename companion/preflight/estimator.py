@@ -17,7 +17,7 @@ from companion.model.rows import Row
 from companion.model.types import FlightMode, MocapPose, VehicleState
 from companion.preflight.checks import Check
 from companion.px4.wanted import HOVER as HOVER_PARAM
-from companion.safety.monitors_mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
+from companion.safety.mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
 
 DEVICE = Check("px4.device", "PX4", "the link opens, PX4 answers", "without PX4 nothing flies")
 HEARTBEAT = Check(

@@ -1,72 +1,65 @@
-"""All monitors of one flight: pure judges of the inputs. What is found becomes one event when it begins; rules.py says what is done."""
+"""All monitors of one flight: trackers take each tick's inputs, then the loop evaluates the event table. Pure."""
 
 from __future__ import annotations
 
 import dataclasses
 
 from companion.config.vehicle import Vehicle
-from companion.model.types import Event, Inputs, OperatorCommand, VehicleState
-from companion.safety.findings import Findings, Situation
-from companion.safety.finite import FiniteInputs
-from companion.safety.monitors_arm import ArmMonitor, ForceMonitor
-from companion.safety.monitors_flight import FlightMonitor
-from companion.safety.monitors_mocap import MocapMonitor, unfused
-from companion.safety.monitors_px4 import Px4Monitor
-from companion.safety.rules import (
-    GUARDIAN_LOST,
-    LOOP_LATE,
-    LOOP_STALLED,
-    OPERATOR_ABORT,
-    OPERATOR_HOLD,
-    OPERATOR_LAND,
-    OPERATOR_RESUME,
-    OPERATOR_START,
-    REATTACHED,
-    RECORDER_DROPS,
-)
-
-__all__ = ["Monitors", "Situation", "unfused"]
+from companion.model.types import Event, Inputs, VehicleState
+from companion.safety.arm import ArmTracker, ForceTracker
+from companion.safety.evaluation import Evaluation
+from companion.safety.flight import FlightTracker
+from companion.safety.mocap import MocapTracker
+from companion.safety.process import ProcessTracker
+from companion.safety.px4 import Px4Tracker
+from companion.safety.rule import Subject
+from companion.safety.situation import Situation
+from companion.safety.validity import InputFilter
 
 AWAKE_STEP_MAX_S = 0.02
-"""A tick counts for no more than this in the age of inputs."""
+"""A tick adds no more than this to the age of inputs."""
 MOVING_M_S, MOVING_RAD_S = 0.03, 0.05
-"""Above the noise of a machine that stands: what it measures must change."""
-# What is asked for lasts one tick; what lasts longer counts once.
-_ASKED = {
-    OperatorCommand.HOLD: (OPERATOR_HOLD, "a stop was asked for"),
-    OperatorCommand.RESUME: (OPERATOR_RESUME, "going on was asked for"),
-    OperatorCommand.START: (OPERATOR_START, "take-off was asked for"),
-    OperatorCommand.LAND: (OPERATOR_LAND, "landing was asked for"),
-    OperatorCommand.ABORT: (OPERATOR_ABORT, "an abort was asked for"),
-}
+"""Above the noise of a vehicle at rest: what it measures must change."""
 
 
 class Monitors:
-    """State is how long each finding has lasted, how old each input is, and what was seen last.
+    """State: the trackers, and since when each rule holds.
 
     Args:
-        vehicle: limits, walls, room and tether.
+        vehicle: thresholds, joint limits, room and tether.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self._s = vehicle.safety
-        self._findings = Findings(vehicle.safety)
-        self._finite = FiniteInputs()
-        self._mocap = MocapMonitor(vehicle)
-        self._px4 = Px4Monitor(vehicle)
-        self._arm = ArmMonitor(vehicle)
-        self._force = ForceMonitor(vehicle)
-        self._flight = FlightMonitor(vehicle)
+        self._filter = InputFilter()
+        self._mocap = MocapTracker(vehicle.safety)
+        self._px4 = Px4Tracker(vehicle.airframe.ground_clearance_m)
+        self._arm = ArmTracker()
+        self._force = ForceTracker(vehicle.safety.force_stuck_s)
+        self._process = ProcessTracker()
+        self._flight = FlightTracker(vehicle)
+        self._evaluation = Evaluation(
+            vehicle,
+            {
+                Subject.INPUTS: self._filter,
+                Subject.MOCAP: self._mocap,
+                Subject.PX4: self._px4,
+                Subject.ARM: self._arm,
+                Subject.FORCE: self._force,
+                Subject.PROCESS: self._process,
+                Subject.FLIGHT: self._flight,
+                Subject.TETHER: self._flight,
+                Subject.OPERATOR: self._process,
+            },
+        )
         self._awake_s = 0.0
         self._last_t_s: float | None = None
-        self._command = OperatorCommand.NONE
         self._airborne = False
         self.trusted: Inputs | None = None
-        """The inputs of the last tick without what is not to be believed: the very same object if all of it is."""
+        """The inputs of the last tick without what is not believed; the same object if all of it is."""
 
     @property
     def mocap_trusted(self) -> bool:
-        """Poses may be passed on to PX4. In the air no repeated one, long before that is a finding: PX4 would think that it stands."""
+        """Poses may be passed on to PX4. In the air a repeated pose may not, long before `mocap_frozen`: PX4 would take it for rest."""
         return self._mocap.trusted and not (self._mocap.repeats and self._airborne)
 
     @property
@@ -75,49 +68,36 @@ class Monitors:
         return self._mocap.innovation_m
 
     def forget(self) -> None:
-        """Tell again what is still there: a HOLD was taken back."""
-        self._findings.forget()
+        """Raise the events of all rules that hold again: a HOLD was ended."""
+        self._evaluation.forget()
 
     def standing(self) -> str | None:
-        """In words, what the vehicle must hold for, as of the last tick; None: nothing, or gone for a second."""
-        return self._findings.standing()
+        """Return what the vehicle must hold for, as of the last tick; None if nothing has asked for it for a second."""
+        return self._evaluation.standing()
 
     def check(self, inputs: Inputs, situation: Situation) -> tuple[Event, ...]:
-        """Events that begin in this tick."""
-        findings = self._findings
-        self._airborne = situation.airborne
+        """Take a tick and return the events that begin."""
+        self._airborne = airborne = situation.airborne
         gap_s = inputs.t_s - self._last_t_s if self._last_t_s is not None else 0.0
         self._last_t_s = inputs.t_s
         awake_s = self._awake_s = self._awake_s + min(gap_s, AWAKE_STEP_MAX_S)
-        i = self._finite.clean(inputs, findings)
-        command = i.command
-        if command is not self._command:
-            self._command = command
-            if command is not OperatorCommand.NONE:
-                findings.found(*_ASKED[command])
-        if situation.found_armed is not None:
-            findings.found(REATTACHED, "{}", situation.found_armed)
+        i = self._filter.clean(inputs)
+        self._process.update(i, gap_s)
+        self._px4.situation = situation
         if not situation.waiting:
             moving = i.vehicle is not None and _moves(i.vehicle)
-            self._mocap.check(i, situation, awake_s, moving, findings)
-            self._px4.check(i, situation, awake_s, moving, findings)
-            self._arm.check(i, awake_s, findings)
-            self._force.check(i, situation, awake_s, gap_s, moving, findings)
-            if gap_s > self._s.loop_late_s:
-                rule = LOOP_STALLED if gap_s > self._s.loop_stalled_s else LOOP_LATE
-                findings.found(rule, "the control loop was held up for {:.0f} ms", gap_s * 1e3)
-            if i.recorder_dropped:
-                findings.found(RECORDER_DROPS, "the recorder loses samples")
-            if i.guardian_ready is False:
-                findings.found(GUARDIAN_LOST, "the guardian is dead, or could not take over")
+            self._mocap.update(i, situation, awake_s, moving)
+            self._px4.update(i, situation, awake_s, moving)
+            self._arm.update(i, awake_s)
+            self._force.update(i, situation, awake_s, gap_s, moving)
             if not self._mocap.trusted:
                 i = dataclasses.replace(i, mocap=None)
-            if situation.airborne:
-                self._flight.check(i, situation, gap_s, findings)
+            if airborne:
+                self._flight.update(i, situation, gap_s)
             if not self._force.trusted:
                 i = dataclasses.replace(i, force=None)
         self.trusted = i
-        return findings.events(inputs.t_s, situation.airborne)
+        return self._evaluation.events(inputs.t_s, airborne, situation.waiting)
 
 
 def _moves(v: VehicleState) -> bool:

@@ -44,7 +44,7 @@ from companion.model.types import (
     Severity,
     Vec3,
 )
-from companion.safety.rules import RULES
+from companion.safety.events import RULES
 from tests.support import CATCH, HOVER
 
 VEHICLE = load_flight(CATCH).vehicle

@@ -13,8 +13,9 @@ import pytest
 from companion.config.loader import FlightConfig, load_flight
 from companion.mission.check import check_mission
 from companion.mission.plan import Plan
-from companion.safety.findings import Findings
-from companion.safety.monitors_flight import FlightMonitor
+from companion.safety.events import RULES
+from companion.safety.flight import FlightTracker
+from companion.safety.rule import thresholds_of
 from companion.safety.tether import TetherWatch, allowed_m, attachment_world_m, distance_m, slack_m
 from tests.safety.healthy import flying, healthy
 
@@ -63,7 +64,10 @@ def test_0_2_m_s_or_more_off_the_fastest_accepted_plan_no_monitor_stops_it(
         assert all(f"could not stop within the {end}" in problem for problem in found)
     vehicle, start = config.vehicle, config.mission.start
     plan = Plan.build(config.mission, vehicle, (*start.position_m, vehicle.airframe.ground_clearance_m), 0.0)
-    monitor, watch, findings = FlightMonitor(vehicle), TetherWatch(vehicle), Findings(vehicle.safety)
+    tracker, watch = FlightTracker(vehicle), TetherWatch(vehicle)
+    stopping = {"geofence_near", "geofence_left", "tether_short", "tether_taut"}
+    rules = [(rule, thresholds_of(rule, vehicle)) for rule in RULES if rule.id in stopping]
+    assert len(rules) == len(stopping)
     line_segment = plan.segments[1]
     steps = int((line_segment.end_s - line_segment.start_s) / 0.02)
     assert tenths > 40 and steps > 200
@@ -75,9 +79,8 @@ def test_0_2_m_s_or_more_off_the_fastest_accepted_plan_no_monitor_stops_it(
         now = healthy(k)
         assert now.vehicle is not None
         state = replace(now.vehicle, position_world_m=position, velocity_world_m_s=velocity, attitude_wxyz=LEVEL)
-        monitor.check(replace(now, vehicle=state), flying(tether=tether), 0.02, findings)
-        ids = {event.id for event in findings.events(0.0, True)} | set(findings._since)
-        assert ids.isdisjoint({"geofence_near", "geofence_left", "tether_short", "tether_taut"})
+        tracker.update(replace(now, vehicle=state), flying(tether=tether), 0.02)
+        assert [rule.id for rule, thresholds in rules if rule.predicate(tracker, thresholds) is not None] == []
 
 
 @pytest.mark.parametrize("mission", ["catch", "hover", "circuit"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 
 import pytest
 
@@ -11,8 +12,7 @@ from companion.config.loader import load_vehicle
 from companion.model.negative_zero import without_negative_zero
 from companion.preflight.checks import Check
 from companion.runtime.console import console_on
-from companion.safety.findings import Findings
-from companion.safety.rules import MOCAP_SLOW
+from tests.safety.healthy import after_a_moment, put, standing, watched
 
 SMALL = -1e-4
 """Rounds to zero in every text below."""
@@ -63,10 +63,11 @@ def test_no_row_of_the_preflight_reads_negative_zero() -> None:
 
 
 def test_no_event_reads_negative_zero() -> None:
-    findings = Findings(load_vehicle("configs/vehicles/tarot650_2r.yaml").safety)
-    findings.found(MOCAP_SLOW, "{:.2f} m and {:.0f} deg apart", SMALL, SMALL)
-    [event] = findings.events(1.0, airborne=False)
-    assert event.text == "0.00 m and 0 deg apart"
+    beyond = put("arm", angle_rad=(math.radians(180.0), SMALL))
+    [event] = watched(
+        load_vehicle("configs/vehicles/tarot650_2r.yaml"), after_a_moment(beyond, 50, sound=0), standing()
+    )
+    assert event.text.startswith("joints at 180, 0 deg")
 
 
 def test_no_line_in_the_terminal_reads_negative_zero() -> None:

@@ -22,7 +22,8 @@ from companion.model.types import (
     Vec8,
     VehicleState,
 )
-from companion.safety.monitors import Monitors, Situation
+from companion.safety.monitors import Monitors
+from companion.safety.situation import Situation
 
 TICK_S = 0.005
 START_S = 10.0

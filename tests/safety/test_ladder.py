@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.model.types import Event, SafetyAction, Severity
-from companion.safety.rules import RULES
+from companion.safety.events import RULES
 from companion.safety.supervisor import (
     HOLD_EXPIRED,
     RESUME,

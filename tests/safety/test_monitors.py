@@ -12,9 +12,12 @@ import pytest
 from companion.config.loader import load_vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction
-from companion.safety.monitors import Monitors, Situation, unfused
-from companion.safety.monitors_arm import error_text
-from companion.safety.rules import RULES, Rule
+from companion.safety.arm import error_text
+from companion.safety.events import RULES
+from companion.safety.mocap import unfused
+from companion.safety.monitors import Monitors
+from companion.safety.rule import Rule
+from companion.safety.situation import Situation
 from tests.safety.healthy import (
     SLOW,
     START_S,

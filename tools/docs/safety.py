@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ from pydantic import BaseModel
 
 from companion.config.vehicle import ForceDevice, Safety, Tether
 from companion.model.types import Event, SafetyAction, Severity
-from companion.safety.rules import RULES, Part, Rule
+from companion.safety.events import RULES
+from companion.safety.rule import Repeat, Rule, Subject
 from companion.safety.supervisor import (
     HOLD_EXPIRED,
     RETRACT_DONE,
@@ -32,42 +34,44 @@ _OWN_EVENTS = (
 
 
 def _default(key: str) -> str:
-    """`key` = default of a limit; without one only the key."""
+    """`key` = default of a threshold, or only the key if it has no default."""
     section, _, name = key.rpartition(".")
     model = _SECTIONS.get(f"{section}." if section else "")
     default: Any = model.model_fields[name].default if model is not None else None
     return f"`{key}`" if default is None else f"`{key}` = {default:g}"
 
 
-def _held(rule: Rule) -> str:
-    if isinstance(rule.hold, str):
-        return _default(rule.hold)
-    return f"{rule.hold:g} s"
+def _hold_time(rule: Rule) -> str:
+    return _default(rule.hold_time) if isinstance(rule.hold_time, str) else f"{rule.hold_time:g} s"
 
 
 def _action(action: SafetyAction | None) -> str:
     return "" if action is None else f"`{action.value}`"
 
 
+def _message(rule: Rule) -> str:
+    """The message with `...` for its values."""
+    return re.sub(r"\{[^}]*\}", "...", rule.message)
+
+
 def monitors_table() -> str:
-    """One row per rule, in the order of the code."""
+    """One row per rule, in the order of the code within each subject."""
     rows = [
-        "| id | what is found | limit | held for | on the ground | in the air |",
-        "|---|---|---|---|---|---|",
+        "| id | what is found | thresholds | hold time | on the ground | in the air | message |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for part in Part:
-        rows.append(f"| **{part.value}** | | | | | |")
+    for subject in Subject:
+        rows.append(f"| **{subject.value}** | | | | | | |")
         for rule in RULES:
-            if rule.part is part:
-                limits = ", ".join(map(_default, rule.limits))
-                once = "" if rule.clears else " (told once)"
+            if rule.subject is subject:
                 cells = (
                     f"`{rule.id}`",
-                    rule.found + once,
-                    limits,
-                    _held(rule),
+                    rule.what + (" (once in a flight)" if rule.repeat is Repeat.NEVER else ""),
+                    ", ".join(map(_default, rule.thresholds + rule.tracked_by)),
+                    _hold_time(rule),
                     _action(rule.ground),
                     _action(rule.air),
+                    _message(rule),
                 )
                 rows.append(f"| {' | '.join(cells)} |")
     return "\n".join(rows)

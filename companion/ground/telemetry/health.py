@@ -1,6 +1,6 @@
 """One light for each device: is it well, by the limits of the vehicle file? With the figure that says so. Pure.
 
-Limits are those of the monitors (`companion.safety.rules`): what lands the vehicle or takes a device away is BAD, what is told is
+Limits are those of the monitors (`companion.safety.events`): what lands the vehicle or takes a device away is BAD, what is told is
 WARN. The lights decide nothing: the monitors do.
 """
 
@@ -13,7 +13,7 @@ from companion.config.vehicle import Vehicle
 from companion.ground.protocol.messages import Health, Light
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.types import Inputs, Outputs, PhaseKind
-from companion.safety.monitors_arm import WATCHDOG_RESTARTED, error_text
+from companion.safety.arm import WATCHDOG_RESTARTED, error_text
 
 NAMES = (
     "PX4", "estimate", "motion capture", "arm", "force sensor", "loop", "recorder", "guardian", "battery", "tether",

@@ -1,26 +1,21 @@
-"""A value that is no number, or no possible one, is no measurement: its record counts as not arrived, and is told by name."""
+"""Records with a value that is not finite or out of range: they count as not arrived, and the rules `*_not_finite` report them."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
-from companion.safety.findings import Findings
-from companion.safety.rules import (
-    ARM_NOT_FINITE,
-    FORCE_NOT_FINITE,
-    MOCAP_NOT_FINITE,
-    STATUS_NOT_FINITE,
-    VEHICLE_NOT_FINITE,
-)
+from companion.safety.situation import Values
 
-ABSURD = 1.0e4
-"""No quantity here, in its unit, is ever so large."""
+OUT_OF_RANGE = 1.0e4
+"""No quantity of the inputs is this large in its unit."""
 _STAMP_MAX_S = 1.0e9
 
 
-class FiniteInputs:
-    """Takes broken records out of the inputs. A record that was looked at once is not looked at again."""
+class InputFilter:
+    """Removes invalid records from the inputs. A record is judged once."""
 
     def __init__(self) -> None:
         self._vehicle: VehicleState | None = None
@@ -28,42 +23,49 @@ class FiniteInputs:
         self._mocap: MocapPose | None = None
         self._arm: ArmState | None = None
         self._force: ForceSample | None = None
+        self.invalid: dict[str, Any] = {}
+        """Invalid records of this tick, by field of `Inputs`."""
 
-    def clean(self, i: Inputs, findings: Findings) -> Inputs:
-        """The same inputs, broken records replaced by None; the same object if there are none."""
+    def clean(self, i: Inputs) -> Inputs:
+        """Return the inputs with invalid records replaced by None; the same object if there are none."""
         vehicle, status, mocap, arm, force = i.vehicle, i.status, i.mocap, i.arm, i.force
-        bad: dict[str, None] = {}
+        invalid: dict[str, Any] = {}
         if vehicle is not None and vehicle is not self._vehicle:
-            if _vehicle_is_sound(vehicle):
+            if _vehicle_is_valid(vehicle):
                 self._vehicle = vehicle
             else:
-                findings.found(VEHICLE_NOT_FINITE, "PX4's state is no measurement: {}", vehicle)
-                bad["vehicle"] = None
+                invalid["vehicle"] = vehicle
         if mocap is not None and mocap is not self._mocap:
-            if _mocap_is_sound(mocap):
+            if _mocap_is_valid(mocap):
                 self._mocap = mocap
             else:
-                findings.found(MOCAP_NOT_FINITE, "this pose is no measurement: {}", mocap)
-                bad["mocap"] = None
+                invalid["mocap"] = mocap
         if arm is not None and arm is not self._arm:
-            if _arm_is_sound(arm):
+            if _arm_is_valid(arm):
                 self._arm = arm
             else:
-                findings.found(ARM_NOT_FINITE, "this joint state is no measurement: {}", arm)
-                bad["arm"] = None
+                invalid["arm"] = arm
         if force is not None and force is not self._force:
-            if _stamp(force.stamp_s) and _sound3(force.force_sensor_n) and _sound3(force.torque_sensor_nm):
+            if _force_is_valid(force):
                 self._force = force
             else:
-                findings.found(FORCE_NOT_FINITE, "this force sample is no measurement: {}", force)
-                bad["force"] = None
+                invalid["force"] = force
         if status is not None and status is not self._status:
-            if _status_is_sound(status):
+            if _status_is_valid(status):
                 self._status = status
             else:
-                findings.found(STATUS_NOT_FINITE, "PX4's status is no measurement: {}", status)
-                bad["status"] = None
-        return dataclasses.replace(i, **bad) if bad else i  # type: ignore[arg-type]
+                invalid["status"] = status
+        self.invalid = invalid
+        return dataclasses.replace(i, **dict.fromkeys(invalid)) if invalid else i  # type: ignore[arg-type]
+
+
+def invalid(field: str) -> Callable[[InputFilter, None], Values | None]:
+    """Return the predicate: this field of the inputs was invalid."""
+
+    def predicate(f: InputFilter, _: None) -> Values | None:
+        return (f.invalid[field],) if field in f.invalid else None
+
+    return predicate
 
 
 # Chained comparisons: NaN fails them all. Written out: these run in every tick, and a call costs more than the comparisons.
@@ -73,9 +75,9 @@ def _stamp(t_s: float) -> bool:
     return -_STAMP_MAX_S < t_s < _STAMP_MAX_S
 
 
-def _sound3(v: Vec3) -> bool:
+def _in_range3(v: Vec3) -> bool:
     x, y, z = v
-    return -ABSURD < x < ABSURD and -ABSURD < y < ABSURD and -ABSURD < z < ABSURD
+    return -OUT_OF_RANGE < x < OUT_OF_RANGE and -OUT_OF_RANGE < y < OUT_OF_RANGE and -OUT_OF_RANGE < z < OUT_OF_RANGE
 
 
 def _is_rotation(q: Quat) -> bool:
@@ -83,8 +85,8 @@ def _is_rotation(q: Quat) -> bool:
     return 0.95 < w * w + x * x + y * y + z * z < 1.05
 
 
-def _vehicle_is_sound(v: VehicleState) -> bool:
-    low, high, old, new, boot_s = -ABSURD, ABSURD, -_STAMP_MAX_S, _STAMP_MAX_S, v.boot_s
+def _vehicle_is_valid(v: VehicleState) -> bool:
+    low, high, old, new, boot_s = -OUT_OF_RANGE, OUT_OF_RANGE, -_STAMP_MAX_S, _STAMP_MAX_S, v.boot_s
     (px, py, pz), (vx, vy, vz), (w, x, y, z) = v.position_world_m, v.velocity_world_m_s, v.attitude_wxyz
     (rx, ry, rz), (fx, fy, fz) = v.angular_rate_body_rad_s, v.specific_force_body_m_s2
     imu_boot_s, (dx, dy, dz) = v.imu_boot_s, v.delta_velocity_body_m_s or (0.0, 0.0, 0.0)
@@ -103,18 +105,18 @@ def _vehicle_is_sound(v: VehicleState) -> bool:
     )
 
 
-def _mocap_is_sound(m: MocapPose) -> bool:
+def _mocap_is_valid(m: MocapPose) -> bool:
     return (
         _stamp(m.stamp_s)
         and (m.latency_s is None or _stamp(m.latency_s))
         and (m.exposure_server_s is None or _stamp(m.exposure_server_s))
-        # Motive may send anything for a body that it does not see; nobody looks at it then.
-        and (not m.tracking_valid or (_sound3(m.position_world_m) and _is_rotation(m.attitude_wxyz)))
+        # Motive may send anything for a body that it does not see; the pose is not used then.
+        and (not m.tracking_valid or (_in_range3(m.position_world_m) and _is_rotation(m.attitude_wxyz)))
     )
 
 
-def _arm_is_sound(a: ArmState) -> bool:
-    low, high = -ABSURD, ABSURD
+def _arm_is_valid(a: ArmState) -> bool:
+    low, high = -OUT_OF_RANGE, OUT_OF_RANGE
     (a1, a2), (w1, w2), (t1, t2), (c1, c2) = a.angle_rad, a.velocity_rad_s, a.torque_nm, a.temperature_c
     return (
         -_STAMP_MAX_S < a.stamp_s < _STAMP_MAX_S
@@ -125,10 +127,14 @@ def _arm_is_sound(a: ArmState) -> bool:
     )
 
 
-def _status_is_sound(s: AutopilotStatus) -> bool:
+def _force_is_valid(f: ForceSample) -> bool:
+    return _stamp(f.stamp_s) and _in_range3(f.force_sensor_n) and _in_range3(f.torque_sensor_nm)
+
+
+def _status_is_valid(s: AutopilotStatus) -> bool:
     voltage, remaining = s.battery_voltage_v, s.battery_remaining
     return (
         _stamp(s.heartbeat_stamp_s)
-        and (voltage is None or -ABSURD < voltage < ABSURD)
-        and (remaining is None or -ABSURD < remaining < ABSURD)
+        and (voltage is None or -OUT_OF_RANGE < voltage < OUT_OF_RANGE)
+        and (remaining is None or -OUT_OF_RANGE < remaining < OUT_OF_RANGE)
     )

@@ -1,0 +1,217 @@
+"""The arm's servos and the force sensor at its end: what is tracked of them, and the predicates of their rules."""
+
+from __future__ import annotations
+
+import math
+
+from companion.model.types import ArmState, ForceSample, Inputs, Vec2, Vec3
+from companion.safety.situation import HOLDS, Age, Situation, Values
+
+WATCHDOG_RESTARTED = 0x80
+"""Bit of `ArmState.hardware_error` that the companion sets: the bus watchdog had switched the torque off."""
+ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
+"""Bits of register 70, Hardware Error Status, of the XM430."""
+AT_LIMIT = 0.97
+"""A joint is at its torque limit from this share of it on."""
+DRIFT_TIME_S = 1.0
+"""Time constant of the mean force."""
+_NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
+
+
+def error_text(errors: tuple[int, int]) -> str:
+    """Return the hardware errors of both servos by name: "servo 2: overload, overheating"."""
+    parts = []
+    for index, error in enumerate(errors):
+        bits = [bit for bit in range(7) if error >> bit & 1]
+        if bits:
+            names = ", ".join(ERROR_NAMES.get(bit, f"bit {bit}") for bit in bits)
+            parts.append(f"servo {index + 1}: {names}")
+    return "; ".join(parts)
+
+
+class ArmTracker:
+    """Both servos."""
+
+    def __init__(self) -> None:
+        self._age = Age()
+        self._newest: ArmState | None = None
+        self.arm: ArmState | None = None
+        """Joint state of this tick."""
+        self.before: ArmState | None = None
+        """The joint state before it, if this tick's is a new one."""
+        self.age_s = 0.0
+
+    def update(self, i: Inputs, awake_s: float) -> None:
+        """Take a tick."""
+        arm = self.arm = i.arm
+        self.age_s = self._age.update(awake_s, arm.stamp_s if arm else None)
+        self.before = None
+        if arm is not None:
+            newest, self._newest = self._newest, arm
+            if newest is not None and arm.stamp_s > newest.stamp_s:
+                self.before = newest
+
+
+def arm_lost(a: ArmTracker, timeout_s: float) -> Values | None:
+    """No joint state has arrived for longer than the timeout."""
+    return HOLDS if a.age_s > timeout_s else None
+
+
+def arm_read_failures(a: ArmTracker, failures_max: int) -> Values | None:
+    """Consecutive bus cycles without an answer have reached the limit."""
+    arm = a.arm
+    return (arm.read_failures,) if arm is not None and arm.read_failures >= failures_max else None
+
+
+def servo_error(a: ArmTracker, _: None) -> Values | None:
+    """A servo reports a hardware error."""
+    arm = a.arm
+    if arm is None:
+        return None
+    first, second = arm.hardware_error
+    return (error_text((first, second)),) if (first | second) & ~WATCHDOG_RESTARTED else None
+
+
+def arm_let_go(a: ArmTracker, _: None) -> Values | None:
+    """A servo's bus watchdog had switched its torque off."""
+    arm = a.arm
+    return HOLDS if arm is not None and (arm.hardware_error[0] | arm.hardware_error[1]) & WATCHDOG_RESTARTED else None
+
+
+def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
+    """A joint has turned further between two reads than the thresholds allow: an angle, and a rate times the time between them."""
+    before, arm = a.before, a.arm
+    if before is None or arm is None:
+        return None
+    jump_rad, rate_max_rad_s = thresholds
+    step_rad = jump_rad + rate_max_rad_s * (arm.stamp_s - before.stamp_s)
+    for index in (1, 0):
+        step = arm.angle_rad[index] - before.angle_rad[index]
+        if not -step_rad < step < step_rad:
+            return (index + 1, math.degrees(step))
+    return None
+
+
+def servo_warm(a: ArmTracker, thresholds: Vec2) -> Values | None:
+    """The hotter servo's temperature has reached the first threshold, and not the second."""
+    if a.arm is None:
+        return None
+    hottest_c = max(a.arm.temperature_c)
+    return (hottest_c,) if thresholds[0] <= hottest_c < thresholds[1] else None
+
+
+def servo_hot(a: ArmTracker, thresholds: Vec2) -> Values | None:
+    """The hotter servo's temperature has reached both thresholds."""
+    if a.arm is None:
+        return None
+    hottest_c = max(a.arm.temperature_c)
+    return (hottest_c,) if hottest_c >= thresholds[0] and hottest_c >= thresholds[1] else None
+
+
+def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:
+    """A joint is at its torque limit."""
+    if a.arm is None:
+        return None
+    t1, t2 = a.arm.torque_nm
+    limit1, limit2 = AT_LIMIT * torque_max_nm[0], AT_LIMIT * torque_max_nm[1]
+    return None if -limit1 < t1 < limit1 and -limit2 < t2 < limit2 else (t1, t2)
+
+
+def joint_rate(a: ArmTracker, rate_max_rad_s: float) -> Values | None:
+    """A joint turns faster than it can."""
+    if a.arm is None:
+        return None
+    w1, w2 = a.arm.velocity_rad_s
+    in_range = -rate_max_rad_s < w1 < rate_max_rad_s and -rate_max_rad_s < w2 < rate_max_rad_s
+    return None if in_range else (math.degrees(w1), math.degrees(w2))
+
+
+def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, Vec2]]) -> Values | None:
+    """A joint is further beyond its limits than the first threshold; the second is each joint's lower and upper limit."""
+    if a.arm is None:
+        return None
+    (a1, a2), (beyond_max_rad, ((low1, high1), (low2, high2))) = a.arm.angle_rad, thresholds
+    if low1 <= a1 <= high1 and low2 <= a2 <= high2:
+        return None
+    beyond_rad = max(low1 - a1, a1 - high1, low2 - a2, a2 - high2)
+    return (math.degrees(a1), math.degrees(a2), math.degrees(beyond_rad)) if beyond_rad > beyond_max_rad else None
+
+
+class ForceTracker:
+    """The force-torque sensor.
+
+    Args:
+        stuck_s: hold time after which samples that repeat themselves count as lost, `safety.force_stuck_s`.
+    """
+
+    def __init__(self, stuck_s: float) -> None:
+        self._stuck_s = stuck_s
+        self._age = Age()
+        self._before: ForceSample | None = None
+        self._same_since_s: float | None = None
+        self._moved = False
+        self.force: ForceSample | None = None
+        """Sample of this tick."""
+        self.age_s = 0.0
+        self.stuck = False
+        """Samples repeat themselves although the vehicle moves."""
+        self.trusted = True
+        """Samples are measurements: they are passed on."""
+        self.mean_n: Vec3 = _NO_FORCE
+        """Low-passed external force in the world frame while the law flies with an empty net; else 0."""
+
+    def update(self, i: Inputs, situation: Situation, awake_s: float, dt_s: float, moving: bool) -> None:
+        """Take a tick; `moving`: PX4's velocity or rates show that the vehicle moves."""
+        force = self.force = i.force
+        self.age_s = self._age.update(awake_s, force.stamp_s if force else None)
+        self.stuck = False
+        if force is not None:
+            self._compare(force, situation, awake_s, moving)
+        control = situation.control
+        if control is None or situation.caught or not situation.airborne:
+            self.mean_n = _NO_FORCE
+            return
+        (mx, my, mz), (x, y, z) = self.mean_n, control.force_ext_world_n
+        k = dt_s / DRIFT_TIME_S
+        self.mean_n = (mx + k * (x - mx), my + k * (y - my), mz + k * (z - mz))
+
+    def _compare(self, force: ForceSample, situation: Situation, awake_s: float, moving: bool) -> None:
+        before = self._before
+        self._before = force
+        if before is not None and force.stamp_s != before.stamp_s:
+            if (
+                force.force_sensor_n != before.force_sensor_n
+                or force.torque_sensor_nm != before.torque_sensor_nm
+                or not situation.airborne
+            ):
+                self._same_since_s, self.trusted = None, True
+            elif self._same_since_s is None:
+                self._same_since_s, self._moved = awake_s, False
+        if self._same_since_s is not None:
+            self._moved = self._moved or moving
+            if self._moved and awake_s - self._same_since_s > self._stuck_s:
+                self.stuck, self.trusted = True, False
+
+
+def force_lost(f: ForceTracker, timeout_s: float) -> Values | None:
+    """No sample has arrived for longer than the timeout."""
+    return HOLDS if f.age_s > timeout_s else None
+
+
+def force_overload(f: ForceTracker, force_max_n: float) -> Values | None:
+    """The sensor reports an overload, or a force beyond its range."""
+    if f.force is None:
+        return None
+    x, y, z = f.force.force_sensor_n
+    return (x, y, z) if f.force.overload or x * x + y * y + z * z > force_max_n**2 else None
+
+
+def force_stuck(f: ForceTracker, _: None) -> Values | None:
+    """Samples repeat themselves although the vehicle moves."""
+    return HOLDS if f.stuck else None
+
+
+def force_drift(f: ForceTracker, drift_n: float) -> Values | None:
+    """The mean force on an empty net exceeds the threshold."""
+    x, y, z = f.mean_n
+    return (x, y, z) if x * x + y * y + z * z > drift_n**2 else None

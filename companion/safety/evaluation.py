@@ -1,0 +1,92 @@
+"""The loop over the event table: which rules hold in a tick, for how long, and which of them become an event."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from companion.config.vehicle import Vehicle
+from companion.model.negative_zero import without_negative_zero
+from companion.model.types import Event, SafetyAction
+from companion.safety.events import RULES
+from companion.safety.rule import Repeat, Rule, Subject, hold_time_s, thresholds_of
+from companion.safety.situation import Values
+
+QUIET_S = 1.0
+"""A rule that held raises its event again only after it has not held for this long; until then it is active."""
+_Bound = tuple[Rule, Any, Any, Any]
+"""A rule, its predicate, and the predicate's two arguments."""
+
+
+class Evaluation:
+    """Evaluates the table tick by tick. Its state: since when each rule holds, and which rules are active.
+
+    Args:
+        vehicle: gives thresholds and hold times.
+        trackers: by subject; the first argument of its rules' predicates.
+    """
+
+    def __init__(self, vehicle: Vehicle, trackers: Mapping[Subject, object]) -> None:
+        bound = [(rule, rule.predicate, trackers[rule.subject], thresholds_of(rule, vehicle)) for rule in RULES]
+        self._air: list[_Bound] = [row for row in bound if row[0].air is not None]
+        self._ground: list[_Bound] = [row for row in bound if row[0].ground is not None]
+        self._air_waiting = [row for row in self._air if row[0].while_waiting]
+        self._ground_waiting = [row for row in self._ground if row[0].while_waiting]
+        self._hold_time_s = {rule.id: hold_time_s(rule, vehicle) for rule in RULES}
+        self._since_s: dict[str, float] = {}
+        self._active: dict[str, tuple[SafetyAction, float, Rule, Values]] = {}
+        """Action, the last time at which the rule held (infinite for a rule that is reported once), and what it found then."""
+
+    def forget(self) -> None:
+        """Raise the events of all rules that hold again, because the operator has ended what was done about them."""
+        self._active = {id_: active for id_, active in self._active.items() if active[1] == math.inf}
+
+    def standing(self) -> str | None:
+        """Return the message of the active rule with the gravest action, HOLD at least; None if there is no such rule."""
+        gravest: SafetyAction | None = None
+        text = None
+        for action, _, rule, values in self._active.values():
+            if action.rank >= SafetyAction.HOLD.rank and (gravest is None or action.rank > gravest.rank):
+                gravest, text = action, rule.message.format(*values)
+        return text
+
+    def events(self, t_s: float, airborne: bool, waiting: bool) -> tuple[Event, ...]:
+        """Evaluate every rule that counts in this tick and return the events that begin.
+
+        Args:
+            t_s: flight clock.
+            airborne: the actions in the air count, and only rules that have one.
+            waiting: only rules with `while_waiting` count.
+        """
+        if airborne:
+            rows = self._air_waiting if waiting else self._air
+        else:
+            rows = self._ground_waiting if waiting else self._ground
+        holds: dict[str, tuple[Rule, Values]] = {}
+        for rule, predicate, tracker, thresholds in rows:
+            values = predicate(tracker, thresholds)
+            if values is not None:
+                holds[rule.id] = (rule, values)
+        if self._since_s:
+            self._since_s = {id_: since_s for id_, since_s in self._since_s.items() if id_ in holds}
+        events = []
+        for id_, (rule, values) in holds.items():
+            action, severity = rule.verdict(airborne)
+            since_s = self._since_s.setdefault(id_, t_s)
+            active = self._active.get(id_)
+            if active is not None and active[0] is action:
+                self._active[id_] = (action, max(active[1], t_s), rule, values)
+            elif t_s - since_s >= self._hold_time_s[id_]:
+                last_s = math.inf if rule.repeat is Repeat.NEVER else t_s
+                self._active[id_] = (action, last_s, rule, values)
+                text = without_negative_zero(rule.message.format(*values))
+                events.append(Event(t_s, id_, severity, action, text))
+        if self._active:
+            self._expire(t_s)
+        return tuple(events)
+
+    def _expire(self, t_s: float) -> None:
+        for id_, (_, last_s, rule, _) in list(self._active.items()):
+            if t_s - last_s > QUIET_S or rule.repeat is Repeat.AT_ONCE:
+                del self._active[id_]

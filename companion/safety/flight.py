@@ -1,0 +1,182 @@
+"""The vehicle in the air: tilt, tracking, thrust, speed, room and tether. Only the vertical force has a state."""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import GRAVITY_M_S2
+from companion.model.frames import tilt_rad
+from companion.model.types import ControlLog, Inputs, TetherState, VehicleState
+from companion.safety.governor import BODY_TOP_M
+from companion.safety.rotor_stop import FLIPPED_TILT_RAD, seems_flipped
+from companion.safety.situation import Situation, Values
+from companion.safety.stop import StopModel
+
+
+class FlightTracker:
+    """One tick in the air.
+
+    Args:
+        vehicle: room, airframe and tether.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        tilt_max_rad = math.radians(vehicle.safety.tilt_abort_deg)
+        # Of a quaternion, x^2 + y^2 = sin^2(tilt / 2): most ticks need no angle.
+        self._upright_max = math.sin(0.5 * min(tilt_max_rad, FLIPPED_TILT_RAD)) ** 2
+        self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
+        self._radius_m = vehicle.airframe.radius_m
+        self._room = vehicle.room
+        self._stop = StopModel(vehicle.tether)
+        self._inputs: Inputs | None = None
+        self.vehicle: VehicleState | None = None
+        self.tilt_rad = 0.0
+        """PX4's tilt; 0 while it is below `safety.tilt_abort_deg` and `FLIPPED_TILT_RAD`."""
+        self.tracking_error_m: float | None = None
+        self.tether: TetherState | None = None
+        self.vertical_n: float | None = None
+        """Vertical force of the law while it is limited above the weight; else None."""
+        self.saturated_s = 0.0
+        """Counts up while the vertical force is limited and down while it is not, because noise makes it flicker."""
+
+    def update(self, i: Inputs, situation: Situation, dt_s: float) -> None:
+        """Take a tick in the air; `i` holds only inputs that are believed."""
+        self._inputs, vehicle = i, i.vehicle
+        self.vehicle = vehicle
+        self.tilt_rad = 0.0
+        if vehicle is not None:
+            _, x, y, _ = vehicle.attitude_wxyz
+            if x * x + y * y > self._upright_max:
+                self.tilt_rad = tilt_rad(vehicle.attitude_wxyz)
+        self.tracking_error_m = situation.tracking_error_m
+        self.tether = situation.tether
+        self._count_saturation(situation.control, dt_s)
+
+    def _count_saturation(self, control: ControlLog | None, dt_s: float) -> None:
+        self.vertical_n = None
+        if control is not None and control.saturated[0] and control.tau[2] > self._weight_n:
+            self.vertical_n = control.tau[2]
+            self.saturated_s += dt_s
+        elif self.saturated_s > 0.0:
+            self.saturated_s = max(0.0, self.saturated_s - dt_s)
+
+    @property
+    def flipped(self) -> bool:
+        """Two sources say in this tick that the vehicle is flipped."""
+        return self.tilt_rad > 0.0 and self._inputs is not None and seems_flipped(self._inputs)
+
+    def stop_s(self, vehicle: VehicleState) -> float:
+        """Velocity times this is the displacement to where the vehicle would come to rest after a fault."""
+        vx, vy, vz = vehicle.velocity_world_m_s
+        return self._stop.time_s(math.sqrt(vx * vx + vy * vy + vz * vz))
+
+    def rotors_in_room(self, x: float, y: float, z: float, tolerance_m: float) -> bool:
+        """Whether the rotors of a vehicle at this position, in m, are in the room."""
+        room, inset_m = self._room, self._radius_m - tolerance_m
+        (x_low, x_high), (y_low, y_high) = room.x_m, room.y_m
+        return (
+            x_low + inset_m <= x <= x_high - inset_m
+            and y_low + inset_m <= y <= y_high - inset_m
+            and z <= room.z_m[1] - BODY_TOP_M + tolerance_m
+        )
+
+
+def tilt(f: FlightTracker, tilt_max_rad: float) -> Values | None:
+    """PX4's tilt exceeds the threshold."""
+    return (math.degrees(f.tilt_rad),) if f.tilt_rad > tilt_max_rad else None
+
+
+def crashed(f: FlightTracker, _: None) -> Values | None:
+    """The vehicle is flipped."""
+    return (math.degrees(f.tilt_rad),) if f.flipped else None
+
+
+def too_fast(f: FlightTracker, speed_max_m_s: float) -> Values | None:
+    """The horizontal speed exceeds the threshold."""
+    if f.vehicle is None:
+        return None
+    vx, vy, _ = f.vehicle.velocity_world_m_s
+    return (math.hypot(vx, vy),) if vx * vx + vy * vy > speed_max_m_s * speed_max_m_s else None
+
+
+def climbs_too_fast(f: FlightTracker, climb_max_m_s: float) -> Values | None:
+    """The vertical speed upward exceeds the threshold."""
+    up_m_s = f.vehicle.velocity_world_m_s[2] if f.vehicle is not None else 0.0
+    return (up_m_s,) if up_m_s > climb_max_m_s else None
+
+
+def sinks_too_fast(f: FlightTracker, sink_max_m_s: float) -> Values | None:
+    """The vertical speed downward exceeds the threshold."""
+    up_m_s = f.vehicle.velocity_world_m_s[2] if f.vehicle is not None else 0.0
+    return (-up_m_s,) if up_m_s < -sink_max_m_s else None
+
+
+def geofence_left(f: FlightTracker, tolerance_m: float) -> Values | None:
+    """The rotors are outside the room by more than the tolerance."""
+    if f.vehicle is None:
+        return None
+    x, y, z = f.vehicle.position_world_m
+    return None if f.rotors_in_room(x, y, z, tolerance_m) else (x, y, z)
+
+
+def geofence_near(f: FlightTracker, tolerance_m: float) -> Values | None:
+    """The rotors would be outside the room by more than the tolerance where the vehicle would come to rest after a fault."""
+    if f.vehicle is None:
+        return None
+    (x, y, z), (vx, vy, vz), stop_s = f.vehicle.position_world_m, f.vehicle.velocity_world_m_s, f.stop_s(f.vehicle)
+    x, y, z = x + vx * stop_s, y + vy * stop_s, z + vz * stop_s
+    return None if f.rotors_in_room(x, y, z, tolerance_m) else (x, y, z)
+
+
+def tracking_error(f: FlightTracker, thresholds: tuple[float, ...]) -> Values | None:
+    """The tracking error exceeds all thresholds."""
+    error_m = f.tracking_error_m
+    return (error_m,) if error_m is not None and error_m > max(thresholds) else None
+
+
+def tracking_warn(f: FlightTracker, threshold_m: float) -> Values | None:
+    """The tracking error exceeds the threshold."""
+    error_m = f.tracking_error_m
+    return (error_m,) if error_m is not None and error_m > threshold_m else None
+
+
+def thrust_saturated(f: FlightTracker, saturated_max_s: float) -> Values | None:
+    """The vertical force is limited, and has been for longer than the threshold."""
+    return (f.vertical_n,) if f.vertical_n is not None and f.saturated_s > saturated_max_s else None
+
+
+def tether_short(f: FlightTracker, slack_min_m: float) -> Values | None:
+    """Less tether than the threshold would be left where the vehicle would come to rest after a fault."""
+    t = f.tether
+    return (t.stop_slack_m,) if t is not None and t.stop_slack_m < slack_min_m else None
+
+
+def tether_taut(f: FlightTracker, _: None) -> Values | None:
+    """The tether is taut."""
+    t = f.tether
+    return (t.slack_m, t.pull_n) if t is not None and t.taut else None
+
+
+def tether_snagged(f: FlightTracker, _: None) -> Values | None:
+    """The tether pulls although there is slack."""
+    t = f.tether
+    return (t.pull_n, t.slack_m) if t is not None and t.snagged else None
+
+
+def tether_near(f: FlightTracker, clearance_min_m: float) -> Values | None:
+    """The tether is nearer to rotors or arm than the threshold."""
+    t = f.tether
+    return (t.clearance_m,) if t is not None and t.clearance_m < clearance_min_m else None
+
+
+def tether_wound(f: FlightTracker, turns_max: float) -> Values | None:
+    """The tether is wound by more turns than the threshold."""
+    t = f.tether
+    return (abs(t.turns),) if t is not None and abs(t.turns) > turns_max else None
+
+
+def tether_separated(f: FlightTracker, _: None) -> Values | None:
+    """The vehicle is further away than the tether is long, and nothing pulls."""
+    t = f.tether
+    return (t.range_m,) if t is not None and t.separated else None

@@ -1,0 +1,303 @@
+"""Motion capture: which poses are believed, and the predicates of its rules.
+
+A pose is believed when it is where PX4's velocity and rates say that the body should be by now. A pose that is not believed counts as
+not arrived and is not passed on to PX4: an estimator that was fed with another body's pose is of no use in a landing.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Safety
+from companion.control.manipulator import GRAVITY_M_S2
+from companion.model.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
+from companion.model.types import Inputs, MocapPose, Quat, Vec2, VehicleState
+from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck, RemoteClock
+from companion.safety.situation import HOLDS, Situation, Values
+from companion.safety.stream_watch import StreamWatch
+
+FUSED_WITHIN_M = 0.10
+FUSED_WITHIN_RAD = math.radians(8.0)
+CONTINUOUS_S = 0.1
+"""After a longer gap a pose is compared with PX4's position, not with the pose before."""
+FORGET_S = 1.0
+"""After a gap this long the next frame is believed: `mocap_lost` has reported the gap."""
+DRIFT_M_S = 0.3
+"""PX4's position may be off by this much more for every second without a believed pose."""
+RATE_WINDOW_S = 1.0
+
+
+def unfused(i: Inputs) -> str | None:
+    """Return why PX4 seems not to fuse vision, or None if position and yaw of its estimate agree with motion capture.
+
+    PX4 accepts poses that it does not fuse without a message, so having sent them proves nothing.
+    """
+    if i.vehicle is None or i.mocap is None:
+        return "no state to compare"
+    apart_m = math.dist(i.vehicle.position_world_m, i.mocap.position_world_m)
+    turned_rad = _yaw_between(i.vehicle.attitude_wxyz, i.mocap.attitude_wxyz)
+    if apart_m <= FUSED_WITHIN_M and turned_rad <= FUSED_WITHIN_RAD:
+        return None
+    return (
+        f"PX4 does not follow motion capture: {apart_m:.2f} m and {math.degrees(turned_rad):.0f} deg of yaw apart; "
+        "check EKF2_EV_CTRL = 11, EKF2_HGT_REF = 3 and the body's axes in Motive"
+    )
+
+
+class MocapTracker:
+    """Judges each frame once: is it believed, does it repeat the one before, does it move as the IMU measures?
+
+    Args:
+        safety: thresholds for a pose that is believed.
+    """
+
+    def __init__(self, safety: Safety) -> None:
+        s = self._s = safety
+        self._jump_rad = math.radians(s.mocap_jump_deg)
+        self._jump_cos_half = math.cos(0.5 * self._jump_rad)
+        self._frame_awake_s = -math.inf
+        self._believed: MocapPose | None = None
+        self._believed_awake_s = -math.inf
+        self._same_since_s: float | None = None
+        self._moved = False
+        self._streams = StreamWatch()
+        self._inertial = InertialCheck(s.mocap_inertial_m, s.mocap_inertial_s, s.mocap_timeout_s)
+        self._imu: VehicleState | None = None
+        """The state whose IMU samples were used last."""
+        self._imu_s = 0.0
+        """End of the newest of them, flight clock."""
+        self._px4_clock, self._server_clock = RemoteClock(), RemoteClock()
+        self._against_imu = False
+        """The newest believed pose does not move as the IMU measures."""
+        self._window_awake_s: float | None = None
+        self._window_frames = 0
+        self.pose: MocapPose | None = None
+        """Pose of this tick."""
+        self.frame: MocapPose | None = None
+        """The newest frame, valid or not."""
+        self.frame_age_s = self.believed_age_s = math.inf
+        """Awake time since the newest frame, and since the newest believed pose."""
+        self.plausible = True
+        """The newest valid pose is believed."""
+        self.off = (0.0, 0.0)
+        """How far the newest pose that was not believed is off: m and deg."""
+        self.frozen = False
+        """New frames repeat the same pose while the vehicle moves in the air, for longer than `safety.mocap_frozen_s`."""
+        self.two_streams = False
+        self.dragged = False
+        """In the air, while the companion commanded, poses did not move as the IMU measured. Latched: the observer soon follows the
+        drag, and the poses must not be believed again. Not judged once PX4 lands for another reason: behind a late link the check can
+        be wrong, and PX4 needs the poses."""
+        self.rate_hz: float | None = None
+        self.compared: tuple[MocapPose, VehicleState] | None = None
+        """A fresh, believed pose and PX4's state in the air; else None."""
+        self.trusted = True
+        """The newest pose is of this body and of now."""
+        self.repeats = False
+        """The newest pose repeats the one before bit for bit: in the air no measurement does."""
+
+    def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
+        """Take a tick; `moving`: PX4's velocity or rates show that the vehicle moves."""
+        pose, vehicle, s = i.mocap, i.vehicle, self._s
+        self.pose = pose
+        self._moved = self._moved or moving
+        if vehicle is not None and vehicle.imu_boot_s is not None:
+            self._predict(vehicle, vehicle.imu_boot_s)
+        if pose is not None and (self.frame is None or pose.stamp_s != self.frame.stamp_s):
+            self._judge(pose, vehicle, awake_s)
+        self.frame_age_s = awake_s - self._frame_awake_s
+        self.believed_age_s = awake_s - self._believed_awake_s
+        self.frozen = (
+            self._same_since_s is not None
+            and self._moved
+            and situation.airborne
+            and awake_s - self._same_since_s > s.mocap_frozen_s
+        )
+        self.two_streams = self._streams.two(awake_s)
+        self.dragged = self.dragged or (self._against_imu and situation.airborne and situation.offboard_expected)
+        self.trusted = self.plausible and not self.frozen and not self.two_streams and not self.dragged
+        self._count(awake_s)
+        self.compared = None
+        if pose is not None and vehicle is not None and situation.airborne and self.trusted:
+            if pose.tracking_valid and self.frame_age_s < s.mocap_timeout_s:
+                self.compared = (pose, vehicle)
+
+    @property
+    def innovation_m(self) -> float:
+        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged."""
+        return self._inertial.innovation_m
+
+    def unbelieved(self, timeout_s: float) -> bool:
+        """Frames arrive, but none was believed for longer than the timeout."""
+        return self.believed_age_s > timeout_s and not self.frame_age_s > timeout_s
+
+    def _predict(self, vehicle: VehicleState, boot_s: float) -> None:
+        """All IMU samples that came since the last tick; `boot_s` is the time of the newest."""
+        before = self._imu
+        if before is not None and boot_s == before.imu_boot_s:
+            return
+        self._imu, self._imu_s = vehicle, self._px4_clock.local_s(boot_s, vehicle.imu_stamp_s)
+        if before is None or before.imu_boot_s is None:
+            return
+        now, then = vehicle.delta_velocity_body_m_s, before.delta_velocity_body_m_s
+        if now is None or then is None:
+            return
+        dt_s = boot_s - before.imu_boot_s
+        (x, y, z), (bx, by, bz) = now, then
+        x, y, z = quat_rotate(vehicle.attitude_wxyz, (x - bx, y - by, z - bz))
+        self._inertial.imu(vehicle.imu_stamp_s, dt_s, (x, y, z - GRAVITY_M_S2 * dt_s))
+
+    def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float) -> None:
+        """A new frame."""
+        before, believed = self.frame, self._believed
+        gone_s = awake_s - self._frame_awake_s
+        self.frame, self._frame_awake_s = pose, awake_s
+        self._window_frames += 1
+        self._streams.update(pose.frame_number, (pose.position_world_m, pose.attitude_wxyz), awake_s)
+        # The gap was reported as lost; a rate over it says nothing about this stream.
+        if gone_s > self._s.mocap_timeout_s:
+            self._window_awake_s = self.rate_hz = None
+        self.repeats = (
+            before is not None
+            and pose.position_world_m == before.position_world_m
+            and pose.attitude_wxyz == before.attitude_wxyz
+        )
+        if before is None or pose.position_world_m != before.position_world_m or not pose.tracking_valid:
+            self._same_since_s, self._moved = None, False
+        elif self._same_since_s is None and pose.attitude_wxyz == before.attitude_wxyz:
+            self._same_since_s, self._moved = awake_s, False
+        if not pose.tracking_valid:
+            return
+        self.plausible = (
+            believed is None or vehicle is None or gone_s > FORGET_S or self._follows(believed, pose, vehicle)
+        )
+        if self.plausible:
+            self._believed, self._believed_awake_s = pose, awake_s
+            # A repeated pose is judged by mocap_frozen: it is not passed on, and says nothing of how the vehicle moves.
+            if not self.repeats:
+                self._against_imu = self._inertial.pose(pose.stamp_s, pose.position_world_m, self._age_s(pose))
+        else:
+            self._against_imu = False
+
+    def _age_s(self, pose: MocapPose) -> float:
+        """Time from the exposure of a pose to the newest IMU sample, limited; negative if the pose is newer."""
+        latency_s, sent_s = pose.latency_s or 0.0, pose.stamp_s
+        if pose.exposure_server_s is not None:
+            sent_s = self._server_clock.local_s(pose.exposure_server_s + latency_s, sent_s)
+        return min(max(-IMU_GAP_MAX_S, self._imu_s - sent_s + latency_s), self._s.mocap_timeout_s)
+
+    def _follows(self, before: MocapPose, pose: MocapPose, vehicle: VehicleState) -> bool:
+        """The pose is where the body can be by now."""
+        dt_s = pose.stamp_s - before.stamp_s
+        x, y, z = pose.position_world_m
+        if dt_s <= CONTINUOUS_S:
+            vx, vy, vz = vehicle.velocity_world_m_s
+            px, py, pz = before.position_world_m
+            px, py, pz = px + vx * dt_s, py + vy * dt_s, pz + vz * dt_s
+            allowed_m = self._s.mocap_jump_m
+            reference = before.attitude_wxyz
+        else:
+            px, py, pz = vehicle.position_world_m
+            allowed_m = min(self._s.mocap_jump_m + DRIFT_M_S * dt_s, self._s.estimate_disagreement_m)
+            reference = vehicle.attitude_wxyz
+        off_m2 = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2
+        cos_half = abs(_dot(pose.attitude_wxyz, reference))
+        if off_m2 <= allowed_m * allowed_m and cos_half >= self._jump_cos_half:
+            return True
+        turned_rad = 2.0 * math.acos(min(1.0, cos_half))
+        turnable_rad = self._jump_rad + 1.5 * math.hypot(*vehicle.angular_rate_body_rad_s) * min(dt_s, CONTINUOUS_S)
+        if off_m2 <= allowed_m * allowed_m and turned_rad <= turnable_rad:
+            return True
+        self.off = (math.sqrt(off_m2), math.degrees(turned_rad))
+        return False
+
+    def _count(self, awake_s: float) -> None:
+        """Frames in each `RATE_WINDOW_S`."""
+        start_s = self._window_awake_s
+        if start_s is None:
+            self._window_awake_s, self._window_frames = awake_s, 0
+        elif awake_s - start_s >= RATE_WINDOW_S:
+            self.rate_hz = self._window_frames / (awake_s - start_s)
+            self._window_awake_s, self._window_frames = awake_s, 0
+
+
+def mocap_lost(m: MocapTracker, timeout_s: float) -> Values | None:
+    """No frame has arrived for longer than the timeout."""
+    return HOLDS if m.frame_age_s > timeout_s else None
+
+
+def mocap_invalid(m: MocapTracker, timeout_s: float) -> Values | None:
+    """Frames arrive, but none was believed for longer than the timeout, and the newest has no valid pose."""
+    return HOLDS if m.unbelieved(timeout_s) and m.frame is not None and not m.frame.tracking_valid else None
+
+
+def mocap_swapped(m: MocapTracker, timeout_s: float) -> Values | None:
+    """Poses arrive, but none was believed for longer than the timeout."""
+    return m.off if m.unbelieved(timeout_s) and m.frame is not None and m.frame.tracking_valid else None
+
+
+def mocap_jump(m: MocapTracker, timeout_s: float) -> Values | None:
+    """The newest pose is not believed, but one within the timeout was."""
+    return m.off if not m.plausible and m.believed_age_s <= timeout_s else None
+
+
+def mocap_two_streams(m: MocapTracker, _: None) -> Values | None:
+    """Frame numbers step back repeatedly."""
+    return HOLDS if m.two_streams else None
+
+
+def mocap_dragged(m: MocapTracker, limit_m: float) -> Values | None:
+    """Poses do not move as the IMU measures."""
+    return (m.innovation_m * 1e3, limit_m * 1e3) if m.dragged else None
+
+
+def mocap_frozen(m: MocapTracker, _: None) -> Values | None:
+    """New frames repeat the same pose although the vehicle moves."""
+    return HOLDS if m.frozen else None
+
+
+def mocap_slow(m: MocapTracker, thresholds: Vec2) -> Values | None:
+    """The rate is below the first threshold; the second is the timeout after which the stream is lost instead."""
+    rate_hz = m.rate_hz
+    slow = rate_hz is not None and rate_hz < thresholds[0] and not m.frame_age_s > thresholds[1]
+    return (rate_hz,) if slow else None
+
+
+def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
+    """The latency exceeds the first threshold, and not the second."""
+    latency_s = m.pose.latency_s if m.pose is not None else None
+    return (latency_s * 1e3,) if latency_s is not None and thresholds[0] < latency_s <= thresholds[1] else None
+
+
+def mocap_too_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
+    """The latency exceeds both thresholds."""
+    latency_s = m.pose.latency_s if m.pose is not None else None
+    return (latency_s * 1e3,) if latency_s is not None and latency_s > max(thresholds) else None
+
+
+def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:
+    """PX4's position and the pose are further apart than the threshold."""
+    if m.compared is None:
+        return None
+    apart_m = math.dist(m.compared[1].position_world_m, m.compared[0].position_world_m)
+    return (apart_m,) if apart_m > disagreement_m else None
+
+
+def yaw_disagrees(m: MocapTracker, disagreement_rad: float) -> Values | None:
+    """PX4's yaw and the pose's differ by more than the threshold."""
+    if m.compared is None:
+        return None
+    pose, vehicle = m.compared[0].attitude_wxyz, m.compared[1].attitude_wxyz
+    # Most ticks need no angles: attitudes that differ by less than the threshold cannot differ by more in yaw, near level.
+    if abs(_dot(vehicle, pose)) >= math.cos(0.4 * disagreement_rad):
+        return None
+    turned_rad = _yaw_between(vehicle, pose)
+    return (math.degrees(turned_rad),) if turned_rad > disagreement_rad else None
+
+
+def _dot(a: Quat, b: Quat) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+
+
+def _yaw_between(a: Quat, b: Quat) -> float:
+    return abs(wrap_rad(euler_zyx_from_quat(a)[2] - euler_zyx_from_quat(b)[2]))

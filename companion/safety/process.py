@@ -1,0 +1,56 @@
+"""The companion's own processes and the operator's commands: what is tracked of them, and the predicates of their rules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from companion.model.types import Inputs, OperatorCommand
+from companion.safety.situation import HOLDS, Values
+
+
+class ProcessTracker:
+    """The control loop, the recorder, the guardian and the operator."""
+
+    def __init__(self) -> None:
+        self._command = OperatorCommand.NONE
+        self.command = OperatorCommand.NONE
+        """The command that begins in this tick: one that lasts for several ticks counts once."""
+        self.gap_s = 0.0
+        """Time since the tick before."""
+        self.recorder_dropped = 0
+        self.guardian_ready: bool | None = None
+
+    def update(self, i: Inputs, gap_s: float) -> None:
+        """Take a tick."""
+        begins, self._command = i.command is not self._command, i.command
+        self.command = i.command if begins else OperatorCommand.NONE
+        self.gap_s, self.recorder_dropped, self.guardian_ready = gap_s, i.recorder_dropped, i.guardian_ready
+
+
+def loop_late(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
+    """The tick is late by more than the first threshold, and not the second."""
+    return (p.gap_s * 1e3,) if thresholds[0] < p.gap_s <= thresholds[1] else None
+
+
+def loop_stalled(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
+    """The tick is late by more than both thresholds."""
+    return (p.gap_s * 1e3,) if p.gap_s > thresholds[0] and p.gap_s > thresholds[1] else None
+
+
+def recorder_drops(p: ProcessTracker, _: None) -> Values | None:
+    """The recorder has dropped samples."""
+    return HOLDS if p.recorder_dropped else None
+
+
+def guardian_lost(p: ProcessTracker, _: None) -> Values | None:
+    """There is a guardian, and it is not ready."""
+    return HOLDS if p.guardian_ready is False else None
+
+
+def commanded(command: OperatorCommand) -> Callable[[ProcessTracker, None], Values | None]:
+    """Return the predicate: this command begins in this tick."""
+
+    def predicate(p: ProcessTracker, _: None) -> Values | None:
+        return HOLDS if p.command is command else None
+
+    return predicate

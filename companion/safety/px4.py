@@ -1,0 +1,162 @@
+"""PX4: what is tracked of its state, clock and status, and the predicates of its rules."""
+
+from __future__ import annotations
+
+import math
+
+from companion.model.flight_stage import failsafe_chose, people_chose
+from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
+from companion.safety.situation import HOLDS, Age, Situation, Values
+
+DISARMED_ABOVE_M = 0.15
+"""Margin over standing height below which PX4's own disarm after a landing is no fault."""
+CLOCK_BACK_S = 1.0
+LAG_FORGOTTEN_S_PER_S = 0.05
+"""A lag that lasts is forgotten at this rate: then it is an offset between the clocks."""
+
+
+class Px4Tracker:
+    """Age, lag and repetition of PX4's state, restarts, mode.
+
+    Args:
+        clearance_m: height of the body's origin when the vehicle stands.
+    """
+
+    def __init__(self, clearance_m: float) -> None:
+        self.high_m = clearance_m + DISARMED_ABOVE_M
+        self._position, self._attitude, self._imu, self._heartbeat = Age(), Age(), Age(), Age()
+        self._seen: VehicleState | None = None
+        self._same_since_s: float | None = None
+        self._moved = False
+        self._boot_s: float | None = None
+        self._offset_s = math.inf
+        """Flight clock less PX4's clock, without lag."""
+        self._lag_awake_s = 0.0
+        self.vehicle: VehicleState | None = None
+        self.status: AutopilotStatus | None = None
+        self.situation = Situation(False, False, None)
+        self.state_age_s = self.heartbeat_age_s = 0.0
+        """Of the oldest of position, attitude and IMU sample; of the newest heartbeat."""
+        self.lag_s = 0.0
+        """How much later PX4's state arrives than at best; 0 without PX4's clock."""
+        self.rebooted_s: float | None = None
+        """PX4's clock, in the tick in which it went back."""
+        self.repeats = False
+        """PX4 sends new positions with the same values although the vehicle moves in the air."""
+
+    def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
+        """Take a tick; `moving`: PX4's velocity or rates show that the vehicle moves."""
+        v = self.vehicle = i.vehicle
+        status = self.status = i.status
+        self.lag_s, self.rebooted_s, self.repeats = 0.0, None, False
+        if v is None:
+            self.state_age_s = max(age.update(awake_s, None) for age in (self._position, self._attitude, self._imu))
+        else:
+            age_s = self._position.update(awake_s, v.position_stamp_s)
+            attitude_s = self._attitude.update(awake_s, v.attitude_stamp_s)
+            imu_s = self._imu.update(awake_s, v.imu_stamp_s)
+            if attitude_s > age_s:
+                age_s = attitude_s
+            if imu_s > age_s:
+                age_s = imu_s
+            self.state_age_s = age_s
+            self._compare(v, situation, awake_s, moving)
+        self.heartbeat_age_s = self._heartbeat.update(awake_s, status.heartbeat_stamp_s if status else None)
+
+    @property
+    def left_offboard(self) -> AutopilotStatus | None:
+        """PX4's status if PX4 should be in OFFBOARD and is not; else None."""
+        status = self.status
+        if status is None or status.mode is FlightMode.OFFBOARD or not self.situation.offboard_expected:
+            return None
+        return status
+
+    def _compare(self, v: VehicleState, situation: Situation, awake_s: float, moving: bool) -> None:
+        before, self._seen = self._seen, v
+        if v.boot_s is not None:
+            if self._boot_s is not None and v.boot_s < self._boot_s - CLOCK_BACK_S:
+                self.rebooted_s = v.boot_s
+                self._offset_s = math.inf
+            # The difference of the clocks is not known: its least value stands for no lag, and slowly grows.
+            offset_s = v.attitude_stamp_s - v.boot_s
+            grown_s = LAG_FORGOTTEN_S_PER_S * (awake_s - self._lag_awake_s)
+            self._lag_awake_s = awake_s
+            self._offset_s = min(self._offset_s + grown_s, offset_s)
+            self.lag_s = offset_s - self._offset_s
+            self._boot_s = v.boot_s
+        if before is not None and v.position_stamp_s != before.position_stamp_s:
+            if v.position_world_m != before.position_world_m or v.velocity_world_m_s != before.velocity_world_m_s:
+                self._same_since_s = None
+            elif self._same_since_s is None:
+                self._same_since_s, self._moved = awake_s, False
+        if self._same_since_s is not None and situation.airborne:
+            self._moved = self._moved or moving
+            self.repeats = self._moved
+
+
+def reattached(p: Px4Tracker, _: None) -> Values | None:
+    """PX4 is armed without a request of the companion."""
+    found = p.situation.found_armed
+    return None if found is None else (found,)
+
+
+def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:
+    """PX4's clock has gone back."""
+    return None if p.rebooted_s is None else (p.rebooted_s,)
+
+
+def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:
+    """PX4's state arrives later than at best by more than the threshold."""
+    return (p.lag_s * 1e3,) if p.lag_s > lag_max_s else None
+
+
+def estimate_frozen(p: Px4Tracker, _: None) -> Values | None:
+    """PX4 sends new positions with the same values although the vehicle moves."""
+    return HOLDS if p.repeats else None
+
+
+def vehicle_state_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
+    """Position, attitude or IMU sample is older than the timeout."""
+    return HOLDS if p.state_age_s > timeout_s else None
+
+
+def heartbeat_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
+    """No heartbeat has arrived for longer than the timeout."""
+    return HOLDS if p.heartbeat_age_s > timeout_s else None
+
+
+def pilot_took_over(p: Px4Tracker, _: None) -> Values | None:
+    """PX4 is in a mode that a pilot has chosen."""
+    status = p.left_offboard
+    return (status.mode.value.upper(), "") if status is not None and people_chose(status) else None
+
+
+def offboard_left(p: Px4Tracker, _: None) -> Values | None:
+    """PX4 is in another mode that it has chosen itself."""
+    status = p.left_offboard
+    if status is None or people_chose(status):
+        return None
+    return (status.mode.value.upper(), "; its failsafe acts" if failsafe_chose(status) else "")
+
+
+def px4_disarmed(p: Px4Tracker, _: None) -> Values | None:
+    """PX4 reports disarmed in the air while the companion commands."""
+    status, vehicle = p.status, p.vehicle
+    if status is None or status.armed or vehicle is None:
+        return None
+    height_m = vehicle.position_world_m[2]
+    flies = p.situation.offboard_expected and p.situation.airborne and height_m > p.high_m
+    return (height_m,) if flies else None
+
+
+def battery_below(p: Px4Tracker, remaining_min: float) -> Values | None:
+    """The remaining charge, 0 to 1, is below the threshold."""
+    remaining = p.status.battery_remaining if p.status is not None else None
+    return (remaining,) if remaining is not None and remaining < remaining_min else None
+
+
+def battery_voltage(p: Px4Tracker, voltage_min_v: float | None) -> Values | None:
+    """The voltage is below the threshold, if there is one."""
+    voltage_v = p.status.battery_voltage_v if p.status is not None else None
+    below = voltage_v is not None and voltage_min_v is not None and voltage_v < voltage_min_v
+    return (voltage_v, voltage_min_v) if below else None

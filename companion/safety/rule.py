@@ -1,0 +1,100 @@
+"""What a row of the event table is, and how it reads its thresholds from the vehicle file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from companion.config.vehicle import Vehicle
+from companion.model.types import SafetyAction, Severity
+from companion.safety.situation import Values
+
+
+class Subject(Enum):
+    """What a rule watches."""
+
+    INPUTS = "inputs"
+    OPERATOR = "operator"
+    MOCAP = "motion capture"
+    PX4 = "PX4"
+    ARM = "arm"
+    FORCE = "force sensor"
+    PROCESS = "process"
+    FLIGHT = "flight"
+    TETHER = "tether"
+
+
+class Repeat(Enum):
+    """When a rule that has raised its event may raise it again."""
+
+    AFTER_QUIET = "after it has not held for a second"
+    NEVER = "once in a flight"
+    AT_ONCE = "each time"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rule:
+    """One row of the table."""
+
+    id: str
+    subject: Subject
+    what: str
+    """What is found, in words."""
+    predicate: Callable[[Any, Any], Values | None]
+    """Takes the subject's tracker and the thresholds, as `thresholds_of` returns them. Returns the values for the message if the
+    condition holds in this tick, else None. Pure."""
+    thresholds: tuple[str, ...] = ()
+    """Keys of the vehicle file, below `safety:` if they have no dot, whose values the predicate gets."""
+    tracked_by: tuple[str, ...] = ()
+    """Keys by which the tracker has already judged what the predicate reads."""
+    hold_time: float | str = 0.0
+    """The condition must hold for this long, s; or the key of `safety:` that says so."""
+    ground: SafetyAction | None
+    """Action before the rotors may lift: from LAND on the companion stands down. None: not evaluated there."""
+    air: SafetyAction | None
+    """Action while the rotors may lift. None: not evaluated there."""
+    message: str
+    """Text of the event; its braces take the predicate's values."""
+    severity: Severity | None = None
+    """None: CRITICAL for RETRACT and graver actions in the air, else WARNING."""
+    repeat: Repeat = Repeat.AFTER_QUIET
+    while_waiting: bool = False
+    """Evaluated also while inputs are still missing on the ground."""
+
+    def verdict(self, airborne: bool) -> tuple[SafetyAction, Severity]:
+        """Return action and severity of the event; NOMINAL where the rule is not evaluated."""
+        action = (self.air if airborne else self.ground) or SafetyAction.NOMINAL
+        if self.severity is not None:
+            return action, self.severity
+        critical = airborne and action.rank >= SafetyAction.RETRACT.rank
+        return action, Severity.CRITICAL if critical else Severity.WARNING
+
+
+def hold_time_s(rule: Rule, vehicle: Vehicle) -> float:
+    """Return a rule's hold time."""
+    return float(getattr(vehicle.safety, rule.hold_time) if isinstance(rule.hold_time, str) else rule.hold_time)
+
+
+def thresholds_of(rule: Rule, vehicle: Vehicle) -> Any:
+    """Return what the predicate gets: None without a threshold, the value of one, a tuple of several. Angles are in rad."""
+    values = tuple(_value(vehicle, key) for key in rule.thresholds)
+    return values if len(values) > 1 else values[0] if values else None
+
+
+def _value(vehicle: Vehicle, key: str) -> Any:
+    if key.startswith("arm.joints."):
+        name = key.rpartition(".")[2]
+        return tuple(_in_rad(name, getattr(joint, name)) for joint in vehicle.arm.joints)
+    value: Any = vehicle if "." in key else vehicle.safety
+    for name in key.split("."):
+        value = getattr(value, name)
+    return _in_rad(key, value)
+
+
+def _in_rad(key: str, value: Any) -> Any:
+    if not key.endswith(("_deg", "_deg_s")):
+        return value
+    return tuple(map(math.radians, value)) if isinstance(value, tuple) else math.radians(value)

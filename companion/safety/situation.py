@@ -1,0 +1,59 @@
+"""What the trackers know beside the inputs: what the core is doing, and how old an input is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from companion.model.types import ControlLog, TetherState
+
+Values = tuple[object, ...]
+"""What a predicate returns when its condition holds: the values for the braces of the rule's message."""
+HOLDS: Values = ()
+"""The condition holds, and the message has no braces."""
+
+
+@dataclass(slots=True)
+class Situation:
+    """What the core is doing, as far as rules depend on it. One object that the core keeps up to date."""
+
+    airborne: bool
+    """The rotors may lift: from arming to touchdown."""
+    offboard_expected: bool
+    """The companion commands the vehicle, so PX4 must be in OFFBOARD."""
+    tracking_error_m: float | None
+    """Distance from the reference; None while no plan is flown."""
+    control: ControlLog | None = None
+    """What the control law computed in the last tick; None while it does not fly."""
+    caught: bool = False
+    """A payload is on board."""
+    tether: TetherState | None = None
+    found_armed: str | None = None
+    """PX4 is armed without a request of the companion: what was found. `airborne` then says whether the vehicle flies."""
+    waiting: bool = False
+    """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
+
+
+class Age:
+    """Age of an input, counted only while this process was awake.
+
+    When the process itself is held up, every stamp grows old although nothing was lost: what arrived meanwhile is read a moment
+    later. The rules `loop_late` and `loop_stalled` report the hold-up.
+    """
+
+    __slots__ = ("_seen_awake_s", "_stamp_s")
+
+    def __init__(self) -> None:
+        self._stamp_s: float | None = None
+        self._seen_awake_s = -math.inf
+
+    def update(self, awake_s: float, stamp_s: float | None) -> float:
+        """Return the awake time in s since the stamp last changed; infinite before the first stamp.
+
+        Args:
+            awake_s: awake time of this process.
+            stamp_s: stamp of the newest input; None if there is none in this tick.
+        """
+        if stamp_s is not None and stamp_s != self._stamp_s:
+            self._stamp_s, self._seen_awake_s = stamp_s, awake_s
+        return awake_s - self._seen_awake_s
