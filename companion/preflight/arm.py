@@ -122,15 +122,7 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
         yield MODEL.bad(
             read, "XM430-W210", "build in the servo that the vehicle file means, or correct arm.joints[].servo_id"
         )
-    firmwares = [servo.firmware for servo in servos]
-    fix = "update with DYNAMIXEL Wizard: Recovery, newest firmware"
-    read, wanted = _both(firmwares), f"{FIRMWARE_MIN} or newer"
-    if min(firmwares) < FIRMWARE_MIN:
-        yield FIRMWARE.bad(read, wanted, fix)
-    elif len(set(firmwares)) > 1:
-        yield FIRMWARE.doubtful(read, f"{wanted}, the same on both", fix)
-    else:
-        yield FIRMWARE.good(read, wanted)
+    yield firmware(FIRMWARE, [servo.firmware for servo in servos])
     modes = [servo.operating_mode for servo in servos]
     yield _equal(MODE, modes, MODE_CURRENT, _mode, "another program has set it: close that, cycle the servos' power")
     delays_us = [servo.return_delay_us for servo in servos]
@@ -139,12 +131,23 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     wanted_ms = vehicle.devices.arm.watchdog_ms
     yield _equal(WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; look for a loose supply")
     yield _current_limit(servos, vehicle)
-    volts = [servo.voltage_v for servo in servos]
+    yield supply(VOLTAGE, [servo.voltage_v for servo in servos])
+
+
+def firmware(check: Check, versions: Sequence[int]) -> Row:
+    """Judge the firmware of the servos."""
+    read, wanted = _both(versions), f"{FIRMWARE_MIN} or newer"
+    fix = "update with DYNAMIXEL Wizard: Recovery, newest firmware"
+    if min(versions) >= FIRMWARE_MIN and len(set(versions)) > 1:
+        return check.doubtful(read, f"{wanted}, the same on both", fix)
+    return check.row(min(versions) >= FIRMWARE_MIN, read, wanted, fix)
+
+
+def supply(check: Check, volts: Sequence[float]) -> Row:
+    """Judge the supply voltage of the servos."""
     read, wanted = _both([f"{volt:.1f} V" for volt in volts]), f"{VOLTAGE_MIN_V:g} to {VOLTAGE_MAX_V:g} V"
-    if all(VOLTAGE_MIN_V <= volt <= VOLTAGE_MAX_V for volt in volts):
-        yield VOLTAGE.good(read, wanted)
-    else:
-        yield VOLTAGE.bad(read, wanted, "feed the servos with 12 V from a converter; check its plugs")
+    within = all(VOLTAGE_MIN_V <= volt <= VOLTAGE_MAX_V for volt in volts)
+    return check.row(within, read, wanted, "feed the servos with 12 V from a converter; check its plugs")
 
 
 def _current_limit(servos: Sequence[ServoReport], vehicle: Vehicle) -> Row:

@@ -37,6 +37,10 @@ class Check:
         """Return a row that warns: the machine can fly, and the operator decides."""
         return self._row(False, read, wanted, fix, Level.WARN)
 
+    def row(self, ok: bool, read: str, wanted: str, fix: str) -> Row:
+        """Return `good` if it is ok, else `bad`."""
+        return self.good(read, wanted) if ok else self.bad(read, wanted, fix)
+
     def _row(self, ok: bool, read: str, wanted: str, fix: str, level: Level) -> Row:
         plain = without_negative_zero
         return Row(self.id, self.title, ok, plain(read), plain(wanted), self.why, plain(fix), level)

@@ -11,7 +11,7 @@ from companion.control.manipulator import Manipulator
 from companion.control.sensing import ForceSensing
 from companion.model.observations import ForceStream, Observations
 from companion.model.rows import Row
-from companion.model.types import ForceSample, Vec3
+from companion.model.types import ForceSample, Quat, Vec2, Vec3
 from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check
 
@@ -129,13 +129,7 @@ def _overload(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
 
 
 def _tare(o: Observations, vehicle: Vehicle) -> Row:
-    """Return the row on the bias as the flight computes it: mean reading minus the weight of the net."""
-    sensing = ForceSensing(vehicle.tool, Manipulator(vehicle.arm, vehicle.tool))
-    for sample in o.force:
-        sensing.collect(sample, o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad)
-    sensing.finish_tare()
-    bias_n = sensing.bias_sensor_n
-    assert bias_n is not None
+    bias_n = tare_bias_n(o.force, vehicle, o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad)
     size_n, full_n = math.hypot(*bias_n), vehicle.devices.force.force_max_n
     x, y, z = bias_n
     read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beside the net's {vehicle.tool.net_mass_kg:g} kg"
@@ -146,10 +140,20 @@ def _tare(o: Observations, vehicle: Vehicle) -> Row:
     return (TARE.doubtful if size_n <= TARE_MAX * full_n else TARE.bad)(read, wanted, fix)
 
 
+def tare_bias_n(samples: Sequence[ForceSample], vehicle: Vehicle, attitude: Quat, arm_rad: Vec2) -> Vec3:
+    """Return the bias that a flight's tare would find: the mean reading less the weight of the net, in the sensor frame."""
+    sensing = ForceSensing(vehicle.tool, Manipulator(vehicle.arm, vehicle.tool))
+    for sample in samples:
+        sensing.collect(sample, attitude, arm_rad)
+    sensing.finish_tare()
+    assert sensing.bias_sensor_n is not None
+    return sensing.bias_sensor_n
+
+
 def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     """Return the row on the differences between the means of five consecutive intervals."""
     size = max(1, len(samples) // 5)
-    means = [_mean(samples[i : i + size]) for i in range(0, len(samples) - size + 1, size)]
+    means = [mean_force_n(samples[i : i + size]) for i in range(0, len(samples) - size + 1, size)]
     drift_n = max(max(mean[axis] for mean in means) - min(mean[axis] for mean in means) for axis in range(3))
     limit_n = vehicle.safety.force_drift_n
     read, wanted = f"drifts by {drift_n:.2f} N", f"{limit_n:g} N"
@@ -158,6 +162,7 @@ def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     return STILL.bad(read, wanted, "let nobody touch the net; let the sensor warm up for some minutes")
 
 
-def _mean(samples: Sequence[ForceSample]) -> Vec3:
+def mean_force_n(samples: Sequence[ForceSample]) -> Vec3:
+    """Return the mean force in the sensor frame."""
     x, y, z = (sum(sample.force_sensor_n[axis] for sample in samples) / len(samples) for axis in range(3))
     return (x, y, z)
