@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.commissioning.force_torque import fit as ft_fit
-from companion.commissioning.force_torque.fit import Loaded
+from companion.commissioning.force_torque.fit import WeightFit
 from companion.config.loader import load_vehicle
 from companion.config.world import World
 from companion.control.manipulator import Manipulator
@@ -30,12 +30,19 @@ def quat_of(rpy_deg: Vec3) -> Quat:
     return quat_from_euler_zyx(roll, pitch, yaw)
 
 
-def loaded(truth: Quat, arm_rad: Vec2 = FOLDED, scale: float = 1.0, off_n: Vec3 = (0.0, 0.0, 0.0)) -> Loaded:
-    """What a sensor mounted as `truth` reads, with a bias."""
-    down = ft_fit.down_in_link2(arm_rad)
-    x, y, z = quat_rotate(quat_conjugate(truth), down)
+def fitted(
+    truth: Quat,
+    sensor_rpy_deg: Vec3 = (0.0, 0.0, 0.0),
+    *,
+    arm_rad: Vec2 = FOLDED,
+    scale: float = 1.0,
+    off_n: Vec3 = (0.0, 0.0, 0.0),
+) -> WeightFit:
+    """Fit the readings of a sensor that has a bias and is mounted as `truth`; the vehicle file says `sensor_rpy_deg`."""
+    x, y, z = quat_rotate(quat_conjugate(truth), ft_fit.down_in_link2(arm_rad))
     n = scale * 9.81 * WEIGHT_KG
-    return Loaded((1.0, -2.0, 30.0), (1.0 + n * x + off_n[0], -2.0 + n * y + off_n[1], 30.0 + n * z + off_n[2]), down)
+    loaded_n = (1.0 + n * x + off_n[0], -2.0 + n * y + off_n[1], 30.0 + n * z + off_n[2])
+    return ft_fit.fit_weight((1.0, -2.0, 30.0), loaded_n, arm_rad, WEIGHT_KG, sensor_rpy_deg)
 
 
 def test_down_in_link_2_is_what_the_arm_says() -> None:
@@ -45,28 +52,28 @@ def test_down_in_link_2_is_what_the_arm_says() -> None:
         assert body == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
 
 
-@pytest.mark.parametrize("mounted_deg", [(0.0, 0.0, 0.0), (0.0, 0.0, 45.0), (180.0, 0.0, 0.0)])
+@pytest.mark.parametrize("mounted_deg", [(0.0, 0.0, 0.0), (180.0, 0.0, 45.0)])
 @pytest.mark.parametrize("turn", TURNS, ids=lambda turn: ",".join(turn.names))
 def test_every_right_angle_turn_is_found(turn: AxisMap, mounted_deg: Vec3) -> None:
     truth = quat_multiply(quat_of(mounted_deg), turn.inverse.quat)
-    fit = ft_fit.fit_weight([loaded(truth, off_n=(0.05, -0.05, 0.05))], WEIGHT_KG, mounted_deg)
+    fit = fitted(truth, mounted_deg, off_n=(0.05, -0.05, 0.05))
     assert fit.rest_deg < 3.0
     assert fit.scale == pytest.approx(1.0, abs=0.03)
     if fit.others:
-        return  # said so, and nothing is proposed
+        assert ft_fit.changes(fit) == {}
+        return
     assert fit.turn == turn
     assert abs(sum(a * b for a, b in zip(quat_of(fit.rpy_deg), truth, strict=True))) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_most_turns_are_certain_in_the_folded_pose() -> None:
-    fits = [ft_fit.fit_weight([loaded(turn.inverse.quat)], WEIGHT_KG, (0.0, 0.0, 0.0)) for turn in TURNS]
-    assert all(not fit.others for fit in fits)
+    assert all(not fitted(turn.inverse.quat).others for turn in TURNS)
 
 
 def test_a_turned_sensor_is_a_patch_and_a_right_one_none() -> None:
-    turned = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 90.0)))], WEIGHT_KG, (0.0, 0.0, 0.0))
+    turned = fitted(quat_of((0.0, 0.0, 90.0)))
     assert ft_fit.changes(turned) == {("tool", "sensor_rpy_deg"): [0.0, 0.0, 90.0]}
-    right = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 90.0)))], WEIGHT_KG, (0.0, 0.0, 90.0))
+    right = fitted(quat_of((0.0, 0.0, 90.0)), (0.0, 0.0, 90.0))
     assert ft_fit.changes(right) == {}
     assert right.turn == IDENTITY
     assert all(row.ok for row in ft_fit.rows(right))
@@ -74,31 +81,24 @@ def test_a_turned_sensor_is_a_patch_and_a_right_one_none() -> None:
 
 def test_straight_down_nobody_can_tell_and_it_says_so() -> None:
     """A turn about the link is invisible there: the configured one is kept, with a warning."""
-    seen = ft_fit.fit_weight([loaded(quat_of((90.0, 0.0, 0.0)), HANGING)], WEIGHT_KG, (0.0, 0.0, 0.0))
+    seen = fitted(quat_of((90.0, 0.0, 0.0)), arm_rad=HANGING)
     assert len(seen.others) == 3
     assert [row.id for row in ft_fit.rows(seen) if not row.ok] == ["ft.pose"]
-    hidden = ft_fit.fit_weight([loaded(quat_of((0.0, 90.0, 0.0)), HANGING)], WEIGHT_KG, (0.0, 0.0, 0.0))
+    hidden = fitted(quat_of((0.0, 90.0, 0.0)), arm_rad=HANGING)
     assert ft_fit.changes(hidden) == {}
     assert {row.id for row in ft_fit.rows(hidden) if not row.ok} == {"ft.pose", "ft.direction"}
 
 
-def test_two_poses_tell_what_one_cannot() -> None:
-    truth = quat_of((90.0, 0.0, 0.0))
-    fit = ft_fit.fit_weight([loaded(truth, HANGING), loaded(truth)], WEIGHT_KG, (0.0, 0.0, 0.0))
-    assert fit.rpy_deg == (90.0, 0.0, 0.0)
-    assert not fit.others
-
-
-@pytest.mark.parametrize("scale", [0.5, 0.9, 1.1, 2.0])
+@pytest.mark.parametrize("scale", [0.9, 2.0])
 def test_a_wrong_scale_is_told_and_no_turn_of_the_sensor(scale: float) -> None:
-    fit = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 0.0)), scale=scale)], WEIGHT_KG, (0.0, 0.0, 0.0))
+    fit = fitted(quat_of((0.0, 0.0, 0.0)), scale=scale)
     assert fit.scale == pytest.approx(scale)
     assert [row.id for row in ft_fit.rows(fit) if not row.ok] == ["ft.scale"]
     assert ft_fit.changes(fit) == {}
 
 
 def test_a_weight_that_touches_something_is_no_turned_sensor() -> None:
-    fit = ft_fit.fit_weight([loaded(quat_of((0.0, 0.0, 0.0)), off_n=(3.0, 3.0, 0.0))], WEIGHT_KG, (0.0, 0.0, 0.0))
+    fit = fitted(quat_of((0.0, 0.0, 0.0)), off_n=(3.0, 3.0, 0.0))
     assert ft_fit.changes(fit) == {}
     assert "ft.direction" in [row.id for row in ft_fit.rows(fit) if not row.ok]
 

@@ -43,7 +43,7 @@ def test_a_y_up_stream_becomes_the_up_axis() -> None:
     assert mocap_align.world_row(a, 15.0) is None
 
 
-@pytest.mark.parametrize("yaw_deg", [90.0, -90.0, 35.0, 180.0])
+@pytest.mark.parametrize("yaw_deg", [-90.0, 35.0, 180.0])
 def test_a_body_whose_zero_is_turned_is_no_turned_world(yaw_deg: float) -> None:
     a = found(f"mocap_body_yaw_deg={yaw_deg}")
     assert abs(math.remainder(a.body_yaw_deg - yaw_deg, 360.0)) < 8.0

@@ -20,8 +20,8 @@ pytestmark = pytest.mark.waits
 
 VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
 WATCH_S = 2
-LIFTED_S, CARRIED_S = 4, 8
-"""The hand lifts the machine as soon as the world begins; later in its round it holds or turns it for 6 s without carrying it."""
+LIFTED_S = 4
+"""The hand lifts the machine as soon as the world begins."""
 
 
 @pytest.fixture
@@ -100,9 +100,9 @@ def test_wrong_body_half_the_rate_and_more_latency_are_found_and_the_patch_is_ri
     }
     overrides = [word for word in set_options(**knobs) if word != "--set"]
     with World(sandbox, overrides=overrides) as world:
-        options = ["--move", "--json", "--vehicle", vehicle, *addresses(world, "rate_hz")]
-        first = document(run_here("mocap", "check", "--write", "--yes", "--seconds", LIFTED_S, *options))
-        again = document(run_here("mocap", "check", "--seconds", CARRIED_S, *options))
+        options = ["--json", "--vehicle", vehicle, *addresses(world, "rate_hz")]
+        first = document(run_here("mocap", "check", "--move", "--write", "--yes", "--seconds", LIFTED_S, *options))
+        again = document(run_here("mocap", "check", "--seconds", 1, *options))
     fixes = bad(first)
     assert {"mocap.own", "mocap.rate", "mocap.delay"} <= set(fixes)
     assert "id 7" in fixes["mocap.own"]
@@ -111,15 +111,15 @@ def test_wrong_body_half_the_rate_and_more_latency_are_found_and_the_patch_is_ri
     assert changes(first) == {"devices.mocap.rigid_body_id": 7, "devices.mocap.rate_hz": 100.0}
     assert Path(first["written"]).read_bytes() == VEHICLE.read_bytes()
     assert "# Motive: Settings > Streaming > Up Axis" in vehicle.read_text(encoding="utf-8")
-    # What is Motive's own stays; what the file said wrong is gone.
-    assert not {"mocap.own"} & set(bad(again))
+    # Motive's own latency stays; what was wrong in the file is right.
+    assert "mocap.own" not in bad(again)
     assert "mocap.delay" in bad(again)
     assert changes(again) == {}
 
 
 def test_a_server_at_another_address_is_found_by_broadcast(sandbox: Sandbox, vehicle: Path) -> None:
     with World(sandbox) as world:
-        options = ["--seconds", WATCH_S, "--json", "--vehicle", vehicle, *addresses(world, "server")]
+        options = ["--seconds", 1, "--json", "--vehicle", vehicle, *addresses(world, "server")]
         wrong = [*options, *set_options(**{"vehicle.devices.mocap.server": "127.0.0.9"})]
         first = document(run_here("mocap", "check", "--write", "--yes", *wrong))
         again = json.loads(run_here("mocap", "check", *options).out)
@@ -198,13 +198,3 @@ def test_a_y_up_stream_read_as_such_is_right(sandbox: Sandbox) -> None:
         rows = json.loads(sandbox.run(*words).out)["rows"]
     names = ("frames.gravity", "frames.height", "frames.place", "frames.yaw")
     assert {row["id"]: row["ok"] for row in rows if row["id"] in names} == dict.fromkeys(names, True)
-
-
-def test_a_body_whose_yaw_is_off_by_a_right_angle_is_motives_to_put_right(sandbox: Sandbox, vehicle: Path) -> None:
-    found, _ = aligned(sandbox, vehicle, "mocap_body_yaw_deg=90")
-    assert set(bad(found)) == {"hand.forward"}
-    assert "reset the rigid body's orientation" in bad(found)["hand.forward"]
-    assert found["alignment"]["body_yaw_deg"] == pytest.approx(90.0, abs=8.0)
-    assert found["alignment"]["world_yaw_deg"] == pytest.approx(0.0, abs=8.0)
-    assert found["patch"] is None
-    assert vehicle.read_bytes() == VEHICLE.read_bytes()

@@ -1,7 +1,7 @@
-"""A known weight on the net: how the force sensor lies in the arm, its scale, what is left. Drift of a sensor at rest. Pure.
+"""How the force sensor is mounted and scaled, from a known weight on the net; drift of a sensor at rest. Pure.
 
-Frames: link 2 (x outwards along the link, y along the joint axis); sensor, turned against it by `tool.sensor_rpy_deg`. A reading is
-the force of the surroundings on the tool side of the sensor.
+Frames: link 2 (x outwards along the link, y along the joint axis) and the sensor, rotated against it by `tool.sensor_rpy_deg`. A
+reading is the force of the surroundings on the tool side of the sensor.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ STUCK = Check(
     "ft.stuck",
     "force sensor alive",
     "never the very same reading for longer than `safety.force_stuck_s`",
-    "a stuck sensor reads well and feels nothing",
+    "a stuck sensor reports plausible values and measures nothing",
 )
-WEIGHT = Check("ft.weight", "known weight", "it is seen on the net", "nothing is known of scale and direction")
+WEIGHT = Check("ft.weight", "known weight", "the sensor measures it", "scale and direction stay unknown")
 SCALE = Check(
-    "ft.scale", "force sensor scale", "force over m g within 5 %", "the law would feel more or less than there is"
+    "ft.scale", "force sensor scale", "force over m g within 5 %", "the law would see more or less force than there is"
 )
 DIRECTION = Check(
     "ft.direction",
     "force sensor direction",
     "the weight pulls where `tool.sensor_rpy_deg` says, within 8 deg",
-    "every force would be answered into a wrong direction",
+    "the law would respond to every force in a wrong direction",
 )
 POSE = Check(
     "ft.pose",
@@ -46,41 +46,29 @@ POSE = Check(
     "a sensor that is turned about the weight's own direction looks right",
     warns=True,
 )
-CHECKS = (STUCK, WEIGHT, SCALE, DIRECTION, POSE)
 
 SCALE_TOLERANCE: Final = 0.05
 DIRECTION_MAX_DEG: Final = 8.0
 EXPLAINED_MAX_DEG: Final = 20.0
-"""A right-angle turn explains a direction no worse than this."""
+"""A right-angle turn explains a direction if no more than this is left."""
 APART_MIN_DEG: Final = 12.0
-"""So much better than the next one must the best explanation be."""
-
-
-@dataclass(frozen=True, slots=True)
-class Loaded:
-    """One pose of the arm, without and with the weight; means over a second or two at rest."""
-
-    empty_n: Vec3
-    loaded_n: Vec3
-    """Both in the sensor's own axes, as streamed."""
-    down_link2: Vec3
-    """Unit vector of gravity in link 2's frame."""
+"""The best explanation has to be better than the next one by this."""
 
 
 @dataclass(frozen=True, slots=True)
 class WeightFit:
-    """What a known weight says."""
+    """Scale and mounting of the sensor by a known weight."""
 
     expected_n: float
     measured_n: float
     scale: float
     """Measured over expected."""
     off_deg: float
-    """Between the weight as it was felt and as the vehicle file says."""
+    """Angle between the measured weight and its direction by the vehicle file."""
     turn: AxisMap
-    """Right-angle turn of the sensor, on top of the vehicle file's, that explains the weight best."""
+    """Right-angle turn of the sensor, on top of the vehicle file's mounting, that explains the weight best."""
     rest_deg: float
-    """What is left beyond it."""
+    """Angle that is left after that turn."""
     others: tuple[AxisMap, ...]
     """Turns that explain it nearly as well."""
     rpy_deg: Vec3
@@ -88,80 +76,64 @@ class WeightFit:
 
 
 def down_in_link2(arm_rad: Vec2) -> Vec3:
-    """Gravity's direction in link 2 while the machine stands level."""
+    """Return gravity's direction in link 2's frame while the machine is level."""
     half = 0.5 * (arm_rad[0] - arm_rad[1])
     return quat_rotate((math.cos(half), 0.0, -math.sin(half), 0.0), (0.0, 0.0, -1.0))
 
 
-def fit_weight(poses: Sequence[Loaded], weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
-    """Of the 24 right-angle turns the one that explains the weight best in all poses; the configured one where it is as good.
+def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Vec2, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
+    """Find which of the 24 right-angle turns explains the weight best; the configured mounting if it is as good.
 
     Args:
-        poses: one or more.
-        weight_kg: of what was hung on the net.
-        sensor_rpy_deg: the vehicle file's.
+        empty_n: mean reading with the net empty, sensor frame.
+        loaded_n: mean reading with the weight on the net, sensor frame.
+        arm_rad: joint angles.
+        weight_kg: mass of the weight.
+        sensor_rpy_deg: the vehicle file's mounting.
     """
-    roll, pitch, yaw = (math.radians(angle) for angle in sensor_rpy_deg)
-    mounted: Quat = quat_from_euler_zyx(roll, pitch, yaw)
-    felt = [_minus(pose.loaded_n, pose.empty_n) for pose in poses]
-    believed = [quat_rotate(quat_conjugate(mounted), pose.down_link2) for pose in poses]
-
-    def off_deg(turn: AxisMap) -> float:
-        squares = [angle_rad(turn.vector(b), f) ** 2 for b, f in zip(believed, felt, strict=True)]
-        return math.degrees(math.sqrt(sum(squares) / len(squares)))
-
-    ranked = sorted(ROTATIONS, key=off_deg)
-    best = IDENTITY if off_deg(IDENTITY) <= off_deg(ranked[0]) + 1.0 else ranked[0]
-    others = tuple(turn for turn in ranked if turn != best and off_deg(turn) < off_deg(best) + APART_MIN_DEG)
-    turned = quat_multiply(mounted, best.inverse.quat)
-    measured_n = sum(norm(f) for f in felt) / len(felt)
-    expected_n = GRAVITY_M_S2 * weight_kg
+    mounted: Quat = quat_from_euler_zyx(*(math.radians(angle) for angle in sensor_rpy_deg))
+    measured = (loaded_n[0] - empty_n[0], loaded_n[1] - empty_n[1], loaded_n[2] - empty_n[2])
+    expected = quat_rotate(quat_conjugate(mounted), down_in_link2(arm_rad))
+    off_deg = {turn: math.degrees(angle_rad(turn.vector(expected), measured)) for turn in ROTATIONS}
+    best = min(ROTATIONS, key=off_deg.__getitem__)
+    if off_deg[IDENTITY] <= off_deg[best] + 1.0:
+        best = IDENTITY
+    measured_n, expected_n = norm(measured), GRAVITY_M_S2 * weight_kg
     return WeightFit(
-        expected_n,
-        measured_n,
-        measured_n / expected_n,
-        off_deg(IDENTITY),
-        best,
-        off_deg(best),
-        others,
-        _degrees(turned),
+        expected_n=expected_n,
+        measured_n=measured_n,
+        scale=measured_n / expected_n,
+        off_deg=off_deg[IDENTITY],
+        turn=best,
+        rest_deg=off_deg[best],
+        others=tuple(turn for turn in ROTATIONS if turn != best and off_deg[turn] < off_deg[best] + APART_MIN_DEG),
+        rpy_deg=_degrees(quat_multiply(mounted, best.inverse.quat)),
     )
 
 
 def rows(fit: WeightFit) -> Iterator[Row]:
-    """Scale, direction, and whether this pose could tell."""
+    """Judge scale and direction, and whether this pose of the arm shows them."""
     read = f"{fit.measured_n:.2f} N of {fit.expected_n:.2f} N, {fit.scale:.3f} of it"
-    wanted = f"within {100 * SCALE_TOLERANCE:g} %"
-    if abs(fit.scale - 1.0) <= SCALE_TOLERANCE:
-        yield SCALE.good(read, wanted)
-    else:
-        fix = (
-            f"it reads {fit.scale:.2f} times the truth: weigh the weight, and let nothing but the net carry it; if that is right, the "
-            "sensor is another model (this one has 50 counts per N) or has to be calibrated by its maker"
-        )
-        yield SCALE.bad(read, wanted, fix)
-    read, wanted = f"{fit.off_deg:.0f} deg from where tool.sensor_rpy_deg says", f"within {DIRECTION_MAX_DEG:g} deg"
-    if fit.off_deg <= DIRECTION_MAX_DEG:
-        yield DIRECTION.good(read, wanted)
-    elif fit.turn != IDENTITY and fit.rest_deg <= EXPLAINED_MAX_DEG and not fit.others:
+    fix = (
+        f"it reads {fit.scale:.2f} times the truth: weigh the weight, and let nothing but the net carry it; if that is right, the "
+        "sensor is another model (this one has 50 counts per N) or has to be calibrated by its maker"
+    )
+    yield SCALE.row(abs(fit.scale - 1.0) <= SCALE_TOLERANCE, read, f"within {100 * SCALE_TOLERANCE:g} %", fix)
+    read = f"{fit.off_deg:.0f} deg from where tool.sensor_rpy_deg says"
+    fix = (
+        "let the weight hang from the net's centre, and nothing touch it; check the arm's angles (companion arm zero); level the "
+        "machine; raise link 2 to some 30 deg below level, and repeat"
+    )
+    if changes(fit):
         rpy = ", ".join(f"{angle:g}" for angle in fit.rpy_deg)
         fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}], which leaves {fit.rest_deg:.0f} deg"
-        yield DIRECTION.bad(read, wanted, fix)
-    else:
-        fix = (
-            "let the weight hang from the net's centre, and nothing touch it; see the arm's angles (companion arm zero); stand the "
-            "machine level; raise link 2 to some 30 deg below level, and do it again"
-        )
-        yield DIRECTION.bad(read, wanted, fix)
-    if fit.others:
-        many = f"{len(fit.others)} other right-angle turns explain it nearly as well"
-        yield POSE.bad(many, "none", "do it again with link 2 some 20 to 35 deg below level, not straight down")
-    else:
-        yield POSE.good("no other right-angle turn explains it", "none")
+    yield DIRECTION.row(fit.off_deg <= DIRECTION_MAX_DEG, read, f"within {DIRECTION_MAX_DEG:g} deg", fix)
+    read = f"{len(fit.others) or 'no'} other right-angle turns explain it as well"
+    yield POSE.row(not fit.others, read, "none", "repeat with link 2 some 20 to 35 deg below level, not straight down")
 
 
 def changes(fit: WeightFit) -> dict[Location, Data]:
-    """Of the vehicle file: a turned sensor, if it is certain."""
+    """Return the mounting that the vehicle file should have; empty if it is right or not certain."""
     right = fit.off_deg <= DIRECTION_MAX_DEG
     if right or fit.turn == IDENTITY or fit.others or fit.rest_deg > EXPLAINED_MAX_DEG:
         return {}
@@ -169,30 +141,21 @@ def changes(fit: WeightFit) -> dict[Location, Data]:
 
 
 def as_json(fit: WeightFit) -> dict[str, Any]:
-    """For scripts; N and degrees."""
-    return {
-        "expected_n": fit.expected_n,
-        "measured_n": fit.measured_n,
-        "scale": fit.scale,
-        "off_deg": fit.off_deg,
-        "rest_deg": fit.rest_deg,
-        "sensor_rpy_deg": list(fit.rpy_deg),
-        "certain": not fit.others,
-    }
+    """Return the JSON document's part; N and degrees."""
+    numbers = {key: getattr(fit, key) for key in ("expected_n", "measured_n", "scale", "off_deg", "rest_deg")}
+    return {**numbers, "sensor_rpy_deg": list(fit.rpy_deg), "certain": not fit.others}
 
 
 def stuck_row(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
-    """The longest time with the very same reading."""
+    """Judge the longest time with exactly the same reading."""
     longest_s, since_s = 0.0, samples[0].stamp_s
     for before, now in itertools.pairwise(samples):
         same = (before.force_sensor_n, before.torque_sensor_nm) == (now.force_sensor_n, now.torque_sensor_nm)
         since_s = since_s if same else now.stamp_s
         longest_s = max(longest_s, now.stamp_s - since_s)
     limit_s = vehicle.safety.force_stuck_s
-    read, wanted = f"the same reading for {longest_s:.2f} s at most", f"{limit_s:g} s"
-    if longest_s <= limit_s:
-        return STUCK.good(read, wanted)
-    return STUCK.bad(read, wanted, "power-cycle the sensor; check its cable")
+    read = f"the same reading for {longest_s:.2f} s at most"
+    return STUCK.row(longest_s <= limit_s, read, f"{limit_s:g} s", "power-cycle the sensor; check its cable")
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,13 +167,12 @@ class Drift:
     """Standard deviation about the drift."""
     per_minute_n: float
     standard_error_n: float
-    """Of `per_minute_n`, by the scatter of means over a second."""
+    """Of `per_minute_n`, from the scatter of means over a second."""
 
 
-def drift(samples: Sequence[ForceSample]) -> tuple[Drift, Drift, Drift]:
-    """A straight line through each axis; at least 4 s of samples."""
-    first, second, third = (_drift([(s.stamp_s, s.force_sensor_n[axis]) for s in samples]) for axis in range(3))
-    return first, second, third
+def drift(samples: Sequence[ForceSample]) -> list[Drift]:
+    """Fit a straight line to each axis x, y, z; takes at least 4 s of samples."""
+    return [_drift([(s.stamp_s, s.force_sensor_n[axis]) for s in samples]) for axis in range(3)]
 
 
 def _drift(points: Sequence[tuple[float, float]]) -> Drift:
@@ -230,14 +192,8 @@ def _drift(points: Sequence[tuple[float, float]]) -> Drift:
     return Drift(mean, noise, 60.0 * slope, 60.0 * math.sqrt(rest / spread))
 
 
-def mean_force(samples: Sequence[ForceSample]) -> Vec3:
-    """Component by component, sensor frame."""
-    x, y, z = (sum(sample.force_sensor_n[axis] for sample in samples) / len(samples) for axis in range(3))
-    return (x, y, z)
-
-
 def _degrees(q: Quat) -> Vec3:
-    """Roll, pitch, yaw, as a person writes a right angle; at a pitch of 90 deg, where roll and yaw are one, yaw is 0."""
+    """Return roll, pitch, yaw to a tenth of a degree; at a pitch of 90 deg, where roll and yaw are one rotation, yaw is 0."""
     w, x, y, z = q
     upright = 2.0 * (w * y - z * x)
     angles = euler_zyx_from_quat(q)
@@ -245,7 +201,3 @@ def _degrees(q: Quat) -> Vec3:
         angles = (math.remainder(2.0 * math.atan2(x, w), 2.0 * math.pi), math.copysign(0.5 * math.pi, upright), 0.0)
     roll, pitch, yaw = (round(math.degrees(angle), 1) + 0.0 for angle in angles)
     return (roll, pitch, yaw)
-
-
-def _minus(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])

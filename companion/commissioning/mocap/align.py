@@ -1,8 +1,4 @@
-"""From a finished hand test to the one setting that is wrong: up axis, the rigid body's yaw, the world's yaw, a mirrored stream. Pure.
-
-Measured by `companion.preflight.hand_test.run`, judged axis by axis by `companion.preflight.hand_test.evaluation`; this says which key
-or which setting of Motive explains all of it.
-"""
+"""The one setting that explains a hand test: up axis, yaw of the rigid body, yaw of the world, a mirrored stream. Pure."""
 
 from __future__ import annotations
 
@@ -24,36 +20,36 @@ from companion.preflight.hand_test.run import HandResult
 WORLD_YAW = Check(
     "align.world_yaw",
     "world's yaw",
-    "the way forward lies in the stream as the mission's `start.yaw_deg` says",
-    "room, tether and course are counted in these axes",
+    "forward in the stream is the mission's `start.yaw_deg`",
+    "room, tether and course are given in these axes",
 )
 _UP: Final[Vec3] = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """What the three moves say about the set-up."""
+    """Axes of the set-up by the three moves."""
 
     axes: AxisMap
-    """What the streamed axes of the rigid body truly are."""
+    """The true directions of the rigid body's streamed axes."""
     mirrored: bool
     level: bool
-    """The stream's attitude turns gravity upright: a whole stream in other axes, or none."""
+    """Gravity is vertical in the stream: then either all of the stream has other axes, or nothing has."""
     up_axis: str
-    """What devices.mocap.up_axis should be."""
+    """Proposed `devices.mocap.up_axis`."""
     body_yaw_deg: float
-    """By how much the body's streamed yaw is too large."""
+    """Error of the body's streamed yaw."""
     world_yaw_deg: float | None
-    """By how much the way forward is turned against the mission's start, counter-clockwise; None: the axes must be put right first."""
+    """Angle from the mission's start yaw to forward, counter-clockwise; None until the axes are right."""
 
 
 def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignment:
-    """Judge a finished test.
+    """Find the axes from a finished test.
 
     Args:
         result: of the test.
-        up_axis: devices.mocap.up_axis as it was.
-        start_yaw_rad: where the nose truly pointed when it was moved forward: the mission's start.
+        up_axis: `devices.mocap.up_axis` during the test.
+        start_yaw_rad: true yaw of the nose while it was moved forward: the mission's start.
     """
     axes = best_axes(result)
     level = angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP) <= math.radians(LEVEL_MAX_DEG)
@@ -71,29 +67,26 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
 
 
 def changes(found: Alignment, up_axis: str) -> dict[Location, Data]:
-    """Of the vehicle file; everything else is set in Motive."""
+    """Return what the vehicle file should have; everything else is set in Motive."""
     return {("devices", "mocap", "up_axis"): found.up_axis} if found.up_axis != up_axis else {}
 
 
 def world_row(found: Alignment, tolerance_deg: float) -> Row | None:
-    """None: it cannot be told before the axes are right."""
+    """Judge the world's yaw; return None if the axes have to be put right first."""
     yaw_deg = found.world_yaw_deg
     if yaw_deg is None:
         return None
-    # What a hand calls forward is not exact to the degree.
-    limit_deg = max(tolerance_deg, YAW_MAX_DEG)
-    read, wanted = f"forward lies {yaw_deg:+.0f} deg from the mission's start yaw", f"within {limit_deg:g} deg"
-    if abs(yaw_deg) <= limit_deg:
-        return WORLD_YAW.good(read, wanted)
+    limit_deg = max(tolerance_deg, YAW_MAX_DEG)  # nobody moves it forward to the degree
+    read = f"forward is {yaw_deg:+.0f} deg from the mission's start yaw"
     fix = (
         f"if the machine stood as the mission's start.yaw_deg says, Motive's ground plane is turned by {yaw_deg:+.0f} deg: set it anew "
-        "with the calibration square's x along the room's x; if not, put the machine so, and do it again"
+        "with the calibration square's x along the room's x; if not, turn the machine that way and repeat"
     )
-    return WORLD_YAW.bad(read, wanted, fix)
+    return WORLD_YAW.row(abs(yaw_deg) <= limit_deg, read, f"within {limit_deg:g} deg", fix)
 
 
 def as_json(found: Alignment) -> dict[str, Any]:
-    """For scripts; degrees."""
+    """Return the JSON document's part; degrees."""
     return {
         "axes": list(found.axes.names),
         "mirrored": found.mirrored,

@@ -1,6 +1,6 @@
-"""What a watched stream of motion capture says: rates, jitter, latency, which body it is, and what to change. Pure.
+"""Rates, jitter, latency and bodies of a watched stream of motion capture, and what to change. Pure.
 
-The rows of the preflight are used as they are (`companion.preflight.mocap`); what is beside them is for a set-up that is new.
+The preflight's rows are used as they are (`companion.preflight.mocap`); the others are for a new set-up.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from companion.config.base import Location
@@ -48,7 +48,6 @@ NETWORK = Check("mocap.network", "way to the server", "a cable", "Wi-Fi holds fr
 CHECKS = (SERVER, OWN, STEADY, DELAY, NETWORK)
 
 MOVED_MIN_M: Final = 0.05
-STILL_MAX_M: Final = 0.02
 RATE_TOLERANCE: Final = 0.05
 DELAY_TOLERANCE_S: Final = 0.003
 EV_DELAY_MS: Final = next(float(one.value or 0.0) for one in WANTED if one.name == "EKF2_EV_DELAY")
@@ -91,35 +90,39 @@ class BodyMotion:
     frames: int
     tracked: int
     moved_m: float
-    """Furthest apart of any coordinate, tracked frames only."""
+    """Diagonal of the box around its positions, tracked frames only."""
     error_m: float
     """Mean marker error."""
+
+    @property
+    def label(self) -> str:
+        """Id, and name if it has one."""
+        return f'id {self.id} "{self.name}"' if self.name else f"id {self.id}"
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How evenly frames arrive; all of them, read together or not."""
+    """How evenly frames arrive."""
 
     rate_hz: float
     server_rate_hz: float | None
-    """Of the frame numbers by the server's own time stamps; None: it has none."""
+    """By frame numbers and the server's own time stamps; None if it sends none."""
     period_s: float
     lost: int
-    share_lost: float
     gap_s: float
-    """Longest between two arrivals."""
+    """Longest time between two arrivals."""
     off_s: tuple[float, ...]
-    """Each arrival against an even stream, sorted; the earliest twentieth is 0."""
+    """Delay of each arrival against an even stream, sorted; the 5th percentile is 0."""
     latency_s: tuple[float, ...]
     """Mid-exposure to transmission, sorted."""
 
     def percentile_off_s(self, share: float) -> float:
-        """Of `off_s`."""
+        """Return a percentile of `off_s`; `share` is 0 to 1."""
         return _percentile(self.off_s, share)
 
 
 def timing(frames: Sequence[FrameSeen]) -> Timing | None:
-    """Least squares of arrival over frame number; None: fewer than 10 frames, or their number stands still."""
+    """Fit arrival over frame number by least squares; None if there are fewer than 10 frames or their number does not advance."""
     if len(frames) < 10 or frames[-1].number <= frames[0].number:
         return None
     n = [frame.number - frames[0].number for frame in frames]
@@ -132,13 +135,11 @@ def timing(frames: Sequence[FrameSeen]) -> Timing | None:
     off = sorted(b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True))
     early = _percentile(off, 0.05)
     stamped_s = frames[-1].timestamp_s - frames[0].timestamp_s
-    lost = n[-1] + 1 - len(frames)
     return Timing(
         rate_hz=(len(frames) - 1) / t[-1],
         server_rate_hz=n[-1] / stamped_s if stamped_s > 0.0 else None,
         period_s=period_s,
-        lost=lost,
-        share_lost=lost / (n[-1] + 1),
+        lost=n[-1] + 1 - len(frames),
         gap_s=max(b - a for a, b in itertools.pairwise(t)),
         off_s=tuple(value - early for value in off),
         latency_s=tuple(sorted(frame.latency_s for frame in frames if frame.latency_s is not None)),
@@ -146,7 +147,7 @@ def timing(frames: Sequence[FrameSeen]) -> Timing | None:
 
 
 def bodies(frames: Sequence[FrameSeen], names: Mapping[int, str]) -> list[BodyMotion]:
-    """Every rigid body that was streamed or is described, by id."""
+    """Return every rigid body that was streamed or is described, by id."""
     ids = {body.id for frame in frames for body in frame.bodies} | set(names)
     found = []
     for number in sorted(ids):
@@ -162,7 +163,7 @@ def bodies(frames: Sequence[FrameSeen], names: Mapping[int, str]) -> list[BodyMo
 
 
 def histogram(t: Timing) -> list[str]:
-    """Arrivals against an even stream, as bars; the last one holds all that is later."""
+    """Draw the arrivals against an even stream as bars; the last bar holds all that came later."""
     width_s = max(0.0005, _percentile(t.off_s, 0.99) / (_BINS - 1))
     counts = [0] * _BINS
     for off_s in t.off_s:
@@ -177,57 +178,46 @@ def histogram(t: Timing) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """Rows, and the changes of the vehicle file that would put right what is wrong."""
+class Watched:
+    """A stream that was watched."""
 
-    rows: list[Row]
-    changes: dict[Location, Data]
+    frames: Sequence[FrameSeen]
+    """In order of arrival."""
+    names: Mapping[int, str]
+    """Of the rigid bodies, by id."""
+    info: ServerInfo
+    route: Route
+    duration_s: float
+    moving: bool
+    """The vehicle was moved meanwhile."""
 
 
-def judge(
-    frames: Sequence[FrameSeen],
-    names: Mapping[int, str],
-    info: ServerInfo,
-    vehicle: Vehicle,
-    duration_s: float,
-    route: Route,
-    *,
-    moving: bool,
-) -> Judged:
-    """All rows of a stream that was watched.
-
-    Args:
-        frames: in order of arrival.
-        names: of the rigid bodies.
-        info: what the server said about itself.
-        vehicle: what the companion believes.
-        duration_s: so long it was watched.
-        route: how it comes.
-        moving: somebody moved the vehicle meanwhile.
-    """
-    device, changes = vehicle.devices.mocap, dict[Location, Data]()
+def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location, Data]]:
+    """Return all rows of a watched stream, and the changes of the vehicle file that would put right what is wrong."""
+    frames, info, device = watched.frames, watched.info, vehicle.devices.mocap
+    changes = dict[Location, Data]()
     version = ".".join(map(str, info.application_version))
-    rows = [SERVER.good(f"{info.application} {version}, NatNet {info.version}, {route.transport}")]
-    rows.append(_network(route))
-    seen = bodies(frames, names)
-    own_id = device.rigid_body_id
-    rows.append(_own(seen, own_id, moving, changes))
+    seen = bodies(frames, watched.names)
+    rows = [
+        SERVER.good(f"{info.application} {version}, NatNet {info.version}, {watched.route.transport}"),
+        _network(watched.route),
+        _own(seen, device.rigid_body_id, watched.moving, changes),
+    ]
     t = timing(frames)
     if t is None:
-        return Judged(rows, changes)
-    poses = _poses(frames, own_id, device.up_axis)
-    others = tuple(body.id for body in seen if body.id != own_id and body.frames)
-    stream = MocapStream(len(frames), t.lost, info.application, others, names.get(own_id, ""))
-    observed = Observations(0.0, duration_s, mocap=tuple(poses), mocap_stream=stream)
+        return rows, changes
+    poses = _poses(frames, device.rigid_body_id, device.up_axis)
+    others = tuple(body.id for body in seen if body.id != device.rigid_body_id and body.frames)
+    stream = MocapStream(len(frames), t.lost, info.application, others, watched.names.get(device.rigid_body_id, ""))
+    observed = Observations(0.0, watched.duration_s, mocap=tuple(poses), mocap_stream=stream)
     rate = _rate(t, device.rate_hz, changes)
-    # The device's own row is the server's here, and the rate is told with its cause.
+    # The preflight's device row is the server's here, and the rate is reported with its cause.
     rows += [
         rate if row.id == preflight.RATE.id else row
         for row in preflight.rows(observed, vehicle)
         if row.id not in (preflight.DEVICE.id, preflight.CLOCK.id)
     ]
-    rows += [_steady(t), *([_delay(t)] if t.latency_s else [])]
-    return Judged(rows, changes)
+    return [*rows, _steady(t), *([_delay(t)] if t.latency_s else [])], changes
 
 
 def _poses(frames: Sequence[FrameSeen], own_id: int, up_axis: str) -> list[MocapPose]:
@@ -246,36 +236,32 @@ def _poses(frames: Sequence[FrameSeen], own_id: int, up_axis: str) -> list[Mocap
 
 
 def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Location, Data]) -> Row:
-    streamed = [body for body in seen if body.frames]
-    moved = [body for body in streamed if body.moved_m >= MOVED_MIN_M]
-    read = ", ".join(_label(body) + (f" moved {100.0 * body.moved_m:.0f} cm" if moving else "") for body in streamed)
+    streamed = {body.id: body for body in seen if body.frames}
+    moved = [body for body in streamed.values() if body.moved_m >= MOVED_MIN_M] if moving else []
+    read = ", ".join(
+        body.label + (f" moved {100.0 * body.moved_m:.0f} cm" if moving else "") for body in streamed.values()
+    )
     read = read or "no rigid body is streamed"
     key: Location = ("devices", "mocap", "rigid_body_id")
-    if moving and len(moved) == 1 and moved[0].id != own_id:
+    if len(moved) == 1 and moved[0].id != own_id:
         changes[key] = moved[0].id
-        return OWN.bad(
-            read, f"id {own_id} moves", f"it is {_label(moved[0])}: set devices.mocap.rigid_body_id: {moved[0].id}"
-        )
+        fix = f"it is {moved[0].label}: set devices.mocap.rigid_body_id: {moved[0].id}"
+        return OWN.bad(read, f"id {own_id} moves", fix)
     if moving and not moved:
-        return OWN.bad(read, f"id {own_id} moves", "nothing moved: do it again and carry the vehicle some 30 cm")
-    if moving and own_id in [body.id for body in moved] and len(moved) > 1:
-        return OWN.bad(read, f"id {own_id} alone moves", "move nothing but the vehicle, and do it again")
-    if own_id in [body.id for body in streamed]:
-        told = "moved as the vehicle did" if moving else "is streamed; --move tells whether it is the vehicle's"
-        name = next(_label(body) for body in streamed if body.id == own_id)
-        return OWN.good(f"{name} {told}")
+        return OWN.bad(read, f"id {own_id} moves", "nothing moved: repeat, and carry the vehicle some 30 cm")
+    if len(moved) > 1 and own_id in [body.id for body in moved]:
+        return OWN.bad(read, f"id {own_id} alone moves", "move nothing but the vehicle, and repeat")
+    if own_id in streamed:
+        result = "moved as the vehicle did" if moving else "is streamed; --move shows whether it is the vehicle's"
+        return OWN.good(f"{streamed[own_id].label} {result}")
     if len(streamed) == 1:
-        changes[key] = streamed[0].id
-        fix = f"set devices.mocap.rigid_body_id: {streamed[0].id}, if that is the vehicle"
+        (changes[key],) = streamed
+        fix = f"set devices.mocap.rigid_body_id: {changes[key]}, if that is the vehicle"
     elif streamed:
         fix = "find out which one the vehicle is: companion mocap check --move"
     else:
         fix = "in Motive create a rigid body of the vehicle's markers and stream rigid bodies"
     return OWN.bad(read, f"id {own_id}", fix)
-
-
-def _label(body: BodyMotion) -> str:
-    return f'id {body.id} "{body.name}"' if body.name else f"id {body.id}"
 
 
 def _rate(t: Timing, expected_hz: float, changes: dict[Location, Data]) -> Row:
@@ -284,37 +270,30 @@ def _rate(t: Timing, expected_hz: float, changes: dict[Location, Data]) -> Row:
     read = f"{t.rate_hz:.1f} Hz, the cameras run at {camera_hz:.1f} Hz"
     if abs(t.rate_hz / expected_hz - 1.0) <= RATE_TOLERANCE:
         return preflight.RATE.good(read, wanted)
-    if abs(camera_hz / expected_hz - 1.0) <= RATE_TOLERANCE:
-        return preflight.RATE.bad(
-            read, wanted, "frames are lost on the way: a cable, a network of its own, a computer less busy"
-        )
-    changes["devices", "mocap", "rate_hz"] = float(round(camera_hz))
-    fix = f"set the camera rate to {expected_hz:g} Hz in Motive; or, to fly with this one, devices.mocap.rate_hz: {round(camera_hz)}"
+    fix = "frames are lost on the way: a cable, a network of its own, a computer less busy"
+    if abs(camera_hz / expected_hz - 1.0) > RATE_TOLERANCE:
+        changes["devices", "mocap", "rate_hz"] = float(round(camera_hz))
+        fix = f"set the camera rate to {expected_hz:g} Hz in Motive; or fly with this one, devices.mocap.rate_hz: {round(camera_hz)}"
     return preflight.RATE.bad(read, wanted, fix)
 
 
 def _steady(t: Timing) -> Row:
     late_s, limit_s = t.percentile_off_s(0.99), 0.5 * t.period_s
-    median, most = t.percentile_off_s(0.5), t.off_s[-1]
-    read = f"late by {1e3 * median:.1f} ms (median), {1e3 * late_s:.1f} ms (99 %), {1e3 * most:.1f} ms (worst)"
-    wanted = f"99 % within {1e3 * limit_s:.1f} ms"
-    if late_s <= limit_s:
-        return STEADY.good(read, wanted)
-    return STEADY.bad(read, wanted, "a cable, no power saving of the network card, and nothing else on this computer")
+    median, worst = t.percentile_off_s(0.5), t.off_s[-1]
+    read = f"late by {1e3 * median:.1f} ms (median), {1e3 * late_s:.1f} ms (99 %), {1e3 * worst:.1f} ms (worst)"
+    fix = "a cable, no power saving of the network card, and nothing else on this computer"
+    return STEADY.row(late_s <= limit_s, read, f"99 % within {1e3 * limit_s:.1f} ms", fix)
 
 
 def _delay(t: Timing) -> Row:
-    value_ms = EV_DELAY_MS
     latency_s = _percentile(t.latency_s, 0.5)
     read = f"{1e3 * latency_s:.1f} ms from exposure to transmission (median)"
-    wanted = f"{value_ms:g} ms, which the parameter file says"
-    if abs(latency_s - 1e-3 * value_ms) <= DELAY_TOLERANCE_S:
-        return DELAY.good(read, wanted)
     fix = (
         "take load off Motive (no video, fewer bodies, labelled markers off); what stays is measured by companion latency, and "
         f"goes into PX4's EKF2_EV_DELAY: {1e3 * latency_s:.0f} ms or a little more"
     )
-    return DELAY.bad(read, wanted, fix)
+    near = abs(latency_s - 1e-3 * EV_DELAY_MS) <= DELAY_TOLERANCE_S
+    return DELAY.row(near, read, f"{EV_DELAY_MS:g} ms, as in the parameter file", fix)
 
 
 def _network(route: Route) -> Row:
@@ -324,42 +303,43 @@ def _network(route: Route) -> Row:
     return NETWORK.good(read)
 
 
-def as_json(frames: Sequence[FrameSeen], names: Mapping[int, str], info: ServerInfo, route: Route) -> dict[str, Any]:
-    """Figures for scripts; seconds, metres, Hz."""
-    t = timing(frames)
+def text(watched: Watched) -> list[str]:
+    """Return the bodies and the histogram of arrivals, for people."""
+    lines = [f"bodies of {watched.info.application}, {watched.route.transport}:"]
+    for body in bodies(watched.frames, watched.names):
+        share = f"{100.0 * body.tracked / body.frames:.0f} % tracked" if body.frames else "not streamed"
+        lines.append(
+            f"  id {body.id:<5} {body.name or '-':<20} {share}, moved {100.0 * body.moved_m:.1f} cm, "
+            f"marker error {1e3 * body.error_m:.1f} mm"
+        )
+    t = timing(watched.frames)
+    if t is not None:
+        lines += ["arrival of the frames against an even stream:", *histogram(t)]
+    return [*lines, ""]
+
+
+def as_json(watched: Watched) -> dict[str, Any]:
+    """Return the JSON document's part; seconds, metres, Hz."""
+    t, info, route = timing(watched.frames), watched.info, asdict(watched.route)
+    del route["wireless"]
+    version = ".".join(map(str, info.application_version))
     return {
-        "server": {
-            "application": info.application,
-            "version": ".".join(map(str, info.application_version)),
-            "natnet": info.version,
-            "transport": route.transport,
-            "local_address": route.local_address,
-            "interface": route.interface,
-        },
-        "bodies": [
-            {
-                "id": b.id,
-                "name": b.name,
-                "frames": b.frames,
-                "tracked": b.tracked,
-                "moved_m": b.moved_m,
-                "error_m": b.error_m,
-            }
-            for b in bodies(frames, names)
-        ],
-        "timing": None
-        if t is None
-        else {
+        "server": {"application": info.application, "version": version, "natnet": info.version, **route},
+        "bodies": [asdict(body) for body in bodies(watched.frames, watched.names)],
+        "timing": t
+        and {
             "rate_hz": t.rate_hz,
             "server_rate_hz": t.server_rate_hz,
             "lost": t.lost,
             "gap_s": t.gap_s,
-            "late_s": {"p50": t.percentile_off_s(0.5), "p99": t.percentile_off_s(0.99), "max": t.off_s[-1]},
-            "latency_s": {"p50": _percentile(t.latency_s, 0.5), "p99": _percentile(t.latency_s, 0.99)}
-            if t.latency_s
-            else None,
+            "late_s": _percentiles(t.off_s) | {"max": t.off_s[-1]},
+            "latency_s": _percentiles(t.latency_s) if t.latency_s else None,
         },
     }
+
+
+def _percentiles(ordered: Sequence[float]) -> dict[str, float]:
+    return {"p50": _percentile(ordered, 0.5), "p99": _percentile(ordered, 0.99)}
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float:

@@ -1,4 +1,4 @@
-"""Motion capture watched as a whole: every rigid body of every frame, the way to the server, servers found by broadcast. I/O only."""
+"""All of motion capture: every rigid body of every frame, the route to the server, servers found by broadcast. I/O only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.natnet import Frame, Malformed, Message, ServerInfo
 from companion.io.protocols import DeviceError
-from companion.model.types import MocapPose
 from companion.runtime.clock import Clock
 
 _SIOCGIFADDR, _SIOCGIFNETMASK = 0x8915, 0x891B
@@ -26,14 +25,12 @@ _ASK_PERIOD_S: Final = 0.25
 
 
 class MocapWatch(NatNetMocap):
-    """The motion-capture edge, which shows every body instead of waiting for one of them.
+    """The motion-capture driver, which reports every body instead of waiting for one.
 
     Args:
         device: addresses, transport, version.
         clock: the flight clock.
-        on_frame: gets every frame in the order of arrival, also those that are read together.
-        connect_timeout_s: until the server info has come.
-        frame_timeout_s: from then until the first frame.
+        on_frame: called with every frame in order of arrival, also with those that are read together.
     """
 
     def __init__(
@@ -41,18 +38,14 @@ class MocapWatch(NatNetMocap):
         device: MocapDevice,
         clock: Clock,
         on_frame: Callable[[FrameSeen], None],
-        *,
-        on_pose: Callable[[MocapPose], None] = lambda _: None,
-        connect_timeout_s: float = 3.0,
-        frame_timeout_s: float = 3.0,
     ) -> None:
-        super().__init__(device, clock, on_pose, connect_timeout_s=connect_timeout_s, body_timeout_s=frame_timeout_s)
+        super().__init__(device, clock, lambda _: None)
         self._on_frame = on_frame
         self._any_frame = asyncio.Event()
 
     @property
     def server_ip(self) -> str:
-        """Numeric address of the server; empty until it was resolved."""
+        """Numeric address of the server; empty until it is resolved."""
         return self._server_ip
 
     @property
@@ -61,7 +54,7 @@ class MocapWatch(NatNetMocap):
         return dict(self._names)
 
     async def _wait_for_body(self) -> None:
-        """Any frame will do; without one the edge's own words say what is wrong."""
+        """Wait for any frame; without one the driver's own error says what is wrong."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._body_timeout_s):
                 await self._any_frame.wait()
@@ -93,7 +86,7 @@ class MocapWatch(NatNetMocap):
 
 
 async def discover(interface: str, command_port: int, within_s: float = 1.0) -> dict[str, ServerInfo]:
-    """NatNet servers of the segment by their addresses: a connect request to the segment's broadcast address, answers collected.
+    """Return the NatNet servers of the segment by address: a connect request is broadcast and the answers are collected.
 
     Args:
         interface: address of this computer in that segment; 0.0.0.0: all segments.
@@ -109,7 +102,7 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
         try:
             opened.bind((interface, 0))
         except OSError:
-            return found  # the edge has said that this is no address of this computer
+            return found  # not an address of this computer; the driver has reported it
 
         def drain() -> None:
             with contextlib.suppress(OSError):
@@ -139,7 +132,7 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
 
 
 def path_to(server_ip: str, device: MocapDevice) -> Route:
-    """The way to the server as the kernel takes it."""
+    """Return the route to the server as the kernel chooses it."""
     local = device.interface
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         if device.interface != "0.0.0.0":
@@ -154,7 +147,7 @@ def path_to(server_ip: str, device: MocapDevice) -> Route:
 
 
 def _broadcast_addresses(interface: str) -> list[str]:
-    """Of the segments that the interface's address is in; the limited broadcast beside them."""
+    """Return the broadcast addresses of the interface's segments, and the limited broadcast."""
     found = []
     for address, mask in _interfaces().values():
         if interface in ("0.0.0.0", address) or (interface.startswith("127.") and address.startswith("127.")):
@@ -166,7 +159,7 @@ def _broadcast_addresses(interface: str) -> list[str]:
 
 
 def _interfaces() -> dict[str, tuple[str, str]]:
-    """IPv4 address and netmask of each network interface (ioctl SIOCGIFADDR, SIOCGIFNETMASK)."""
+    """Return IPv4 address and netmask of each network interface (ioctl SIOCGIFADDR, SIOCGIFNETMASK)."""
     found = {}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():

@@ -1,0 +1,228 @@
+"""`companion ft check`: the force sensor at rest and under a known weight. `companion ft tare`: its drift and its own bias."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Final
+
+from companion.commissioning.force_torque import fit as ft_fit
+from companion.commissioning.force_torque.watch import FtSensor, arm_angles, pose_rad, until_loaded
+from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import GRAVITY_M_S2
+from companion.io.dynamixel.registers import usb_latency_ms
+from companion.io.protocols import DeviceError
+from companion.model.observations import ForceStream, Observations
+from companion.model.rows import Row
+from companion.model.types import IDENTITY_QUAT, ArmState, ForceSample, Vec2, VehicleState
+from companion.preflight import force as preflight
+from companion.preflight.arm import usb_latency
+from companion.preflight.checks import Check
+from companion.preflight.force import mean_force_n, tare_bias_n
+from companion.runtime.clock import flight_clock
+
+WATCH_S: Final = 3.0
+LOADED_S: Final = 2.0
+TARE_S: Final = 1.0
+"""As long as a flight tares."""
+DRIFT_WARN_N_MIN: Final = 0.3
+ZERO_MAX_N: Final = 0.3
+_EMPTY: Final = "the machine stands level on its legs, the net is empty, hands off"
+
+DRIFT = Check(
+    "ft.drift",
+    "force sensor drift",
+    "below 0.3 N in a minute",
+    "drift after the tare looks like a force; let the sensor warm up before a flight",
+    warns=True,
+)
+BIAS_SET = Check(
+    "ft.bias_set", "sensor's own bias", "the reading is zero right after it was set", "the sensor ignored the command"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """The sensor at rest, then perhaps under a known weight."""
+
+    empty: Sequence[ForceSample]
+    arm_rad: Vec2
+    stream: ForceStream
+    usb_latency_ms: int | None
+    weight_kg: float | None
+    """None if no weight was announced."""
+    loaded: Sequence[ForceSample] = ()
+    """Empty if no weight was recognised."""
+    loaded_arm_rad: Vec2 = (0.0, 0.0)
+    problem: str = ""
+    """Why a device failed after the measurement at rest; empty if none did."""
+
+
+async def watch(session: Session) -> Watched:
+    """Watch the sensor at rest, then under the weight."""
+    vehicle, weight_kg = session.vehicle, session.arguments.weight
+    clock, device = flight_clock(), vehicle.devices.force
+    given_rad = pose_rad(session.arguments.arm_pose, vehicle)
+    async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
+        session.say(f"force sensor: {device.port}; {_EMPTY} for {WATCH_S:g} s")
+        empty = await sensor.tare_samples(WATCH_S)
+        health = sensor.health()
+        product = f"{sensor.product_name}, firmware {sensor.firmware}" if sensor.firmware else sensor.product_name
+        stream = ForceStream(len(empty) - 1, health.bad_sums, product, health.lost)
+        seen = Watched(empty, await angles_rad(), stream, usb_latency_ms(device.port), weight_kg)
+        if weight_kg is None:
+            return seen
+        try:
+            weight_n = GRAVITY_M_S2 * weight_kg
+            session.say(
+                f"hang {weight_kg:g} kg ({weight_n:.2f} N) on the net's centre and let it come to rest; it is recognised"
+            )
+            if not await until_loaded(sensor, mean_force_n(empty), weight_n):
+                return seen
+            session.say(f"recognised; do not touch it for {LOADED_S:g} s")
+            loaded = await sensor.tare_samples(LOADED_S)
+            seen = replace(seen, loaded=loaded, loaded_arm_rad=await angles_rad())
+            session.say("take the weight off")
+        except DeviceError as error:
+            return replace(seen, problem=str(error))
+        return seen
+
+
+def judge(seen: Watched, vehicle: Vehicle) -> Report:
+    """Judge the sensor at rest, and scale and direction if a weight was announced."""
+    rows = _rest_rows(seen, vehicle)
+    duration_s = seen.empty[-1].stamp_s - seen.empty[0].stamp_s
+    rest = {
+        "rate_hz": (len(seen.empty) - 1) / duration_s if duration_s > 0.0 else None,
+        "mean_n": list(mean_force_n(seen.empty)),
+        "bias_n": list(tare_bias_n(seen.empty, vehicle, IDENTITY_QUAT, seen.arm_rad)),
+        "arm_deg": [math.degrees(angle) for angle in seen.arm_rad],
+    }
+    data = {"rest": rest, "weight": None}
+    if seen.problem:
+        return Report([*rows, preflight.DEVICE.bad(seen.problem, "", "")], data)
+    if seen.weight_kg is None:
+        return Report(rows, data, advice=["a known weight shows scale and direction: companion ft check --weight KG"])
+    if not seen.loaded:
+        fix = "hang it on the net itself; a sensor that measures nothing of it has a broken cable or is bypassed by its mount"
+        wanted = f"{GRAVITY_M_S2 * seen.weight_kg:.2f} N"
+        return Report([*rows, ft_fit.WEIGHT.bad("no steady force appeared", wanted, fix)], data)
+    fit = ft_fit.fit_weight(
+        mean_force_n(seen.empty),
+        mean_force_n(seen.loaded),
+        seen.loaded_arm_rad,
+        seen.weight_kg,
+        vehicle.tool.sensor_rpy_deg,
+    )
+    rows.append(ft_fit.WEIGHT.good(f"{fit.measured_n:.2f} N"))
+    if over := sum(sample.overload for sample in seen.loaded):
+        rows.append(preflight.OVERLOAD.bad(f"{over} samples under the weight", "none", "a lighter weight"))
+    return Report([*rows, *ft_fit.rows(fit)], {**data, "weight": ft_fit.as_json(fit)}, changes=ft_fit.changes(fit))
+
+
+def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
+    """Return the preflight's rows of what was watched, and whether the readings change."""
+    samples = seen.empty
+    still = VehicleState(
+        0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), IDENTITY_QUAT, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY_M_S2)
+    )
+    observed = Observations(
+        samples[0].stamp_s,
+        samples[-1].stamp_s - samples[0].stamp_s,
+        vehicle=(still,),
+        arm=(ArmState(0.0, seen.arm_rad, (0.0, 0.0), (0.0, 0.0), (0, 0), (0.0, 0.0), 0),),
+        force=tuple(samples),
+        force_stream=seen.stream,
+    )
+    bias_fix = (
+        "free the net; without a load correct tool.net_mass_kg, or loosen the sensor's mount; what then stays becomes the sensor's own "
+        "zero by companion ft tare --sensor"
+    )
+    return [
+        *(
+            replace(row, fix=bias_fix) if row.id == preflight.TARE.id and not row.ok else row
+            for row in preflight.rows(observed, vehicle)
+        ),
+        ft_fit.stuck_row(samples, vehicle),
+        usb_latency(preflight.USB, seen.usb_latency_ms),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Tared:
+    """The empty net for some time, and the sensor's reading after its own zero was set."""
+
+    samples: Sequence[ForceSample]
+    first: Sequence[ForceSample]
+    """The first of them, as long as a flight tares."""
+    arm_rad: Vec2
+    zeroed: Sequence[ForceSample] = ()
+    """Empty if the sensor's own zero was not set."""
+
+
+async def watch_drift(session: Session) -> Tared:
+    """Watch the empty net; set or clear the sensor's own zero if asked to."""
+    arguments, vehicle = session.arguments, session.vehicle
+    given_rad = pose_rad(arguments.arm_pose, vehicle)
+    for wanted, question in (
+        (arguments.sensor, "make the present reading the sensor's own zero?"),
+        (arguments.clear, "clear the sensor's own zero?"),
+    ):
+        if wanted and not session.confirm(question):
+            raise GivenUp("nothing was written to the sensor")
+    clock, device = flight_clock(), vehicle.devices.force
+    async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
+        if arguments.clear:
+            sensor.set_bias(False)
+        session.say(f"force sensor: {device.port}; {_EMPTY} for {arguments.seconds:g} s")
+        first = await sensor.tare_samples(TARE_S)
+        samples = list(first)
+        while samples[-1].stamp_s - samples[0].stamp_s < arguments.seconds:
+            samples += await sensor.tare_samples(TARE_S)
+        seen = Tared(samples, first, await angles_rad())
+        if not arguments.sensor:
+            return seen
+        sensor.set_bias(True)
+        await sensor.tare_samples(0.1)  # samples that were on their way
+        return replace(seen, zeroed=await sensor.tare_samples(TARE_S))
+
+
+def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
+    """Judge the drift of each axis, and whether the sensor's own zero was set."""
+    rows = []
+    if seen.zeroed:
+        left_n = math.hypot(*mean_force_n(seen.zeroed))
+        read = f"reads {left_n:.2f} N right after it was set"
+        rows.append(BIAS_SET.row(left_n <= ZERO_MAX_N, read, f"{ZERO_MAX_N:g} N", "power-cycle the sensor and repeat"))
+    axes = dict(zip("xyz", ft_fit.drift(seen.samples), strict=True))
+    worst_n = max(abs(axis.per_minute_n) for axis in axes.values())
+    fix = "leave it powered for twenty minutes and repeat; keep sun and the motors' heat away from it"
+    read = f"{worst_n:.2f} N a minute on the worst axis"
+    rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g} N a minute", fix))
+    rows.append(ft_fit.stuck_row(seen.samples, vehicle))
+    x, y, z = bias_n = tare_bias_n(seen.first, vehicle, IDENTITY_QUAT, seen.arm_rad)
+    net_kg = vehicle.tool.net_mass_kg
+    data = {
+        "drift": [{"axis": name, **asdict(axis)} for name, axis in axes.items()],
+        "tare": {"bias_n": list(bias_n), "net_mass_kg": net_kg},
+        "temperature_c": None,
+    }
+    text = [
+        *(
+            f"  F{name}  mean {one.mean_n:+7.2f} N   noise {one.noise_n:.3f} N   drift {one.per_minute_n:+.3f} "
+            f"+- {one.standard_error_n:.3f} N a minute"
+            for name, one in axes.items()
+        ),
+        f"  a flight's tare removes ({x:+.2f}, {y:+.2f}, {z:+.2f}) N beside the net's {net_kg:g} kg",
+        "  temperature: the sensor's protocol does not report it",
+        "",
+    ]
+    return Report(rows, data, text)
+
+
+TOOLS: Final = {
+    "check": Tool("ft check", SENSORS, watch, judge, preflight.DEVICE, {"rest": None, "weight": None}),
+    "tare": Tool("ft tare", SENSORS, watch_drift, judge_drift, preflight.DEVICE, {"drift": None, "tare": None}),
+}

@@ -1,0 +1,164 @@
+"""`companion mocap check`: is motion capture streamed as the flight needs it? `companion mocap align`: in which axes?"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from companion.commissioning.mocap import align as mocap_align
+from companion.commissioning.mocap import judge as mocap_judge
+from companion.commissioning.mocap.judge import FrameSeen, Watched
+from companion.commissioning.mocap.watch import MocapWatch, discover, path_to
+from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
+from companion.config.base import Location
+from companion.config.document import Data
+from companion.config.loader import load_flight
+from companion.config.mission import Start
+from companion.config.vehicle import MocapDevice, Vehicle
+from companion.io.mocap.natnet import ServerInfo
+from companion.io.protocols import DeviceError
+from companion.model.rows import refusals
+from companion.preflight.hand_test import evaluation as hand_evaluation
+from companion.preflight.hand_test.run import HandResult
+from companion.runtime.clock import flight_clock
+
+if TYPE_CHECKING:
+    from companion.model.types import MocapPose
+
+_DESCRIPTION_TIMEOUT_S: Final = 1.0
+_NO_DATA: Final[Mapping[str, Any]] = {"server": None, "bodies": [], "timing": None}
+
+
+@dataclass(frozen=True, slots=True)
+class NotStreaming:
+    """A server that did not answer, or does not stream to this computer."""
+
+    problem: str
+    info: ServerInfo | None
+    """What it said about itself; None if it did not answer."""
+    others: Mapping[str, ServerInfo]
+    """Servers that answered a broadcast, by address."""
+
+
+async def watch(session: Session) -> Watched | NotStreaming:
+    """Watch the stream of the vehicle file's server; look for another server if it does not answer."""
+    arguments, device = session.arguments, session.vehicle.devices.mocap
+    clock = flight_clock()
+    frames: list[FrameSeen] = []
+    driver = MocapWatch(device, clock, frames.append)
+    session.say(f"motion capture: {device.server}, {device.transport}; nothing moves by itself")
+    try:
+        async with driver:
+            with contextlib.suppress(TimeoutError):  # without a description the bodies have no names
+                async with asyncio.timeout(_DESCRIPTION_TIMEOUT_S):
+                    while not driver.names:  # noqa: ASYNC110 - the driver signals nothing
+                        await asyncio.sleep(0.02)
+            move = "; carry the vehicle about, some 30 cm and back" if arguments.move else ""
+            session.say(f"watching for {arguments.seconds:g} s{move}")
+            frames.clear()
+            start_s = clock()
+            await asyncio.sleep(arguments.seconds)
+            info = driver.server_info
+            assert info is not None
+            route = path_to(driver.server_ip, device)
+            return Watched(tuple(frames), driver.names, info, route, clock() - start_s, arguments.move)
+    except DeviceError as error:
+        if driver.server_info is not None:
+            return NotStreaming(str(error), driver.server_info, {})
+        session.say("no answer; asking the whole segment")
+        return NotStreaming(str(error), None, await discover(device.interface, device.command_port))
+
+
+def judge(seen: Watched | NotStreaming, vehicle: Vehicle) -> Report:
+    """Judge the stream, or say where to look for it."""
+    if isinstance(seen, Watched):
+        rows, changes = mocap_judge.judge(seen, vehicle)
+        return Report(rows, mocap_judge.as_json(seen), mocap_judge.text(seen), changes)
+    fix, changes, advice = "", {}, []
+    if seen.info is not None:
+        changes = _streaming(seen.info, vehicle.devices.mocap)
+    elif seen.others:
+        advice = [
+            f"found {one.application} (NatNet {one.version}) at {address}" for address, one in seen.others.items()
+        ]
+        if len(seen.others) == 1:
+            (address,) = seen.others
+            fix = f"set devices.mocap.server: {address}"
+            changes = {("devices", "mocap", "server"): address}
+    else:
+        advice = ["nobody answers on this segment: Motive is not running, does not stream, or is on another network"]
+    return Report([mocap_judge.SERVER.bad(seen.problem, "", fix)], _NO_DATA, changes=changes, advice=advice)
+
+
+def _streaming(info: ServerInfo, device: MocapDevice) -> dict[Location, Data]:
+    """Return what the server says about its stream where the vehicle file says something else."""
+    if info.multicast is None:
+        return {}
+    found: dict[str, Data] = {"transport": "multicast" if info.multicast else "unicast"}
+    if info.multicast:
+        found |= {"multicast_group": info.multicast_group, "data_port": info.data_port}
+    if device.natnet_version is not None and info.version in ("3.0", "4.1"):
+        found["natnet_version"] = info.version
+    return {("devices", "mocap", key): new for key, new in found.items() if new and new != getattr(device, key)}
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A hand test, and where the mission starts."""
+
+    outcome: HandResult | str
+    """What was measured, or why there is nothing."""
+    start: Start
+
+
+async def carry(session: Session) -> Carried:
+    """Guide the user through the hand test, with poses forwarded to PX4."""
+    from companion.io.devices import SomeEdges, VisionValve  # imports MAVSDK
+    from companion.io.mocap.driver import NatNetMocap
+    from companion.io.px4.driver import MavsdkAutopilot
+    from companion.preflight.hand_test.command import ENDED_BY_HAND, perform
+
+    arguments = session.arguments
+    config = load_flight(arguments.mission, arguments.vehicle, overrides=arguments.overrides)
+    clock, devices, edges = flight_clock(), config.vehicle.devices, SomeEdges(VisionValve())
+
+    def forward(pose: MocapPose) -> None:
+        if edges.autopilot is not None and pose.tracking_valid:
+            edges.autopilot.send_vision(pose)
+
+    session.say(
+        "axes of motion capture, by hand: lift, forward, turn left; put the machine where the mission starts, nose as there"
+    )
+    try:
+        async with (
+            NatNetMocap(devices.mocap, clock, forward) as edges.mocap,
+            MavsdkAutopilot(devices.autopilot, clock) as edges.autopilot,
+        ):
+            outcome = await perform(edges, config, session.console, arguments.json)
+    except DeviceError as error:
+        outcome = str(error)
+    if outcome == ENDED_BY_HAND:
+        raise GivenUp("given up; nothing was changed")
+    return Carried(outcome, config.mission.start)
+
+
+def judge_axes(carried: Carried, vehicle: Vehicle) -> Report:
+    """Judge the hand test, and find the one setting that explains what is wrong."""
+    outcome, start, up_axis = carried.outcome, carried.start, vehicle.devices.mocap.up_axis
+    if isinstance(outcome, str):
+        return Report([hand_evaluation.ended(outcome, "companion mocap align")], {"alignment": None})
+    found = mocap_align.alignment(outcome, up_axis, math.radians(start.yaw_deg))
+    rows = hand_evaluation.rows(outcome, up_axis)
+    changes = mocap_align.changes(found, up_axis) if refusals(rows) else {}
+    world = mocap_align.world_row(found, start.yaw_tolerance_deg)
+    return Report([*rows, *([world] if world else [])], {"alignment": mocap_align.as_json(found)}, changes=changes)
+
+
+TOOLS: Final[Mapping[str, Tool[Any]]] = {
+    "check": Tool("mocap check", SENSORS, watch, judge),
+    "align": Tool("mocap align", SENSORS, carry, judge_axes),
+}

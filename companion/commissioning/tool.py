@@ -1,0 +1,301 @@
+"""The one commissioning tool: collect with devices open, fit, propose a change of the vehicle file, show.
+
+Its instances are the `TOOLS` of `companion.commissioning.arm`, `.force_torque`, `.latency` and `.mocap`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import importlib
+import json
+import signal
+import sys
+from collections import Counter
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Generic, TypeVar
+
+from rich.text import Text
+
+from companion.commissioning.patch import Patch, propose
+from companion.config.base import Location
+from companion.config.document import ConfigError, Data
+from companion.config.loader import load_vehicle
+from companion.config.vehicle import Vehicle
+from companion.io.protocols import DeviceError
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
+from companion.model.rows import Level, Row, refusals
+from companion.preflight.checks import Check
+from companion.runtime.console import console_on, tell
+
+SCHEMA_VERSION: Final = 1
+VEHICLE: Final = "configs/vehicles/tarot650_2r.yaml"
+WRITE_HELP: Final = "write the proposed change into the vehicle file; the old file is kept beside it"
+_T = TypeVar("_T")
+
+
+class GivenUp(Exception):
+    """The user ended the tool or answered no; the message says what was not done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """How the tools of a command treat the user and the vehicle file."""
+
+    guides_on_stderr: bool
+    """Instructions go to standard error even without `--json`."""
+    asks_before_writing: bool
+    """`--write` alone asks before it writes the vehicle file."""
+    ok_when_written: bool
+    """Exit code 0 once the proposed change is written; otherwise the user has to measure again."""
+
+
+ARM: Final = Family(guides_on_stderr=False, asks_before_writing=False, ok_when_written=True)
+SENSORS: Final = Family(guides_on_stderr=True, asks_before_writing=True, ok_when_written=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a tool found."""
+
+    rows: Sequence[Row] = ()
+    data: Mapping[str, Any] = field(default_factory=dict)
+    """JSON values beside the rows, with units in their keys."""
+    text: Sequence[str] = ()
+    """Lines printed above the rows."""
+    changes: Mapping[Location, Data] = field(default_factory=dict)
+    """Values that the vehicle file should have."""
+    advice: Sequence[str] = ()
+    """Lines printed below the rows."""
+    ok: bool | None = None
+    """Whether everything but `changes` is right; None if the rows decide."""
+    brief: Mapping[str, str] = field(default_factory=dict)
+    """Titles by id prefix: rows with this prefix that are ok are printed as one line."""
+
+
+class Session:
+    """One run of a tool.
+
+    Args:
+        arguments: the parsed options.
+        family: of the tool.
+
+    Raises:
+        ConfigError: the vehicle file or an override is wrong.
+    """
+
+    def __init__(self, arguments: argparse.Namespace, family: Family) -> None:
+        if not str(arguments.vehicle).strip():
+            raise ConfigError(
+                [f"companion {arguments.command}: --vehicle: expected the name of a file, got an empty one"]
+            )
+        self.arguments = arguments
+        self.vehicle = load_vehicle(arguments.vehicle, arguments.overrides)
+        self.console = console_on(sys.stderr if family.guides_on_stderr or arguments.json else sys.stdout)
+        """For instructions and progress."""
+
+    def say(self, text: str, style: str = "") -> None:
+        """Print one line of instructions."""
+        self.console.print(Text(text, style=style), soft_wrap=True)
+
+    def ask(self, question: str) -> bool | None:
+        """Ask a yes-or-no question, which `--yes` answers with yes. Return None if there is no terminal to ask at."""
+        if getattr(self.arguments, "yes", False):
+            return True
+        if sys.stdin is None or not sys.stdin.isatty():
+            return None
+        self.say(f"{question} [y/N]", "bold")
+        return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+    def confirm(self, question: str) -> bool:
+        """Return whether the user agrees; say that nothing is done if there is no terminal to ask at."""
+        answer = self.ask(question)
+        if answer is None:
+            self.say(f"{question} not done: there is no terminal to ask at, say --yes")
+        return bool(answer)
+
+
+@dataclass(frozen=True, slots=True)
+class Tool(Generic[_T]):
+    """One commissioning tool."""
+
+    name: str
+    """As in `companion NAME`."""
+    family: Family
+    collect: Callable[[Session], _T | Coroutine[Any, Any, _T]]
+    """Check the options, open the devices, guide the user, return what was measured. Ctrl-C cancels it if it is a coroutine."""
+    fit: Callable[[_T, Vehicle], Report]
+    """Judge what was measured. Pure."""
+    device: Check | None = None
+    """The row for a device that does not open or goes silent; None if one line on standard error says it."""
+    no_data: Mapping[str, Any] = field(default_factory=dict)
+    """`Report.data` when a device fails."""
+
+
+def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
+    """Run a tool to its end; return the exit code.
+
+    Raises:
+        ConfigError: an option or the vehicle file is wrong, or the vehicle file cannot take the change.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    session = Session(arguments, tool.family)
+    try:
+        collected = tool.collect(session)
+        if isinstance(collected, Coroutine):
+            collected = run_until_interrupted(collected)
+        report = tool.fit(collected, session.vehicle)
+    except DeviceError as error:
+        if tool.device is None:
+            tell(error)
+            return EXIT_REFUSED
+        report = Report([tool.device.bad(str(error), "", "")], tool.no_data)
+    except GivenUp as end:
+        tell(f"companion {tool.name}: {end}")
+        return EXIT_ABORTED
+    patch = propose(arguments.vehicle, report.changes) if report.changes else None
+    written = str(patch.write()) if patch and _may_write(session, tool.family, patch) else None
+    settled = not patch or (written is not None and tool.family.ok_when_written)
+    ok = settled and (not refusals(report.rows) if report.ok is None else report.ok)
+    if arguments.json:
+        document = {
+            "schema_version": SCHEMA_VERSION,
+            "tool": tool.name,
+            "ok": ok,
+            **report.data,
+            "rows": [row.as_json() for row in report.rows],
+            "patch": patch.as_json() if patch else None,
+            "written": written,
+            "backup": written,  # the arm's name for it
+        }
+        print(json.dumps(document, allow_nan=False))
+    else:
+        for line in (
+            *report.text,
+            *row_lines(report.rows, report.brief),
+            *report.advice,
+            *_patch_lines(patch, written),
+        ):
+            print(line)
+    return EXIT_OK if ok else EXIT_REFUSED
+
+
+def _may_write(session: Session, family: Family, patch: Patch) -> bool:
+    if not getattr(session.arguments, "write", False):
+        return False
+    if not family.asks_before_writing or session.arguments.yes:
+        return True
+    session.say(patch.text)
+    return session.confirm(f"write this to {patch.shown}?")
+
+
+def row_lines(rows: Sequence[Row], brief: Mapping[str, str]) -> list[str]:
+    """Return the rows as lines: result, title, what was read; then what to do about those that are not ok.
+
+    Args:
+        rows: in the order in which they are printed.
+        brief: see `Report.brief`.
+    """
+    lines, hidden, wrong = [], Counter[str](), set()
+    for row in rows:
+        group = row.id.rpartition(".")[0]
+        if row.ok and group in brief:
+            hidden[group] += 1
+            continue
+        mark = "ok" if row.ok else "WARN" if row.level is Level.WARN else "FAIL"
+        wanted = f"   (wanted: {row.wanted})" if row.wanted and not row.ok else ""
+        lines.append(f"{mark:<5} {row.title:<34} {row.read}{wanted}")
+        if not row.ok:
+            wrong.add(group)
+            lines += [f"      -> {row.fix}"] if row.fix else []
+    lines += [
+        f"{'ok':<5} {brief[group]:<34} {'the other' if group in wrong else 'all'} {count} are right"
+        for group, count in hidden.items()
+    ]
+    return lines
+
+
+def _patch_lines(patch: Patch | None, written: str | None) -> list[str]:
+    if not patch:
+        return []
+    return ["", patch.text, "", f"written; the old file: {written}" if written else "not written; --write does it"]
+
+
+def run_until_interrupted(work: Coroutine[Any, Any, _T]) -> _T:
+    """Run a coroutine in its own event loop. Ctrl-C cancels it and is raised again when it has ended, however that was.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C.
+    """
+
+    async def guarded() -> tuple[_T] | None:
+        interrupted = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        task = asyncio.ensure_future(work)
+
+        def interrupt() -> None:
+            interrupted.set()
+            task.cancel()
+
+        loop.add_signal_handler(signal.SIGINT, interrupt)
+        try:
+            await asyncio.wait((task,))
+        finally:
+            loop.remove_signal_handler(signal.SIGINT)
+        if interrupted.is_set():
+            if not task.cancelled():
+                task.exception()  # retrieved: it is not what ended the work
+            return None
+        return (task.result(),)
+
+    done = asyncio.run(guarded())
+    if done is None:
+        raise KeyboardInterrupt
+    return done[0]
+
+
+def add_tool(
+    parts: Any, name: str, module: str, *, help: str, description: str, write: str = WRITE_HELP, yes: bool = True
+) -> argparse.ArgumentParser:
+    """Add a tool's parser with the options that all tools have.
+
+    Args:
+        parts: sub-parsers of the command.
+        name: the tool's word, its key in `TOOLS`.
+        module: where `TOOLS` is; imported when the tool runs.
+        help: one line.
+        description: with the exit codes.
+        write: help of `--write`; empty if the tool has no such option.
+        yes: whether the tool has `--yes`.
+    """
+    parser: argparse.ArgumentParser = parts.add_parser(name, help=help, description=description)
+    parser.add_argument("--vehicle", metavar="FILE", default=VEHICLE, help=f"vehicle file (default: {VEHICLE})")
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
+        help="override a value, e.g. vehicle.devices.arm.port=/dev/ttyUSB0",
+    )  # fmt: skip
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON document and nothing else on standard output"
+    )
+    if write:
+        parser.add_argument("--write", action="store_true", help=write)
+    if yes:
+        parser.add_argument("--yes", action="store_true", help="answer every question with yes")
+    parser.set_defaults(run=lambda arguments: run_tool(importlib.import_module(module).TOOLS[name], arguments))
+    return parser
+
+
+def number(low: float, high: float, unit: str = "", kind: Callable[[str], float] = float) -> Callable[[str], float]:
+    """Return an argparse type: a number within limits, neither NaN nor infinite."""
+
+    def parse(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"expected {low:g} to {high:g}{unit}, got '{text}'")
+        return value
+
+    return parse
