@@ -32,7 +32,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
         yield one
 
 
-def test_jog_moves_one_joint_and_stays_within_the_walls(held: Rig) -> None:
+def test_jog_moves_one_joint_and_stays_within_the_limits(held: Rig) -> None:
     code, done = held.json("jog", "--joint", "2", "--to", "120", "--yes", process=True)
     assert (code, done["stopped"]) == (EXIT_OK, "")
     assert done["angle_deg"] == pytest.approx([165.0, 120.0], abs=1.0)
@@ -40,7 +40,7 @@ def test_jog_moves_one_joint_and_stays_within_the_walls(held: Rig) -> None:
     for words, told in (
         (("--joint", "2", "--to", "149"), "expected -7 to 147 deg"),
         (("--joint", "2"), "--joint N and --to DEG belong together"),
-        ((), "no terminal to take keys from"),
+        ((), "no terminal to read keys from"),
         (("--joint", "3", "--to", "0"), "expected 1 (shoulder) or 2 (elbow), got '3'"),
     ):
         ended = held.run("jog", *words, "--yes")
@@ -54,7 +54,7 @@ def test_jog_stops_when_gravity_does_not_explain_the_load(held: Rig) -> None:
     heavy = ("--set", "vehicle.tool.net_mass_kg=0.5")
     code, done = held.json("jog", "--joint", "2", "--to", "125", "--yes", *heavy)
     assert code == EXIT_REFUSED
-    assert "beside gravity; look what is in its way" in done["stopped"] or "from where it is led" in done["stopped"]
+    assert "beside gravity; look for what is in its way" in done["stopped"] or "from its reference" in done["stopped"]
 
 
 def test_keys_at_a_terminal_move_the_arm_and_q_lets_go(held: Rig) -> None:

@@ -1,4 +1,4 @@
-"""The arm's motion on the ground: bounded in speed, torque and walls, and ended by everything that should end it."""
+"""The arm's motion on the ground: bounded in speed, torque and angle, and ended by everything that should end it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from companion.commissioning.arm.jog import KEY_TIMEOUT_S, STEP_DEG, ByKeys, ToAngle, keys_in
-from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, TORQUE_SHARE, Motion, Moved, walls_deg
-from companion.commissioning.arm.sweep import Sweeper, legs_of
+from companion.commissioning.arm.jog import KEY_TIMEOUT_S, STEP_DEG, ByKeys, keys_in
+from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, TORQUE_SHARE, Motion, Moved, limits_deg
+from companion.commissioning.arm.sweep import Leg, Sweeper, legs_of
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
@@ -84,6 +84,17 @@ class Bench:
         return math.degrees(self.angle[0]), math.degrees(self.angle[1])
 
 
+class Keys:
+    """Keys that a terminal has sent."""
+
+    def __init__(self) -> None:
+        self.sent = ""
+
+    def take(self) -> str:
+        taken, self.sent = self.sent, ""
+        return taken
+
+
 def test_a_joint_reaches_its_goal_slowly_and_the_other_one_stays(vehicle: Vehicle) -> None:
     bench = Bench(vehicle)
     bench.motion.go(0, math.radians(140.0), math.radians(99.0))
@@ -97,19 +108,19 @@ def test_a_joint_reaches_its_goal_slowly_and_the_other_one_stays(vehicle: Vehicl
     )
 
 
-def test_no_goal_lies_beyond_a_wall(vehicle: Vehicle) -> None:
+def test_no_goal_lies_beyond_a_joint_limit(vehicle: Vehicle) -> None:
     for joint, goal_deg in ((0, 400.0), (1, -400.0)):
         bench = Bench(vehicle, (120.0, 60.0))
         bench.motion.go(joint, math.radians(goal_deg), math.radians(20.0))
         assert bench.until(lambda m: m.reached).stop == ""
-        low, high = walls_deg(vehicle.arm, joint)
+        low, high = limits_deg(vehicle.arm, joint)
         assert bench.degrees[joint] == pytest.approx(high if goal_deg > 0 else low, abs=1.0)
 
 
 def test_something_in_the_way_stops_it_gently(vehicle: Vehicle) -> None:
     bench = Bench(vehicle)
-    wall_rad = math.radians(40.0)
-    bench.disturbance = lambda angle: (0.0, -200.0 * max(0.0, angle[1] - wall_rad))
+    obstacle_rad = math.radians(40.0)
+    bench.disturbance = lambda angle: (0.0, -200.0 * max(0.0, angle[1] - obstacle_rad))
     bench.motion.go(1, math.radians(80.0), math.radians(20.0))
     moved = bench.until(lambda m: m.reached)
     assert moved.stop.startswith("joint 2: +0.") and "in its way" in moved.stop and moved.torque_nm == (0.0, 0.0)
@@ -148,7 +159,8 @@ def test_a_pose_that_is_too_heavy_is_refused_before_anything_moves(vehicle: Vehi
 
 
 def test_a_held_key_moves_a_released_one_stops(vehicle: Vehicle) -> None:
-    bench, leader = Bench(vehicle), ByKeys()
+    bench, keys = Bench(vehicle), Keys()
+    leader = ByKeys(keys.take)
     leader.begin(bench.state())
     moved: Moved | None = None
 
@@ -156,12 +168,12 @@ def test_a_held_key_moves_a_released_one_stops(vehicle: Vehicle) -> None:
         nonlocal moved
         for tick in range(round(seconds / DT_S)):
             if key and tick % round(every_s / DT_S) == 0:
-                leader.press([key])
+                keys.sent += key
             moved = bench.step()
             assert not leader.update(bench.motion, moved, bench.state())
 
     run(0.1)
-    leader.press(["2"])
+    keys.sent += "2"
     run(2.0, "+")
     held_deg = bench.degrees[1]
     assert held_deg - 10.0 > 0.6 * 2.0 * SPEED_MAX_DEG_S
@@ -169,17 +181,18 @@ def test_a_held_key_moves_a_released_one_stops(vehicle: Vehicle) -> None:
     assert bench.degrees[1] - held_deg <= STEP_DEG + 1.0
     assert bench.degrees[0] == pytest.approx(90.0, abs=1.0)
     stays_deg = bench.degrees[1]
-    leader.press(["+", "x"])
+    keys.sent += "+x"
     run(1.0)
     assert bench.degrees[1] == pytest.approx(stays_deg, abs=0.3), "any other key stops it"
-    leader.press(["q"])
+    keys.sent += "q"
     assert leader.update(bench.motion, moved, bench.state())
 
 
 def test_a_key_that_a_jam_makes_last_times_out(vehicle: Vehicle) -> None:
-    bench, leader = Bench(vehicle), ByKeys()
+    bench, keys = Bench(vehicle), Keys()
+    leader = ByKeys(keys.take)
     leader.begin(bench.state())
-    leader.press(["+"])
+    keys.sent += "+"
     leader.update(bench.motion, None, bench.state())
     late = replace(bench.state(), stamp_s=KEY_TIMEOUT_S + 0.1)
     leader.update(bench.motion, None, late)
@@ -189,7 +202,8 @@ def test_a_key_that_a_jam_makes_last_times_out(vehicle: Vehicle) -> None:
 
 
 def test_nobody_at_the_keys_ends_it(vehicle: Vehicle) -> None:
-    bench, leader = Bench(vehicle), ByKeys()
+    bench, keys = Bench(vehicle), Keys()
+    leader = ByKeys(keys.take)
     leader.begin(bench.state())
     assert not leader.update(bench.motion, None, bench.state())
     assert leader.update(bench.motion, None, replace(bench.state(), stamp_s=1000.0))
@@ -201,7 +215,7 @@ def test_what_a_terminal_sends_is_taken_apart() -> None:
 
 
 def test_to_an_angle_and_no_further(vehicle: Vehicle) -> None:
-    bench, leader = Bench(vehicle), ToAngle(1, 50.0)
+    bench, leader = Bench(vehicle), Sweeper([Leg(1, 50.0, SPEED_MAX_DEG_S)], 1.0)
     leader.begin(bench.state())
     bench.until(lambda m: leader.update(bench.motion, m, bench.state()))
     assert bench.degrees == pytest.approx((90.0, 50.0), abs=1.0)
@@ -211,11 +225,7 @@ def test_the_sweeps_keep_samples_of_both_ways_at_both_speeds_and_end_hanging(veh
     bench = Bench(vehicle, (165.0, 140.0))
     sweeper = Sweeper(legs_of(vehicle.arm), vehicle.arm.torque_per_amp_nm_a)
 
-    def led(moved: Moved) -> bool:
-        sweeper.update(bench.motion, moved, bench.state())
-        return sweeper.done
-
-    assert bench.until(led).stop == ""
+    assert bench.until(lambda moved: sweeper.update(bench.motion, moved, bench.state())).stop == ""
     assert bench.degrees == pytest.approx((90.0, 0.0), abs=1.0)
     seen = {(one.joint, one.direction, sweeper.legs[one.leg].speed_deg_s) for one in sweeper.samples}
     assert len(seen) == 8
@@ -225,7 +235,7 @@ def test_the_sweeps_keep_samples_of_both_ways_at_both_speeds_and_end_hanging(veh
             assert math.degrees(math.fsum(speeds) / len(speeds)) == pytest.approx(leg.speed_deg_s, rel=0.05)
 
 
-def test_walls_without_room_to_sweep_are_one_line() -> None:
+def test_joint_limits_without_room_to_sweep_are_one_line() -> None:
     narrow = load_vehicle(
         SHIPPED, ["vehicle.arm.joints[0].angle_deg=[80, 100]", "vehicle.safety.fold_arm_deg=[90, 140]"]
     )

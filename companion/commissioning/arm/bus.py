@@ -1,6 +1,6 @@
-"""Talk with whatever servos are on a bus, at any baud rate: blocking, for people's tools; nothing here gives torque.
+"""Read and write registers of any servo on a bus, at any baud rate. Blocking; nothing here gives torque.
 
-The real dynamixel-sdk speaks on the wire, through the flight's own port (`companion.io.dynamixel.registers.ServoPort`).
+Uses dynamixel-sdk on the flight's own port (`companion.io.dynamixel.registers.ServoPort`).
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ LED = Register(65, 1, "LED")
 PING_BYTES: Final = 14
 _WRITE_TIMEOUT_S = 1.0
 _REPLY_TIMEOUT_MS: Final = 100.0
-"""An FTDI adapter with its factory latency timer holds an answer back by 16 ms, a busy computer by more. Who is not there costs it."""
+"""An FTDI adapter with its factory latency timer delays an answer by 16 ms, a busy computer by more."""
 _ERROR_NUMBER: Final = 0x7F
 
 
 class _CountingPort(dxl.ServoPort):
-    """Tells noise from silence."""
+    """Counts bytes, to separate noise from silence."""
 
     came_bytes = 0
 
@@ -52,18 +52,17 @@ class _CountingPort(dxl.ServoPort):
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """What answered a broadcast ping at one baud rate."""
+class PingAnswers:
+    """The answers to a broadcast ping at one baud rate."""
 
-    baud: int
     servos: tuple[tuple[int, int, int], ...]
     """Id, model and firmware of each, by id."""
     garbled: bool
-    """Something came that nobody can read: two servos with one id, or noise."""
+    """Unreadable bytes came: two servos with one id, or noise."""
 
 
 class ServoTalk:
-    """One port. Not thread-safe; a KeyboardInterrupt may fly out of any of its methods and leaves nothing under torque.
+    """One port. Not thread-safe. A KeyboardInterrupt in any method leaves no servo under torque.
 
     Args:
         port: serial device.
@@ -84,7 +83,7 @@ class ServoTalk:
             self._port.closePort()
 
     def open(self, baud: int) -> None:
-        """Open the port, or go on at another baud rate.
+        """Open the port, or change its baud rate.
 
         Raises:
             DeviceError: no such port, busy, not permitted.
@@ -93,18 +92,18 @@ class ServoTalk:
         self._port.baudrate = baud
         if not self._port.openPort():
             raise DeviceError(f"arm bus {self._name}: this computer's serial ports do not know baud rate {baud}")
-        self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's is that of a tick; nobody waits for one here
-        # What the wire still carries at the old rate is nobody's answer.
+        self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's is one control tick
+        # Bytes at the old rate are no answer.
         with contextlib.suppress(OSError):
             self._port.ser.reset_input_buffer()
 
     @property
     def baud(self) -> int:
-        """At which the port is open."""
+        """Baud rate at which the port is open."""
         return int(self._port.baudrate)
 
-    def heard(self) -> Heard:
-        """Everybody who answers a broadcast ping; takes up to 1.5 s, for every servo answers in the time of its id.
+    def ping_all(self) -> PingAnswers:
+        """Return the answers to a broadcast ping. Takes up to 1.5 s: every servo answers in the time slot of its id.
 
         Raises:
             DeviceError: the port is gone.
@@ -113,10 +112,10 @@ class ServoTalk:
         with self._named("broadcast ping"):
             answered, _ = self._protocol.broadcastPing(self._port)
         servos = tuple((servo_id, model, firmware) for servo_id, (model, firmware) in sorted(answered.items()))
-        return Heard(self.baud, servos, self._port.came_bytes - before != PING_BYTES * len(servos))
+        return PingAnswers(servos, self._port.came_bytes - before != PING_BYTES * len(servos))
 
     def answers(self, servo_id: int) -> bool:
-        """Whether this one answers a ping.
+        """Return whether this servo answers a ping.
 
         Raises:
             DeviceError: the port is gone.
@@ -126,7 +125,7 @@ class ServoTalk:
         return bool(result == COMM_SUCCESS)
 
     def read(self, servo_id: int, register: Register) -> int:
-        """A register's value.
+        """Return a register's value.
 
         Raises:
             DeviceError: no answer, or a refusal.
@@ -137,13 +136,13 @@ class ServoTalk:
         return int.from_bytes(bytes(data), "little", signed=register.signed)
 
     def write(self, servo_id: int, register: Register, value: int, *, read_back: bool = True) -> None:
-        """Write a register, and see that it took it.
+        """Write a register and read it back.
 
         Args:
-            servo_id: whom.
+            servo_id: whose.
             register: which.
-            value: what.
-            read_back: False for registers after which the servo answers elsewhere (id, baud rate): nothing is expected of it.
+            value: the new value.
+            read_back: False for id and baud rate, after which the servo answers elsewhere: no answer is expected.
 
         Raises:
             DeviceError: no answer, a refusal, or another value is read afterwards.
@@ -172,7 +171,7 @@ class ServoTalk:
 
     @contextlib.contextmanager
     def _named(self, doing: str) -> Iterator[None]:
-        """A port that dies raises whatever its driver likes; people want one line of it."""
+        """Convert whatever a failing port raises to a DeviceError."""
         self._port.is_using = False  # an exception in an earlier transaction leaves it set
         try:
             yield

@@ -1,4 +1,4 @@
-"""Moves the real arm along what a leader wants, over the flight's own arm edge, and lets go of it whatever happens."""
+"""Move the real arm after a leader, over the flight's own driver, and make it limp at the end however that comes."""
 
 from __future__ import annotations
 
@@ -14,63 +14,63 @@ from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.protocols import DeviceError
 from companion.model.types import ArmState, Vec2
 from companion.runtime.clock import flight_clock
+from companion.runtime.terminal import Bars
 
 PERIOD_S: Final = 0.005
+_SHOW_S: Final = 0.1
 _READ_TIMEOUT_S: Final = 0.03
 
 
 class Leader(Protocol):
-    """Says where to go next."""
+    """Decides where the arm goes next."""
 
     def begin(self, state: ArmState) -> Sequence[Vec2]:
-        """Where the arm is; returns every pose (rad) that it is going to be led to, as far as that is known.
-
-        Raises:
-            ConfigError: nothing can be done from here.
-        """
+        """Return every pose (rad) that the arm will be led to, as far as that is known."""
         ...
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """After each control step; True: all is done."""
+        """Take over after each control step; `moved` is None before the first. Return True when all is done."""
+        ...
+
+    def status(self) -> str:
+        """Return what it does now, for people."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """How it ended."""
+    """The end of a motion."""
 
     stop: str
-    """Why it ended early, one line; empty: the leader said that all is done."""
+    """Why it ended early, one line; empty if the leader ended it."""
     angle_deg: Vec2
-    """Both joints at the end."""
     load_max_nm: Vec2
-    """Largest torque beside gravity."""
+    """Largest torque beside gravity of each joint."""
 
 
-async def drive(vehicle: Vehicle, leader: Leader) -> Driven:
+async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
     """Open the arm, follow the leader, let go. Cancelled at any time, the arm is limp within a few ms.
 
     Raises:
         DeviceError: the arm does not open, or a pose is too heavy.
-        ConfigError: the leader's.
     """
     clock = flight_clock()
-    safety = vehicle.safety
+    limits = [joint.angle_deg for joint in vehicle.arm.joints]
     async with DynamixelArm(vehicle.devices.arm, gentle(vehicle.arm), clock) as arm:
         state = arm.latest()
-        assert state is not None, "the edge has read once before it is open"
+        assert state is not None, "the driver has read once before it is open"
         motion = Motion(vehicle, state)
         refusal = motion.refusal(leader.begin(state))
         if refusal:
             raise DeviceError(refusal)
         moved: Moved | None = None
-        stepped_s, due_s = state.stamp_s, clock()
+        stepped_s, due_s, show_due_s = state.stamp_s, clock(), 0.0
         while True:
             newest = await arm.read(_READ_TIMEOUT_S)
             if newest is not None:
                 state = newest
             age_s = clock() - state.stamp_s
-            if age_s > safety.arm_timeout_s:
+            if age_s > vehicle.safety.arm_timeout_s:
                 text = f"lost the arm: no answer for {age_s:.2f} s, {state.read_failures} reads; look for a loose cable"
                 return _driven(text, motion, state)
             if state.stamp_s > stepped_s:
@@ -79,10 +79,26 @@ async def drive(vehicle: Vehicle, leader: Leader) -> Driven:
                 arm.write_torque(moved.torque_nm)
                 if moved.stop:
                     return _driven(moved.stop, motion, state)
-                if leader.update(motion, moved, state):
+                done = leader.update(motion, moved, state)
+                if stepped_s >= show_due_s:
+                    show_due_s = stepped_s + _SHOW_S
+                    _show(bars, limits, state, moved)
+                    bars.say(leader.status())
+                if done:
                     return _driven("", motion, state)
             due_s = max(due_s + PERIOD_S, clock())
             await asyncio.sleep(due_s - clock())
+
+
+def _show(bars: Bars, limits_deg: Sequence[Vec2], state: ArmState, moved: Moved) -> None:
+    degrees = [math.degrees(angle) for angle in state.angle_rad]
+    bars.show(
+        [(deg - low) / (high - low) for deg, (low, high) in zip(degrees, limits_deg, strict=True)],
+        [
+            f"{deg:7.1f} deg  {load:+.2f} N m beside gravity  {hot:.0f} degC"
+            for deg, load, hot in zip(degrees, moved.load_nm, state.temperature_c, strict=True)
+        ],
+    )
 
 
 def _driven(stop: str, motion: Motion, state: ArmState) -> Driven:

@@ -1,20 +1,20 @@
-"""`companion arm jog`: what keys, or an option, mean for the motion of one joint. Pure."""
+"""`companion arm jog` without `--to`: what keys mean for the motion of a joint. Pure."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Final
 
 from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, Motion, Moved
 from companion.model.types import ArmState, Vec2
 
 STEP_DEG: Final = 2.0
-"""A key moves the joint so far; held down, it repeats before that is over."""
+"""Motion per key; a key that is held repeats before it is over."""
 KEY_TIMEOUT_S: Final = 0.5
-"""No key for so long: the joint stays where it is."""
+"""Without a key for this time the joint stops."""
 IDLE_S: Final = 60.0
-"""No key for so long: the arm is let go of."""
+"""Without a key for this time the arm goes limp."""
 FORWARD_KEYS: Final = frozenset({"\x1b[C", "\x1b[A", "+", "="})
 BACKWARD_KEYS: Final = frozenset({"\x1b[D", "\x1b[B", "-"})
 END_KEYS: Final = frozenset({"q", "Q", "\x1b", "\x04"})
@@ -22,7 +22,7 @@ JOINT_KEYS: Final = {"1": 0, "2": 1}
 
 
 def keys_in(data: str) -> list[str]:
-    """What a terminal sends, key by key: arrows are three characters."""
+    """Split what a terminal sends into keys; an arrow is three characters."""
     keys: list[str] = []
     at = 0
     while at < len(data):
@@ -32,68 +32,34 @@ def keys_in(data: str) -> list[str]:
     return keys
 
 
-class ToAngle:
-    """Leads one joint to an angle.
+class ByKeys:
+    """A leader that moves a joint while its keys are pressed.
 
     Args:
-        joint: 0 or 1.
-        goal_deg: within the walls, margin kept.
+        pressed: returns what the terminal has sent since the last call.
     """
 
-    def __init__(self, joint: int, goal_deg: float) -> None:
-        self._joint = joint
-        self._goal_rad = math.radians(goal_deg)
-        self._gone = False
-        self.moved: Moved | None = None
-
-    def begin(self, state: ArmState) -> Sequence[Vec2]:
-        """Here and there."""
-        first, second = state.angle_rad
-        there = (self._goal_rad, second) if self._joint == 0 else (first, self._goal_rad)
-        return (state.angle_rad, there)
-
-    def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """True: it is there."""
-        self.moved = moved
-        if not self._gone:
-            self._gone = True
-            motion.go(self._joint, self._goal_rad, math.radians(SPEED_MAX_DEG_S))
-            return False
-        return moved is not None and moved.reached
-
-
-class ByKeys:
-    """Leads whichever joint somebody moves by keys, as long as they are pressed."""
-
-    def __init__(self) -> None:
-        self.joint = 0
-        self.told = ""
-        self.state: ArmState | None = None
-        self.moved: Moved | None = None
-        self._pressed: list[str] = []
+    def __init__(self, pressed: Callable[[], str]) -> None:
+        self._pressed = pressed
+        self._joint = 0
+        self._refusal = ""
         self._moves_until_s = 0.0
         self._ends_s = math.inf
         self._moving = False
 
-    def press(self, keys: Sequence[str]) -> None:
-        """Somebody pressed these."""
-        self._pressed += keys
-
-    def begin(self, state: ArmState) -> Sequence[Vec2]:
-        """Nowhere yet."""
+    def begin(self, state: ArmState) -> list[Vec2]:
+        """Return the pose that the arm is in."""
         self._ends_s = state.stamp_s + IDLE_S
-        return (state.angle_rad,)
+        return [state.angle_rad]
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """True: somebody ends it, or nobody is there any more."""
-        self.state, self.moved = state, moved
-        pressed, self._pressed = self._pressed, []
-        for key in pressed:
+        """Follow the keys; return True at an end key, or when no key came for a long time."""
+        for key in keys_in(self._pressed()):
             self._ends_s = state.stamp_s + IDLE_S
             if key in END_KEYS:
                 return True
             if key in JOINT_KEYS:
-                self.joint = JOINT_KEYS[key]
+                self._joint = JOINT_KEYS[key]
                 self._halt(motion)
             elif key in FORWARD_KEYS or key in BACKWARD_KEYS:
                 self._go(motion, 1.0 if key in FORWARD_KEYS else -1.0, state)
@@ -103,14 +69,18 @@ class ByKeys:
             self._halt(motion)
         return state.stamp_s > self._ends_s
 
+    def status(self) -> str:
+        """Return which joint the keys move, or why it may not go on."""
+        return self._refusal or f"keys move joint {self._joint + 1}"
+
     def _go(self, motion: Motion, way: float, state: ArmState) -> None:
-        goal_rad = motion.reference_rad[self.joint] + way * math.radians(STEP_DEG)
-        there = (goal_rad, state.angle_rad[1]) if self.joint == 0 else (state.angle_rad[0], goal_rad)
-        self.told = motion.refusal((there,))
-        if self.told:
+        goal_rad = motion.reference_rad[self._joint] + way * math.radians(STEP_DEG)
+        there = (goal_rad, state.angle_rad[1]) if self._joint == 0 else (state.angle_rad[0], goal_rad)
+        self._refusal = motion.refusal((there,))
+        if self._refusal:
             self._halt(motion)
             return
-        motion.go(self.joint, goal_rad, math.radians(SPEED_MAX_DEG_S))
+        motion.go(self._joint, goal_rad, math.radians(SPEED_MAX_DEG_S))
         self._moving, self._moves_until_s = True, state.stamp_s + KEY_TIMEOUT_S
 
     def _halt(self, motion: Motion) -> None:

@@ -1,7 +1,7 @@
-"""Slow, bounded motion of one joint at a time on the ground, and every reason to end it. Pure: joint states in, torques out.
+"""Slow, bounded motion of one joint at a time on the ground, and every reason to stop it. Pure: joint states in, torques out.
 
-The law is that of `companion.control.arm_hold`, behind a reference that never runs faster than asked; a small integral carries what
-friction and masses leave over. Angles are the paper's; the body is taken for level.
+The law is that of `companion.control.arm_hold` behind a reference of limited speed; a small integral compensates friction and wrong
+masses. Angles are the paper's; the body is assumed to be level.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
 SPEED_MAX_DEG_S: Final = 20.0
 ACCELERATION_DEG_S2: Final = 60.0
 TORQUE_SHARE: Final = 0.6
-"""Of `torque_max_nm`: no more is asked of a servo here."""
+"""Of `torque_max_nm`: the limit of each servo here."""
 LOAD_NM: Final = 0.5
-"""A torque that gravity and friction do not explain by more than this for `LOAD_S`: something is in the way."""
+"""Torque beside gravity that means an obstacle if it lasts for `LOAD_S`."""
 LOAD_S: Final = 0.15
-WALL_MARGIN_DEG: Final = 3.0
+LIMIT_MARGIN_DEG: Final = 3.0
 RUNAWAY_DEG_S: Final = 90.0
-"""No joint turns so fast here unless its sign is wrong, or somebody pulls at it."""
+"""A joint turns this fast only if its sign is wrong or it is pulled."""
 ASTRAY_DEG: Final = 10.0
-"""The joint that is to stay has moved by this."""
+"""Distance of a joint from its reference at which the motion stops."""
 REACHED_DEG: Final = 0.7
 _INTEGRAL_NM_RAD_S: Final = 12.0
 _INTEGRAL_MAX_NM: Final = 0.25
 _LEAD_RAD: Final = math.radians(5.0)
-"""The reference waits for a joint that does not follow."""
+"""The reference waits for a joint that is further behind."""
 
 
 def gentle(arm: Arm, share: float = TORQUE_SHARE) -> Arm:
-    """The arm with so much less torque allowed: the bus clips by it, whatever the law asks."""
+    """Return the arm with this share of the torque allowed; the driver clips every command to it."""
     first, second = (joint.model_copy(update={"torque_max_nm": share * joint.torque_max_nm}) for joint in arm.joints)
     return arm.model_copy(update={"joints": (first, second)})
 
 
-def walls_deg(arm: Arm, joint: int) -> tuple[float, float]:
-    """How far a joint may be moved here."""
+def limits_deg(arm: Arm, joint: int) -> tuple[float, float]:
+    """Return the joint limits less a margin."""
     low, high = arm.joints[joint].angle_deg
-    return low + WALL_MARGIN_DEG, high - WALL_MARGIN_DEG
+    return low + LIMIT_MARGIN_DEG, high - LIMIT_MARGIN_DEG
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +60,15 @@ class Moved:
     reached: bool
     """Reference and joint are at the goal."""
     stop: str = ""
-    """Why the motion has to end at once; empty: it need not. The torque is 0 then."""
+    """Why the motion has to end at once, with a torque of 0; empty if it need not."""
 
 
 class Motion:
-    """Leads both joints, one of which moves.
+    """Controls both joints, one of which moves.
 
     Args:
         vehicle: arm, tool and limits.
-        state: where the arm is now.
+        state: the arm's state now.
     """
 
     def __init__(self, vehicle: Vehicle, state: ArmState) -> None:
@@ -87,30 +87,30 @@ class Motion:
 
     @property
     def reference_rad(self) -> Vec2:
-        """Where the joints are led now."""
+        """The reference of both joints."""
         return (self._reference[0], self._reference[1])
 
     def go(self, joint: int, goal_rad: float, speed_rad_s: float) -> None:
-        """Move a joint from now on; the other one stays where it is led.
+        """Move a joint from now on; the other one stays at its reference.
 
         Args:
             joint: 0 or 1.
-            goal_rad: clipped to the walls, margin kept; a joint beyond them may only come back.
+            goal_rad: clipped to the joint limits less the margin; a joint beyond them may only come back.
             speed_rad_s: at most `SPEED_MAX_DEG_S`.
         """
-        low, high = (math.radians(wall) for wall in walls_deg(self._arm, joint))
+        low, high = (math.radians(limit) for limit in limits_deg(self._arm, joint))
         here = self._reference[joint]
         self._goal[joint] = max(min(low, here), min(max(high, here), goal_rad))
         self._goal[1 - joint] = self._reference[1 - joint]
         self._speed_rad_s = min(speed_rad_s, math.radians(SPEED_MAX_DEG_S))
 
     def halt(self) -> None:
-        """Stay here."""
+        """Stop both joints at their references."""
         self._goal = list(self._reference)
         self._rate = [0.0, 0.0]
 
     def refusal(self, poses_rad: Sequence[Vec2]) -> str:
-        """Why these poses may not be gone to; empty: they may."""
+        """Return why the arm may not go to these poses (rad); empty if it may."""
         for pose in poses_rad:
             gravity = self._manipulator.gravity_torque_nm(pose, IDENTITY_QUAT)
             for joint in (0, 1):
@@ -126,8 +126,8 @@ class Motion:
         """One control step.
 
         Args:
-            state: the newest, fresh.
-            dt_s: since the last step; a late one leads no further than 20 ms.
+            state: the newest.
+            dt_s: since the last step; a late step moves the reference by at most 20 ms.
         """
         dt_s = min(dt_s, 0.02)
         for joint in (0, 1):
@@ -136,7 +136,9 @@ class Motion:
         rate = (self._rate[0], self._rate[1])
         gravity = self._manipulator.gravity_torque_nm(state.angle_rad, IDENTITY_QUAT)
         held = hold_torque_nm(self._manipulator, state.angle_rad, state.velocity_rad_s, reference, rate, IDENTITY_QUAT)
-        torque = [self._whole(joint, held[joint], reference[joint] - state.angle_rad[joint], dt_s) for joint in (0, 1)]
+        torque = [
+            self._torque_nm(joint, held[joint], reference[joint] - state.angle_rad[joint], dt_s) for joint in (0, 1)
+        ]
         load = (torque[0] - gravity[0], torque[1] - gravity[1])
         self.load_max_nm = [max(most, abs(now)) for most, now in zip(self.load_max_nm, load, strict=True)]
         self._loaded_s = self._loaded_s + dt_s if max(map(abs, load)) > LOAD_NM else 0.0
@@ -151,7 +153,7 @@ class Motion:
         return Moved((torque[0], torque[1]), reference, rate, load, reached, stop)
 
     def _lead(self, joint: int, angle_rad: float, dt_s: float) -> None:
-        """Move the reference: to the goal, not faster than allowed, not away from a joint that does not follow."""
+        """Move the reference towards the goal, within its speed, and not away from a joint that does not follow."""
         left = self._goal[joint] - self._reference[joint]
         if left == 0.0:
             self._rate[joint] = 0.0
@@ -167,7 +169,7 @@ class Motion:
             self._reference[joint] += way * speed * dt_s
             self._rate[joint] = way * speed
 
-    def _whole(self, joint: int, held_nm: float, error_rad: float, dt_s: float) -> float:
+    def _torque_nm(self, joint: int, held_nm: float, error_rad: float, dt_s: float) -> float:
         most = self._limit_nm[joint]
         grown = self._integral[joint] + _INTEGRAL_NM_RAD_S * error_rad * dt_s
         self._integral[joint] = max(-_INTEGRAL_MAX_NM, min(_INTEGRAL_MAX_NM, grown))
@@ -185,18 +187,18 @@ class Motion:
             if state.temperature_c[joint] >= safety.servo_warn_c:
                 return f"{name}: {state.temperature_c[joint]:.0f} degC; let the arm cool down"
             if abs(math.degrees(state.velocity_rad_s[joint])) > RUNAWAY_DEG_S:
-                return f"{name} runs away; if nobody pulled at it, its sign is wrong: companion arm zero"
+                return f"{name} runs away; unless it was pulled, its sign is wrong: companion arm zero"
             astray_deg = math.degrees(abs(state.angle_rad[joint] - self._reference[joint]))
             if astray_deg > ASTRAY_DEG:
-                return f"{name} is {astray_deg:.0f} deg from where it is led; look what is in its way, or pulls at it"
+                return f"{name} is {astray_deg:.0f} deg from its reference; look for what is in its way, or pulls it"
             low, high = self._arm.joints[joint].angle_deg
             angle_deg = math.degrees(state.angle_rad[joint])
             if not low <= angle_deg <= high:
-                return f"{name} is at {angle_deg:.0f} deg, beyond its walls, {low:g} to {high:g} deg; bring it back by hand"
+                return f"{name} is at {angle_deg:.0f} deg, beyond its limits, {low:g} to {high:g} deg; bring it back by hand"
         if self._loaded_s > LOAD_S:
             joint = 0 if abs(load[0]) > abs(load[1]) else 1
             return (
-                f"joint {joint + 1}: {load[joint]:+.2f} N m beside gravity; look what is in its way, and for masses or a torque "
+                f"joint {joint + 1}: {load[joint]:+.2f} N m beside gravity; look for what is in its way, and for masses or a torque "
                 "constant that are not the vehicle file's"
             )
         return ""

@@ -1,7 +1,7 @@
-"""The poses in which somebody holds the arm so that its zeros, directions and plugs can be told. Pure.
+"""The poses in which the user holds the arm, so that its zeros, directions and plugs can be found. Pure.
 
 Angles are the paper's: joint 1 from body +x, positive turning down; joint 2 turns the lower link the other way, so that it points along
-`alpha_1 - alpha_2`. Only directions that anybody can hold are asked for exactly: level or plumb.
+`alpha_1 - alpha_2`. Exact are only directions that a hand can hold: level or plumb.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from companion.config.vehicle import Arm, Joint
 from companion.model.types import Vec2
 
 SWING_DEG, SWING_MIN_DEG = 45.0, 25.0
-"""Of a joint that cannot be brought from one such direction to another."""
+"""Swing of a joint whose limits do not allow an exact direction."""
 _STRAIGHT_DEG = ((0.0, 0.0), (90.0, 0.0))
 _DIRECTIONS = {
     0: "straight forward (towards the nose), level",
@@ -26,39 +26,38 @@ _DIRECTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One thing that somebody is asked to do with the arm."""
+    """One instruction to the user."""
 
     name: str
-    told: str
-    """What to do, for people."""
+    instruction: str
     joint: int | None
-    """The one joint that moves, 0 or 1; None: both may."""
+    """The one joint that moves, 0 or 1; None if both may."""
     by_deg: float
-    """By how much it moves."""
+    """Angle by which it moves."""
     exact: bool
-    """It ends in a direction that can be held exactly; else only the way it moves counts."""
+    """It ends in a direction that can be held exactly; otherwise only the sense of the motion counts."""
     pose_deg: Vec2
-    """Both joints at its end; of a joint that moves without being exact, about."""
+    """Both joints at the end; approximate if not exact."""
 
     @property
     def hand_rad(self) -> Vec2:
-        """Both joints at its end."""
+        """Both joints at the end."""
         return (math.radians(self.pose_deg[0]), math.radians(self.pose_deg[1]))
 
 
 def steps_of(arm: Arm) -> tuple[Step, Step, Step]:
-    """The three steps for an arm, within its walls: straight, elbow alone, shoulder alone.
+    """Return the three steps for an arm, within its limits: straight, elbow alone, shoulder alone.
 
     Raises:
-        ConfigError: the walls leave no straight pose, or a joint too little room.
+        ConfigError: the joint limits leave no straight pose, or a joint too little room.
     """
     first, second = arm.joints
     straight = next((pose for pose in _STRAIGHT_DEG if _within(first, pose[0]) and _within(second, pose[1])), None)
     if straight is None:
         raise ConfigError(
             [
-                "arm.joints[].angle_deg: the walls allow the arm neither straight forward (0, 0) nor straight down (90, 0), and one of "
-                "the two is needed to find the zeros; widen the walls as far as the arm can really go"
+                "arm.joints[].angle_deg: the limits allow neither straight forward (0, 0) nor straight down (90, 0), and one of "
+                "the two is needed to find the zeros; widen the limits as far as the arm can really go"
             ]
         )
     elbow_deg, elbow_exact = _turn(second, straight[1], 1)
@@ -85,8 +84,8 @@ def _turn(joint: Joint, from_deg: float, index: int) -> tuple[float, bool]:
     by_deg = min(SWING_DEG, high - from_deg) if high - from_deg >= from_deg - low else -min(SWING_DEG, from_deg - low)
     if abs(by_deg) < SWING_MIN_DEG:
         raise ConfigError(
-            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the walls leave {abs(by_deg):.0f} deg to turn, at least "
-             f"{SWING_MIN_DEG:g} are needed to tell which way the servo counts"]
+            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the limits leave {abs(by_deg):.0f} deg to turn, at least "
+             f"{SWING_MIN_DEG:g} are needed to find which way the servo counts"]
         )  # fmt: skip
     return by_deg, False
 
@@ -96,7 +95,7 @@ def _direction(angle_deg: float) -> str:
 
 
 def _elbow_text(alpha1_deg: float, by_deg: float, exact: bool) -> str:
-    # The lower link points along alpha_1 - alpha_2: what turns joint 2 forward turns the link back.
+    # The lower link points along alpha_1 - alpha_2: a positive turn of joint 2 turns the link back.
     still = "leave the upper link as it is"
     if exact:
         return f"{still}, bend the elbow until the lower link points {_direction(alpha1_deg - by_deg)}"
@@ -111,7 +110,7 @@ def _shoulder_text(alpha1_deg: float, by_deg: float, exact: bool) -> str:
 
 
 def _way(from_deg: float, by_deg: float) -> str:
-    """Where a link that points forward or down goes when its angle (positive down from forward) changes."""
+    """Return where a link that points forward or down goes when its angle (positive down from forward) changes."""
     middle_deg = from_deg + math.copysign(SWING_DEG, by_deg)
     forward, down = math.cos(math.radians(middle_deg)), math.sin(math.radians(middle_deg))
     if from_deg == 0.0:

@@ -1,4 +1,4 @@
-"""What a servo must be set to for the companion, what was found, and who of the found is which joint's. Pure."""
+"""Settings of a servo, as found and as the companion needs them, and which servo belongs to which joint. Pure."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ SETTINGS: Final = (
     dxl.STATUS_RETURN_LEVEL, dxl.HARDWARE_ERROR, dxl.BUS_WATCHDOG, dxl.PRESENT_POSITION, dxl.PRESENT_VOLTAGE,
     dxl.PRESENT_TEMPERATURE,
 )  # fmt: skip
-"""What is read of every servo."""
+"""Registers that are read of every servo."""
 CURRENT_LIMIT_MAX: Final = 1193
 CURRENT_RESERVE: Final = 1.1
 SHUTDOWN_BITS: Final = 0b00110100
-"""Overheating, electrical shock, overload: the factory's, register 63."""
+"""Overheating, electrical shock, overload: the factory's value of register 63."""
 NO_SHADOW: Final = 255
 _DRIVE_REVERSE: Final = 1
 
@@ -37,10 +37,10 @@ class FoundServo:
     model: int
     firmware: int
     registers: dict[str, int]
-    """By the register's name; empty: it answers pings alone."""
+    """By the register's name; empty if it only answers pings."""
 
     def value(self, register: Register) -> int:
-        """A register as it was read.
+        """Return a register's value.
 
         Raises:
             KeyError: it was not read.
@@ -49,11 +49,11 @@ class FoundServo:
 
     @property
     def is_xm430(self) -> bool:
-        """An XM430-W210, and its registers were read."""
+        """Whether it is an XM430-W210 and its registers were read."""
         return self.model == dxl.MODEL_NUMBER_XM430_W210 and bool(self.registers)
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`: names and units instead of register values."""
+        """Return the JSON document's part, with names and units instead of register values."""
         about: dict[str, Any] = {"id": self.servo_id, "baud": self.baud, "model": self.model, "firmware": self.firmware}
         if not self.registers:
             return about
@@ -67,7 +67,7 @@ class FoundServo:
             "current_limit_counts": value(dxl.CURRENT_LIMIT),
             "pwm_limit_counts": value(bus.PWM_LIMIT),
             "position_limit_counts": [value(bus.MIN_POSITION_LIMIT), value(bus.MAX_POSITION_LIMIT)],
-            "watchdog": watchdog_text(value(dxl.BUS_WATCHDOG)),
+            "watchdog": _watchdog_text(value(dxl.BUS_WATCHDOG)),
             "torque_on": bool(value(dxl.TORQUE_ENABLE)),
             "hardware_error": value(dxl.HARDWARE_ERROR),
             "temperature_c": value(dxl.PRESENT_TEMPERATURE),
@@ -78,38 +78,39 @@ class FoundServo:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """Everybody who answered at any of the baud rates tried."""
+    """All servos that answered."""
 
     bauds: tuple[int, ...]
+    """Baud rates that were tried."""
     servos: tuple[FoundServo, ...]
     garbled_at: tuple[int, ...]
-    """Baud rates at which something came that nobody can read."""
+    """Baud rates at which unreadable bytes came."""
     latency_ms: int | None
-    """Latency timer of the adapter; None: it has none."""
+    """Latency timer of the adapter; None if it has none."""
 
 
 class Setting(NamedTuple):
-    """One register that the companion wants otherwise, or finds as it wants it."""
+    """One register, as found and as the companion needs it."""
 
     register: Register
     found: int
     wanted: int
     shown: Callable[[int], str]
-    """A value of it for people."""
+    """Formats a value for people."""
     why: str
 
     @property
-    def fine(self) -> bool:
-        """Nothing to do."""
+    def right(self) -> bool:
+        """Whether there is nothing to write."""
         return self.found == self.wanted
 
 
 def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> list[Setting]:
-    """Every setting that the companion minds, in the order in which they are to be written: what is answered elsewhere comes last.
+    """Return every setting that the companion needs, in the order of writing: id and baud rate, which change the address, last.
 
     Args:
         servo: as it was found, registers read.
-        joint: the one it is for.
+        joint: the joint that it is for.
         arm: torque constant.
         device: the bus's baud rate.
     """
@@ -119,16 +120,16 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
     delay = dxl.RETURN_DELAY_UNIT_US
     rows: list[tuple[Register, int, Callable[[int], str], str]] = [
         (dxl.RETURN_DELAY, 0, lambda v: f"{v * delay} us", "the factory's 500 us a servo are a fifth of a control tick"),
-        (dxl.OPERATING_MODE, dxl.MODE_CURRENT, mode_text, "the companion commands currents"),
-        (bus.DRIVE_MODE, 0, drive_text, "the vehicle file's sign says which way a servo counts"),
+        (dxl.OPERATING_MODE, dxl.MODE_CURRENT, _mode_text, "the companion commands currents"),
+        (bus.DRIVE_MODE, 0, _drive_text, "the vehicle file's sign says which way a servo counts"),
         (bus.HOMING_OFFSET, 0, str, "the vehicle file's zero_count says where zero is"),
-        (bus.SHADOW_ID, NO_SHADOW, lambda v: "none" if v > 252 else str(v), "it would obey another servo's commands"),
+        (bus.SHADOW_ID, NO_SHADOW, lambda v: "none" if v > 252 else str(v), "it would follow another servo's commands"),
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
         (bus.PWM_LIMIT, 885, str, "less than full voltage is less torque at speed"),
-        (bus.MIN_POSITION_LIMIT, 0, str, "the companion keeps the walls itself"),
-        (bus.MAX_POSITION_LIMIT, dxl.COUNTS_PER_TURN - 1, str, "the companion keeps the walls itself"),
+        (bus.MIN_POSITION_LIMIT, 0, str, "the companion keeps the joint limits itself"),
+        (bus.MAX_POSITION_LIMIT, dxl.COUNTS_PER_TURN - 1, str, "the companion keeps the joint limits itself"),
         (bus.STARTUP, 0, str, "no torque when the power comes on"),
-        (bus.SHUTDOWN, SHUTDOWN_BITS, lambda v: f"0x{v:02x}", "overheating, shock and overload let go"),
+        (bus.SHUTDOWN, SHUTDOWN_BITS, lambda v: f"0x{v:02x}", "overheating, shock and overload switch the torque off"),
         (bus.ID, joint.servo_id, str, "the vehicle file's servo_id"),
         (bus.BAUD, bus.BAUDS.index(device.baud), baud_text, "the vehicle file's devices.arm.baud"),
     ]  # fmt: skip
@@ -137,50 +138,46 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Who is which joint's."""
+    """Which servo belongs to which joint."""
 
     joints: tuple[FoundServo | None, FoundServo | None]
-    """By their ids; a single servo that is left over is the missing joint's."""
+    """By id; one servo that is left over belongs to the missing joint."""
     renamed: int | None
     """The joint whose servo has another id than the vehicle file says."""
     others: tuple[FoundServo, ...]
-    """Not the arm's, or nobody can say which joint's."""
+    """Not the arm's, or of an unknown joint."""
 
 
 def assign(servos: Sequence[FoundServo], arm: Arm) -> Assignment:
-    """By id; when one joint's servo is missing and one XM430 is left over, that must be it."""
+    """Assign servos by id; if one joint's servo is missing and one XM430 is left over, that must be it."""
     by_joint: list[FoundServo | None] = []
     for joint in arm.joints:
         having = [servo for servo in servos if servo.servo_id == joint.servo_id and servo.is_xm430]
         by_joint.append(having[0] if len(having) == 1 else None)
     left = [servo for servo in servos if servo not in by_joint]
     candidates = [servo for servo in left if servo.is_xm430]
-    missing = [index for index, servo in enumerate(by_joint) if servo is None]
     renamed = None
-    if len(missing) == 1 and len(candidates) == 1:
-        renamed = missing[0]
+    if by_joint.count(None) == 1 and len(candidates) == 1:
+        renamed = by_joint.index(None)
         by_joint[renamed] = candidates[0]
         left.remove(candidates[0])
     return Assignment((by_joint[0], by_joint[1]), renamed, tuple(left))
 
 
-def mode_text(mode: int) -> str:
-    """Operating mode by name."""
-    return f"{mode} ({MODES.get(mode, 'unknown')})"
-
-
-def drive_text(mode: int) -> str:
-    """Drive mode by name."""
-    return f"{mode} ({'reverse' if mode & _DRIVE_REVERSE else 'normal'})"
-
-
 def baud_text(value: int) -> str:
-    """Value of register 8 as a rate."""
+    """Return a value of register 8 as a rate."""
     return str(bus.BAUDS[value]) if value < len(bus.BAUDS) else f"value {value}"
 
 
-def watchdog_text(value: int) -> str:
-    """Register 98."""
+def _mode_text(mode: int) -> str:
+    return f"{mode} ({MODES.get(mode, 'unknown')})"
+
+
+def _drive_text(mode: int) -> str:
+    return f"{mode} ({'reverse' if mode & _DRIVE_REVERSE else 'normal'})"
+
+
+def _watchdog_text(value: int) -> str:
     if value == dxl.WATCHDOG_TRIPPED:
         return "let go"
     return f"{value * dxl.WATCHDOG_UNIT_MS} ms" if value else "off"

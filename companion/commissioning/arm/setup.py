@@ -1,18 +1,24 @@
-"""`companion arm setup`: bring each servo to what the companion wants. Written with torque off, read back, the baud rate last.
+"""`companion arm setup`: bring each servo to what the companion needs. Written with torque off, read back, the baud rate last.
 
-Every step leaves servos that `companion arm scan` finds, so that a setup that was interrupted is begun again.
+Every step leaves servos that `companion arm scan` finds, so a setup that was interrupted can be run again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rich.table import Table
+from rich.text import Text
+
 from companion.commissioning.arm import bus
 from companion.commissioning.arm.bus import ServoTalk
+from companion.commissioning.arm.scan import scan, scan_for
 from companion.commissioning.arm.servo import FoundServo, Scan, Setting, assign, baud_text, settings
-from companion.config.vehicle import Arm, ArmDevice
+from companion.commissioning.tool import GivenUp, Report, Session
+from companion.config.vehicle import Arm, ArmDevice, Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.protocols import DeviceError
 
@@ -24,27 +30,25 @@ class ServoPlan:
     joint: int
     servo: FoundServo
     settings: tuple[Setting, ...]
-    """All that the companion minds, in the order in which they are written."""
-    wake: bool
-    """Its bus watchdog has let go, or torque is on: both are ended first."""
+    """All that the companion needs, in the order in which they are written."""
 
     @property
     def writes(self) -> tuple[Setting, ...]:
-        """What differs."""
-        return tuple(setting for setting in self.settings if not setting.fine)
+        """Settings that differ."""
+        return tuple(setting for setting in self.settings if not setting.right)
+
+    @property
+    def wake(self) -> bool:
+        """Whether torque is on or the bus watchdog is: both are switched off first."""
+        return bool(self.servo.value(dxl.TORQUE_ENABLE)) or self.servo.value(dxl.BUS_WATCHDOG) != 0
 
     @property
     def needed(self) -> bool:
-        """There is something to do."""
+        """Whether there is something to do."""
         return bool(self.writes) or self.wake
 
-    @property
-    def turns_over(self) -> bool:
-        """Afterwards the servo counts otherwise than before: its zero and sign have to be found again."""
-        return any(setting.register in (bus.DRIVE_MODE, bus.HOMING_OFFSET) for setting in self.writes)
-
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the JSON document's part."""
         changes = [
             {
                 "register": setting.register.address,
@@ -62,70 +66,63 @@ class ServoPlan:
 class SetupPlan:
     """What a setup would do with the servos that were found."""
 
-    servos: tuple[ServoPlan, ...]
-    refusal: str
-    """Why nothing may be done, with what to do instead; empty: go on."""
+    servos: tuple[ServoPlan, ...] = ()
+    refusal: str = ""
+    """Why nothing may be done, with what to do instead; empty if it may."""
     one_at_a_time: bool = False
-    """That is: connect one servo alone."""
+    """What to do instead is to connect one servo alone."""
     absent: tuple[int, ...] = ()
-    """Joints whose servo was not there."""
+    """Joints whose servo was not found."""
 
 
 def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> SetupPlan:
-    """Decide, from a scan of all baud rates.
+    """Plan a setup.
 
     Args:
-        found: the scan.
+        found: a scan of all baud rates.
         arm: joints of the vehicle file.
         device: baud rate of the vehicle file.
-        joint: 0 or 1: the one servo that is connected is this joint's, whatever its id; None: by their ids.
+        joint: 0 or 1 if the one servo that is connected is this joint's whatever its id; None to go by the ids.
     """
+    alone = "connect only the servo of joint 1: companion arm setup --joint 1; then only that of joint 2: companion arm setup --joint 2"
+    if joint is not None:
+        alone = f"connect only the servo of joint {joint + 1} and run companion arm setup --joint {joint + 1} again"
     if found.garbled_at:
         where = " and ".join(map(str, found.garbled_at))
-        text = f"answers that nobody can read at {where} baud, as from two servos with one id"
-        return SetupPlan((), f"{text}; {_alone(joint)}", one_at_a_time=True)
+        text = f"unreadable answers at {where} baud, as from two servos with one id; {alone}"
+        return SetupPlan(refusal=text, one_at_a_time=True)
     strange = [servo for servo in found.servos if not servo.is_xm430]
     if strange:
         servo = strange[0]
         text = f"servo {servo.servo_id} at {servo.baud} baud is no XM430-W210 that answers (model {servo.model})"
-        return SetupPlan((), f"{text}; take it off this bus, or cycle its power")
+        return SetupPlan(refusal=f"{text}; take it off this bus, or cycle its power")
     if not found.servos:
-        return SetupPlan((), "no servo answers at any baud rate; check their power and the plugs of the cable")
+        return SetupPlan(refusal="no servo answers at any baud rate; check their power and the plugs of the cable")
     if joint is not None:
         if len(found.servos) > 1:
             ids = " and ".join(str(servo.servo_id) for servo in found.servos)
-            return SetupPlan(
-                (), f"servos {ids} are connected, but one alone must be; {_alone(joint)}", one_at_a_time=True
-            )
-        return SetupPlan((_servo_plan(joint, found.servos[0], arm, device),), "")
-    who = assign(found.servos, arm)
-    if who.others:
-        ids = ", ".join(f"{servo.servo_id} at {servo.baud} baud" for servo in found.servos)
-        return SetupPlan(
-            (), f"nobody can say which joint's servos these are: {ids}; {_alone(None)}", one_at_a_time=True
-        )
-    plans = tuple(_servo_plan(index, servo, arm, device) for index, servo in enumerate(who.joints) if servo is not None)
-    return SetupPlan(plans, "", absent=tuple(index for index, servo in enumerate(who.joints) if servo is None))
+            return SetupPlan(refusal=f"servos {ids} are connected, expected one; {alone}", one_at_a_time=True)
+        joints: Sequence[tuple[int, FoundServo | None]] = [(joint, found.servos[0])]
+    else:
+        who = assign(found.servos, arm)
+        if who.others:
+            ids = ", ".join(f"{servo.servo_id} at {servo.baud} baud" for servo in found.servos)
+            text = f"it is unknown which joint's servos these are: {ids}; {alone}"
+            return SetupPlan(refusal=text, one_at_a_time=True)
+        joints = list(enumerate(who.joints))
+    return SetupPlan(
+        tuple(ServoPlan(i, one, tuple(settings(one, arm.joints[i], arm, device))) for i, one in joints if one),
+        absent=tuple(i for i, one in joints if one is None),
+    )
 
 
-def _alone(joint: int | None) -> str:
-    if joint is not None:
-        return f"connect only the servo of joint {joint + 1} and run companion arm setup --joint {joint + 1} again"
-    return "connect only the servo of joint 1: companion arm setup --joint 1; then only that of joint 2: companion arm setup --joint 2"
-
-
-def _servo_plan(joint: int, servo: FoundServo, arm: Arm, device: ArmDevice) -> ServoPlan:
-    wake = bool(servo.value(dxl.TORQUE_ENABLE)) or servo.value(dxl.BUS_WATCHDOG) != 0
-    return ServoPlan(joint, servo, tuple(settings(servo, arm.joints[joint], arm, device)), wake)
-
-
-def carry_out(port: str, plans: tuple[ServoPlan, ...], tell: Callable[[str], None] = lambda _: None) -> None:
+def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None] = lambda _: None) -> None:
     """Write what the plans say, servo after servo.
 
     Args:
         port: serial device.
         plans: of one and the same scan.
-        tell: told what is being written.
+        report: called with what is being written.
 
     Raises:
         DeviceError: no answer, a refusal, or a value that did not stay; what was written until then stays.
@@ -133,18 +130,18 @@ def carry_out(port: str, plans: tuple[ServoPlan, ...], tell: Callable[[str], Non
     with ServoTalk(port) as talk:
         for one in plans:
             if one.needed:
-                _carry_out(talk, one, tell)
+                _carry_out(talk, one, report)
 
 
-def _carry_out(talk: ServoTalk, one: ServoPlan, tell: Callable[[str], None]) -> None:
+def _carry_out(talk: ServoTalk, one: ServoPlan, report: Callable[[str], None]) -> None:
     talk.open(one.servo.baud)
     servo_id = one.servo.servo_id
-    # EEPROM is locked while torque is on; a watchdog that let go refuses goals until it is cleared.
+    # EEPROM is locked while torque is on; a watchdog that tripped refuses goals until it is cleared.
     talk.write(servo_id, dxl.TORQUE_ENABLE, 0)
     talk.write(servo_id, dxl.BUS_WATCHDOG, 0)
     for setting in one.writes:
         register = setting.register
-        tell(f"servo {servo_id}: {register} {setting.shown(setting.found)} -> {setting.shown(setting.wanted)}")
+        report(f"servo {servo_id}: {register} {setting.shown(setting.found)} -> {setting.shown(setting.wanted)}")
         if register == bus.ID:
             talk.write(servo_id, register, setting.wanted, read_back=False)
             _expect(talk, setting.wanted, f"id {setting.wanted}", f"id {servo_id}")
@@ -161,5 +158,124 @@ def _expect(talk: ServoTalk, servo_id: int, now: str, before: str) -> None:
     if not talk.answers(servo_id):
         raise DeviceError(
             f"servo {servo_id}: does not answer with its new {now} (it had {before}); run companion arm scan: it is found at "
-            "either, and setup goes on from there"
+            "either, and setup continues from there"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """The end of a setup."""
+
+    plan: SetupPlan
+    outcome: str
+    text: tuple[str, ...]
+    """Remarks, one line each."""
+    right: bool
+    """Every servo is as the companion needs it."""
+
+
+def set_up(session: Session) -> Done:
+    """Scan, show what would be written, ask, write, scan again; one servo after the other if they cannot be told apart.
+
+    Raises:
+        DeviceError: a servo does not answer any more; scan again.
+        GivenUp: the user does not want it to be written.
+    """
+    joint, arguments = session.arguments.joint, session.arguments
+    session.say("setup: torque stays off; what is to be written is shown first", "bold")
+    wanted = _plan(session, joint)
+    at_terminal = sys.stdin is not None and sys.stdin.isatty() and not arguments.yes and not arguments.json
+    if not (wanted.one_at_a_time and joint is None and at_terminal):
+        return _set_up(session, wanted)
+    session.say(wanted.refusal, "yellow")
+    for joint, which in (
+        (0, "only the servo of joint 1 (shoulder)"),
+        (1, "only the servo of joint 2 (elbow)"),
+        (None, "both"),
+    ):
+        session.say(f"connect {which}, then press Enter", "bold")
+        if not sys.stdin.readline():
+            raise GivenUp("ended before both servos were set up")
+        done = _set_up(session, _plan(session, joint))
+        if not done.right:
+            break
+    return done
+
+
+def _plan(session: Session, joint: int | None) -> SetupPlan:
+    return plan(scan_for(session), session.vehicle.arm, session.vehicle.devices.arm, joint)
+
+
+def _set_up(session: Session, wanted: SetupPlan) -> Done:
+    vehicle = session.vehicle
+    if wanted.refusal:
+        return Done(wanted, "refused", (wanted.refusal,), right=False)
+    needed = [one for one in wanted.servos if one.needed]
+    _show(session, wanted.servos)
+    absent = tuple(
+        f"servo {vehicle.arm.joints[index].servo_id} (joint {index + 1}) does not answer: check its power and cable"
+        for index in wanted.absent
+    )
+    if not needed:
+        text = "nothing to write: every servo that answers is as the companion needs it"
+        return Done(wanted, "nothing to do", (*absent, text), right=not absent)
+    answer = session.ask(f"write this to {len(needed)} servo{'s' if len(needed) > 1 else ''}?")
+    if answer is None:
+        return Done(
+            wanted, "not written", (*absent, "nothing was written; --yes writes it without asking"), right=False
+        )
+    if not answer:
+        raise GivenUp("nothing was written")
+    carry_out(vehicle.devices.arm.port, needed, lambda text: session.say(f"  {text}"))
+    session.say("reading back")
+    lines = [*absent, *_left(vehicle, wanted)]
+    right = not lines
+    if any(setting.register in (bus.DRIVE_MODE, bus.HOMING_OFFSET) for one in needed for setting in one.writes):
+        lines.append("a servo counts differently now: run companion arm zero")
+    return Done(wanted, "written", (*lines, *(["set up and read back"] if right else [])), right)
+
+
+def _left(vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
+    """Scan again and return what is not as it was to be, one line each."""
+    arm, device = vehicle.arm, vehicle.devices.arm
+    servos = {servo.servo_id: servo for servo in scan(device, only=device.baud).servos if servo.is_xm430}
+    lines: list[str] = []
+    for one in wanted.servos:
+        servo_id = arm.joints[one.joint].servo_id
+        if servo_id not in servos:
+            lines.append(
+                f"servo {servo_id}: does not answer at {device.baud} baud any more; companion arm scan finds it"
+            )
+            continue
+        for setting in settings(servos[servo_id], arm.joints[one.joint], arm, device):
+            if not setting.right:
+                text = f"reads {setting.shown(setting.found)} afterwards, expected {setting.shown(setting.wanted)}"
+                lines.append(f"servo {servo_id}: {setting.register} {text}; run companion arm setup again")
+    return lines
+
+
+def _show(session: Session, plans: Sequence[ServoPlan]) -> None:
+    table = Table("joint", "servo", "setting", "before", "after", "why", box=None, pad_edge=False)
+    for one in plans:
+        for setting in one.writes:
+            name = (str(one.joint + 1), str(one.servo.servo_id), str(setting.register))
+            table.add_row(*map(Text, (*name, setting.shown(setting.found), setting.shown(setting.wanted), setting.why)))
+    if table.row_count:
+        session.console.print(table)
+    for one in plans:
+        who = f"joint {one.joint + 1}, servo {one.servo.servo_id}"
+        which = "the other" if one.writes else "all"
+        session.say(f"{who}: {which} {len(one.settings) - len(one.writes)} settings are right")
+        if one.wake:
+            session.say(f"{who}: torque or its bus watchdog is on: both are switched off")
+
+
+def judge(done: Done, vehicle: Vehicle) -> Report:
+    """Report the end of a setup."""
+    data = {
+        "outcome": done.outcome,
+        "refusal": done.plan.refusal,
+        "absent_joints": [index + 1 for index in done.plan.absent],
+        "servos": [one.as_json() for one in done.plan.servos],
+    }
+    return Report((), data, done.text, ok=done.right)

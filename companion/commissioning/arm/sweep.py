@@ -1,12 +1,13 @@
-"""The slow sweeps by which friction and torque constant are told: which way the joints go, and which samples count. Pure."""
+"""Straight motions of one joint after the other: a jog to an angle, and the sweeps that measure friction. Pure."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from companion.commissioning.arm.motion import Motion, Moved, walls_deg
+from companion.commissioning.arm.motion import Motion, Moved, limits_deg
 from companion.config.document import ConfigError
 from companion.config.vehicle import Arm
 from companion.model.types import ArmState, Vec2
@@ -14,10 +15,10 @@ from companion.model.types import ArmState, Vec2
 HANGING_DEG: Final = (90.0, 0.0)
 SPEEDS_DEG_S: Final = (9.0, 18.0)
 REACH_DEG: Final = ((-30.0, 30.0), (-5.0, 70.0))
-"""Each joint's sweep about hanging, within its walls."""
+"""Each joint's sweep about hanging, within its limits."""
 REACH_MIN_DEG: Final = 20.0
 SETTLED_S: Final = 0.4
-"""At constant speed for so long before a sample counts."""
+"""Time at constant speed before a sample counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +28,8 @@ class Leg:
     joint: int
     goal_deg: float
     speed_deg_s: float
-    counts: bool
-    """Its samples are for the fit; else it only leads somewhere."""
+    counts: bool = False
+    """Its samples are for the fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,30 +47,31 @@ class Sample:
 
 
 def legs_of(arm: Arm) -> tuple[Leg, ...]:
-    """To hanging, both sweeps there and back at each speed, and to hanging again: there it may go limp.
+    """Return the sweeps: to hanging, each joint there and back at each speed, and to hanging again, where the arm may go limp.
 
     Raises:
-        ConfigError: the walls leave a joint too little room.
+        ConfigError: the joint limits leave too little room.
     """
-    lows_highs = [walls_deg(arm, joint) for joint in (0, 1)]
-    home = [max(low, min(high, deg)) for (low, high), deg in zip(lows_highs, HANGING_DEG, strict=True)]
-    legs = [Leg(0, home[0], SPEEDS_DEG_S[-1], False), Leg(1, home[1], SPEEDS_DEG_S[-1], False)]
+    limits = [limits_deg(arm, joint) for joint in (0, 1)]
+    home = [max(low, min(high, deg)) for (low, high), deg in zip(limits, HANGING_DEG, strict=True)]
+    fast = SPEEDS_DEG_S[-1]
+    legs = [Leg(0, home[0], fast), Leg(1, home[1], fast)]
     for joint in (0, 1):
-        (low, high), (down, up) = lows_highs[joint], REACH_DEG[joint]
+        (low, high), (down, up) = limits[joint], REACH_DEG[joint]
         begin, end = max(low, home[joint] + down), min(high, home[joint] + up)
         if end - begin < REACH_MIN_DEG:
-            room = f"about hanging and between its walls joint {joint + 1} has {max(0.0, end - begin):.0f} deg"
-            why = f"at least {REACH_MIN_DEG:g} are needed to tell gravity from friction"
+            room = f"about hanging and within its limits joint {joint + 1} has {max(0.0, end - begin):.0f} deg"
+            why = f"at least {REACH_MIN_DEG:g} are needed to separate gravity from friction"
             raise ConfigError([f"arm.joints[{joint}].angle_deg: {room}, {why}"])
-        legs.append(Leg(joint, begin, SPEEDS_DEG_S[-1], False))
+        legs.append(Leg(joint, begin, fast))
         for speed in SPEEDS_DEG_S:
             legs += [Leg(joint, end, speed, True), Leg(joint, begin, speed, True)]
-        legs.append(Leg(joint, home[joint], SPEEDS_DEG_S[-1], False))
+        legs.append(Leg(joint, home[joint], fast))
     return tuple(legs)
 
 
-def duration_s(legs: tuple[Leg, ...], start_deg: Vec2) -> float:
-    """About how long they take."""
+def duration_s(legs: Sequence[Leg], start_deg: Vec2) -> float:
+    """Return about how long the legs take."""
     at = list(start_deg)
     total = 0.0
     for leg in legs:
@@ -79,47 +81,50 @@ def duration_s(legs: tuple[Leg, ...], start_deg: Vec2) -> float:
 
 
 class Sweeper:
-    """Leads a `Motion` along its legs and keeps what counts.
+    """A leader that follows its legs and keeps the samples that count.
 
     Args:
-        legs: of `legs_of`.
-        torque_per_amp_nm_a: by which the arm edge has turned currents into the torques of its states.
+        legs: in order.
+        torque_per_amp_nm_a: the constant by which the arm's driver converts currents to torques.
     """
 
-    def __init__(self, legs: tuple[Leg, ...], torque_per_amp_nm_a: float) -> None:
+    def __init__(self, legs: Sequence[Leg], torque_per_amp_nm_a: float) -> None:
         self.legs = legs
         self._nm_a = torque_per_amp_nm_a
         self.samples: list[Sample] = []
-        self.leg = -1
-        """The one under way."""
+        self._leg = -1
         self._steady_since_s: float | None = None
 
-    @property
-    def done(self) -> bool:
-        """All legs are behind."""
-        return self.leg >= len(self.legs)
+    def begin(self, state: ArmState) -> list[Vec2]:
+        """Return every pose from here to the end of the last leg."""
+        at, poses = list(state.angle_rad), [state.angle_rad]
+        for leg in self.legs:
+            at[leg.joint] = math.radians(leg.goal_deg)
+            poses.append((at[0], at[1]))
+        return poses
 
-    def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> None:
-        """After each control step: note the sample, begin the next leg when the last one has ended.
-
-        Args:
-            motion: what is led.
-            moved: the last step's; None: none yet.
-            state: by which it was computed.
-        """
-        if self.done:
-            return
-        if moved is not None and self.leg >= 0:
+    def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
+        """Note the sample, and begin the next leg when one has ended; return True after the last."""
+        if moved is not None and 0 <= self._leg < len(self.legs):
             self._note(moved, state)
-        if self.leg < 0 or (moved is not None and moved.reached):
-            self.leg += 1
+        if self._leg < 0 or (moved is not None and moved.reached):
+            self._leg += 1
             self._steady_since_s = None
-            if not self.done:
-                leg = self.legs[self.leg]
+            if self._leg < len(self.legs):
+                leg = self.legs[self._leg]
                 motion.go(leg.joint, math.radians(leg.goal_deg), math.radians(leg.speed_deg_s))
+        return self._leg >= len(self.legs)
+
+    def status(self) -> str:
+        """Return what moves now."""
+        if not 0 <= self._leg < len(self.legs):
+            return ""
+        leg = self.legs[self._leg]
+        how = f"at {leg.speed_deg_s:g} deg/s" if leg.counts else "on the way"
+        return f"{self._leg + 1}/{len(self.legs)}  joint {leg.joint + 1} to {leg.goal_deg:.0f} deg, {how}"
 
     def _note(self, moved: Moved, state: ArmState) -> None:
-        leg = self.legs[self.leg]
+        leg = self.legs[self._leg]
         rate = moved.reference_rate_rad_s[leg.joint]
         if not leg.counts or abs(abs(rate) - math.radians(leg.speed_deg_s)) > 1e-9:
             self._steady_since_s = None
@@ -132,12 +137,12 @@ class Sweeper:
             return
         self.samples.append(
             Sample(
-                self.leg,
-                leg.joint,
-                1 if rate > 0.0 else -1,
-                state.stamp_s,
-                state.angle_rad,
-                state.velocity_rad_s[leg.joint],
-                state.torque_nm[leg.joint] / self._nm_a,
+                leg=self._leg,
+                joint=leg.joint,
+                direction=1 if rate > 0.0 else -1,
+                t_s=state.stamp_s,
+                angle_rad=state.angle_rad,
+                velocity_rad_s=state.velocity_rad_s[leg.joint],
+                current_a=state.torque_nm[leg.joint] / self._nm_a,
             )
         )

@@ -1,4 +1,4 @@
-"""Zeros, directions and plugs of the arm's servos, from three poses in which somebody holds it. Pure: counts in, result out."""
+"""Zeros, directions and plugs of the arm's servos, from three poses in which the user holds it. Pure: counts in, result out."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from companion.config.vehicle import Arm
 from companion.io.dynamixel.registers import COUNTS_PER_TURN
 
 HELD_S: Final = 2.0
-"""The arm is held when it was still for so long."""
+"""A pose counts after this time at rest."""
 STILL_DEG: Final = 1.5
-"""No joint moves by more than this while it is held."""
+"""Largest motion of a joint at rest."""
 BEGUN_DEG: Final = 5.0
-"""It was moved at all."""
+"""Motion that begins a step."""
 NEAR_SHARE: Final = 0.35
-"""Of a turn that is asked for exactly: nearer than this to it counts."""
+"""Of an exact turn: largest error."""
 ALONE_SHARE: Final = 0.35
-"""The other joint may turn by so much of it."""
+"""Of a turn: largest motion of the other joint."""
 HAND_DEG: Final = 2.0
-"""So exactly can somebody hold a link level or plumb; a zero of the vehicle file within this is left as it is."""
+"""Accuracy of a link held level or plumb; a zero of the vehicle file within this is kept."""
 DISAGREE_DEG: Final = 8.0
-"""Poses that tell a zero differently by more than this were not held as asked, or the arm slips."""
+"""Poses whose zeros differ by more were not held as asked, or the arm slips."""
 _DEG_PER_COUNT: Final = 360.0 / COUNTS_PER_TURN
 
 Counts = tuple[int, int]
@@ -35,14 +35,14 @@ Counts = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class ZeroJoint:
-    """What was found of one joint."""
+    """One joint."""
 
     servo_id: int
     sign: int
     zero_count: int
     """Present position (register 132) at joint angle 0, within one turn unless the joint turns more than once."""
     spread_deg: float | None
-    """Between the poses that tell the zero; None: one alone tells it."""
+    """Difference between the poses that show the zero; None if only one does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +51,10 @@ class ZeroResult:
 
     joints: tuple[ZeroJoint, ZeroJoint]
     swapped: bool
-    """The servos of the vehicle file sit in each other's joint."""
-    held_counts: tuple[Counts, Counts, Counts]
-    """Mean positions in the three poses, in the order of the vehicle file's servos."""
+    """The servos of the vehicle file are in each other's joint."""
 
     def changes(self, arm: Arm) -> dict[Location, Data]:
-        """What the vehicle file should say instead; empty: it is right as far as a hand can tell."""
+        """Return what the vehicle file should have; empty if it is right within `HAND_DEG`."""
         wanted: dict[Location, Data] = {}
         for index, (found, joint) in enumerate(zip(self.joints, arm.joints, strict=True)):
             at: Location = ("arm", "joints", index)
@@ -69,37 +67,37 @@ class ZeroResult:
         return wanted
 
     def error_deg(self, arm: Arm, index: int) -> float:
-        """How far the vehicle file's zero is from the one found, in turns of the servo, -180 to 180."""
+        """Return the error of the vehicle file's zero within one turn of the servo, -180 to 180."""
         counts = arm.joints[index].zero_count - self.joints[index].zero_count
         return ((counts + COUNTS_PER_TURN / 2) % COUNTS_PER_TURN - COUNTS_PER_TURN / 2) * _DEG_PER_COUNT
 
 
 @dataclass(frozen=True, slots=True)
 class ZeroView:
-    """What to show now."""
+    """The state of the guide, for display."""
 
     step: Step | None
-    """None: done."""
+    """The step under way; None at the end."""
     number: int
     moved_deg: tuple[float, float]
     """Since the step began, as each servo counts, in the order of the vehicle file's servos."""
     held: float
-    """0 to 1: how long the arm has been held as asked."""
+    """Share of `HELD_S` for which the arm has been held, 0 to 1."""
     notice: str
-    """What is not as asked; empty: nothing."""
+    """What is not as asked; empty if all is."""
     result: ZeroResult | None = None
     failed: str = ""
-    """Why the poses cannot be understood; the guide is then at its end."""
+    """Why the poses contradict each other, which ends the guide."""
 
 
 class ZeroGuide:
-    """Watches the arm, decides when a pose is held, and says in the end what it means.
+    """Watch the arm, decide when a pose is held, and find the result in the end.
 
     Args:
-        arm: the vehicle file's; its walls say which poses are asked for.
+        arm: the vehicle file's; its joint limits decide which poses are asked for.
 
     Raises:
-        ConfigError: the walls leave no such poses.
+        ConfigError: the joint limits leave no such poses.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -111,12 +109,12 @@ class ZeroGuide:
         self._begun = False
 
     def update(self, t_s: float, counts: Counts, accept: bool = False) -> ZeroView:
-        """One reading.
+        """Take one reading.
 
         Args:
             t_s: any clock.
             counts: present positions (register 132), in the order of the vehicle file's servos.
-            accept: somebody says that the arm is held now; it need not have been moved then.
+            accept: the user says that the arm is held now; it need not have been moved.
         """
         index = len(self._held)
         step = self.steps[index]
@@ -142,7 +140,7 @@ class ZeroGuide:
         return self._conclude(moved)
 
     def _still_s(self, t_s: float) -> float:
-        """How long nothing has moved."""
+        """Return for how long nothing has moved."""
         newest = self._window[-1][1]
         low, high = list(newest), list(newest)
         since_s = t_s
@@ -180,11 +178,11 @@ class ZeroGuide:
             if found.spread_deg is not None and found.spread_deg > DISAGREE_DEG:
                 text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
                 return _failed(view, f"{text}; hold them more exactly, and look for a horn that slips")
-        result = ZeroResult((joints[0], joints[1]), elbow == 0, (first, second, third))
+        result = ZeroResult((joints[0], joints[1]), elbow == 0)
         return ZeroView(None, view.number, moved, 1.0, "", result)
 
     def _joint(self, joint: int, servo: int, counts: Sequence[int]) -> ZeroJoint:
-        # The elbow turns in the second step, the shoulder in the third; in the third the elbow is only left about as it is.
+        # The elbow turns in the second step, the shoulder in the third, where the elbow stays only roughly.
         at = 1 if joint == 1 else 2
         turns = self.steps[at]
         sign = 1 if (counts[at] - counts[at - 1]) * turns.by_deg > 0.0 else -1

@@ -1,0 +1,92 @@
+"""`companion arm zero`: the arm is limp and the user holds it; the servos' lights show what counts. I/O only."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from rich.console import Console
+
+from companion.commissioning.arm import bus
+from companion.commissioning.arm.bus import ServoTalk
+from companion.commissioning.arm.zero import ZeroGuide, ZeroResult, ZeroView
+from companion.config.vehicle import Vehicle
+from companion.io.dynamixel import registers as dxl
+from companion.io.protocols import DeviceError
+from companion.runtime.terminal import Bars, pressed, raw_keys
+
+PERIOD_S: Final = 0.02
+STEP_TIMEOUT_S: Final = 180.0
+_FULL_DEG: Final = 90.0
+"""Angle at which a bar is full."""
+
+
+def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
+    """Lead the user through the guide's steps, without torque; the lights are out at the end however it comes.
+
+    Raises:
+        DeviceError: a servo does not answer or is not set up, a pose was not held in time, or the poses contradict each other.
+    """
+    device, ids = vehicle.devices.arm, [joint.servo_id for joint in vehicle.arm.joints]
+    names = [*(f"servo {servo_id}" for servo_id in ids), "held"]
+    with ServoTalk(device.port) as talk, raw_keys() as keys, Bars(console, names) as bars:
+        talk.open(device.baud)
+        for servo_id in ids:
+            _ready(talk, servo_id)
+        try:
+            return _steps(talk, ids, guide, bars, keys)
+        finally:
+            with contextlib.suppress(DeviceError):
+                _lights(talk, ids, 0)
+
+
+def _ready(talk: ServoTalk, servo_id: int) -> None:
+    name = f"arm bus: servo {servo_id}"
+    if not talk.answers(servo_id):
+        fix = "companion arm scan finds it, companion arm setup puts it right"
+        raise DeviceError(f"{name} does not answer at {talk.baud} baud; {fix}")
+    talk.write(servo_id, dxl.TORQUE_ENABLE, 0)
+    drive, offset = talk.read(servo_id, bus.DRIVE_MODE), talk.read(servo_id, bus.HOMING_OFFSET)
+    if drive or offset:
+        found = f"{bus.DRIVE_MODE} is {drive} and {bus.HOMING_OFFSET} {offset}, expected 0 and 0"
+        raise DeviceError(f"{name}: {found}; run companion arm setup first: it would change a zero found now")
+
+
+def _steps(talk: ServoTalk, ids: Sequence[int], guide: ZeroGuide, bars: Bars, keys: int | None) -> ZeroResult:
+    number, deadline_s = 0, 0.0
+    while True:
+        counts = (talk.read(ids[0], dxl.PRESENT_POSITION), talk.read(ids[1], dxl.PRESENT_POSITION))
+        now_s = time.monotonic()
+        typed = pressed(keys)
+        view = guide.update(now_s, counts, accept="\n" in typed or "\r" in typed)
+        if view.failed:
+            raise DeviceError(f"arm zero: {view.failed}; run companion arm zero again")
+        if view.result is not None:
+            return view.result
+        assert view.step is not None
+        if view.number != number:
+            number, deadline_s = view.number, now_s + STEP_TIMEOUT_S
+            _lights(talk, ids, 0)
+            bars.say(f"{number}/{len(guide.steps)}  {view.step.instruction}", "bold")
+            _lights(talk, ids, 1)
+        if now_s > deadline_s:
+            text = f"step {number} ({view.step.name}): not held within {STEP_TIMEOUT_S:.0f} s: {_why(view)}"
+            raise DeviceError(f"arm zero: {text}; run it again")
+        first, second = view.moved_deg
+        shares = [abs(first) / _FULL_DEG, abs(second) / _FULL_DEG, view.held]
+        bars.show(shares, [f"{first:+7.1f} deg", f"{second:+7.1f} deg", view.notice])
+        time.sleep(PERIOD_S)
+
+
+def _why(view: ZeroView) -> str:
+    if view.notice:
+        return view.notice
+    moved_deg = max(map(abs, view.moved_deg))
+    return f"the arm has turned by {moved_deg:.0f} deg" if moved_deg >= 1.0 else "nothing has moved"
+
+
+def _lights(talk: ServoTalk, ids: Sequence[int], on: int) -> None:
+    for servo_id in ids:
+        talk.write(servo_id, bus.LED, on)

@@ -1,0 +1,183 @@
+"""`companion arm scan|setup|zero|jog|friction`: from servos out of their boxes to an arm whose numbers are measured."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from companion.commissioning.arm import scan as arm_scan
+from companion.commissioning.arm import setup as arm_setup
+from companion.commissioning.arm.bus import BAUDS
+from companion.commissioning.arm.drive import Driven, Leader, drive
+from companion.commissioning.arm.friction import fit
+from companion.commissioning.arm.hold import hold
+from companion.commissioning.arm.jog import ByKeys
+from companion.commissioning.arm.motion import LOAD_NM, SPEED_MAX_DEG_S, TORQUE_SHARE, limits_deg
+from companion.commissioning.arm.servo import Scan
+from companion.commissioning.arm.sweep import Leg, Sample, Sweeper, duration_s, legs_of
+from companion.commissioning.arm.zero import ZeroGuide, ZeroResult
+from companion.commissioning.tool import ARM, GivenUp, Report, Session, Tool
+from companion.config.document import ConfigError
+from companion.config.vehicle import Vehicle
+from companion.model.rows import Level
+from companion.runtime.terminal import Bars, pressed, raw_keys
+
+_NAMES = ("joint 1", "joint 2")
+
+
+def _stand_text(vehicle: Vehicle) -> str:
+    """Return what the machine must stand on so that the arm can hang."""
+    arm = vehicle.arm
+    below_m = sum(arm.link_lengths_m) + vehicle.tool.net_radius_m - arm.shoulder_body_m[2]
+    text = f"the arm reaches {below_m:.2f} m below the body"
+    if below_m <= vehicle.airframe.ground_clearance_m:
+        return text
+    clearance = f"on its own feet the machine has {vehicle.airframe.ground_clearance_m:.2f} m"
+    return f"{text}, {clearance}: put it on a stand, level, with nothing below the arm"
+
+
+def _scan(session: Session) -> Scan:
+    baud = session.arguments.baud
+    if baud not in (None, *BAUDS):
+        raise ConfigError([f"--baud {baud}: expected one of {', '.join(map(str, BAUDS))}"])
+    return arm_scan.scan_for(session, baud)
+
+
+def _judge_scan(found: Scan, vehicle: Vehicle) -> Report:
+    judged = arm_scan.judge(found, vehicle)
+    wrong = {row.id for row in judged.rows if not row.ok and row.level is not Level.WARN}
+    settled = {"arm.scan.baud" if "baud" in location else "arm.scan.ids" for location in judged.changes}
+    return Report(
+        judged.rows,
+        arm_scan.as_json(found, judged),
+        arm_scan.table(found, judged),
+        judged.changes,
+        advice=[] if wrong else ["the servos are as the vehicle file says"],
+        ok=wrong <= settled,
+        brief={f"arm.scan.joint{n}": f"joint {n}: settings" for n in (1, 2)},
+    )
+
+
+def _zero(session: Session) -> ZeroResult:
+    guide = ZeroGuide(session.vehicle.arm)
+    session.say("zero: the arm is limp, nothing moves by itself; propellers off", "bold")
+    session.say(f"  {_stand_text(session.vehicle)}")
+    session.say(
+        "  the servos' lights are on while a step is to be done, and off once it counts: held still for 2 s, or Enter"
+    )
+    for number, step in enumerate(guide.steps, 1):
+        session.say(f"  {number}. {step.instruction}")
+    return hold(session.vehicle, guide, session.console)
+
+
+def _judge_zero(result: ZeroResult, vehicle: Vehicle) -> Report:
+    text, joints = [], []
+    if result.swapped:
+        text.append("the servos are swapped: each moved when the other joint was to be moved")
+    for number, (found, joint) in enumerate(zip(result.joints, vehicle.arm.joints, strict=True), 1):
+        error_deg = result.error_deg(vehicle.arm, number - 1)
+        turned = "" if found.sign == joint.sign else ", which is the opposite direction"
+        spread = "" if found.spread_deg is None else f", poses agree within {found.spread_deg:.1f} deg"
+        text.append(
+            f"joint {number}: servo {found.servo_id}, sign {found.sign:+d}{turned}, zero_count {found.zero_count} "
+            f"(the vehicle file's is {error_deg:+.1f} deg off){spread}"
+        )
+        joints.append({"joint": number, **asdict(found), "file_error_deg": error_deg})
+    changes = result.changes(vehicle.arm)
+    if not changes:
+        text.append("the vehicle file is right, as far as a hand can hold the arm")
+    return Report((), {"swapped": result.swapped, "joints": joints}, text, changes)
+
+
+async def _drive(session: Session, leader: Leader, what: str) -> Driven:
+    """Say what will happen, ask, move."""
+    part = session.arguments.part
+    session.say(f"{part}: {what}", "bold")
+    session.say(f"  propellers off; {_stand_text(session.vehicle)}")
+    bounds = f"at most {SPEED_MAX_DEG_S:g} deg/s and {100 * TORQUE_SHARE:.0f} % of the torque"
+    session.say(f"  {bounds}; it stops at {LOAD_NM:g} N m that gravity does not explain, and at Ctrl-C at once")
+    session.say("  at the end, however it comes, the arm goes limp: keep hands off its way down, and nothing below it")
+    answer = session.ask("may the arm move now?")
+    if answer is None:
+        raise ConfigError([f"companion arm {part}: there is no terminal to ask whether the arm may move; add --yes"])
+    if not answer:
+        raise GivenUp("the arm was not moved")
+    with Bars(session.console, _NAMES) as bars:
+        return await drive(session.vehicle, leader, bars)
+
+
+async def _jog(session: Session) -> Driven:
+    arguments, arm = session.arguments, session.vehicle.arm
+    joint, goal_deg = arguments.joint, arguments.to
+    if (goal_deg is None) != (joint is None):
+        raise ConfigError(
+            ["companion arm jog: --joint N and --to DEG belong together; without both, keys move the arm"]
+        )
+    if goal_deg is not None:
+        low, high = limits_deg(arm, joint)
+        if not low <= goal_deg <= high:
+            expected = f"expected {low:g} to {high:g} deg, joint {joint + 1}'s limits less a margin"
+            raise ConfigError([f"companion arm jog: --to {goal_deg:g}: {expected}"])
+        leader = Sweeper([Leg(joint, goal_deg, SPEED_MAX_DEG_S)], arm.torque_per_amp_nm_a)
+        return await _drive(session, leader, f"joint {joint + 1} moves to {goal_deg:g} deg")
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise ConfigError(
+            ["companion arm jog: no terminal to read keys from; --joint N --to DEG --yes moves without keys"]
+        )
+    keys = "1, 2: which joint; arrows or + and -: move it while held; any other key: stop; q: end"
+    with raw_keys() as descriptor:
+        return await _drive(session, ByKeys(lambda: pressed(descriptor)), f"keys move the arm; {keys}")
+
+
+def _judge_jog(driven: Driven, vehicle: Vehicle) -> Report:
+    first, second = driven.angle_deg
+    load_nm = max(driven.load_max_nm)
+    text = [f"stopped: {driven.stop}"] if driven.stop else []
+    text.append(f"the arm is limp, at ({first:.1f}, {second:.1f}) deg; at most {load_nm:.2f} N m beside gravity")
+    data = {"stopped": driven.stop, "angle_deg": [first, second], "load_max_nm": list(driven.load_max_nm)}
+    return Report((), data, text, ok=not driven.stop)
+
+
+async def _sweep(session: Session) -> tuple[Driven, Sequence[Sample]]:
+    vehicle = session.vehicle
+    legs = legs_of(vehicle.arm)
+    leader = Sweeper(legs, vehicle.arm.torque_per_amp_nm_a)
+    seconds = duration_s(legs, vehicle.safety.fold_arm_deg)
+    driven = await _drive(session, leader, f"both joints sweep slowly for about {seconds:.0f} s, about hanging")
+    return driven, leader.samples
+
+
+def _judge_sweep(swept: tuple[Driven, Sequence[Sample]], vehicle: Vehicle) -> Report:
+    driven, samples = swept
+    if driven.stop:
+        data: Mapping[str, Any] = {"stopped": driven.stop, "joints": [None, None], "notes": []}
+        return Report((), data, [f"stopped: {driven.stop}"], ok=False)
+    found = fit(samples, vehicle)
+    text = []
+    for number, one in enumerate(found.joints, 1):
+        if one is not None:
+            text += [
+                f"joint {number}, from {one.bins} means over {one.gravity_span_nm:.2f} N m of gravity:",
+                f"  torque constant   {one.torque_per_amp_nm_a.text(3)} N m/A",
+                f"  dry friction      {one.dry_nm.text(4)} N m",
+                f"  viscous friction  {one.viscous_nms.text(4)} N m s/rad",
+                f"  turned by         {one.off_deg.text(2)} deg",
+            ]
+    for name, unit in (("torque_per_amp_nm_a", "N m/A"), ("joint_friction_nm", "N m")):
+        estimate = getattr(found, name)
+        value = "the data cannot tell" if estimate is None else f"{estimate.text(3)} {unit}"
+        text.append(f"{name}: {value}; the vehicle file says {getattr(vehicle.arm, name):g}")
+    known = found.torque_per_amp_nm_a is not None and found.joint_friction_nm is not None
+    data = {"stopped": "", **asdict(found)}
+    return Report((), data, [*text, *found.notes], found.changes(vehicle), ok=known)
+
+
+TOOLS: Final[Mapping[str, Tool[Any]]] = {
+    "scan": Tool("arm scan", ARM, _scan, _judge_scan),
+    "setup": Tool("arm setup", ARM, arm_setup.set_up, arm_setup.judge),
+    "zero": Tool("arm zero", ARM, _zero, _judge_zero),
+    "jog": Tool("arm jog", ARM, _jog, _judge_jog),
+    "friction": Tool("arm friction", ARM, _sweep, _judge_sweep),
+}
