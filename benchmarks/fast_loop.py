@@ -30,10 +30,10 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.config.document import ConfigError
-from companion.config.loader import FlightConfig, load_flight
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.types import Inputs, Outcome, Reference
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns import flights as campaign
 from sitl.fast.loop import TICK_S, FastFlight, FastResult
 from sitl.world.world import PHYSICS_DT_S, World
@@ -87,7 +87,7 @@ def _cpu_us(into: list[float], count: int) -> Iterator[None]:
     into.append((time.process_time() - start) / count * 1e6)
 
 
-def flight_us(config: FlightConfig, repeats: int) -> tuple[float, FastFlight, FastResult]:
+def flight_us(config: SitlConfig, repeats: int) -> tuple[float, FastFlight, FastResult]:
     """CPU time per tick of whole flights, construction left out, and the last of them.
 
     Raises:
@@ -105,7 +105,7 @@ def flight_us(config: FlightConfig, repeats: int) -> tuple[float, FastFlight, Fa
     return median(times), flight, result
 
 
-def raw_step_us(config: FlightConfig, world: World, result: FastResult, repeats: int) -> float:
+def raw_step_us(config: SitlConfig, world: World, result: FastResult, repeats: int) -> float:
     """`mj_step` alone on the flight's own model, from states all along the flight, no Python between the steps."""
     model, data = world.model, mujoco.MjData(world.model)
     snapshots = result.snapshots[:: max(1, len(result.snapshots) // _RAW_STARTS)]
@@ -123,7 +123,7 @@ def raw_step_us(config: FlightConfig, world: World, result: FastResult, repeats:
     return median(times)
 
 
-def core_us(config: FlightConfig, inputs: list[Inputs]) -> list[float]:
+def core_us(config: SitlConfig, inputs: list[Inputs]) -> list[float]:
     """Time of every `FlightCore.step` of a recorded flight, by the wall clock: single steps are too short for the CPU clock."""
     core = FlightCore(config)
     clock = time.perf_counter
@@ -135,7 +135,7 @@ def core_us(config: FlightConfig, inputs: list[Inputs]) -> list[float]:
     return sorted(times)
 
 
-def law_us(config: FlightConfig, inputs: list[Inputs], repeats: int) -> tuple[float, int]:
+def law_us(config: SitlConfig, inputs: list[Inputs], repeats: int) -> tuple[float, int]:
     """CPU time per update of the law on the states of a recorded flight, and how many those are."""
     calls: list[LawCall] = []
     core = FlightCore(config)
@@ -163,7 +163,7 @@ def reference_us(repeats: int) -> float:
     return median(times)
 
 
-def two_workers(config: FlightConfig) -> tuple[float, float]:
+def two_workers(config: SitlConfig) -> tuple[float, float]:
     """Flights per second of wall time by one worker process and by two, grading included, as `companion compare --jobs` flies them."""
     text = config.model_dump_json()
     flight = {
@@ -217,7 +217,7 @@ def rotorpy_s(python: str) -> dict[str, Any] | None:
 
 
 def measure(
-    config: FlightConfig, repeats: int, workers: bool, rotorpy: str | None, say: Callable[[str], None]
+    config: SitlConfig, repeats: int, workers: bool, rotorpy: str | None, say: Callable[[str], None]
 ) -> list[Row]:
     """All rows."""
     say("flights on one core")
@@ -319,7 +319,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.flights < 1:
         parser.error("--flights must be at least 1")
     try:
-        config = load_flight(options.mission, controller_law=options.controller, preset=options.preset)
+        config = load_sitl(options.mission, controller_law=options.controller, preset=options.preset)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2

@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.analysis.log import FlightLog
-from companion.config.loader import load_flight
 from companion.launcher.launcher import Launcher, landing_signals
+from companion.sitl_config.loader import load_sitl
 from sitl.faults.processes import SIGNALS
 
 MISSION = Path(__file__).parents[1] / "configs/missions/catch.yaml"
@@ -56,7 +56,7 @@ class Row:
 def fly(kind: str, seed: int, after_catch_s: float, folder: Path) -> Row:
     """One flight with one fault."""
     fault = json.dumps([{"kind": kind, "after": "catch", "t_s": after_catch_s}])
-    config = load_flight(MISSION, overrides=[f"world.faults={fault}", f"world.seed={seed}"])
+    config = load_sitl(MISSION, overrides=[f"world.faults={fault}", f"world.seed={seed}"])
     folder.mkdir(parents=True)
     launcher = Launcher(config, folder, sitl=True, on_message=lambda message: None)
     with landing_signals(launcher.request_landing):

@@ -25,7 +25,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.control.manipulator import Manipulator
 from companion.mission.check import check_mission
 from companion.mission.sample_check import TRACKING_M
@@ -33,6 +32,7 @@ from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 from companion.safety.governor import BODY_TOP_M
 from companion.safety.tether import slack_m
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 
 BASE = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
@@ -73,10 +73,10 @@ class Row:
         return found
 
 
-def drawn(number: int, phases_max: int = 4) -> FlightConfig:
+def drawn(number: int, phases_max: int = 4) -> SitlConfig:
     """Mission `number`: machine, room, tether, wind and phases, some of them beyond what can be flown."""
     rng = random.Random(number)
-    data: Data = json.loads(load_flight(BASE).model_dump_json())
+    data: Data = json.loads(load_sitl(BASE).model_dump_json())
     vehicle, mission, world = data["vehicle"], data["mission"], data["world"]
     half_x, half_y, top = rng.uniform(1.7, 2.5), rng.uniform(1.5, 2.2), rng.uniform(1.8, 2.6)
     vehicle["room"] = {"x_m": [-half_x, half_x], "y_m": [-half_y, half_y], "z_m": [0.0, top]}
@@ -127,7 +127,7 @@ def drawn(number: int, phases_max: int = 4) -> FlightConfig:
         payload_kg = rng.uniform(0.1, 0.4)
         mission["catch"] = {"expected_at_m": middle[:2], "payload_max_kg": payload_kg}
         world |= {"payload_kg": payload_kg, "catch_at_m": middle[:2]}
-    return FlightConfig.model_validate_json(json.dumps(data))
+    return SitlConfig.model_validate_json(json.dumps(data))
 
 
 def _point(rng: random.Random, vehicle: Data) -> list[float]:
@@ -178,7 +178,7 @@ def fly(number: int, phases_max: int = 4) -> Row:
     return row
 
 
-def margins_m(config: FlightConfig, result: FastResult) -> tuple[float, float]:
+def margins_m(config: SitlConfig, result: FastResult) -> tuple[float, float]:
     """Least slack beyond the margin, and least distance of what moves from walls and ceiling, by the world's truth, in the air."""
     vehicle, room = config.vehicle, config.vehicle.room
     manipulator = Manipulator(vehicle.arm, vehicle.tool)

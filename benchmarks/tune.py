@@ -35,10 +35,10 @@ from pydantic import ValidationError
 from companion.analysis.metrics import lowpass_zero_phase
 from companion.config.controller import LAWS, PRESETS
 from companion.config.document import ConfigError
-from companion.config.loader import FlightConfig, load_flight
 from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_conjugate, quat_rotate
 from companion.model.types import Inputs, Outcome, Outputs, PhaseKind
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import TICK_S, FastFlight
 
 Array = npt.NDArray[np.float64]
@@ -196,7 +196,7 @@ TUNABLES: dict[str, Tunable] = {
 
 
 def arm_impedance_error_nm(
-    config: FlightConfig, inputs: Sequence[Inputs], outputs: Sequence[Outputs]
+    config: SitlConfig, inputs: Sequence[Inputs], outputs: Sequence[Outputs]
 ) -> tuple[Array, Array]:
     """dI of the joint rows against the fixed target, and e_tau, both low-passed, N m, (ticks, 2).
 
@@ -224,7 +224,7 @@ def arm_impedance_error_nm(
     return inertial + slow[:, 2:4] - slow[:, 4:6], slow[:, 4:6]
 
 
-def fly(config: FlightConfig) -> Grade:
+def fly(config: SitlConfig) -> Grade:
     """One flight in the fast loop, graded from the catch to the landing."""
     result = FastFlight(config).run()
     completed = result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
@@ -259,9 +259,9 @@ def rms(rows: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(rows * rows, axis=1))))
 
 
-def configuration(law: str, gains: Gains, payload_kg: float, seed: int) -> FlightConfig:
+def configuration(law: str, gains: Gains, payload_kg: float, seed: int) -> SitlConfig:
     """The mission with these gains, checked as a file would be."""
-    flight = load_flight(MISSION, controller_law=law)
+    flight = load_sitl(MISSION, controller_law=law)
     wires = SLOW if seed % 2 == 0 else {}
     world = flight.world.model_copy(update={"payload_kg": payload_kg, "seed": seed, **wires})
     controller = LAWS[law].model_validate(gains | {"law": law})
@@ -370,7 +370,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     a = parser.parse_args(arguments)
     try:
         payloads_kg = [float(text) for text in a.payloads.split(",")]
-        base = load_flight(MISSION, controller_law=a.law).controller.model_dump(mode="json")
+        base = load_sitl(MISSION, controller_law=a.law).controller.model_dump(mode="json")
     except (ValueError, ConfigError) as error:
         print(f"tune: {error}", file=sys.stderr)
         return 2
@@ -403,7 +403,7 @@ def show(law: str, payloads_kg: Sequence[float], seeds: Sequence[int], pool: Pro
     """A line per preset and payload: means over the seeds."""
     print("law/preset payload_kg  e_p_m  arm_nm  rigid_nm  activity_nm  cost  failed")
     for preset in PRESETS[law]:
-        gains = load_flight(MISSION, controller_law=law, preset=preset).controller.model_dump(mode="json")
+        gains = load_sitl(MISSION, controller_law=law, preset=preset).controller.model_dump(mode="json")
         for payload_kg in payloads_kg:
             flown = list(pool.map(fly, [configuration(law, gains, payload_kg, seed) for seed in seeds]))
             good = [grade for grade in flown if grade.completed]

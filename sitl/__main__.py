@@ -15,9 +15,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.config.loader import FlightConfig
 from companion.runtime.event_loop import run
 from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime
+from companion.sitl_config.loader import SitlConfig
 from sitl.autopilot.mavlink import LinkError
 from sitl.faults.timing import FaultError, in_time
 from sitl.px4.backend import RealPx4
@@ -37,7 +37,7 @@ def _say(message: dict[str, Any]) -> None:
         )  # unbuffered: nothing is left to be flushed into a closed pipe
 
 
-async def _serve(config: FlightConfig, for_launcher: bool, truth_file: Path, px4_folder: Path | None) -> None:
+async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_folder: Path | None) -> None:
     start = config.mission.start
     ports = Ports() if for_launcher else _STANDARD
     on_message = _say if for_launcher else _tell
@@ -122,7 +122,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--for-launcher", action="store_true")
     parser.add_argument("--px4", type=Path, metavar="DIR", help="fly a real PX4, which lives in this folder")
     arguments = parser.parse_args(argv)
-    config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
+    config = SitlConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     try:
         truth_file = arguments.config.with_name(TRUTH_FILE)
         run(_serve(in_time(config), arguments.for_launcher, truth_file, arguments.px4))

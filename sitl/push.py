@@ -16,12 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.config.controller import AdaptiveConfig, ControllerConfig, CscConfig, PscConfig
-from companion.config.loader import FlightConfig
 from companion.config.mission import ArmMove, Hold, Land, Takeoff
-from companion.config.world import Push
 from companion.control.manipulator import Manipulator
 from companion.model.flight_stage import SPOOL_S
 from companion.model.types import Vec2, Vec3
+from companion.sitl_config.loader import SitlConfig
+from companion.sitl_config.world import Push
 from sitl.fast.loop import FastFlight
 
 Array = npt.NDArray[np.float64]
@@ -136,8 +136,8 @@ class PushResult:
 
 
 def push_config(
-    config: FlightConfig, force_world_n: Vec3 = (0.0, 0.0, -2.0), duration_s: float = 1.0, base_rows: bool = False
-) -> FlightConfig:
+    config: SitlConfig, force_world_n: Vec3 = (0.0, 0.0, -2.0), duration_s: float = 1.0, base_rows: bool = False
+) -> SitlConfig:
     """The same machine and law on the test's mission: up, arm into the catch pose, hover, push.
 
     Args:
@@ -162,7 +162,7 @@ def push_config(
     return config.model_copy(update={"mission": mission, "world": world, "controller": controller})
 
 
-def push_test(config: FlightConfig, target: TargetImpedance | None = None) -> PushResult:
+def push_test(config: SitlConfig, target: TargetImpedance | None = None) -> PushResult:
     """Fly a configuration of `push_config` in the fast loop.
 
     Args:
@@ -210,7 +210,7 @@ def push_test(config: FlightConfig, target: TargetImpedance | None = None) -> Pu
     )
 
 
-def ideal_response(target: TargetImpedance, config: FlightConfig, t_s: Array) -> tuple[Array, Array]:
+def ideal_response(target: TargetImpedance, config: SitlConfig, t_s: Array) -> tuple[Array, Array]:
     """Deflection of base (m, world) and joints (rad) of the ideal machine, level, at the times since the push began."""
     push = config.world.push
     assert push is not None

@@ -15,10 +15,10 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from companion.config.faults import FaultKind
 from companion.config.vehicle import Vehicle
-from companion.config.world import World as WorldConfig
 from companion.model.types import IDENTITY_QUAT, Vec2
+from companion.sitl_config.faults import FaultKind
+from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import AutopilotBackend, StubBackend
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.faults.injector import Faults, Sample, sample
@@ -332,6 +332,7 @@ class Sitl:
         return {
             "autopilot": self.autopilot.about(),
             "payload_kg": self._config.payload_kg,
+            "knobs": self._config.model_dump(mode="json"),
             "thrown": world.thrown_t_s is not None,
             "caught": caught is not None,
             "caught_after_arming_s": since_arming(caught),

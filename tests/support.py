@@ -24,8 +24,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from companion.cli.main import main
-from companion.config.loader import load_flight
 from companion.model.types import Inputs, Outputs
+from companion.sitl_config.loader import load_sitl
 
 ROOT = Path(__file__).parents[1]
 CATCH = ROOT / "configs/missions/catch.yaml"
@@ -262,7 +262,7 @@ class World:
 
     def __init__(self, sandbox: Sandbox, mission: Path = CATCH, overrides: Sequence[str] = ()) -> None:
         self._config = sandbox.cwd / "world.json"
-        self._config.write_text(load_flight(mission, overrides=overrides).model_dump_json(), encoding="utf-8")
+        self._config.write_text(load_sitl(mission, overrides=overrides).model_dump_json(), encoding="utf-8")
         self._log = sandbox.cwd / "world.log"
         with open(self._log, "wb") as log:
             self.process = subprocess.Popen(

@@ -13,9 +13,9 @@ from typing import Any
 
 from benchmarks.measuring.far_end import stand_apart
 from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
-from companion.config.loader import load_flight
 from companion.launcher.sitl_process import SitlProcess
 from companion.runtime.event_loop import run
+from companion.sitl_config.loader import load_sitl
 
 # Present current, velocity and position of an XM430 lie together (126, 10 bytes); goal current is 102.
 _PRESENT_ADDRESS, _PRESENT_BYTES, _GOAL_CURRENT_ADDRESS, _GOAL_CURRENT_BYTES = 126, 10, 102, 2
@@ -92,7 +92,7 @@ def bare_dynamixel_in_world(cycles: int, mission: Path, folder: Path) -> BusCycl
     Raises:
         LaunchError: the world did not start.
     """
-    world = SitlProcess(load_flight(mission), folder)
+    world = SitlProcess(load_sitl(mission), folder)
     try:
         return _bus_cycles(world.devices()["arm"]["port"], cycles)
     finally:

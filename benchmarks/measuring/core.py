@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.fast_loop import core_us, flight_us, law_us, raw_step_us
 from benchmarks.measuring.latency import Latency
-from companion.config.loader import load_flight
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import TICK_S
 from sitl.world.world import PHYSICS_DT_S
 from tests.support import CATCH
@@ -23,7 +23,7 @@ def measure(say: Callable[[str], None], repeats: int = REPEATS) -> dict[str, Any
         BenchmarkError: the flight did not complete.
     """
     say("flights in the fast closed loop")
-    tick_us, flight, result = flight_us(load_flight(CATCH), repeats)
+    tick_us, flight, result = flight_us(load_sitl(CATCH), repeats)
     say("core, law, raw MuJoCo")
     law, _ = law_us(flight.config, result.inputs, repeats)
     raw_us = raw_step_us(flight.config, flight.plant.world, result, repeats)

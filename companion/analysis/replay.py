@@ -102,10 +102,10 @@ def check_replayable(log: FlightLog) -> str:
 
 def flight_core(config_json: str) -> Core:
     """Make the flight core from a recorded configuration."""
-    from companion.config.loader import FlightConfig
+    from companion.config.loader import logged_flight
     from companion.core.flight_core import FlightCore
 
-    core: Core = FlightCore(FlightConfig.model_validate_json(config_json))
+    core: Core = FlightCore(logged_flight(config_json))
     return core
 
 

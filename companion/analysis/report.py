@@ -13,6 +13,7 @@ from companion.analysis.animation import movie_of, player_html
 from companion.analysis.log import FlightLog
 from companion.analysis.page import CLOSING, folded, opening, picture
 from companion.analysis.plots import Plot, write_plots
+from companion.analysis.summary import effective_config
 
 _STYLE = """
 :root { --width: 62rem; }
@@ -42,6 +43,7 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
 
 def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
     about = log.metadata.get("companion", {})
+    config = effective_config(log, summary)
     mission = (log.config.get("mission") or {}).get("name", "flight")
     vehicle = (log.config.get("vehicle") or {}).get("name", "")
     outcome = str(summary["outcome"])
@@ -72,7 +74,7 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
             for name, value in sorted(about.items())
             if name.startswith("version_")
         ),
-        folded("Effective configuration", json.dumps(log.config, indent=2) if log.config else ""),
+        folded("Effective configuration", json.dumps(config, indent=2) if config else ""),
         *(
             folded(f"Metadata: {name}", json.dumps(values, indent=2, sort_keys=True))
             for name, values in sorted(log.metadata.items())

@@ -47,6 +47,7 @@ def empty_summary(
         "events": [],
         "tether": {"min_slack_m": None},
         "graded_every": 1,
+        "world": None,
     }
 
 
@@ -105,6 +106,12 @@ def summarise(
         graded_every=log.stride,
     )
     return summary
+
+
+def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
+    """Return the log's configuration, with that of the simulated world if the summary holds it; empty if the log has none."""
+    world = summary.get("world")
+    return {**log.config, "world": world} if log.config and world else log.config
 
 
 def write_summary(summary: dict[str, Any], path: Path) -> None:

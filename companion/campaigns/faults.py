@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.config.faults import KINDS, PHASES, FaultKind, FlightPhase
 from companion.config.vehicle import Vehicle
 from companion.model.types import Event, Outcome, PhaseKind, SafetyAction, Vec3
+from companion.sitl_config.faults import KINDS, PHASES, FaultKind, FlightPhase
 
 Row = dict[str, Any]
 

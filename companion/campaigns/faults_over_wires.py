@@ -14,11 +14,11 @@ from typing import Any
 
 from companion.analysis.log import FlightLog, LogError
 from companion.campaigns.faults import Flown, Point, Row, Tick, Variant, row_of
-from companion.config.faults import FlightPhase
 from companion.config.loader import FlightConfig
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
 from companion.safety.touchdown import HEIGHT_MARGIN_M
+from companion.sitl_config.faults import FlightPhase
 
 FLIGHT_TIMEOUT_S = 240.0
 LEAVE_TIMEOUT_S = 60.0

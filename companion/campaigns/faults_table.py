@@ -14,7 +14,7 @@ from rich.table import Table
 
 from companion.analysis.page import CLOSING, folded, opening
 from companion.campaigns.faults import GOOD, Row, good, outcomes
-from companion.config.faults import KINDS, PHASES
+from companion.sitl_config.faults import KINDS, PHASES
 
 _STYLE = """
 :root { --width: 84rem; }

@@ -19,10 +19,10 @@ import numpy as np
 from companion.config.base import Model, NonNegative
 from companion.config.document import ConfigError, problem_lines
 from companion.config.explain import validate
-from companion.config.world import World
 from companion.config.yaml_strict import read_document
 from companion.config.yaml_text import flow_text
 from companion.model.types import Outcome
+from companion.sitl_config.world import World
 
 Row = dict[str, Any]
 

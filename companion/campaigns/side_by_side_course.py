@@ -10,6 +10,7 @@ import numpy as np
 
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
+from companion.analysis.summary import effective_config
 from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 
@@ -121,4 +122,4 @@ class Flight:
 
 def flight_of(letter: str, name: str, path: str, digest: str, log: FlightLog, summary: dict[str, Any]) -> Flight:
     """What a comparison needs of a flight; the ticks of the log are not kept."""
-    return Flight(letter, name, path, digest, summary, log.config, log.metadata, course_of(log))
+    return Flight(letter, name, path, digest, summary, effective_config(log, summary), log.metadata, course_of(log))

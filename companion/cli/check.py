@@ -40,6 +40,7 @@ from companion.recorder.client import RecorderProcess
 from companion.runtime.clock import flight_clock
 from companion.runtime.console import console_on, tell
 from companion.runtime.subprocesses import LaunchError
+from companion.sitl_config.loader import SitlConfig
 
 GROUPS = {
     "px4": "PX4",
@@ -63,14 +64,14 @@ Plans = Callable[[FlightConfig], list[str]]
 class Task:
     """The command's arguments."""
 
-    config: FlightConfig
+    config: SitlConfig
     mission: str
     sitl: str | None
     hand: bool
     json: bool
 
 
-def run(arguments: argparse.Namespace, config: FlightConfig, problems: Plans) -> int:
+def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> int:
     """Run the command and return the exit code.
 
     Args:
@@ -115,12 +116,12 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
     Raises:
         LaunchError: the simulated world does not start.
     """
-    config = task.config
+    config = task.config.flight
     with contextlib.ExitStack() as stack:
         line = stack.enter_context(_Line(people))
         if task.sitl is not None:
             line("the simulated world starts")
-            world = SitlProcess(config, scratch, px4=task.sitl == "px4")
+            world = SitlProcess(task.config, scratch, px4=task.sitl == "px4")
             stack.callback(world.stop)
             config = replace_device_settings(config, world.devices(line.world))
         line("recorder")

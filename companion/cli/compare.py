@@ -19,10 +19,10 @@ from companion.campaigns.process import CampaignProcess, Message
 from companion.cli.campaign import Flown, Place, count, fly, versions, wide_console
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
-from companion.config.loader import FlightConfig, load_flight
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_LOST
 from companion.runtime.console import tell
+from companion.sitl_config.loader import SitlConfig, load_sitl
 
 
 def add_parser(commands: Any) -> None:
@@ -80,7 +80,7 @@ class _Grid:
     """What is to be flown."""
 
     variants: list[Variant]
-    configs: list[FlightConfig]
+    configs: list[SitlConfig]
     flights: list[Flight]
 
     def job(self, jobs: int | None, scheduler: str | None) -> Message:
@@ -130,12 +130,12 @@ def _grid(arguments: argparse.Namespace) -> _Grid:
         variants = variants_of(PRESETS, arguments.controllers, arguments.presets, arguments.ablation)
     except ValueError as error:
         raise ConfigError([f"companion compare: {error}"]) from None
-    configs: list[FlightConfig] = []
+    configs: list[SitlConfig] = []
     for variant in variants:
         overrides = (*arguments.overrides, *variant.overrides)
         try:
             configs.append(
-                load_flight(arguments.mission, arguments.vehicle, variant.controller, variant.base_preset, overrides)
+                load_sitl(arguments.mission, arguments.vehicle, variant.controller, variant.base_preset, overrides)
             )
         except ConfigError as error:
             # What is wrong for the first one is likely to be wrong for all; what only a later one refuses is its own.

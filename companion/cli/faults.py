@@ -16,11 +16,11 @@ from companion.campaigns.process import CampaignProcess
 from companion.cli.campaign import Flown, Place, count, fly, versions, wide_console
 from companion.config.document import ConfigError
 from companion.config.explain import nearest
-from companion.config.faults import KINDS, PHASES, FlightPhase
-from companion.config.loader import FlightConfig, load_flight
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_LOST, EXIT_OK
 from companion.runtime.console import tell
+from companion.sitl_config.faults import KINDS, PHASES, FlightPhase
+from companion.sitl_config.loader import SitlConfig, load_sitl
 
 DEFAULT_MISSION = "configs/missions/catch.yaml"
 _RESULTS = "faults.json"
@@ -127,7 +127,7 @@ def _flights(arguments: argparse.Namespace) -> list[tuple[Variant, FlightPhase]]
     return chosen
 
 
-def _config(arguments: argparse.Namespace) -> FlightConfig:
+def _config(arguments: argparse.Namespace) -> SitlConfig:
     """Checked before anything flies.
 
     Raises:
@@ -136,7 +136,7 @@ def _config(arguments: argparse.Namespace) -> FlightConfig:
     for override in arguments.overrides:
         if override.partition("=")[0].strip().partition("[")[0] == "world.faults":
             raise ConfigError(["companion faults: --set world.faults: the campaign sets it; use --kinds and --phases"])
-    config = load_flight(
+    config = load_sitl(
         arguments.mission, arguments.vehicle, arguments.controller, arguments.preset, arguments.overrides
     )
     problems = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
@@ -146,7 +146,7 @@ def _config(arguments: argparse.Namespace) -> FlightConfig:
 
 
 def _fly(
-    config: FlightConfig, flights: Sequence[tuple[Variant, FlightPhase]], arguments: argparse.Namespace, out: Path
+    config: SitlConfig, flights: Sequence[tuple[Variant, FlightPhase]], arguments: argparse.Namespace, out: Path
 ) -> Flown[Row]:
     if arguments.wires:
         wires = WireFlights(_fly_options(arguments), config, out, arguments.jobs or default_jobs())
@@ -180,7 +180,7 @@ def _fly_options(arguments: argparse.Namespace) -> list[str]:
     return options
 
 
-def _show(config: FlightConfig, flown: Flown[Row], arguments: argparse.Namespace, out: Path) -> int:
+def _show(config: SitlConfig, flown: Flown[Row], arguments: argparse.Namespace, out: Path) -> int:
     rows = flown.rows
     table: dict[str, Any] = {"rows": rows, "summary": summary(rows)}
     settings = {

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from companion.cli.planning_progress import PlanningProgress
+from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
-from companion.config.loader import FlightConfig, load_flight
-from companion.config.schema import schema_json
+from companion.config.loader import FlightConfig
 from companion.install.extras import missing_extra
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell, terminal_console
 from companion.runtime.subprocesses import use_default_signals
+from companion.sitl_config.loader import SitlConfig, load_sitl
 
 _WITH_MODULES = (
     *(
@@ -184,11 +185,11 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
     )
 
 
-def _load(arguments: argparse.Namespace, *, hardware: bool) -> FlightConfig:
+def _load(arguments: argparse.Namespace, *, hardware: bool) -> SitlConfig:
     for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
         if path is not None and not path.strip():
             raise ConfigError([f"companion {arguments.command}: {name}: expected the name of a file, got an empty one"])
-    return load_flight(
+    return load_sitl(
         arguments.mission,
         arguments.vehicle,
         arguments.controller,

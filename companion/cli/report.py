@@ -116,6 +116,7 @@ def graded(path: Path) -> Graded:
         "preset": _setting(log, "preset"),
         "payload_kg": known.get("payload_kg"),
         "recorder": {**own["recorder"], **(known.get("recorder") or {})},
+        "world": known.get("world"),
         "autopilot": known.get("autopilot") or autopilot_of(log, {}),
     }
     # The guardian acts after the last tick: its events are no outputs of the core.

@@ -16,10 +16,10 @@ from companion.campaigns.robustness import DRIVERS, SAFE, Cases, Row
 from companion.campaigns.robustness_table import flights_table, thirds_table
 from companion.cli.campaign import Flown, Place, count, fly, versions, wide_console
 from companion.config.document import ConfigError
-from companion.config.loader import FlightConfig, load_flight
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_LOST
 from companion.runtime.console import tell
+from companion.sitl_config.loader import SitlConfig, load_sitl
 
 DEFAULT_MISSION = "configs/missions/catch.yaml"
 _RESULTS = "robustness.json"
@@ -67,7 +67,7 @@ class _Job:
     """What is to be flown."""
 
     mission: str
-    config: FlightConfig
+    config: SitlConfig
     cases: tuple[robustness.Case, ...]
     """Empty: draws."""
 
@@ -128,7 +128,7 @@ def _job(arguments: argparse.Namespace) -> _Job:
     # Another law has presets of its own.
     preset = arguments.preset or (kept.preset if kept is not None and arguments.controller is None else None)
     law = arguments.controller or (kept.controller if kept is not None else None)
-    config = load_flight(mission, arguments.vehicle, law, preset, arguments.overrides)
+    config = load_sitl(mission, arguments.vehicle, law, preset, arguments.overrides)
     problems = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
     if problems:
         raise ConfigError(problems)

@@ -27,7 +27,6 @@ from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.vehicle import ANY_INTERFACE, Vehicle
-from companion.config.world import World
 from companion.config.yaml_strict import read_document
 
 M = TypeVar("M", bound=Model)
@@ -45,6 +44,7 @@ class Sources(Model):
     phases: tuple[str, ...]
     """file:line:col of each phase of the mission."""
     overrides: tuple[str, ...]
+    """`--set` options as given, without those of the simulated world."""
 
 
 class FlightConfig(Model):
@@ -53,7 +53,6 @@ class FlightConfig(Model):
     mission: Mission
     vehicle: Vehicle
     controller: ControllerConfig
-    world: World
     sources: Sources
 
 
@@ -73,7 +72,8 @@ def load_flight(
         vehicle_path: vehicle file instead of the one that the mission names.
         controller_law: law instead of the one that the mission names (a key of `PRESETS`).
         preset: built-in preset of that law, or of the mission's, instead of the mission's choice.
-        overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked.
+        overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Those of the section `world`
+            are not read: they belong to the simulated world (`companion.sitl_config`).
         hardware: the vehicle file's addresses are used: no SITL replaces them. Then each must name one network.
 
     Raises:
@@ -82,12 +82,12 @@ def load_flight(
     parsed = parse_overrides(overrides)
     lines: list[str] = []
     mission_file = read_document(mission_path)
-    mission = _check(Mission, mission_file, "mission", parsed, lines)
+    mission = check_document(Mission, mission_file, "mission", parsed, lines)
 
     vehicle: Vehicle | None = None
     vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, lines)
     if vehicle_file is not None:
-        vehicle = _check(Vehicle, vehicle_file, "vehicle", parsed, lines)
+        vehicle = check_document(Vehicle, vehicle_file, "vehicle", parsed, lines)
         if hardware and vehicle is not None:
             lines += _open_to_every_network(vehicle, vehicle_file)
 
@@ -103,8 +103,7 @@ def load_flight(
     if controller_file is not None:
         controller = _check_controller(controller_file, parsed, lines)
 
-    world = _check(World, Document("world", {}), "world", parsed, lines)
-    if lines or mission is None or vehicle is None or controller is None or world is None:
+    if lines or mission is None or vehicle is None or controller is None:
         raise ConfigError(lines)
     assert vehicle_file is not None
     assert controller_file is not None
@@ -112,13 +111,12 @@ def load_flight(
         mission=mission,
         vehicle=vehicle,
         controller=controller,
-        world=world,
         sources=Sources(
             mission=mission_file.source,
             vehicle=vehicle_file.source,
             controller=controller_file.source,
             phases=tuple(str(mission_file.origin(("phases", index))) for index in range(len(mission.phases))),
-            overrides=tuple(overrides),
+            overrides=tuple(text for text, one in zip(overrides, parsed, strict=True) if one.section != "world"),
         ),
     )
 
@@ -130,29 +128,32 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
         ConfigError: one line per problem.
     """
     lines: list[str] = []
-    vehicle = _check(Vehicle, read_document(path), "vehicle", parse_overrides(overrides), lines)
+    vehicle = check_document(Vehicle, read_document(path), "vehicle", parse_overrides(overrides), lines)
     if vehicle is None:
         raise ConfigError(lines)
     return vehicle
 
 
-def load_world(overrides: Sequence[str] = ()) -> World:
-    """The simulated world of the `world.` overrides; there is no file of it.
+def logged_flight(config_json: str) -> FlightConfig:
+    """Return the configuration that a log holds. Older logs also hold the simulated world's, which is left out.
 
     Raises:
-        ConfigError: one line per problem.
+        ValueError: not JSON, or not a configuration of this version.
     """
-    lines: list[str] = []
-    world = _check(World, Document("world", {}), "world", parse_overrides(overrides), lines)
-    if world is None:
-        raise ConfigError(lines)
-    return world
+    data = json.loads(config_json)
+    if isinstance(data, dict):
+        data.pop("world", None)
+    return FlightConfig.model_validate_json(json.dumps(data))
 
 
-def _check(
+def check_document(
     model: type[M], document: Document, section: Section, overrides: list[Override], lines: list[str]
 ) -> M | None:
-    """One document, overridden and validated; what is wrong with it is appended to `lines`."""
+    """Override and validate a document; one line per problem is appended to `lines`.
+
+    Returns:
+        The model, or None if the document has a problem.
+    """
     _override(document, section, overrides, lines)
     return _validated(model, document, lines)
 

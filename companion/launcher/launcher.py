@@ -39,6 +39,7 @@ from companion.runtime.subprocesses import (
     terminate,
     write_text,
 )
+from companion.sitl_config.loader import SitlConfig
 
 SITL_SETTLE_TIMEOUT_S = 40.0
 """Time for the simulated world to come to rest after the flight process is gone."""
@@ -91,13 +92,14 @@ class Launcher:
     """Runs one flight.
 
     Args:
-        config: checked configuration; with SITL the device addresses are replaced by the simulated world's.
+        config: checked configuration; with SITL the device addresses are replaced by the simulated world's. Only sitl is
+            given the configuration of the world.
         out: existing folder for all files of the flight.
         sitl: False for hardware; True or "stub" for the simulated world with the PX4 stub; "px4" with a real PX4.
         on_message: called with every message of the flight process, for the display; messages of the world have "source": "sitl".
     """
 
-    def __init__(self, config: FlightConfig, out: Path, *, sitl: bool | Sitl, on_message: OnMessage) -> None:
+    def __init__(self, config: SitlConfig, out: Path, *, sitl: bool | Sitl, on_message: OnMessage) -> None:
         self._config = config
         self._out = out
         self._sitl_kind = sitl
@@ -135,9 +137,9 @@ class Launcher:
         sitl: SitlProcess | None = None
         keep_off(self._config.vehicle.computer.cpus)
         try:
-            config = self._config
+            config = self._config.flight
             if self._sitl_kind:
-                sitl = SitlProcess(config, self._out, px4=self._sitl_kind == "px4")
+                sitl = SitlProcess(self._config, self._out, px4=self._sitl_kind == "px4")
                 config = replace_device_settings(
                     config, sitl.devices(self._on_world_message, lambda: self._stop_requested)
                 )

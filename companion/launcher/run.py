@@ -9,18 +9,18 @@ from rich.console import Console
 
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import empty_summary, summarise, write_summary
-from companion.config.loader import FlightConfig
 from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
 from companion.model.types import Outcome
 from companion.runtime.console import FlightDisplay, print_result, tell
 from companion.runtime.ipc import Message
 from companion.runtime.subprocesses import LaunchError
+from companion.sitl_config.loader import SitlConfig
 
 TICKS_MAX = 60_000
 """A longer flight (over 5 minutes at 200 Hz) is evaluated and drawn with fewer ticks: one hour at full rate would need 6 GB."""
 
 
-def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
+def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
     """Run a flight, write its summary and, if requested, its report; return the exit code."""
     where = config.vehicle.name if sitl is None else "SITL" if sitl == "stub" else "a real PX4 in SITL"
     title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
@@ -60,7 +60,7 @@ def run_flight(config: FlightConfig, out: Path, *, sitl: Sitl | None, console: C
     return result.exit_code
 
 
-def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[FlightLog | None, dict[str, Any]]:
+def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[FlightLog | None, dict[str, Any]]:
     """Read the log, if there is one, and write summary.json."""
     log = None
     path = out / "flight.mcap"
@@ -78,6 +78,7 @@ def _summary(config: FlightConfig, result: FlightResult, out: Path) -> tuple[Fli
     }
     summary = summarise(log, **about) if log is not None else empty_summary(**about)
     summary["autopilot"] = autopilot_of(log, result.world)
+    summary["world"] = result.world.get("knobs")
     logged = {event["id"] for event in summary["events"]}
     summary["events"] += [event for event in result.events if event["id"] not in logged]
     summary["events"] += result.guardian_events

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from companion.config.loader import FlightConfig
 from companion.runtime.subprocesses import LaunchError, how_it_ended, last_line, terminate, write_text
+from companion.sitl_config.loader import SitlConfig
 
 SITL_READY_TIMEOUT_S = 30.0
 PX4_READY_TIMEOUT_S = 700.0
@@ -31,12 +31,12 @@ class SitlProcess:
     """A running simulated world.
 
     Args:
-        config: configuration of the flight.
+        config: configuration of the flight and its world.
         out: folder of the flight.
         px4: use a real PX4 instead of the stub.
     """
 
-    def __init__(self, config: FlightConfig, out: Path, *, px4: bool = False) -> None:
+    def __init__(self, config: SitlConfig, out: Path, *, px4: bool = False) -> None:
         self._px4 = px4
         self._error: str | None = None
         path = out / "sitl_config.json"

@@ -10,8 +10,8 @@ from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol
 
-from companion.config.world import World as WorldConfig
 from companion.model.types import Vec4
+from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery, Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.estimator import Estimator

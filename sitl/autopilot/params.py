@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 
-from companion.config.px4_defaults import PX4_DEFAULTS as PX4_DEFAULTS
+from companion.px4.defaults import PX4_DEFAULTS as PX4_DEFAULTS
 from companion.px4.wanted import BY_NAME, simulated_values
 
 MAV_PARAM_TYPE_INT32 = 6

@@ -1,7 +1,7 @@
 """`python -m sitl.campaigns.faults`: one mission with one fault after the other, in the fast loop. Started by `companion faults`.
 
 Standard input: one line of JSON, then nothing; when it ends, so does the campaign.
-    config        effective configuration (`FlightConfig`)
+    config        effective configuration (`SitlConfig`)
     flights       {kind, size, duration_s, phase}, as of `companion.campaigns.faults.Variant`
     jobs          processes; null: one per core
     scheduler     address of a Dask scheduler instead; null: this machine
@@ -16,10 +16,10 @@ import sys
 import time
 
 from companion.campaigns.faults import Flown, Point, Tick, Variant, row_of
-from companion.config.loader import FlightConfig
 from companion.model.frames import quat_rotate, tilt_rad
 from companion.model.types import Outcome
 from companion.safety.touchdown import HEIGHT_MARGIN_M
+from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns import flights as campaign
 from sitl.campaigns.flights import CampaignError, Data
 from sitl.fast.loop import FastFlight, FastResult
@@ -38,7 +38,7 @@ def fly(config_json: str, flight: Data) -> Data:
     variant = Variant(flight["kind"], flight["size"], flight["duration_s"])
     data = json.loads(config_json)
     data["world"]["faults"] = [variant.fault(flight["phase"])]
-    config = FlightConfig.model_validate_json(json.dumps(data))
+    config = SitlConfig.model_validate_json(json.dumps(data))
     fast, result, error = None, FastResult(), None
     try:
         fast = FastFlight(config)
@@ -94,13 +94,13 @@ def grid(job: Data) -> tuple[list[str], list[Data]]:
     Raises:
         CampaignError: the mission has no such phase.
     """
-    config = FlightConfig.model_validate_json(json.dumps(job["config"]))
+    config = SitlConfig.model_validate_json(json.dumps(job["config"]))
     flights = [{**flight, "variant": 0} for flight in job["flights"]]
     for phase in {flight["phase"] for flight in flights}:
         faults = [{"kind": "mocap_loss", "phase": phase}]
         data = {**job["config"], "world": {**job["config"]["world"], "faults": faults}}
         try:
-            in_time(FlightConfig.model_validate_json(json.dumps(data)))
+            in_time(SitlConfig.model_validate_json(json.dumps(data)))
         except FaultError as error:
             raise CampaignError(str(error), bad_input=True) from None
     return [config.model_dump_json()], flights

@@ -1,7 +1,7 @@
 """`python -m sitl.campaigns.flights`: flies a grid of fast flights over cores or over machines. Started by `companion compare`.
 
 Standard input: one line of JSON, then nothing; when it ends, so does the campaign.
-    configs       effective configurations (`FlightConfig`), one per variant
+    configs       effective configurations (`SitlConfig`), one per variant
     flights       {variant, controller, preset, payload_kg, seed, series}: `variant` counts in `configs`
     jobs          processes; null: one per core
     scheduler     address of a Dask scheduler instead; null: this machine
@@ -32,6 +32,7 @@ from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.config.loader import FlightConfig
 from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Sent, Severity
+from companion.sitl_config.loader import SitlConfig
 from sitl.fast.loop import FastFlight, FastResult
 
 SCHEDULER_TIMEOUT_S = 10.0
@@ -63,7 +64,7 @@ def fly(config_json: str, flight: Data) -> Data:
     start_s = time.perf_counter()
     data = json.loads(config_json)
     data["world"].update(payload_kg=flight["payload_kg"], seed=flight["seed"])
-    config = FlightConfig.model_validate_json(json.dumps(data))
+    config = SitlConfig.model_validate_json(json.dumps(data))
     result, caught_t_s, error = FastResult(), None, None
     try:
         fast = FastFlight(config)
@@ -72,7 +73,7 @@ def fly(config_json: str, flight: Data) -> Data:
     # A law that cannot go on ends its flight process: that flight is lost, and the others are flown all the same.
     except Exception as failure:
         error = f"{type(failure).__name__}: {failure}"
-    row, log = row_of(config, result, caught_t_s, error)
+    row, log = row_of(config.flight, result, caught_t_s, error)
     head = {key: flight[key] for key in ("controller", "preset", "payload_kg", "seed")}
     series = series_of(log) if flight["series"] and log.inputs else None
     return {"row": {**head, **row}, "series": series, "wall_s": time.perf_counter() - start_s}

@@ -1,7 +1,7 @@
 """`python -m sitl.campaigns.robustness`: one mission flown in many worlds, each drawn at random. Started by `companion robustness`.
 
 Standard input: one line of JSON, then nothing; when it ends, so does the campaign.
-    config        effective configuration (`FlightConfig`)
+    config        effective configuration (`SitlConfig`)
     seed          of the draws
     first, count  numbers of the draws: a draw depends on the seed and its own number, not on how many are flown
     fixed         keys of the world that are not drawn, nor a case's: as the configuration has them
@@ -23,12 +23,12 @@ import numpy as np
 
 from companion.analysis import metrics
 from companion.analysis.log import FlightLog
-from companion.config.loader import FlightConfig
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.mission.plan import Plan
 from companion.model.types import Outcome, PhaseKind, SafetyAction
+from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns import flights as campaign
 from sitl.campaigns.flights import CampaignError, Data
 from sitl.fast.loop import FastFlight, FastResult
@@ -168,7 +168,7 @@ def fly(config_json: str, flight: Data) -> Data:
     begun_s = time.perf_counter()
     data = json.loads(config_json)
     data["world"].update(flight["world"])
-    config = FlightConfig.model_validate_json(json.dumps(data))
+    config = SitlConfig.model_validate_json(json.dumps(data))
     result, error = FastResult(), None
     thrown = felt = False
     caught_t_s: float | None = None
@@ -181,7 +181,7 @@ def fly(config_json: str, flight: Data) -> Data:
     # A law that cannot go on ends its flight process: that flight is lost, and the others are flown all the same.
     except Exception as failure:
         error = f"{type(failure).__name__}: {failure}"
-    graded, log = campaign.row_of(config, result, caught_t_s, error)
+    graded, log = campaign.row_of(config.flight, result, caught_t_s, error)
     row = {
         **{key: flight[key] for key in ("name", "number", "world")},
         **_row(graded, log, result),
@@ -254,7 +254,7 @@ def grid(job: Data) -> tuple[list[str], list[Data]]:
     Raises:
         CampaignError: nothing can be thrown at the mission.
     """
-    config = FlightConfig.model_validate_json(json.dumps(job["config"]))
+    config = SitlConfig.model_validate_json(json.dumps(job["config"]))
     if job["cases"] is not None:
         flights = [{"name": case["name"], "number": None, "world": case["world"]} for case in job["cases"]]
     else:

@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from companion.config.faults import FaultKind
-from companion.config.loader import FlightConfig
 from companion.core.flight_core import FlightCore
 from companion.io.dynamixel.registers import WATCHDOG_ERROR
 from companion.io.px4.delta_velocity import DeltaVelocity
@@ -40,6 +38,8 @@ from companion.model.types import (
     Vec4,
     VehicleState,
 )
+from companion.sitl_config.faults import FaultKind
+from companion.sitl_config.loader import SitlConfig
 from sitl.autopilot.autopilot import Command7, Px4Stub
 from sitl.autopilot.backend import set_hover_thrust, stub_of
 from sitl.autopilot.commander import FORCE_MAGIC, Command
@@ -141,7 +141,7 @@ class FastFlight:
         command: what the operator asks for at a flight time, for tests.
     """
 
-    def __init__(self, config: FlightConfig, land_at_s: float | None = None) -> None:
+    def __init__(self, config: SitlConfig, land_at_s: float | None = None) -> None:
         config = in_time(config)
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
@@ -163,7 +163,7 @@ class FastFlight:
             vehicle = vehicle.model_copy(update={"airframe": airframe})
             config = config.model_copy(update={"vehicle": vehicle})
         self.config = config
-        self.core = FlightCore(config)
+        self.core = FlightCore(config.flight)
         self._watchdog_s = vehicle.devices.arm.watchdog_ms * 1e-3
         for drive in self._drives:
             drive.mode, drive.torque_on = MODE_CURRENT, True

@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from companion.config.faults import Fault, FaultKind
-from companion.config.world import World as WorldConfig
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
 from companion.model.types import Quat, Vec3, Vec4
+from companion.sitl_config.faults import Fault, FaultKind
+from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.modes import NavState
 from sitl.servo.drive import COUNTS_PER_TURN, ServoDrive
 from sitl.world.model import SECOND, SECOND_CATCH

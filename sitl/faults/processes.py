@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from companion.config.faults import FaultKind
 from companion.model.frames import tilt_rad
 from companion.model.types import Vec3
+from companion.sitl_config.faults import FaultKind
 from sitl.autopilot.modes import NavState
 
 FlightFaultKind = Literal["kill_flight", "stop_flight", "hold_gil", "stall_loop"]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.config.faults import Fault, FaultKind, FlightPhase
-from companion.config.loader import FlightConfig
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.model.flight_stage import SPOOL_S
 from companion.model.types import PhaseKind
+from companion.sitl_config.faults import Fault, FaultKind, FlightPhase
+from companion.sitl_config.loader import SitlConfig
 
 AFTER_CATCH_S = 0.1
 """Phase "catch"."""
@@ -25,7 +25,7 @@ class FaultError(Exception):
     """A fault that this mission has no place for; one line."""
 
 
-def in_time(config: FlightConfig) -> FlightConfig:
+def in_time(config: SitlConfig) -> SitlConfig:
     """The configuration with every fault at a time instead of in a phase, and a heavy payload as the one that is thrown.
 
     Raises:
@@ -41,7 +41,7 @@ def in_time(config: FlightConfig) -> FlightConfig:
     return config.model_copy(update={"world": config.world.model_copy(update=changes)})
 
 
-def _timed(fault: Fault, config: FlightConfig) -> Fault:
+def _timed(fault: Fault, config: SitlConfig) -> Fault:
     if fault.kind in _FROM_START or fault.phase == "ground":
         t_s = REBOOT_ON_GROUND_S if fault.kind == "autopilot_reboot" else 0.0
         return fault.model_copy(update={"after": "start", "t_s": t_s, "phase": None})
@@ -53,7 +53,7 @@ def _timed(fault: Fault, config: FlightConfig) -> Fault:
     return fault.model_copy(update={"after": "arming", "t_s": t_s, "phase": None})
 
 
-def _plan_time_s(phase: FlightPhase, config: FlightConfig) -> float:
+def _plan_time_s(phase: FlightPhase, config: SitlConfig) -> float:
     """Seconds since the plan's start. The line is the first way sideways, before its middle; the return is the last one."""
     plan = Plan.build(config.mission, config.vehicle)
 

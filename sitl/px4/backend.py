@@ -9,10 +9,10 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from companion.config.faults import FaultKind
 from companion.config.vehicle import Airframe
-from companion.config.world import World as WorldConfig
 from companion.model.types import Vec4
+from companion.sitl_config.faults import FaultKind
+from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.backend import Observation
 from sitl.autopilot.modes import NavState

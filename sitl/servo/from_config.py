@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from companion.config.vehicle import ArmDevice, Joint, Vehicle
-from companion.config.world import Servo, World
+from companion.sitl_config.world import Servo, World
 from sitl.servo import registers as reg
 from sitl.servo.model import ServoModel
 

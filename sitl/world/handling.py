@@ -12,7 +12,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.config.world import World as WorldConfig
 from companion.model.frames import (
     quat_conjugate,
     quat_from_euler_zyx,
@@ -21,6 +20,7 @@ from companion.model.frames import (
     yaw_from_quat,
 )
 from companion.model.types import Quat, Vec3
+from companion.sitl_config.world import World as WorldConfig
 
 STIFFNESS_N_M, DAMPING_NS_M = 900.0, 95.0
 TURN_STIFFNESS_NM, TURN_DAMPING_NMS = 40.0, 4.0

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-from companion.config.world import World
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply
 from companion.model.types import Quat, Vec3
+from companion.sitl_config.world import World
 
 _PLACE = {"x": 0, "y": 1, "z": 2}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Airframe, Vehicle
-from companion.config.world import World
+from companion.sitl_config.world import World
 
 PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"

@@ -12,12 +12,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from companion.config.faults import Fault, FaultKind
 from companion.config.vehicle import Joint, Vehicle
-from companion.config.world import Push, Servo
-from companion.config.world import World as WorldConfig
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
 from companion.model.types import Quat, Vec2, Vec3, Vec4
+from companion.sitl_config.faults import Fault, FaultKind
+from companion.sitl_config.world import Push, Servo
+from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
 from sitl.faults.injector import Faults

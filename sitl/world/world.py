@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from companion.config.vehicle import Vehicle
-from companion.config.world import World as WorldConfig
 from companion.model.types import Quat, Vec2, Vec3, Vec4
+from companion.sitl_config.world import World as WorldConfig
 from sitl.world.handling import Wrench
 from sitl.world.model import mjcf
 

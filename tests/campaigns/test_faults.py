@@ -28,8 +28,6 @@ from companion.campaigns.faults_over_wires import _offset_s
 from companion.campaigns.faults_over_wires import flown as flown_over_wires
 from companion.campaigns.faults_table import outcomes_markdown, write_html
 from companion.cli.main import main
-from companion.config.faults import IN_FLIGHT, KINDS, PHASES, FaultKind
-from companion.config.loader import load_flight
 from companion.launcher.launcher import FlightResult
 from companion.launcher.run import _summary
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
@@ -45,9 +43,10 @@ from companion.model.types import (
     Vec3,
 )
 from companion.safety.events import RULES
+from companion.sitl_config.loader import load_sitl
 from tests.support import CATCH, HOVER
 
-VEHICLE = load_flight(CATCH).vehicle
+VEHICLE = load_sitl(CATCH).vehicle
 STANDING_M = VEHICLE.airframe.ground_clearance_m
 LOST = Variant("mocap_loss")
 
@@ -193,7 +192,7 @@ def test_tables_and_files(tmp_path: Path) -> None:
 
 
 def test_a_flight_that_left_nothing_behind_is_lost_and_says_why(tmp_path: Path) -> None:
-    found = flown_over_wires(tmp_path, load_flight(CATCH))
+    found = flown_over_wires(tmp_path, load_sitl(CATCH))
     assert found.outcome == "lost"
     assert "summary.json" in str(found.error)
 
@@ -222,7 +221,7 @@ def test_what_a_dead_recorder_did_not_log_is_in_the_summary_all_the_same(tmp_pat
         "action": "warn",
         "text": "x",
     }
-    _, made = _summary(load_flight(CATCH), FlightResult(Outcome.COMPLETED, events=(told,)), tmp_path)
+    _, made = _summary(load_sitl(CATCH), FlightResult(Outcome.COMPLETED, events=(told,)), tmp_path)
     assert made["events"] == [told]
 
 

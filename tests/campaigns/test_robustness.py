@@ -13,8 +13,8 @@ from companion.campaigns import robustness
 from companion.campaigns.robustness import Kept, Row, as_cases, held_against, read_cases, worst, write_cases
 from companion.campaigns.robustness_plots import write_distribution
 from companion.config.document import ConfigError
-from companion.config.loader import load_flight
 from companion.model.types import Outcome
+from companion.sitl_config.loader import load_sitl
 from tests.support import CATCH
 
 WORLD: dict[str, Any] = {
@@ -108,7 +108,7 @@ def test_the_printed_command_flies_the_same_world() -> None:
     line = robustness.fly_command(str(CATCH), "adaptive", "recommended", WORLD, ["controller.rho_max=5.0"])
     words = shlex.split(line)
     assert words[:4] == ["companion", "fly", str(CATCH), "--sitl"]
-    config = load_flight(CATCH, None, "adaptive", "recommended", words[words.index("--set") + 1 :])
+    config = load_sitl(CATCH, None, "adaptive", "recommended", words[words.index("--set") + 1 :])
     (case,) = as_cases([row(0, 0.04)])
     assert config.world == case.world
 

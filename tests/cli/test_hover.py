@@ -13,8 +13,8 @@ from companion.analysis.hover_fit import HoverFit, VoltageSlope
 from companion.analysis.log import FlightLog
 from companion.cli import main as cli
 from companion.cli.hover import jsonable, lines
-from companion.config.loader import load_flight
 from companion.config.yaml_strict import read_document
+from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from tests.analysis.recorded import record
@@ -26,7 +26,7 @@ ERROR = 0.05
 @pytest.fixture(scope="module")
 def flown() -> tuple[FlightLog, float]:
     """A flight, and the true hover thrust of its world."""
-    flight = FastFlight(load_flight("configs/missions/catch.yaml", overrides=(f"world.hover_thrust_error={ERROR}",)))
+    flight = FastFlight(load_sitl("configs/missions/catch.yaml", overrides=(f"world.hover_thrust_error={ERROR}",)))
     truth = flight.plant.world.hover_command
     return log_of(flight.config, flight.run(), None), truth
 
@@ -62,7 +62,7 @@ def test_the_value_that_it_gives_is_one_that_flies(recorded: Path, capsys: pytes
     told: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert set(told) == set(jsonable(HoverFit(0.5, 0.0, 2.0, None, None, None, None, None)))
     value = told["patch"]["airframe"]["hover_thrust"]
-    config = load_flight("configs/missions/catch.yaml", overrides=(f"vehicle.airframe.hover_thrust={value}",))
+    config = load_sitl("configs/missions/catch.yaml", overrides=(f"vehicle.airframe.hover_thrust={value}",))
     assert config.vehicle.airframe.hover_thrust == value == round(told["hover_thrust"], 4)
     assert told["configured_error"] == pytest.approx(ERROR, abs=0.005)
     assert told["slope_per_v"] is None

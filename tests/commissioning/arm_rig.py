@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.config.loader import load_flight
 from companion.io.devices import SomeEdges, VisionValve
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
@@ -28,6 +27,7 @@ from companion.preflight import arm as preflight
 from companion.preflight.observe import observe
 from companion.runtime.clock import flight_clock
 from companion.runtime.realtime import WORLD_PRIORITY
+from companion.sitl_config.loader import load_sitl
 from sitl.server import start_of
 from sitl.servo.bus import ServoBus
 from sitl.servo.from_config import plugged_in, servos_of
@@ -88,7 +88,7 @@ class Rig:
         return asyncio.run(self._look())
 
     async def _look(self) -> dict[str, Row]:
-        config = load_flight(CATCH, self.vehicle, overrides=self.overrides(_LOOK))
+        config = load_sitl(CATCH, self.vehicle, overrides=self.overrides(_LOOK))
         vehicle, clock, edges = config.vehicle, flight_clock(), SomeEdges(VisionValve())
         async with AsyncExitStack() as stack:
             try:
@@ -128,7 +128,7 @@ def rig(folder: Path, *overrides: str) -> Iterator[Rig]:
 @contextmanager
 def bench(folder: Path, servos: str = "[{}, {}]") -> Iterator[Rig]:
     """Servos with `world.servos` as given, in an arm that stands as the mission begins, and a copy of the shipped vehicle file."""
-    config = load_flight(CATCH, overrides=[f"world.servos={servos}"])
+    config = load_sitl(CATCH, overrides=[f"world.servos={servos}"])
     vehicle, start = config.vehicle, config.mission.start
     models = servos_of(vehicle, config.world)
     for model, joint, angle_rad in zip(

@@ -10,11 +10,11 @@ import pytest
 from companion.commissioning.force_torque import fit as ft_fit
 from companion.commissioning.force_torque.fit import WeightFit
 from companion.config.loader import load_vehicle
-from companion.config.world import World
 from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import ForceSample, Quat, Vec2, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
+from companion.sitl_config.world import World
 from sitl.world.handling import HungWeight
 from tests.support import ROOT
 

@@ -13,7 +13,8 @@ import pytest
 
 from companion.config.controller import LAWS, AdaptiveConfig
 from companion.config.document import ConfigError
-from companion.config.loader import PRESETS, FlightConfig, load_flight, load_vehicle, load_world
+from companion.config.loader import PRESETS, FlightConfig, load_vehicle, logged_flight
+from companion.sitl_config.loader import SitlConfig, load_sitl, load_world
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parent / "data"
@@ -173,11 +174,11 @@ def test_motion_capture_from_every_network_is_refused_unless_the_world_is_simula
         f'{VEHICLE}:63:16: devices.mocap.interface: expected the address of this computer on the camera network, got "0.0.0.0" (every network); '
         "`ip -4 address` shows it, `companion mocap check` proposes it; only a flight with --sitl does not need it"
     )
-    assert lines_of(lambda: load_flight(CATCH, hardware=True)) == [line]
-    assert load_flight(CATCH).vehicle.devices.mocap.interface == "0.0.0.0"
-    given = load_flight(CATCH, overrides=["vehicle.devices.mocap.interface=192.168.1.20"], hardware=True)
+    assert lines_of(lambda: load_sitl(CATCH, hardware=True)) == [line]
+    assert load_sitl(CATCH).vehicle.devices.mocap.interface == "0.0.0.0"
+    given = load_sitl(CATCH, overrides=["vehicle.devices.mocap.interface=192.168.1.20"], hardware=True)
     assert given.vehicle.devices.mocap.interface == "192.168.1.20"
-    told = lines_of(lambda: load_flight(CATCH, overrides=["vehicle.devices.mocap.interface=0.0.0.0"], hardware=True))
+    told = lines_of(lambda: load_sitl(CATCH, overrides=["vehicle.devices.mocap.interface=0.0.0.0"], hardware=True))
     assert told[0].startswith("--set vehicle.devices.mocap.interface")
 
 
@@ -187,7 +188,7 @@ def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]
     text = path.read_text()
     assert text.count(old) >= 1
     path.write_text(text.replace(old, new, 1))
-    assert lines_of(lambda: load_flight(CATCH)) == expected
+    assert lines_of(lambda: load_sitl(CATCH)) == expected
 
 
 BAD_VEHICLE = [
@@ -219,7 +220,7 @@ def test_bad_vehicle_file(project: Path, old: str, new: str, expected: list[str]
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    found = lines_of(lambda: load_flight(CATCH))
+    found = lines_of(lambda: load_sitl(CATCH))
     assert len(found) == len(expected)
     for line, end in zip(found, expected, strict=True):
         assert line.startswith(f"{VEHICLE}:")
@@ -260,12 +261,12 @@ BAD_OVERRIDES = [
 
 @pytest.mark.parametrize(("option", "line"), BAD_OVERRIDES, ids=[option for option, _ in BAD_OVERRIDES])
 def test_bad_override(project: Path, option: str, line: str) -> None:
-    assert lines_of(lambda: load_flight(CATCH, preset="paper", overrides=[option])) == [line]
+    assert lines_of(lambda: load_sitl(CATCH, preset="paper", overrides=[option])) == [line]
 
 
 def test_problems_of_all_files_are_told_together(project: Path) -> None:
     overrides = ["mission.phases[2].duration_s=0", "vehicle.airframe.mass_kg=0", "controller.nu=1", "world.seed=-1"]
-    lines = lines_of(lambda: load_flight(CATCH, overrides=overrides))
+    lines = lines_of(lambda: load_sitl(CATCH, overrides=overrides))
     assert [line.split(":")[0] for line in lines] == [
         "--set mission.phases[2].duration_s",
         "--set vehicle.airframe.mass_kg",
@@ -275,13 +276,13 @@ def test_problems_of_all_files_are_told_together(project: Path) -> None:
 
 
 def test_unknown_controller_and_preset(project: Path) -> None:
-    assert lines_of(lambda: load_flight(CATCH, controller_law="cscc")) == [
+    assert lines_of(lambda: load_sitl(CATCH, controller_law="cscc")) == [
         "--controller cscc: no such controller; available: adaptive, csc, psc"
     ]
-    assert lines_of(lambda: load_flight(CATCH, controller_law="psc", preset="paper")) == [
+    assert lines_of(lambda: load_sitl(CATCH, controller_law="psc", preset="paper")) == [
         "--preset paper: no such preset of 'psc'; available: tuned"
     ]
-    assert lines_of(lambda: load_flight(CATCH, preset="papr")) == [
+    assert lines_of(lambda: load_sitl(CATCH, preset="papr")) == [
         "--preset papr: no such preset of 'adaptive'; available: paper, recommended"
     ]
 
@@ -306,7 +307,7 @@ BAD_LAW_IN_MISSION = [
 def test_unknown_law_or_preset_in_a_mission(project: Path, choice: str, end: str) -> None:
     path = project / CATCH
     path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", choice))
-    [line] = lines_of(lambda: load_flight(CATCH))
+    [line] = lines_of(lambda: load_sitl(CATCH))
     assert line.startswith(f"{CATCH}:9:")
     assert line.endswith(": " + end)
 
@@ -314,10 +315,10 @@ def test_unknown_law_or_preset_in_a_mission(project: Path, choice: str, end: str
 def test_the_preset_option_is_of_the_missions_law(project: Path) -> None:
     path = project / CATCH
     path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", "{law: csc}"))
-    assert load_flight(CATCH).controller.law == "csc"
-    assert load_flight(CATCH, preset="tuned").controller.law == "csc"
-    assert load_flight(CATCH, controller_law="psc").controller.law == "psc"
-    assert lines_of(lambda: load_flight(CATCH, preset="paper")) == [
+    assert load_sitl(CATCH).controller.law == "csc"
+    assert load_sitl(CATCH, preset="tuned").controller.law == "csc"
+    assert load_sitl(CATCH, controller_law="psc").controller.law == "psc"
+    assert lines_of(lambda: load_sitl(CATCH, preset="paper")) == [
         "--preset paper: no such preset of 'csc'; available: tuned"
     ]
 
@@ -334,7 +335,7 @@ def test_unknown_law_in_a_controller_file(project: Path, law: str, end: str) -> 
     path = project / CATCH
     (path.parent / "mine.yaml").write_text(f"schema_version: 1\n{law}\npreset: mine\n")
     path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", "{file: mine.yaml}"))
-    assert lines_of(lambda: load_flight(CATCH)) == [f"configs/missions/mine.yaml{end}"]
+    assert lines_of(lambda: load_sitl(CATCH)) == [f"configs/missions/mine.yaml{end}"]
 
 
 BAD_COMPARISON_OVERRIDES = [
@@ -347,16 +348,16 @@ BAD_COMPARISON_OVERRIDES = [
 
 @pytest.mark.parametrize(("law", "option", "text"), BAD_COMPARISON_OVERRIDES)
 def test_bad_override_of_a_comparison_law(project: Path, law: str, option: str, text: str) -> None:
-    lines = lines_of(lambda: load_flight(CATCH, controller_law=law, overrides=[option]))
+    lines = lines_of(lambda: load_sitl(CATCH, controller_law=law, overrides=[option]))
     assert lines == [f"--set {option.partition('=')[0]}: {text}"]
 
 
 def test_missing_mission() -> None:
-    assert lines_of(lambda: load_flight("none.yaml")) == ["none.yaml: no such file"]
+    assert lines_of(lambda: load_sitl("none.yaml")) == ["none.yaml: no such file"]
 
 
 def test_overrides_reach_every_section(project: Path) -> None:
-    config = load_flight(
+    config = load_sitl(
         CATCH,
         overrides=[
             "world.payload_kg=0.3",
@@ -381,7 +382,7 @@ def test_overrides_reach_every_section(project: Path) -> None:
 def test_override_of_a_key_and_a_section_that_the_file_leaves_to_defaults(project: Path) -> None:
     text = (project / VEHICLE).read_text()
     (project / VEHICLE).write_text(text[: text.index("safety:")])
-    config = load_flight(CATCH, overrides=["vehicle.safety.battery_min=0.3", "vehicle.airframe.hover_thrust=0.5"])
+    config = load_sitl(CATCH, overrides=["vehicle.safety.battery_min=0.3", "vehicle.airframe.hover_thrust=0.5"])
     assert config.vehicle.safety.battery_min == 0.3
     assert config.vehicle.airframe.hover_thrust == 0.5
 
@@ -389,21 +390,21 @@ def test_override_of_a_key_and_a_section_that_the_file_leaves_to_defaults(projec
 @pytest.mark.parametrize(("law", "preset"), [(law, preset) for law, presets in PRESETS.items() for preset in presets])
 @pytest.mark.parametrize("mission", ["catch", "hover"])
 def test_config_survives_a_json_round_trip(mission: str, law: str, preset: str) -> None:
-    config = load_flight(
+    config = load_sitl(
         ROOT / "configs" / "missions" / f"{mission}.yaml",
         controller_law=law,
         preset=preset,
         overrides=["world.payload_kg=0.1"],
     )
     assert type(config.controller) is LAWS[law]
-    again = FlightConfig.model_validate_json(config.model_dump_json())
+    again = SitlConfig.model_validate_json(config.model_dump_json())
     assert again == config
     assert again.model_dump_json() == config.model_dump_json()
     assert json.loads(config.model_dump_json())["controller"]["preset"] == preset
 
 
 def test_paper_preset_is_the_papers_table() -> None:
-    controller = load_flight(ROOT / CATCH, preset="paper").controller
+    controller = load_sitl(ROOT / CATCH, preset="paper").controller
     assert isinstance(controller, AdaptiveConfig)
     assert controller.inertia_md == (1, 1, 1, 0.015, 0.015, 0.015, 0.1, 0.1)
     assert controller.lambda_gain == (1.5, 1.5, 2.0, 3.5, 3.5, 2.5, 1.0, 1.0)
@@ -423,7 +424,7 @@ def test_relative_names_are_relative_to_the_file_that_names_them(
     shutil.copy(ROOT / "configs/controllers/adaptive_paper.yaml", mission.parent / "mine.yaml")
     mission.write_text(mission.read_text().replace("{law: adaptive, preset: recommended}", "{file: mine.yaml}"))
     monkeypatch.chdir(elsewhere)
-    config = load_flight(mission)
+    config = load_sitl(mission)
     assert config.controller.preset == "paper"
     assert config.sources.controller == str(mission.parent / "mine.yaml")
     assert config.sources.phases[1] == f"{mission}:32:5"
@@ -433,7 +434,7 @@ def test_a_vehicle_on_the_command_line_is_relative_to_the_current_directory(
     project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (project / VEHICLE).rename(project / "other.yaml")
-    config = load_flight(CATCH, vehicle_path="other.yaml", overrides=["vehicle.name=other"])
+    config = load_sitl(CATCH, vehicle_path="other.yaml", overrides=["vehicle.name=other"])
     assert config.vehicle.name == "other"
     assert config.sources.vehicle == "other.yaml"
 
@@ -448,7 +449,21 @@ def test_vehicle_and_world_load_alone(project: Path) -> None:
     assert lines_of(lambda: load_world(["world.sed=7"])) == ["--set world.sed: unknown key; did you mean seed?"]
 
 
+def test_a_flights_configuration_holds_nothing_of_the_simulated_world(project: Path) -> None:
+    config = load_sitl(CATCH, overrides=["world.payload_kg=0.37", "vehicle.name=other"])
+    text = config.flight.model_dump_json()
+    assert "0.37" not in text and set(json.loads(text)) == {"mission", "vehicle", "controller", "sources"}
+    assert config.flight.sources.overrides == ("vehicle.name=other",)
+    with pytest.raises(ValueError, match="world"):
+        FlightConfig.model_validate_json(config.model_dump_json())
+
+
+def test_the_world_in_the_configuration_of_an_older_log_is_left_out(project: Path) -> None:
+    config = load_sitl(CATCH, overrides=["world.payload_kg=0.37"])
+    assert logged_flight(config.model_dump_json()) == config.flight
+
+
 def test_a_loaded_config_is_frozen(project: Path) -> None:
-    config = load_flight(CATCH)
+    config = load_sitl(CATCH)
     with pytest.raises(ValueError, match="frozen"):
         config.world.payload_kg = 1.0

@@ -9,8 +9,8 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from companion.cli.schema import KINDS, schema_json
 from companion.config.loader import PRESET_DIRECTORY, PRESETS
-from companion.config.schema import KINDS, schema_json
 from companion.config.yaml_strict import read_document
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.config.controller import AdaptiveConfig, CscConfig
-from companion.config.loader import FlightConfig, load_flight
+from companion.config.loader import FlightConfig
 from companion.control.csc import CscController
 from companion.control.dynamics import Dynamics, rotation_matrix
 from companion.control.factory import build_controller
@@ -17,6 +17,7 @@ from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.frames import quat_rotate
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference, Vec3
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.control.states import POSE, ZERO, at
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
@@ -25,11 +26,11 @@ MISSION = "configs/missions/catch.yaml"
 WEIGHT_N = 3.0 * 9.81
 
 
-def configured(*overrides: str) -> FlightConfig:
-    return load_flight(MISSION, controller_law="csc", overrides=overrides)
+def configured(*overrides: str) -> SitlConfig:
+    return load_sitl(MISSION, controller_law="csc", overrides=overrides)
 
 
-def law(config: FlightConfig) -> CscConfig:
+def law(config: SitlConfig) -> CscConfig:
     assert isinstance(config.controller, CscConfig)
     return config.controller
 
@@ -39,13 +40,13 @@ def flown(*overrides: str) -> FastResult:
     return FastFlight(configured(*overrides)).run()
 
 
-def stepped(config: FlightConfig, state: PlantState, acceleration: Vec3 = ZERO, vertical_scale: float = 1.0) -> Wrench:
+def stepped(config: SitlConfig, state: PlantState, acceleration: Vec3 = ZERO, vertical_scale: float = 1.0) -> Wrench:
     """The first tick: level, and nothing filtered yet."""
     reference = Reference((0.0, 0.0, 1.0), ZERO, acceleration, 0.0, 0.0, POSE, (0.0, 0.0), (0.0, 0.0))
     return CscController(law(config), config.vehicle, 0.49).step(0.005, state, reference, vertical_scale)
 
 
-def acceleration(config: FlightConfig, state: PlantState, wrench: Wrench) -> np.ndarray:
+def acceleration(config: SitlConfig, state: PlantState, wrench: Wrench) -> np.ndarray:
     """chi'' of position and joints that the nominal machine has under the wrench, the attitude being held level."""
     terms = Dynamics(config.vehicle).terms(
         rotation_matrix(IDENTITY_QUAT),
@@ -148,7 +149,7 @@ def test_a_wrong_model_is_visibly_worse(scale: float, sign: int) -> None:
 
 def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
     flight = FastFlight(configured("world.payload_kg=0.2"))
-    again = FlightCore(FlightConfig.model_validate_json(flight.config.model_dump_json()))
+    again = FlightCore(FlightConfig.model_validate_json(flight.config.flight.model_dump_json()))
     result = flown("world.payload_kg=0.2")
     assert [again.step(inputs) for inputs in result.inputs] == result.outputs
 
@@ -156,7 +157,7 @@ def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
 def test_the_factory_builds_the_law_that_is_asked_for() -> None:
     config = configured()
     assert isinstance(build_controller(config.controller, config.vehicle, 0.49), CscController)
-    adaptive = load_flight(MISSION)
+    adaptive = load_sitl(MISSION)
     assert isinstance(adaptive.controller, AdaptiveConfig)
     assert type(build_controller(adaptive.controller, adaptive.vehicle, 0.49)).__name__ == "AdaptiveController"
 

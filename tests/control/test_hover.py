@@ -7,12 +7,12 @@ from functools import cache
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.control.hover import SHARE_MAX, HoverThrust
 from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.types import PlantState
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 
 MASS_KG = 3.0
@@ -116,7 +116,7 @@ def _flown(error: float, adapt: bool, preset: str, faults: str) -> FastResult:
     return result
 
 
-def configured(error: float, adapt: bool, preset: str, faults: str = "[]") -> FlightConfig:
+def configured(error: float, adapt: bool, preset: str, faults: str = "[]") -> SitlConfig:
     """Without the law's own disturbance observer, which would make good for a wrong hover thrust by itself."""
     overrides = (
         "controller.disturbance_time_xyz_s=[0, 0, 0]",
@@ -124,7 +124,7 @@ def configured(error: float, adapt: bool, preset: str, faults: str = "[]") -> Fl
         f"vehicle.airframe.hover_thrust_adapt={str(adapt).lower()}",
         f"world.faults={faults}",
     )
-    return load_flight("configs/missions/catch.yaml", preset=preset, overrides=overrides)
+    return load_sitl("configs/missions/catch.yaml", preset=preset, overrides=overrides)
 
 
 @cache

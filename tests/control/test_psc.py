@@ -11,13 +11,14 @@ import pytest
 from companion.analysis.log import FlightLog
 from companion.analysis.replay import flight_core, replay
 from companion.config.controller import PscConfig
-from companion.config.loader import FlightConfig, load_flight
+from companion.config.loader import FlightConfig
 from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
 from companion.control.psc import PayloadEstimator, PscController
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight, FastResult
 from tests.analysis.recorded import record
@@ -29,16 +30,16 @@ MISSION = "configs/missions/catch.yaml"
 MASS_KG, G = 3.0, 9.81
 
 
-def configured(*overrides: str) -> FlightConfig:
-    return load_flight(MISSION, controller_law="psc", overrides=overrides)
+def configured(*overrides: str) -> SitlConfig:
+    return load_sitl(MISSION, controller_law="psc", overrides=overrides)
 
 
-def law(config: FlightConfig) -> PscConfig:
+def law(config: SitlConfig) -> PscConfig:
     assert isinstance(config.controller, PscConfig)
     return config.controller
 
 
-def controller(config: FlightConfig) -> PscController:
+def controller(config: SitlConfig) -> PscController:
     return PscController(law(config), config.vehicle, 0.49)
 
 
@@ -50,7 +51,7 @@ def flown(*overrides: str) -> FastResult:
 REFERENCE = Reference((0.0, 0.0, 1.0), ZERO, (0.2, 0.0, 0.1), 0.0, 0.0, POSE, (0.0, 0.0), (0.3, -0.2))
 
 
-def stepped(config: FlightConfig, state: PlantState) -> Wrench:
+def stepped(config: SitlConfig, state: PlantState) -> Wrench:
     return controller(config).step(0.005, state, REFERENCE, 1.0)
 
 
@@ -150,7 +151,7 @@ def test_the_mass_estimate_converges_after_the_catch(payload_kg: float) -> None:
 
 
 def test_the_estimate_is_in_the_log_and_comes_out_of_a_replay_bit_for_bit(tmp_path: Path) -> None:
-    flight = FastFlight(load_flight(SHORT_CATCH, controller_law="psc"))
+    flight = FastFlight(load_sitl(SHORT_CATCH, controller_law="psc"))
     log = FlightLog.read(record(log_of(flight.config, flight.run(), None), tmp_path / "flight.mcap"))
     estimates = [o.control.payload_estimate_kg for o in log.outputs if o.control is not None]
     assert None not in estimates
@@ -173,6 +174,6 @@ def test_without_force_sensor_the_mission_goes_on() -> None:
 
 def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
     flight = FastFlight(configured("world.payload_kg=0.2"))
-    again = FlightCore(FlightConfig.model_validate_json(flight.config.model_dump_json()))
+    again = FlightCore(FlightConfig.model_validate_json(flight.config.flight.model_dump_json()))
     result = flown("world.payload_kg=0.2")
     assert [again.step(inputs) for inputs in result.inputs] == result.outputs

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.model.types import (
     AutopilotRequest,
     FlightMode,
@@ -22,6 +21,7 @@ from companion.model.types import (
     Vec3,
     VehicleState,
 )
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.fast.loop import FastFlight, FastResult
 from tests.safety.healthy import put
@@ -29,17 +29,17 @@ from tests.support import CATCH, SHORT_CATCH
 
 replace = dataclasses.replace
 Change = Callable[[Inputs], Inputs]
-STANDS_M = load_flight("configs/missions/catch.yaml").vehicle.airframe.ground_clearance_m
+STANDS_M = load_sitl("configs/missions/catch.yaml").vehicle.airframe.ground_clearance_m
 
 
-def configured(mission: Path) -> FlightConfig:
-    return load_flight(mission, preset="recommended")
+def configured(mission: Path) -> SitlConfig:
+    return load_sitl(mission, preset="recommended")
 
 
 class Spoiled(FastFlight):
     """Motion capture that has the floor elsewhere, and what else the companion is told wrong."""
 
-    def __init__(self, config: FlightConfig, change: Change, lift_m: float) -> None:
+    def __init__(self, config: SitlConfig, change: Change, lift_m: float) -> None:
         super().__init__(config)
         self._change, self._lift_m = change, lift_m
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.core.flight_core import FlightCore
 from companion.model.flight_stage import PEOPLE_CHOOSE
 from companion.model.types import (
@@ -24,6 +23,7 @@ from companion.model.types import (
     Severity,
 )
 from companion.safety.rotor_stop import DISARM_STILL_S
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.safety.healthy import healthy, put
 
@@ -31,8 +31,8 @@ replace = dataclasses.replace
 Change = Callable[[Inputs], Inputs]
 
 
-def configured(*overrides: str) -> FlightConfig:
-    return load_flight("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
+def configured(*overrides: str) -> SitlConfig:
+    return load_sitl("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
 
 
 CONFIG = FastFlight(configured()).config
@@ -137,7 +137,7 @@ def test_one_that_stands_and_does_not_disarm_is_told() -> None:
 class Dies:
     """A companion that dies and is started again; what PX4 does meanwhile is PX4's."""
 
-    def __init__(self, config: FlightConfig, died_s: float, back_s: float) -> None:
+    def __init__(self, config: SitlConfig, died_s: float, back_s: float) -> None:
         self._config, self._died_s, self._back_s = config, died_s, back_s
         self._core = FlightCore(config)
         self._reborn = False

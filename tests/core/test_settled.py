@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.core.flight_core import FlightCore
 from companion.model import flight_stage as seq
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import AutopilotRequest, FlightMode, Inputs, Outcome, Outputs
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from tests.safety.healthy import put
 
@@ -20,8 +20,8 @@ replace = dataclasses.replace
 Change = Callable[[Inputs], Inputs]
 
 
-def configured(*overrides: str) -> FlightConfig:
-    return load_flight("configs/missions/hover.yaml", overrides=overrides)
+def configured(*overrides: str) -> SitlConfig:
+    return load_sitl("configs/missions/hover.yaml", overrides=overrides)
 
 
 class Changed(FastFlight):

@@ -11,7 +11,6 @@ import math
 from collections import deque
 from functools import cache
 
-from companion.config.loader import load_flight
 from companion.core.flight_core import FlightCore
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
@@ -25,6 +24,7 @@ from companion.model.types import (
     Quat,
     VehicleState,
 )
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.support import HOVER
 
@@ -63,7 +63,7 @@ class Begun:
 
 @cache
 def _recorded() -> tuple[FastFlight, list[Inputs]]:
-    flight = FastFlight(load_flight(HOVER, overrides=LOW_HOVER))
+    flight = FastFlight(load_sitl(HOVER, overrides=LOW_HOVER))
     flight.px4.land = Deaf()  # type: ignore[assignment]
     return flight, flight.run().inputs
 

@@ -16,13 +16,14 @@ from companion.analysis.summary import empty_summary
 from companion.campaigns.faults_table import kinds_markdown
 from companion.cli.main import _normalised, _parser
 from companion.config.controller import AdaptiveConfig
-from companion.config.faults import KINDS
 from companion.config.loader import PRESETS, load_flight
 from companion.config.vehicle import Safety
-from companion.config.world import Fault, World
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_CODES
 from companion.model.types import SafetyAction
 from companion.safety.supervisor import HOLD_EXPIRED, RETRACT_DONE, RETRACT_EXPIRED
+from companion.sitl_config.faults import KINDS
+from companion.sitl_config.loader import load_sitl
+from companion.sitl_config.world import Fault, World
 from sitl.autopilot.params import Params
 from tools.docs.safety import tables as safety_tables
 from tools.docs.tables import written
@@ -125,7 +126,7 @@ def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.Mon
         of_flight = hasattr(arguments, "overrides")
         if of_flight and mission and mission.endswith(".yaml") and arguments.vehicle is None:
             law, preset = (getattr(arguments, name, None) for name in ("controller", "preset"))
-            load_flight(mission, None, law, preset, arguments.overrides)
+            load_sitl(mission, None, law, preset, arguments.overrides)
     assert seen >= {"fly", "check", "sitl", "report", "replay", "schema"}
 
 

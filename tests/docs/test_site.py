@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.schema import KINDS
+from companion.cli.schema import KINDS
 from companion.model.types import SafetyAction
 from companion.safety.events import RULES
 from companion.safety.rule import Rule

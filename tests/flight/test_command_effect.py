@@ -10,7 +10,6 @@ from functools import cache
 
 import pytest
 
-from companion.config.loader import load_flight
 from companion.core.flight_core import FlightCore
 from companion.flight.command_effect import Effect, effect_of
 from companion.model.codec import differences
@@ -22,6 +21,7 @@ from companion.model.types import (
     Outputs,
     SafetyAction,
 )
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.flights.test_ladder_flights import TAUT
 from tests.safety.healthy import put
@@ -60,7 +60,7 @@ class Commanded:
 
 class _Asking(FastFlight):
     def __init__(self, script: Script, change: Change, *overrides: str) -> None:
-        super().__init__(load_flight("configs/missions/hover.yaml", overrides=overrides))
+        super().__init__(load_sitl("configs/missions/hover.yaml", overrides=overrides))
         self._script = list(script)
         self._change = change
 

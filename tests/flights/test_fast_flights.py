@@ -7,14 +7,14 @@ from functools import cache
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.model.frames import tilt_rad
 from companion.model.types import Outcome, PhaseKind
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 
 
-def configured(*overrides: str, preset: str = "recommended") -> FlightConfig:
-    return load_flight("configs/missions/catch.yaml", preset=preset, overrides=overrides)
+def configured(*overrides: str, preset: str = "recommended") -> SitlConfig:
+    return load_sitl("configs/missions/catch.yaml", preset=preset, overrides=overrides)
 
 
 @cache

@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 
 from companion.analysis.summary import summarise
-from companion.config.loader import load_flight
 from companion.model.types import Event
 from companion.runtime.console import print_result
+from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from tests.flights.test_fast_flights import event_ids
@@ -26,13 +26,13 @@ CONFIRMED_S = 0.25
 @cache
 def usual() -> Event:
     """The catch of a flight without a fault."""
-    outputs = FastFlight(load_flight(SHORT_CATCH)).run().outputs
+    outputs = FastFlight(load_sitl(SHORT_CATCH)).run().outputs
     return next(event for o in outputs for event in o.events if event.id == "catch")
 
 
 def summary_of(fault: str) -> tuple[dict[str, Any], list[str]]:
     """Summary of a flight with a fault, and the ids of its events."""
-    config = load_flight(SHORT_CATCH, overrides=[f"world.faults=[{fault}]"])
+    config = load_sitl(SHORT_CATCH, overrides=[f"world.faults=[{fault}]"])
     result = FastFlight(config).run()
     log = log_of(config, result, None)
     return summarise(log, outcome="aborted", controller="adaptive", preset="recommended"), event_ids(result)

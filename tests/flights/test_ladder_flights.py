@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.core.flight_core import FlightCore
 from companion.model.codec import differences
 from companion.model.frames import tilt_rad
@@ -24,6 +23,7 @@ from companion.model.types import (
     SafetyAction,
     VehicleState,
 )
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import SHORT_CATCH
 
@@ -31,14 +31,14 @@ replace = dataclasses.replace
 Change = Callable[[Inputs], Inputs]
 
 
-def configured(*overrides: str) -> FlightConfig:
-    return load_flight("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
+def configured(*overrides: str) -> SitlConfig:
+    return load_sitl("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
 
 
 class Changed(FastFlight):
     """A flight whose companion sees other inputs than there are."""
 
-    def __init__(self, config: FlightConfig, change: Change) -> None:
+    def __init__(self, config: SitlConfig, change: Change) -> None:
         super().__init__(config)
         self._change = change
 
@@ -52,7 +52,7 @@ def flown(change: Change, *overrides: str) -> FastResult:
 
 def short_flown(change: Change) -> FastResult:
     """Take-off at 3.0 s, the catch at 5.5 s, landing from 7.5 s on."""
-    return Changed(load_flight(SHORT_CATCH, preset="recommended"), change).run()
+    return Changed(load_sitl(SHORT_CATCH, preset="recommended"), change).run()
 
 
 def asking(*script: tuple[float, OperatorCommand]) -> Change:
@@ -137,7 +137,7 @@ def test_taut_it_goes_back_along_the_tether_and_lands() -> None:
     ids = event_ids(result)
     assert ids == ["takeoff", "tether_taut", "retract_done", "touchdown"]
     assert result.outputs[-1].outcome is Outcome.ABORTED
-    anchor = load_flight("configs/missions/catch.yaml").vehicle.tether.anchor_world_m
+    anchor = load_sitl("configs/missions/catch.yaml").vehicle.tether.anchor_world_m
     way = [o.reference.position_world_m for o in result.outputs if o.action is SafetyAction.RETRACT and o.reference]
     away = [math.dist(p[:2], anchor[:2]) for p in way]
     # The governor takes the little that is left of the climb out within its acceleration.

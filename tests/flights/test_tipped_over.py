@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from companion.config.loader import load_flight
 from companion.model.frames import euler_zyx_from_quat, tilt_rad
 from companion.model.types import Outcome
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.world.handling import Wrench
 from tests.support import HOVER, LOW_HOVER
@@ -25,7 +25,7 @@ class TippedOver(FastFlight):
 
     def __init__(self, below_m: float, after_s: float, *faults: str) -> None:
         low = [f"{key}={value}" for key, value in LOW_HOVER.items()]
-        super().__init__(load_flight(HOVER, overrides=[*low, f"world.faults=[{', '.join(faults)}]"]))
+        super().__init__(load_sitl(HOVER, overrides=[*low, f"world.faults=[{', '.join(faults)}]"]))
         self.begun_s = self.stopped_s = math.inf
         world, step = self.plant.world, self.plant.step
 

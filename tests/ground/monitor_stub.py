@@ -17,7 +17,6 @@ from typing import Any, Self
 
 from aiohttp import WSMsgType, web
 
-from companion.config.loader import load_flight
 from companion.ground.protocol.messages import (
     VERSION,
     Ack,
@@ -37,6 +36,7 @@ from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_jsonable
 from companion.model.types import Sent
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.support import CATCH, DEADLINE_S
 
@@ -61,7 +61,7 @@ class Flown:
 @cache
 def flown() -> Flown:
     """The mission `catch`, flown in the fast loop."""
-    config = load_flight(CATCH)
+    config = load_sitl(CATCH)
     result = FastFlight(config).run()
     rows = [(i, o, sent_at(i.tick, i.t_s)) for i, o in zip(result.inputs, result.outputs, strict=True)]
     streams, events = replay(rows, config, SESSION, 1.7e9)

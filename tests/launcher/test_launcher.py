@@ -18,9 +18,9 @@ import pytest
 from pymavlink import mavutil
 
 from companion.analysis.log import FlightLog
-from companion.config.loader import load_flight
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
+from companion.sitl_config.loader import load_sitl
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options, wait_until
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=1.0")
@@ -231,7 +231,7 @@ def test_process_that_cannot_start_is_named_in_one_line(tmp_path: Path, package:
 @pytest.mark.waits
 def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
     # Armed, it would stay until its rotors stand: longer than the launcher waits.
-    world = SitlProcess(load_flight(HOVER), tmp_path)
+    world = SitlProcess(load_sitl(HOVER), tmp_path)
     try:
         address = world.devices()["autopilot"]["address"].removeprefix("udpout://")
         with closing(mavutil.mavlink_connection(f"udpout:{address}", source_system=255)) as ground:

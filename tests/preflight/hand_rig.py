@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.model.frames import (
     attitude_enu_flu_from_ned_frd,
     attitude_ned_frd_from_enu_flu,
@@ -14,6 +13,7 @@ from companion.model.frames import (
 )
 from companion.model.types import MocapPose, VehicleState
 from companion.preflight.hand_test.run import HandSample
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.autopilot.autopilot import Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.estimator import Estimator
@@ -26,16 +26,16 @@ from tests.support import CATCH
 TICK_S = 0.005
 
 
-def world(*overrides: str) -> FlightConfig:
+def world(*overrides: str) -> SitlConfig:
     """The catch mission's machine with its world set otherwise, nothing thrown, a hand that begins after 4 s."""
     words = ["world.payload_kg=0", "world.hand_t_s=4", *(f"world.{text}" for text in overrides)]
-    return load_flight(CATCH, overrides=words)
+    return load_sitl(CATCH, overrides=words)
 
 
 class Standing:
     """Machine, PX4 stub and motion capture; what the companion would hear of them every 5 ms."""
 
-    def __init__(self, config: FlightConfig) -> None:
+    def __init__(self, config: SitlConfig) -> None:
         self.config = config
         start = config.mission.start
         params = Params()

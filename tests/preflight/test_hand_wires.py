@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import MocapDevice
 from companion.io.devices import SomeEdges, VisionValve, open_what_opens
 from companion.io.mocap.driver import NatNetMocap
@@ -26,6 +25,7 @@ from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.hand_test.command import run_hand_test
 from companion.runtime.clock import flight_clock
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 from tests.io.test_px4_stub import companion
@@ -50,9 +50,9 @@ def world(sandbox: Sandbox) -> Iterator[World]:
 
 
 @pytest.fixture
-def config(world: World) -> FlightConfig:
+def config(world: World) -> SitlConfig:
     """Of a companion whose devices are the world's."""
-    return load_flight(CATCH, overrides=[word for word in world.addresses() if word != "--set"])
+    return load_sitl(CATCH, overrides=[word for word in world.addresses() if word != "--set"])
 
 
 def terminal() -> Console:
@@ -65,7 +65,7 @@ def text_of(console: Console) -> str:
 
 
 async def over_wires(
-    config: FlightConfig,
+    config: SitlConfig,
     console: Console,
     record: Path | None = None,
     beside: Callable[[], Coroutine[Any, Any, None]] | None = None,
@@ -86,7 +86,7 @@ async def said(console: Console, words: str) -> None:
             await asyncio.sleep(0.01)
 
 
-def test_any_key_ends_it_and_the_terminal_is_as_before(config: FlightConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_key_ends_it_and_the_terminal_is_as_before(config: SitlConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     keyboard, tty = pty.openpty()
     console = terminal()
     try:
@@ -107,7 +107,7 @@ def test_any_key_ends_it_and_the_terminal_is_as_before(config: FlightConfig, mon
     assert [(row.id, row.read, row.refuses) for row in rows] == [("hand.done", "ended by hand", True)]
 
 
-def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: FlightConfig) -> None:
+def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: SitlConfig) -> None:
     console = terminal()
 
     async def interrupt() -> None:
@@ -124,7 +124,7 @@ def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: FlightConfig) -> 
     assert (row.id, row.read) == ("hand.done", "ended by hand")
 
 
-def test_a_whole_round_passes_and_is_kept(config: FlightConfig, tmp_path: Path) -> None:
+def test_a_whole_round_passes_and_is_kept(config: SitlConfig, tmp_path: Path) -> None:
     console, path = terminal(), tmp_path / "state" / "hand-tests.json"
     rows = asyncio.run(over_wires(config, console, path))
     assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"], rows
@@ -140,7 +140,7 @@ def test_a_whole_round_passes_and_is_kept(config: FlightConfig, tmp_path: Path) 
 
 
 def test_it_is_refused_when_px4_is_armed() -> None:
-    config = load_flight(CATCH)
+    config = load_sitl(CATCH)
 
     async def go() -> list[Row]:
         port = free_udp_port()
@@ -160,12 +160,12 @@ def test_it_is_refused_when_px4_is_armed() -> None:
 
 
 def test_without_motion_capture_or_px4_it_says_which() -> None:
-    config = load_flight(CATCH)
+    config = load_sitl(CATCH)
     (row,) = asyncio.run(run_hand_test(SomeEdges(VisionValve()), config, terminal()))
     assert row.read == "motion capture is not open"
 
 
-def test_scripts_keep_their_standard_output(config: FlightConfig, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scripts_keep_their_standard_output(config: SitlConfig, capsys: pytest.CaptureFixture[str]) -> None:
     async def interrupt() -> None:
         os.kill(os.getpid(), signal.SIGINT)
 

@@ -8,15 +8,16 @@ from pathlib import Path
 import pytest
 
 from companion.config.document import ConfigError
-from companion.config.loader import load_vehicle, load_world
-from companion.config.px4_defaults import PX4_DEFAULTS
+from companion.config.loader import load_vehicle
 from companion.config.vehicle import AutopilotDevice, Vehicle
-from companion.config.world import World
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.rows import Level, Row
 from companion.preflight.px4 import firmware_row, rows
+from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.wanted import HOVER, WANTED, file_values, names, simulated_values
 from companion.runtime.clock import flight_clock
+from companion.sitl_config.loader import load_world
+from companion.sitl_config.world import World
 from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.loader import load_flight
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.recorder.flights import flight_of, record
 from tests.recorder.viewers import Viewed, view
@@ -14,14 +14,14 @@ from tests.recorder.viewers import Viewed, view
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A flight of the fast loop, catch included and then sent down, as the file that the recorder leaves."""
-    config = load_flight("configs/missions/catch.yaml")
+    config = load_sitl("configs/missions/catch.yaml")
     result = FastFlight(config, land_at_s=13.0).run()
     assert result.caught
     path = [o.reference.position_world_m for o in result.outputs if o.reference is not None][::40]
     return record(
         tmp_path_factory.mktemp("flown") / "flight.mcap",
         flight_of(result),
-        config_json=config.model_dump_json(),
+        config_json=config.flight.model_dump_json(),
         plan_json=json.dumps(path),
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from companion.campaigns.robustness import SAFE, WORST, Case, Cases, held_against, read_cases
-from companion.config.loader import load_flight
+from companion.sitl_config.loader import load_sitl
 from sitl.campaigns import robustness
 from tests.support import ROOT
 
@@ -18,7 +18,7 @@ KEPT: Cases = read_cases(FILE)
 
 @cache
 def config_json() -> str:
-    return load_flight(ROOT / KEPT.mission, None, KEPT.controller, KEPT.preset).model_dump_json()
+    return load_sitl(ROOT / KEPT.mission, None, KEPT.controller, KEPT.preset).model_dump_json()
 
 
 def test_ten_are_kept_of_the_law_that_users_get() -> None:

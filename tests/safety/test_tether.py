@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import Outcome, Outputs, PhaseKind, Quat, TetherState, Vec2, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 from companion.safety.tether_shape import Clearance, steepest_slope
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.world.world import Truth
 
@@ -30,8 +30,8 @@ LENGTH_M = 3.0
 
 
 @cache
-def config(*overrides: str) -> FlightConfig:
-    return load_flight("configs/missions/catch.yaml", overrides=overrides)
+def config(*overrides: str) -> SitlConfig:
+    return load_sitl("configs/missions/catch.yaml", overrides=overrides)
 
 
 def vehicle(*overrides: str) -> Vehicle:

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from companion.config.base import Model
-from companion.config.faults import KINDS, Fault
-from companion.config.world import Push, Servo, World
+from companion.sitl_config.faults import KINDS, Fault
+from companion.sitl_config.world import Push, Servo, World
 
 Settings = dict[str, Any]
 

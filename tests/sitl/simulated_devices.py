@@ -21,10 +21,10 @@ from urllib.parse import urlsplit
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.loader import FlightConfig
 from companion.io.force_torque import rft
 from companion.io.mocap.natnet import Message
 from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu, quat_from_euler_zyx
+from companion.sitl_config.loader import SitlConfig
 from sitl.autopilot.backend import StubBackend
 from sitl.autopilot.commander import Command
 from sitl.autopilot.mavlink import Ports as LinkPorts
@@ -72,7 +72,7 @@ class WorldLoop(asyncio.SelectorEventLoop):
         return self.t_s
 
 
-def emitted(config: FlightConfig, end: int, usual: Emitted | None = None) -> Emitted:
+def emitted(config: SitlConfig, end: int, usual: Emitted | None = None) -> Emitted:
     """Return what the ends emit in so many steps of the physics.
 
     The flight ends at the first step in which that is not what they emit in `usual`.
@@ -81,7 +81,7 @@ def emitted(config: FlightConfig, end: int, usual: Emitted | None = None) -> Emi
         return runner.run(_emitted(in_time(config), end, usual))
 
 
-async def _emitted(config: FlightConfig, end: int, usual: Emitted | None) -> Emitted:
+async def _emitted(config: SitlConfig, end: int, usual: Emitted | None) -> Emitted:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, WorldLoop)
     events: list[Any] = []
@@ -196,7 +196,7 @@ def _received(opened: socket.socket) -> bytes:
 class Pilot:
     """Takes off, flies in +x through the catch and holds the arm as it was; leaves the rotors off if a hand is there."""
 
-    def __init__(self, config: FlightConfig, autopilot: StubBackend, plant: Plant, partner: Partner) -> None:
+    def __init__(self, config: SitlConfig, autopilot: StubBackend, plant: Plant, partner: Partner) -> None:
         self._joints, self._arm_rad = config.vehicle.arm.joints, plant.world.q[slice(*_span(plant))]
         self._px4, self._plant, self._partner = autopilot.px4, plant, partner
         self._arms = not config.world.hand

@@ -9,16 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Vehicle
-from companion.config.world import World as WorldConfig
 from companion.model.types import Outcome, Vec3, Vec4
+from companion.sitl_config.loader import SitlConfig, load_sitl
+from companion.sitl_config.world import World as WorldConfig
 from sitl.fast.loop import FastFlight
 from sitl.world.world import World
 from tests.support import CATCH
 
 HOVER = CATCH.parent / "hover.yaml"
-VEHICLE = load_flight(HOVER).vehicle
+VEHICLE = load_sitl(HOVER).vehicle
 SMALL = {"rotor_arm_m": 0.22, "inertia_kg_m2": (0.022, 0.022, 0.04), "yaw_torque_per_thrust_m": 0.016}
 FULL_N = VEHICLE.airframe.thrust_max_n / 4.0
 
@@ -61,8 +61,8 @@ def test_the_joints_have_the_armature_of_the_vehicle_file() -> None:
     assert world.model.dof_armature[list(world.layout.joint_v)].tolist() == [0.003, 0.003]
 
 
-def hovering(vehicle: Vehicle) -> FlightConfig:
-    config = load_flight(HOVER)
+def hovering(vehicle: Vehicle) -> SitlConfig:
+    config = load_sitl(HOVER)
     return config.model_copy(update={"vehicle": vehicle})
 
 

@@ -22,14 +22,14 @@ import pytest
 
 from companion.analysis import metrics
 from companion.campaigns.process import CampaignProcess
-from companion.config.loader import load_flight
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT
 from companion.model.types import Outcome, PhaseKind
+from companion.sitl_config.loader import load_sitl
 from sitl.campaigns import flights as campaign
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, position_error_m, sandbox_in, wait_until
 
-CONFIG = load_flight(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
+CONFIG = load_sitl(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
 FLIGHT: dict[str, Any] = {
     "variant": 0,
     "controller": "adaptive",
@@ -50,7 +50,7 @@ def fast() -> tuple[FastFlight, FastResult]:
 @pytest.fixture(scope="module")
 def result() -> dict[str, Any]:
     """The same flight, flown by the campaign from a configuration with another payload and seed."""
-    other = load_flight(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
+    other = load_sitl(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
     return campaign.fly(other.model_dump_json(), FLIGHT)
 
 
@@ -155,7 +155,7 @@ TINY = (
     *("compare", "--mission", SHORT_CATCH, "--payloads", "0.2", "--controllers", "adaptive"),
     *("--presets", "paper,recommended", "--json"),
 )
-PAPER = load_flight(SHORT_CATCH, preset="paper", overrides=("world.payload_kg=0.2", "world.seed=3"))
+PAPER = load_sitl(SHORT_CATCH, preset="paper", overrides=("world.payload_kg=0.2", "world.seed=3"))
 
 
 @pytest.fixture(scope="module")

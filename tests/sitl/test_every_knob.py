@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
-from companion.config.world import World
+from companion.sitl_config.loader import SitlConfig, load_sitl
+from companion.sitl_config.world import World
 from sitl.fast.loop import FastFlight, FastResult
 from tests.sitl.knobs import Pair, Settings, fault_pairs, pairs
 from tests.sitl.simulated_devices import END_STEPS, Emitted, emitted
 from tests.support import SHORT_CATCH
 
-BASE = load_flight(SHORT_CATCH)
+BASE = load_sitl(SHORT_CATCH)
 PAIRS = [*pairs(), *fault_pairs()]
 
 _SET_UP = "the companion's set-up of the bus writes this register, or a row of its preflight judges it; the fast loop has neither"
@@ -61,7 +61,7 @@ class Watched(list[Any]):
         super().append(item)
 
 
-def world(settings: Settings) -> FlightConfig:
+def world(settings: Settings) -> SitlConfig:
     return BASE.model_copy(update={"world": World.model_validate(settings)})
 
 

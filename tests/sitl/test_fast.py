@@ -8,14 +8,14 @@ from functools import cache
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.io.dynamixel.registers import WATCHDOG_ERROR
 from companion.model.types import Outcome
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 
 
-def configured(*overrides: str) -> FlightConfig:
-    return load_flight("configs/missions/hover.yaml", overrides=("world.payload_kg=0", *overrides))
+def configured(*overrides: str) -> SitlConfig:
+    return load_sitl("configs/missions/hover.yaml", overrides=("world.payload_kg=0", *overrides))
 
 
 @cache

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.faults import Fault
-from companion.config.loader import load_flight
 from companion.model.types import AutopilotStatus, FlightMode, LandedState, VehicleState
+from companion.sitl_config.faults import Fault
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.link import FastLink
 from sitl.fast.loop import TICK_S, FastFlight
 from sitl.faults.processes import strike
@@ -85,7 +85,7 @@ async def _read(fd: int, size: int) -> bytes:
 
 @pytest.fixture
 def flight() -> FastFlight:
-    return FastFlight(load_flight(CATCH))
+    return FastFlight(load_sitl(CATCH))
 
 
 def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from companion.campaigns.faults import Row, Variant, good
-from companion.config.faults import KINDS, FaultKind, FlightPhase
-from companion.config.loader import FlightConfig, load_flight
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.flight_stage import SPOOL_S
 from companion.model.types import SafetyAction
 from companion.safety.stop import StopModel
+from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.faults import fly, grid
 from sitl.campaigns.flights import CampaignError
 from sitl.campaigns.robustness import draw, throws
@@ -25,14 +25,14 @@ from sitl.faults.processes import environment
 from sitl.faults.timing import FaultError, in_time
 from tests.support import CATCH, HOVER, SHORT_CATCH, sandbox_in
 
-CONFIG = load_flight(CATCH, preset="recommended")
+CONFIG = load_sitl(CATCH, preset="recommended")
 LINE_M_S = 0.74
 """The line of the catch, in its middle."""
 CONFIG_JSON = CONFIG.model_dump_json()
 
 
-def with_faults(*faults: dict[str, Any], mission: Any = CATCH, world: str = "world.seed=1") -> FlightConfig:
-    return load_flight(mission, overrides=[f"world.faults={json.dumps(list(faults))}", world])
+def with_faults(*faults: dict[str, Any], mission: Any = CATCH, world: str = "world.seed=1") -> SitlConfig:
+    return load_sitl(mission, overrides=[f"world.faults={json.dumps(list(faults))}", world])
 
 
 @cache
@@ -72,7 +72,7 @@ def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
     with pytest.raises(FaultError, match="mission 'hover' has no return; give t_s instead"):
         in_time(with_faults({"kind": "mocap_loss", "phase": "return"}, mission=HOVER))
     with pytest.raises(CampaignError) as refused:
-        grid({"config": load_flight(HOVER).model_dump(mode="json"), "flights": [{"phase": "return"}]})
+        grid({"config": load_sitl(HOVER).model_dump(mode="json"), "flights": [{"phase": "return"}]})
     assert refused.value.bad_input
 
 
@@ -241,7 +241,7 @@ def test_a_catch_in_a_drawn_world_is_no_drag(number: int) -> None:
     """Wind, delays, mass errors and the blow of a thrown payload: the flights from which the threshold was chosen, two of them."""
     knobs = draw(11, number, throws(CONFIG.mission, CONFIG.vehicle))
     flight = FastFlight(
-        load_flight(CATCH, overrides=[f"world.{key}={json.dumps(value)}" for key, value in knobs.items()])
+        load_sitl(CATCH, overrides=[f"world.{key}={json.dumps(value)}" for key, value in knobs.items()])
     )
     result = flight.run()
     assert result.caught

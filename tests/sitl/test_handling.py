@@ -8,11 +8,11 @@ import math
 import pytest
 
 from companion.config.document import ConfigError
-from companion.config.loader import load_world
-from companion.config.world import World
 from companion.io.mocap.natnet import z_up_from_y_up
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import Quat, Vec3
+from companion.sitl_config.loader import load_world
+from companion.sitl_config.world import World
 from sitl.world.handling import FORWARD_M, LIFT_M, REST_S, ROUND_S, TURN_DEG
 from sitl.world.mocap_misalignment import MocapMisalignment
 from tests.preflight.hand_rig import Standing, world

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Safety
 from companion.model.types import Outcome
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import CATCH
 
 LIMIT_M = Safety().mocap_inertial_m
 
 
-def flown(amplitude_m_s2: float, hz: float, *faults: str) -> tuple[FlightConfig, FastFlight, FastResult]:
-    config = load_flight(
+def flown(amplitude_m_s2: float, hz: float, *faults: str) -> tuple[SitlConfig, FastFlight, FastResult]:
+    config = load_sitl(
         CATCH,
         overrides=[
             f"world.accel_vibration_m_s2={amplitude_m_s2}",

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.model.types import Vec3
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.push import (
     PushResult,
@@ -30,8 +30,8 @@ BACK: Vec3 = (-2.0, 0.0, 0.0)
 LEFT: Vec3 = (0.0, 2.0, 0.0)
 
 
-def catch(preset: str, *overrides: str) -> FlightConfig:
-    return load_flight("configs/missions/catch.yaml", preset=preset, overrides=overrides)
+def catch(preset: str, *overrides: str) -> SitlConfig:
+    return load_sitl("configs/missions/catch.yaml", preset=preset, overrides=overrides)
 
 
 @cache
@@ -124,7 +124,7 @@ def test_without_base_rows_the_papers_base_is_pushed_away() -> None:
 
 
 def test_every_law_has_a_target_and_only_those_with_base_rows_take_them() -> None:
-    config = load_flight("configs/missions/catch.yaml", controller_law="psc")
+    config = load_sitl("configs/missions/catch.yaml", controller_law="psc")
     target = target_of(config.controller, 3.0)
     assert (target.stiffness_kp > 0).all()
     with pytest.raises(PushTestError, match="psc has no base rows"):

@@ -10,9 +10,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from companion.config.faults import Fault
 from companion.config.loader import load_vehicle
-from companion.config.world import World
+from companion.sitl_config.faults import Fault
+from companion.sitl_config.world import World
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from sitl.px4.backend import OF_THE_STUB, refuse_what_needs_the_stub

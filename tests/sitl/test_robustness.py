@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
-from companion.config.world import World
 from companion.control.manipulator import Manipulator
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import PhaseKind
+from companion.sitl_config.loader import SitlConfig, load_sitl
+from companion.sitl_config.world import World
 from sitl.campaigns import robustness
 from sitl.campaigns.flights import CampaignError
 from sitl.fast.loop import FastFlight
@@ -23,7 +23,7 @@ from sitl.world.model import link_masses_kg
 from sitl.world.world import World as SimulatedWorld
 from tests.support import CATCH, DEADLINE_S, HOVER, SHORT_CATCH, position_error_m, run_here, sandbox_in
 
-CONFIG = load_flight(CATCH, preset="recommended")
+CONFIG = load_sitl(CATCH, preset="recommended")
 PLACES = robustness.throws(CONFIG.mission, CONFIG.vehicle)
 DRAWS = [robustness.draw(7, number, PLACES) for number in range(400)]
 
@@ -104,14 +104,14 @@ def test_catch_points_are_on_the_first_pass() -> None:
 
 
 def test_a_mission_that_stands_still_is_refused() -> None:
-    hover = load_flight(HOVER)
+    hover = load_sitl(HOVER)
     with pytest.raises(CampaignError, match=r"mission 'hover' never flies in the direction of \+x") as refused:
         robustness.throws(hover.mission, hover.vehicle)
     assert refused.value.bad_input
 
 
 def test_what_is_fixed_is_not_drawn() -> None:
-    config = load_flight(CATCH, overrides=["world.wind_m_s=[1.0,0.0,0.0]"])
+    config = load_sitl(CATCH, overrides=["world.wind_m_s=[1.0,0.0,0.0]"])
     _, flights = robustness.grid(job(config=config.model_dump(mode="json"), fixed=["wind_m_s"]))
     assert [flight["world"]["wind_m_s"] for flight in flights] == [[1.0, 0.0, 0.0]] * 3
     assert [f["world"]["payload_kg"] for f in flights] == [d["payload_kg"] for d in DRAWS[:3]]
@@ -130,7 +130,7 @@ def row() -> dict[str, Any]:
 def test_a_row_is_what_the_flight_was(row: dict[str, Any]) -> None:
     data = CONFIG.model_dump(mode="json")
     data["world"].update(DRAWS[0])
-    flight = FastFlight(FlightConfig.model_validate_json(json.dumps(data)))
+    flight = FastFlight(SitlConfig.model_validate_json(json.dumps(data)))
     flown = flight.run()
     assert (row["name"], row["number"], row["world"]) == ("draw 0", 0, DRAWS[0])
     assert (row["outcome"], row["why"], row["error"]) == ("completed", None, None)
@@ -195,7 +195,7 @@ def test_links_weigh_what_the_world_says() -> None:
 
 
 def test_the_command_flies_writes_and_flies_its_worst_again(tmp_path: Path) -> None:
-    config = load_flight(SHORT_CATCH)
+    config = load_sitl(SHORT_CATCH)
     places = robustness.throws(config.mission, config.vehicle)
     with sandbox_in(tmp_path) as place:
         options = ("--jobs", "1", "--json")

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.loader import FlightConfig, load_flight
 from companion.config.vehicle import Vehicle
 from companion.model.types import Outcome, Outputs
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.server import Ports, Sitl, start_of
 from sitl.world.plant import Plant
@@ -21,8 +21,8 @@ CATCH_S, PERIOD_S = 6.5, 15.0
 """Of catch.yaml: the first catch, and how much later each further one is."""
 
 
-def configured(*overrides: str, mission: str = "catch") -> FlightConfig:
-    return load_flight(ROOT / f"configs/missions/{mission}.yaml", overrides=overrides)
+def configured(*overrides: str, mission: str = "catch") -> SitlConfig:
+    return load_sitl(ROOT / f"configs/missions/{mission}.yaml", overrides=overrides)
 
 
 @cache

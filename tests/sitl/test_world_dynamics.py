@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
-from companion.config.world import World as WorldConfig
 from companion.control.manipulator import Manipulator
+from companion.sitl_config.world import World as WorldConfig
 from sitl.world.model import base_mass_kg
 from sitl.world.world import PHYSICS_DT_S, World
 from tests.pinocchio_or_skip import pin

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from companion.config.schema import KINDS
+from companion.cli.schema import KINDS
 
 Schema = dict[str, Any]
 _INTRO = {

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from companion.analysis.log import FlightLog, LogError, writer
 from companion.config.ground import topic_name
-from companion.config.loader import FlightConfig
+from companion.config.loader import FlightConfig, logged_flight
 from companion.ground.protocol.messages import VERSION, Preflight, PreflightRow, Presence, State
 from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.ground.telemetry.stream import replay
@@ -52,7 +52,7 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
             f"{path}: holds no configuration (metadata record 'config'); there is no room to draw the flight in"
         )
     try:
-        config = FlightConfig.model_validate_json(log.config_json)
+        config = logged_flight(log.config_json)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from companion.config.px4_defaults import PX4_DEFAULTS
 from companion.io.protocols import DeviceError
 from companion.model.types import AutopilotStatus
+from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.params_file import Value, same
 from companion.px4.wanted import BY_NAME, NO_VEHICLE
 

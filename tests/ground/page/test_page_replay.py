@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from companion.analysis.log import FlightLog
-from companion.config.loader import load_flight
 from companion.ground.protocol.messages import Presence, Stream
 from companion.model.codec import to_jsonable
+from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.analysis.recorded import record
 from tests.broker import free_port
@@ -196,10 +196,10 @@ def test_ten_minutes_load_in_pieces(browser: Any, stand: Stand) -> None:
 
 
 def test_the_real_monitor_plays_the_log_of_a_flight(browser: Any, tmp_path: Path) -> None:
-    config = load_flight(CATCH)
+    config = load_sitl(CATCH)
     result = FastFlight(config).run()
     sent = tuple(sent_at(i.tick, i.t_s) for i in result.inputs)
-    metadata = {"config": {"json": config.model_dump_json()}}
+    metadata = {"config": {"json": config.flight.model_dump_json()}}
     log = FlightLog(tmp_path, tuple(result.inputs), tuple(result.outputs), sent, metadata, True)
     path = record(log, tmp_path / "flight.mcap")
     url = f"http://127.0.0.1:{(port := free_port())}/"

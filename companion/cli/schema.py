@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 from companion.config.controller import ControllerConfig
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.config.world import World
+from companion.sitl_config.world import World
 
 KINDS: dict[str, TypeAdapter[Any]] = {
     "mission": TypeAdapter(Mission),

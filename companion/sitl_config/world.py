@@ -9,8 +9,8 @@ from pydantic import AfterValidator, Field
 
 from companion.config.base import Fraction, Model, NonNegative, Positive, Vector2, Vector3
 from companion.config.explain import nearest
-from companion.config.faults import Fault as Fault
-from companion.config.px4_defaults import PX4_DEFAULTS
+from companion.px4.defaults import PX4_DEFAULTS
+from companion.sitl_config.faults import Fault as Fault
 
 REAL32_MAX = 3.4e38
 RelativeError = Annotated[float, Field(ge=-0.5, le=0.5)]
