@@ -43,6 +43,7 @@ from companion.model.types import (
     Vec3,
 )
 from companion.safety.events import RULES
+from companion.sitl_config.faults import IN_FLIGHT, KINDS, PHASES, FaultKind
 from companion.sitl_config.loader import load_sitl
 from tests.support import CATCH, HOVER
 
