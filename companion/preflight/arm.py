@@ -218,7 +218,7 @@ def usb_latency(check: Check, latency_ms: int | None) -> Row:
         return check.good("not an FTDI adapter", wanted)
     if latency_ms <= LATENCY_GOOD_MS:
         return check.good(f"{latency_ms} ms", wanted)
-    fix = "keep it at 1 with a udev rule: README, Fly for real, Serial ports"
+    fix = "keep it at 1 with a udev rule: docs/commissioning.md, step 2"
     return check.bad(f"{latency_ms} ms", wanted, fix)
 
 
