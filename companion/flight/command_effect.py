@@ -21,13 +21,13 @@ def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) 
         after: outputs of the tick with it.
     """
     if after.phase == PILOT_FLIES:
-        return False, "a pilot has the vehicle: nothing is sent against them"
+        return False, "a pilot has control: nothing is sent"
     stood = before is None or before.phase_kind is PhaseKind.GROUND
     if after.phase_kind is PhaseKind.DONE and not stood:
         return command in _DOWN, "down already" if command in _DOWN else f"{_NOTHING[command]}: the flight is over"
     if after.phase == Stage.AUTOPILOT_LAND.value:
         if command in _DOWN:
-            return True, "recorded; PX4 is landing on its own, it goes on"
+            return True, "recorded; PX4's own landing continues"
         return False, f"{_NOTHING[command]}: PX4 is landing on its own"
     return _JUDGES[command](before, after)
 
@@ -50,14 +50,14 @@ def _hold(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase_kind is PhaseKind.DONE:
         return True, "not taking off: standing down"
     if after.phase_kind is PhaseKind.GROUND:
-        return True, "it stays on the ground until start is commanded"
+        return True, "the vehicle stays on the ground until start is commanded"
     if before is not None and before.phase == Stage.SPOOL.value:
         return True, "not taking off: the rotors spool down"
     if "no_room_to_stay" in _events(after):
         return True, "too low to hold: landing"
     action = after.action
     if action is SafetyAction.RETRACT:
-        return False, "not held: it goes back along the tether and lands"
+        return False, "not held: it returns along the tether and lands"
     if action.rank > SafetyAction.HOLD.rank or after.phase_kind is PhaseKind.LANDING:
         return False, "not held: it is landing"
     held_already = before is not None and before.action is SafetyAction.HOLD
@@ -73,7 +73,7 @@ def _resume(before: Outputs | None, after: Outputs) -> Effect:
     if after.action.rank > SafetyAction.HOLD.rank:
         return False, f"resume refused: {_instead(after)}"
     if after.phase_kind is PhaseKind.LANDING:
-        return True, "the landing goes on"
+        return True, "the landing continues"
     return True, "going on"
 
 

@@ -104,7 +104,7 @@ class Operator:
         if asked.command is OperatorCommand.RESUME and self.hold is not None and asked.hold != self.hold:
             self._given = OperatorCommand.NONE
             meant = f"hold {asked.hold}" if asked.hold else "no hold"
-            text = f"resume refused: it names {meant}, now hold {self.hold} stands; look again, then command it anew"
+            text = f"resume refused: it names {meant}, now hold {self.hold} is active; check the situation, then command it again"
             return Turn(OperatorCommand.NONE, asked, text)
         self._given = asked.command
         return Turn(asked.command, asked)

@@ -183,7 +183,7 @@ class Flight:
         lines = [f"landing without it: {line}" for line in self._edges.failures]
         if not goes_on:
             lines = [
-                "PX4 was armed when the companion started, and has disarmed since; nothing was lifted: start again to fly"
+                "PX4 was armed when the companion started and has disarmed since; no take-off happened: start again to fly"
             ]
         for text in lines:
             self._tell(0, outputs, Event(outputs.t_s, REATTACHED, Severity.WARNING, SafetyAction.WARN, text))
@@ -213,7 +213,7 @@ class Flight:
         """Report the state of the link to ground stations when it changes."""
         client = self._recorder.client
         gone = client.gone and client.ground is not None
-        ground = "no telemetry and no commands any more: the recorder is gone; Ctrl-C lands" if gone else client.ground
+        ground = "the recorder process has ended: no telemetry, no commands; Ctrl-C lands" if gone else client.ground
         if ground != self._ground:
             self._ground = ground
             ipc.send(self._channel, {"type": "ground", "text": ground})

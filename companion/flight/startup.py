@@ -96,7 +96,7 @@ async def with_hover_thrust(config: FlightConfig, autopilot: MavsdkAutopilot) ->
     value = float(await autopilot.read_param(_HOVER_PARAM))
     if not 0.1 <= value <= 0.8:
         raise DeviceError(
-            f"autopilot: {_HOVER_PARAM} = {value:.3f} is no hover thrust of this machine, expected 0.1 to 0.8;"
+            f"autopilot: {_HOVER_PARAM} = {value:.3f} is not a plausible hover thrust, expected 0.1 to 0.8;"
             f" set it in PX4 or give airframe.hover_thrust"
         )
     airframe = airframe.model_copy(update={"hover_thrust": value})

@@ -13,19 +13,22 @@ from companion.preflight.checks import Check
 from companion.safety.arm import error_text
 
 DEVICE = Check(
-    "arm.device", "arm bus", "the port opens, both servos answer and take their settings", "no arm, no flight"
+    "arm.device", "arm bus", "the port opens, both servos answer and take their settings", "the flight needs the arm"
 )
 MODEL = Check(
-    "arm.model", "servos", "XM430-W210 (model 1030)", "another servo has another torque constant and other registers"
+    "arm.model", "servos", "XM430-W210 (model 1030)", "other models have another torque constant and other registers"
 )
 FIRMWARE = Check(
     "arm.firmware",
     "servo firmware",
     "38 or newer, the same on both",
-    "older firmware has no bus watchdog: an arm whose companion died goes on pulling",
+    "older firmware has no bus watchdog: the arm would keep its torque after the companion has died",
 )
 MODE = Check(
-    "arm.mode", "operating mode", "current control (register 11 is 0)", "a torque would be taken for something else"
+    "arm.mode",
+    "operating mode",
+    "current control (register 11 is 0)",
+    "in another mode a torque command means something else",
 )
 RETURN_DELAY = Check(
     "arm.return_delay",
@@ -37,36 +40,39 @@ WATCHDOG = Check(
     "arm.watchdog",
     "bus watchdog",
     "`devices.arm.watchdog_ms` (register 98)",
-    "a dead companion would leave the arm under torque",
+    "the arm would keep its torque after the companion has died",
 )
 CURRENT_LIMIT = Check(
     "arm.current_limit",
     "current limit",
     "what `torque_max_nm` needs (register 38)",
-    "the arm would be weaker than the law believes",
+    "the arm would be weaker than the law assumes",
 )
 VOLTAGE = Check(
-    "arm.voltage", "servo supply", "10.0 to 14.8 V", "outside of it the servos let go with an input voltage error"
+    "arm.voltage",
+    "servo supply",
+    "10.0 to 14.8 V",
+    "outside of it the servos switch their torque off with an input voltage error",
 )
 TEMPERATURE = Check(
     "arm.temperature",
     "servo temperature",
     "`safety.servo_warn_c`; from `safety.servo_max_c` on refused",
-    "at 80 degC a servo lets go",
+    "at 80 degC a servo switches its torque off",
 )
 ERROR = Check(
     "arm.error",
     "servo hardware error",
-    "none (register 70); a bus watchdog that let go is told",
+    "none (register 70); a tripped bus watchdog is reported",
     "a servo with an error gives no torque until it is rebooted",
 )
 ANGLES = Check(
     "arm.angles",
     "joint angles",
-    "within the walls of both joints",
-    "beyond a wall links touch the airframe, or zero_count and sign are wrong",
+    "within the limits of both joints",
+    "beyond a limit links touch the airframe, or zero_count and sign are wrong",
 )
-STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "an arm that sinks or is touched falsifies the tare")
+STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of the arm falsifies the tare")
 READS = Check(
     "arm.reads",
     "bus cycles without an answer",
@@ -77,7 +83,7 @@ USB = Check(
     "arm.usb_latency",
     "arm's USB latency timer",
     "1 ms, or no FTDI adapter",
-    "more costs control ticks; from 5 ms on the bus is refused when it is opened",
+    "more delays control ticks; from 5 ms on the driver refuses the bus",
     warns=True,
 )
 CHECKS = (
@@ -119,9 +125,7 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     if all(model == MODEL_XM430_W210 for model in models):
         yield MODEL.good(read, "XM430-W210")
     else:
-        yield MODEL.bad(
-            read, "XM430-W210", "build in the servo that the vehicle file means, or correct arm.joints[].servo_id"
-        )
+        yield MODEL.bad(read, "XM430-W210", "install the configured servo, or correct arm.joints[].servo_id")
     yield firmware(FIRMWARE, [servo.firmware for servo in servos])
     modes = [servo.operating_mode for servo in servos]
     yield _equal(MODE, modes, MODE_CURRENT, _mode, "another program has set it: close that, cycle the servos' power")
@@ -171,14 +175,14 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
         yield TEMPERATURE.good(read, wanted)
     else:
         row = TEMPERATURE.doubtful if hottest_c < safety.servo_max_c else TEMPERATURE.bad
-        yield row(read, wanted, "let the arm cool down; look for a joint that jams or an arm that leans on something")
+        yield row(read, wanted, "let the arm cool down; look for a jammed joint or an arm under load")
     errors = (_or(state.hardware_error[0] for state in states), _or(state.hardware_error[1] for state in states))
     named = error_text(errors)
     if named:
         yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
     elif (errors[0] | errors[1]) & WATCHDOG_BIT:
         fix = "look for a loose cable or supply, and for a computer that stalls"
-        yield ERROR.doubtful("a bus watchdog let go", "none", fix)
+        yield ERROR.doubtful("a bus watchdog tripped", "none", fix)
     else:
         yield ERROR.good("none", "none")
     yield _angles(last, vehicle)
@@ -189,7 +193,7 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
     if moved_rad <= STILL_RAD:
         yield STILL.good(read, wanted)
     else:
-        yield STILL.bad(read, wanted, "fold the arm so that it stays by itself, and let go of it")
+        yield STILL.bad(read, wanted, "fold the arm so that it rests by itself, and do not touch it")
 
 
 def _angles(last: ArmState, vehicle: Vehicle) -> Row:

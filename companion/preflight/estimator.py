@@ -19,59 +19,59 @@ from companion.preflight.checks import Check
 from companion.px4.wanted import HOVER as HOVER_PARAM
 from companion.safety.mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
 
-DEVICE = Check("px4.device", "PX4", "the link opens, PX4 answers", "without PX4 nothing flies")
+DEVICE = Check("px4.device", "PX4", "the link opens, PX4 answers", "the flight needs PX4")
 HEARTBEAT = Check(
     "px4.heartbeat",
     "PX4 heartbeat",
     "newer than `safety.heartbeat_timeout_s`",
     "a link that loses heartbeats loses setpoints, too, and the flight ends in PX4's failsafe",
 )
-DISARMED = Check("px4.disarmed", "PX4 is disarmed", "disarmed", "an armed machine is not to be checked but landed")
+DISARMED = Check("px4.disarmed", "PX4 is disarmed", "disarmed", "an armed vehicle must be landed, not checked")
 RATES = Check(
     "px4.rates",
     "PX4 state rates",
     "position, attitude and IMU at 80 Hz or more; below 40 Hz refused",
-    "the law flies on this state at 200 Hz; what comes too seldom is old, and the machine swings",
+    "the law uses this state at 200 Hz; with stale data the vehicle oscillates",
 )
 LAG = Check(
     "px4.lag",
     "PX4 link lag",
-    "nothing later than `safety.link_lag_max_s` beyond the best",
-    "a link that holds state back cannot be flown over",
+    "at most `safety.link_lag_max_s` above the least delay",
+    "a delayed state makes the control unstable",
     warns=True,
 )
 VISION = Check(
     "px4.vision",
     "EKF2 fuses motion capture",
     "local position, attitude, velocity and position flags, live test ratios below 1, accuracy below 0.1 m, all the time",
-    "PX4 takes poses without fusing them; it would drift away with the machine in the air",
+    "PX4 accepts poses without fusing them; in flight the vehicle would drift away",
     settles=True,
 )
 AGREES = Check(
     "px4.agrees",
     "PX4 against motion capture",
     "0.10 m, 8 deg of yaw",
-    "PX4 would hold another place or another heading than the mission means",
+    "PX4 would hold another position or heading than the mission's",
     settles=True,
 )
 STEADY = Check(
     "px4.steady",
     "PX4's estimate at rest",
-    "wanders less than 0.04 m and 3 deg against motion capture",
-    "an estimate that still wanders carries the machine with it at take-off",
+    "varies by less than 0.04 m and 3 deg against motion capture",
+    "the vehicle follows a drifting estimate at take-off",
     settles=True,
 )
 BATTERY = Check(
     "px4.battery",
     "battery",
     "`safety.battery_warn` of charge and `safety.battery_voltage_min_v`",
-    "below `safety.battery_min` the flight lands by itself, wherever it is",
+    "below `safety.battery_min` the vehicle lands at once",
 )
 HOVER = Check(
     "px4.hover_thrust",
     "hover thrust",
     "within 15 % of weight over `airframe.thrust_max_n`; beyond 35 % refused (PX4's own in its row)",
-    "the first second after take-off is flown on it: too high jumps, too low does not lift",
+    "it sets the thrust in the first second: too high and the vehicle jumps, too low and it does not take off",
 )
 CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, HOVER)
 
@@ -118,7 +118,7 @@ def _heartbeat(o: Observations, vehicle: Vehicle) -> Row:
         return HEARTBEAT.bad("none came", wanted, "check link and baud rate")
     age_s = max(0.0, o.start_s + o.duration_s - o.status[-1].heartbeat_stamp_s)
     if age_s > limit_s:
-        return HEARTBEAT.bad(f"the last one is {age_s:.1f} s old", wanted, "check cable, baud rate and PX4's power")
+        return HEARTBEAT.bad(f"none for {age_s:.1f} s", wanted, "check cable, baud rate and PX4's power")
     return HEARTBEAT.good(f"{age_s:.1f} s old", wanted)
 
 
@@ -152,7 +152,7 @@ def _lag(o: Observations, vehicle: Vehicle) -> Row:
     read, wanted = f"{late_s * 1e3:.0f} ms at the 99th percentile", f"{limit_s * 1e3:.0f} ms"
     if late_s <= limit_s:
         return LAG.good(read, wanted)
-    return LAG.bad(read, wanted, "take other traffic off the link and the load off this computer")
+    return LAG.bad(read, wanted, "reduce other traffic on the link and the load of this computer")
 
 
 def vision(o: Observations) -> Row:
@@ -168,7 +168,7 @@ def vision(o: Observations) -> Row:
         )
     fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and that the body is tracked; then reboot PX4"
     if not o.mocap:
-        fix = "there is no motion capture to fuse: see that first"
+        fix = "there is no motion capture to fuse: see its rows first"
     return VISION.bad(missing, wanted, fix)
 
 
@@ -179,14 +179,14 @@ def missing_evidence(o: Observations) -> str | None:
     if not o.estimator:
         return "no ESTIMATOR_STATUS"
     if o.vehicle[0].position_stamp_s > o.start_s + COVER_S or o.estimator[0].stamp_s > o.start_s + COVER_S:
-        return "the estimate has only just come"
+        return "the estimate has just begun"
     end_s = o.start_s + o.duration_s
     if o.vehicle[-1].position_stamp_s < end_s - COVER_S or o.estimator[-1].stamp_s < end_s - COVER_S:
-        return "the estimate has stopped coming"
+        return "the estimate has stopped"
     for report in o.estimator:
         lacking = [name for bit, name in FLAGS.items() if not report.flags & bit]
         if lacking:
-            return f"the estimator says that it has no good {', '.join(lacking)}"
+            return f"the estimator reports no valid {', '.join(lacking)}"
     if all(max(_ratios(report)[1:]) == 0.0 for report in o.estimator):
         return "the innovation test ratios of position are 0: nothing is fused"
     worst = max(max(_ratios(report)) for report in o.estimator)
@@ -214,7 +214,7 @@ def agreement(o: Observations) -> Iterator[Row]:
     pairs = list(_pairs(o.vehicle, o.mocap))
     if not pairs:
         fix = "see the rates of both"
-        yield AGREES.bad("no two of them belong together in time", "", fix)
+        yield AGREES.bad("no pair matches in time", "", fix)
         return
     apart = [
         tuple(a - b for a, b in zip(state.position_world_m, pose.position_world_m, strict=True))
@@ -231,13 +231,13 @@ def agreement(o: Observations) -> Iterator[Row]:
         yield AGREES.bad(read, wanted, fix)
     wander_m = max(max(d[axis] for d in apart) - min(d[axis] for d in apart) for axis in range(3))
     wander_rad = max(turned_rad) - min(turned_rad)
-    read = f"wanders by {wander_m:.3f} m and {math.degrees(wander_rad):.1f} deg"
+    read = f"varies by {wander_m:.3f} m and {math.degrees(wander_rad):.1f} deg"
     wanted = f"{STEADY_M:g} m, {math.degrees(STEADY_RAD):.0f} deg"
     if wander_m <= STEADY_M and wander_rad <= STEADY_RAD:
         yield STEADY.good(read, wanted)
     else:
         yield STEADY.bad(
-            read, wanted, "leave the machine standing still; if it goes on, reboot PX4 and calibrate its gyros"
+            read, wanted, "leave the vehicle at rest; if it does not settle, reboot PX4 and calibrate its gyros"
         )
 
 
@@ -261,7 +261,7 @@ def _battery(o: Observations, vehicle: Vehicle) -> Row:
         safety.battery_voltage_min_v,
     )
     told = [f"{remaining:.0%}" if remaining is not None else "", f"{voltage_v:.1f} V" if voltage_v is not None else ""]
-    read = ", ".join(text for text in told if text) or "PX4 tells neither charge nor voltage"
+    read = ", ".join(text for text in told if text) or "PX4 reports neither charge nor voltage"
     wanted = f"{safety.battery_warn:.0%}" + (f", {voltage_min_v:g} V" if voltage_min_v is not None else "")
     if remaining is not None and remaining < safety.battery_warn:
         return BATTERY.bad(read, wanted, "charge the battery")

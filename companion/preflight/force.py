@@ -16,26 +16,26 @@ from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check
 
 DEVICE = Check(
-    "force.device", "force sensor", "the port opens, an RFT60 answers and streams", "the law would not feel the payload"
+    "force.device", "force sensor", "the port opens, an RFT60 answers and streams", "the law needs the payload's force"
 )
 RATE = Check(
     "force.rate",
     "force sensor rate",
     "90 % of `devices.force.rate_hz`; below half refused",
-    "a catch is felt late, or not at all",
+    "a catch is detected late, or not at all",
 )
 CHECKSUMS = Check(
     "force.checksums",
     "force sensor packets",
-    "none with a wrong checksum",
-    "a disturbed line loses samples, more so in flight",
+    "none with an invalid checksum",
+    "interference loses samples, more so in flight",
     warns=True,
 )
 NOISE = Check(
     "force.noise",
     "force sensor noise",
     "0.3 N; above 1.5 N refused",
-    "the law answers to every force that it feels, and noise becomes motion",
+    "the law responds to every measured force, so noise becomes motion",
 )
 OVERLOAD = Check(
     "force.overload", "force sensor overload", "none", "an overloaded sensor saturates, and may be damaged for good"
@@ -44,19 +44,19 @@ TARE = Check(
     "force.tare",
     "force sensor tare",
     "bias below 5 % of `devices.force.force_max_n`; above 10 % refused",
-    "what does not come from the empty net is taken out as bias: something that leans on the net is missing in flight",
+    "every force at rest except the empty net's is removed as bias, so a load on the net would be missing in flight",
 )
 STILL = Check(
     "force.still",
     "force sensor at rest",
     "drifts less than `safety.force_drift_n`",
-    "a tare that is taken while somebody touches the net is wrong for the whole flight",
+    "a tare taken while the net is touched is wrong for the whole flight",
 )
 USB = Check(
     "force.usb_latency",
     "force sensor's USB latency timer",
     "1 ms, or no FTDI adapter",
-    "samples come in bursts, up to 16 ms late",
+    "samples arrive in bursts, up to 16 ms late",
     warns=True,
 )
 CHECKS = (DEVICE, RATE, CHECKSUMS, NOISE, OVERLOAD, TARE, STILL, USB)
@@ -73,7 +73,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield DEVICE.bad(failure, "", "")
         return
     if stream is None:
-        yield DEVICE.bad("was not looked at", "", "")
+        yield DEVICE.bad("not checked", "", "")
         return
     if stream.lost is not None:
         yield DEVICE.bad(stream.lost, "it goes on streaming", "check plug and cable")
@@ -115,7 +115,7 @@ def _noise(samples: Sequence[ForceSample]) -> Row:
     read, wanted = f"{noise_n:.2f} N (one sigma)", f"{NOISE_GOOD_N:g} N"
     if noise_n <= NOISE_GOOD_N:
         return NOISE.good(read, wanted)
-    fix = "switch off what shakes the machine; ground the sensor; lead its cable away from motors"
+    fix = "remove sources of vibration; ground the sensor; route its cable away from motors"
     return (NOISE.doubtful if noise_n <= NOISE_MAX_N else NOISE.bad)(read, wanted, fix)
 
 
@@ -124,7 +124,7 @@ def _overload(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     if not count:
         return OVERLOAD.good("none", "none")
     limit_n = vehicle.devices.force.force_max_n
-    fix = f"take the load off; without a load the sensor or its mount is damaged (devices.force.force_max_n is {limit_n:g} N)"
+    fix = f"remove the load; if there is none, the sensor or its mount is damaged (devices.force.force_max_n is {limit_n:g} N)"
     return OVERLOAD.bad(f"{count} of {len(samples)} samples", "none", fix)
 
 
@@ -136,7 +136,7 @@ def _tare(o: Observations, vehicle: Vehicle) -> Row:
     wanted = f"{TARE_GOOD * full_n:g} N"
     if size_n <= TARE_GOOD * full_n:
         return TARE.good(read, wanted)
-    fix = "free the net; without a load correct tool.net_mass_kg, loosen the sensor's mount or set its bias with the vendor's tool"
+    fix = "free the net; if it is free, correct tool.net_mass_kg, loosen the sensor's mount or set its bias with the vendor's tool"
     return (TARE.doubtful if size_n <= TARE_MAX * full_n else TARE.bad)(read, wanted, fix)
 
 
@@ -159,7 +159,7 @@ def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     read, wanted = f"drifts by {drift_n:.2f} N", f"{limit_n:g} N"
     if drift_n <= limit_n:
         return STILL.good(read, wanted)
-    return STILL.bad(read, wanted, "let nobody touch the net; let the sensor warm up for some minutes")
+    return STILL.bad(read, wanted, "do not touch the net; let the sensor warm up for some minutes")
 
 
 def mean_force_n(samples: Sequence[ForceSample]) -> Vec3:

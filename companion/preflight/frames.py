@@ -25,65 +25,65 @@ HAND_TEST = Check(
     "frames.hand_test",
     "hand test",
     "passed once with this vehicle, server, rigid body, up axis and NatNet version (not in SITL)",
-    "PX4 fuses motion capture and cannot notice wrong axes; at rest not all of them show",
+    "PX4 fuses motion capture and cannot detect wrong axes; not all of them show at rest",
     warns=True,
 )
-REST = Check("frames.rest", "at rest", "nothing moves while it is watched", "gravity is only known at rest")
+REST = Check("frames.rest", "at rest", "no motion during the observation", "gravity can be measured at rest only")
 GRAVITY = Check(
     "frames.gravity",
     "gravity in motion capture's axes",
-    "what the accelerometer feels, turned by motion capture's attitude, points up within 5 deg",
-    "the thrust would point that far off",
+    "specific force, rotated by motion capture's attitude, points up within 5 deg",
+    "the thrust would be tilted by that angle",
 )
 HEIGHT = Check(
     "frames.height",
     "height at rest",
     "`airframe.ground_clearance_m` within 3 cm; beyond the mission's `start.tolerance_m` refused",
-    "heights are wrong by that, and the touchdown comes early or late",
+    "heights are wrong by that, and touchdown is detected early or late",
 )
 PLACE = Check(
     "frames.place",
     "start place in motion capture's axes",
     "the mission's `start.position_m`",
-    "the room, the tether and the way are counted in these axes",
+    "room, tether and path are given in these axes",
 )
 YAW = Check(
     "frames.yaw",
     "start yaw in motion capture's axes",
     "the mission's `start.yaw_deg`",
-    "PX4 fuses this yaw and cannot notice that it is wrong: the machine would circle or fly off",
+    "PX4 fuses this yaw and cannot detect that it is wrong: the vehicle would circle or fly away",
 )
 NOISE_POSITION = Check(
     "frames.noise_position",
     "noise of the position at rest",
     "2 mm, and no frame 30 mm off; above 10 mm refused",
-    "the machine would shake, or lose its estimate",
+    "the vehicle would shake, or lose its estimate",
 )
 NOISE_ATTITUDE = Check(
     "frames.noise_attitude",
     "noise of the attitude at rest",
     "0.3 deg, and no frame 10 deg off; above 2 deg refused",
-    "a yaw that jumps is markers taken for one another; PX4 follows it",
+    "a jumping yaw means that markers are confused; PX4 follows it",
 )
 ACCELEROMETER = Check(
     "frames.accelerometer",
     "gravity by the accelerometer",
     "9.81 m/s2 within 0.5",
-    "PX4's height and tilt lean on it",
+    "PX4's height and tilt depend on it",
     warns=True,
 )
 PX4_TILT = Check(
     "frames.px4_tilt",
     "PX4's tilt against motion capture's",
     "within 3 deg",
-    "an attitude setpoint would lean the machine by that",
+    "every attitude setpoint would be wrong by that",
     settles=True,
 )
 PX4_YAW = Check(
     "frames.px4_yaw",
     "PX4's yaw against motion capture's",
     "`safety.yaw_disagreement_deg`",
-    "PX4 does not fuse motion capture's yaw: the machine would fly off sideways",
+    "PX4 does not fuse motion capture's yaw: the vehicle would fly away sideways",
     settles=True,
 )
 CHECKS = (
@@ -302,21 +302,21 @@ def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
         turned_rad(mean_attitude([p.attitude_wxyz for p in first]), mean_attitude([p.attitude_wxyz for p in last]))
     )
     rate_deg_s = math.degrees(norm(mean_vector([state.angular_rate_body_rad_s for state in states])))
-    read = f"moved by {1e3 * moved_m:.1f} mm and {moved_deg:.1f} deg while it was watched, gyro {rate_deg_s:.1f} deg/s"
+    read = (
+        f"moved by {1e3 * moved_m:.1f} mm and {moved_deg:.1f} deg during the observation, gyro {rate_deg_s:.1f} deg/s"
+    )
     wanted = f"at most {1e3 * MOVED_MAX_M:g} mm, {MOVED_MAX_DEG:g} deg, {RATE_MAX_DEG_S:g} deg/s"
     if moved_m > MOVED_MAX_M or moved_deg > MOVED_MAX_DEG:
-        return REST.bad(read, wanted, "hands off, and check again")
+        return REST.bad(read, wanted, "do not touch the vehicle, and check again")
     if rate_deg_s > RATE_MAX_DEG_S:
-        return REST.bad(read, wanted, "motion capture says that it stands: calibrate PX4's gyro")
+        return REST.bad(read, wanted, "motion capture shows it at rest: calibrate PX4's gyro")
     return REST.good(read, wanted)
 
 
 def _noise(poses: list[MocapPose], at: Pose) -> Iterator[Row]:
     away_mm = [1e3 * math.dist(pose.position_world_m, at.position_m) for pose in poses]
     away_deg = [math.degrees(turned_rad(pose.attitude_wxyz, at.attitude)) for pose in poses]
-    fix = (
-        "refine the calibration, clean the lenses, cover what shines; give the rigid body more markers, asymmetric ones"
-    )
+    fix = "refine the calibration, clean the lenses, cover reflections; give the rigid body more markers, placed asymmetrically"
     for check, away, unit, good, most, jump in (
         (NOISE_POSITION, away_mm, "mm", NOISE_GOOD_MM, NOISE_MAX_MM, JUMP_MAX_MM),
         (NOISE_ATTITUDE, away_deg, "deg", NOISE_GOOD_DEG, NOISE_MAX_DEG, JUMP_MAX_DEG),

@@ -15,34 +15,34 @@ DISK = Check(
     "machine.disk",
     "disk space",
     "the log of the mission and of twice its length",
-    "a log that ends in the middle explains nothing; a full disk slows the whole computer down",
+    "an incomplete log explains nothing; a full disk slows down the whole computer",
 )
 GOVERNOR = Check(
     "machine.governor",
     "processor",
-    "governor `performance` on every core, where it is told",
-    "a core that clocks down makes ticks late",
+    "governor `performance` on every core, where it is reported",
+    "a reduced clock frequency makes ticks late",
     warns=True,
 )
 REALTIME = Check(
     "machine.realtime",
     "real-time permission",
     "SCHED_FIFO",
-    "without it a busy computer makes ticks late",
+    "without it ticks are late on a busy computer",
     warns=True,
 )
 MEMORY_LOCK = Check(
     "machine.memory_lock",
     "memory lock",
     "RLIMIT_MEMLOCK unlimited, unless `computer.lock_memory` is false",
-    "pages that the system dropped are read from the card again in flight, which takes tens of milliseconds",
+    "swapped-out pages are read from the card in flight, which takes tens of milliseconds",
     warns=True,
 )
 CPUS = Check(
     "machine.cpus",
     "cores of the flight",
     "this computer has every core of `computer.cpus`, and one more",
-    "a flight that was to have cores of its own would share them with everything else",
+    "the flight would share its cores with all other processes",
 )
 RECORDER = Check(
     "machine.recorder",
@@ -71,7 +71,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
             fix = "sudo companion install --systemd does it for good; until the next boot, cpupower frequency-set -g performance"
             yield GOVERNOR.bad(", ".join(others), "performance", fix)
         else:
-            yield GOVERNOR.good("performance" if machine.governors else "no governor is told here", "performance")
+            yield GOVERNOR.good("performance" if machine.governors else "no governor is reported", "performance")
         if machine.realtime is None:
             yield REALTIME.bad(
                 "refused: the flight runs at normal priority", "SCHED_FIFO", _PERMIT.format("@dialout - rtprio 60")
@@ -82,7 +82,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield _cpus(machine, vehicle.computer)
     if o.recorder is not None:
         if o.recorder:
-            yield RECORDER.bad(o.recorder, "it opens a log", "see the line itself; it names file and reason")
+            yield RECORDER.bad(o.recorder, "it opens a log", "the line names file and reason")
         else:
             yield RECORDER.good("opens a log", "it opens a log")
 

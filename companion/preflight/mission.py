@@ -18,8 +18,8 @@ from companion.preflight.checks import Check
 PLAN = Check(
     "mission.plan",
     "mission",
-    "inside room and tether, within all limits; `fly` looks at it before it opens a device, exit 2",
-    "the flight would leave the room, pull at the tether or ask for more than the machine can",
+    "inside room and tether, within all limits; `fly` checks it before it opens a device, exit 2",
+    "the flight would leave the room, load the tether or exceed the vehicle's limits",
 )
 ARM = Check(
     "mission.arm",
@@ -31,7 +31,7 @@ ROOM = Check(
     "mission.room",
     "place in the room",
     "body origin and rotors inside `room`",
-    "the walls of the room are all that keeps the rotors from the real ones",
+    "only the configured room keeps the rotors from the real walls",
 )
 CHECKS = (PLAN, ARM, ROOM)
 
@@ -41,7 +41,7 @@ def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
     mission, vehicle = config.mission, config.vehicle
     if o.plan is not None:
         if o.plan:
-            yield PLAN.bad("; ".join(o.plan), "", "change the mission; companion check --plan-only tells quickly")
+            yield PLAN.bad("; ".join(o.plan), "", "change the mission; companion check --plan-only is a quick check")
         else:
             length = f", {o.mission_s:.0f} s" if o.mission_s is not None else ""
             yield PLAN.good(f"'{mission.name}' can be flown{length}")
@@ -71,4 +71,4 @@ def _room(position: Vec3, room: Room, radius_m: float) -> Row:
     inside = all(low + r <= p <= high - r for p, r, (low, high) in zip(position, reach, spans, strict=True))
     if inside:
         return ROOM.good(read, wanted)
-    return ROOM.bad(read, f"{wanted}, rotors ({radius_m:g} m) included", "carry it further in, or correct room")
+    return ROOM.bad(read, f"{wanted}, rotors ({radius_m:g} m) included", "move it further inside, or correct room")

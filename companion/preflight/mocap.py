@@ -11,12 +11,12 @@ from companion.model.rows import Row
 from companion.model.types import MocapPose
 from companion.preflight.checks import Check
 
-DEVICE = Check("mocap.device", "motion capture", "the server answers and streams", "without it PX4 has no position")
+DEVICE = Check("mocap.device", "motion capture", "the server answers and streams", "PX4 needs it for its position")
 RATE = Check(
     "mocap.rate",
     "mocap rate",
     "90 % of `devices.mocap.rate_hz`; below `safety.mocap_rate_min_hz` refused",
-    "PX4's estimate becomes slow and noisy; in flight it counts as a fault",
+    "PX4's estimate becomes slow and noisy; in flight it is a fault",
 )
 JITTER = Check(
     "mocap.jitter",
@@ -28,8 +28,8 @@ JITTER = Check(
 LATENCY = Check(
     "mocap.latency",
     "mocap latency",
-    "`safety.mocap_latency_warn_s`, and told by the server; `safety.mocap_timeout_s` refuses",
-    "EKF2_EV_DELAY says 5 ms: what is older is fused as if it were new",
+    "`safety.mocap_latency_warn_s`, and reported by the server; `safety.mocap_timeout_s` refuses",
+    "EKF2_EV_DELAY is 5 ms: older poses are fused as if they were current",
 )
 LOST = Check(
     "mocap.lost",
@@ -41,27 +41,27 @@ TRACKED = Check(
     "mocap.tracked",
     "body tracked",
     "in every frame; less than 95 % refused",
-    "a body that is lost at the start is lost in flight: PX4 then drifts",
+    "a body that is lost on the ground is lost in flight: PX4 then drifts",
 )
 BODY = Check(
     "mocap.body",
     "rigid body",
     "`devices.mocap.rigid_body_id`, and nothing else that could be taken for it",
-    "another body's pose would be flown",
+    "the pose of another body would be used",
     warns=True,
 )
 ERROR = Check(
     "mocap.error",
     "marker error",
     "2 mm on average",
-    "bent or swapped markers turn the body's axes",
+    "bent or swapped markers rotate the body's axes",
     warns=True,
 )
 CLOCK = Check(
     "mocap.clock",
     "mocap clock against ours",
-    "frames by their number come steadily: rate within 1 %, wandering less than 20 ms",
-    "clocks that run apart, or a server that stops and catches up, make every age wrong",
+    "frames arrive steadily by their numbers: rate within 1 %, jitter below 20 ms",
+    "diverging clocks, or a server that stalls and catches up, make every age wrong",
     warns=True,
 )
 CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, BODY, ERROR, CLOCK)
@@ -81,7 +81,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield DEVICE.bad(failure, "", "")
         return
     if stream is None:
-        yield DEVICE.bad("was not looked at", "", "")
+        yield DEVICE.bad("not checked", "", "")
         return
     yield DEVICE.good(stream.application or "answers")
     yield _rate(o, stream, vehicle)
@@ -121,7 +121,7 @@ def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     told_s = sorted(pose.latency_s for pose in poses if pose.latency_s is not None)
     if not told_s:
         return LATENCY.doubtful(
-            "the server does not tell it", wanted, "use NatNet 3.0 or 4.1 with cameras that stamp exposure"
+            "the server does not report it", wanted, "use NatNet 3.0 or 4.1 with cameras that stamp exposure"
         )
     high_s = told_s[int(0.99 * (len(told_s) - 1))]
     read = f"{told_s[len(told_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"
@@ -184,7 +184,7 @@ def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     # Late frames are jitter; what counts here is where the bulk of a tenth of the time lies.
     off_s = sorted(_medians([b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True)]))
     wander_s = off_s[-1] - off_s[0]
-    read = f"{period_s * 1e3:.3f} ms a frame, wanders by {wander_s * 1e3:.1f} ms"
+    read = f"{period_s * 1e3:.3f} ms a frame, jitter {wander_s * 1e3:.1f} ms"
     if abs(period_s * expected_hz - 1.0) <= CLOCK_GOOD and wander_s <= WANDER_GOOD_S:
         return CLOCK.good(read, wanted)
     fix = "set devices.mocap.rate_hz to the camera rate; look for a server that stalls, or time synchronisation that steps"

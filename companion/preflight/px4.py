@@ -32,7 +32,7 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
     found = [] if firmware is None else [firmware_row(firmware)]
     if not params:
         if firmware is not None:
-            why = "nobody knows how PX4 would behave"
+            why = "PX4's behaviour would be unknown"
             found.append(
                 Row(UNREAD_ID, "PX4 parameters", False, "none was read", "", why, "check the link, then try again")
             )
@@ -56,7 +56,7 @@ def firmware_row(firmware: str) -> Row:
     if version < OLDEST:
         return row(False, Level.REFUSE, "flash a release of PX4 1.16 or 1.18: parameters of this one have other names")
     if version not in KNOWN_GOOD:
-        return row(False, fix="nothing here was flown with it: flash 1.16 or 1.18, or fly with care, tethered")
+        return row(False, fix="this version was not tested: flash 1.16 or 1.18, or fly with care, tethered")
     if kind != "release":
         return row(False, fix=f"this is a build of kind {kind}: flash the release")
     return row(True)

@@ -16,20 +16,20 @@ from companion.preflight.checks import Check
 LINE = Check(
     "tether.line",
     "tether as described",
-    "for people to compare with what hangs there",
+    "to be compared with the real tether",
     "every distance to the taut sphere is computed from it",
 )
 STRENGTH = Check(
     "tether.strength",
     "tether strength",
-    "`tether.load_rating_n` holds the rotors at full command",
-    "a tether that breaks is none",
+    "`tether.load_rating_n` covers full thrust",
+    "the tether must not break",
 )
 SLACK = Check(
     "tether.slack",
     "tether slack at the start",
     "`tether.margin_m` or more, where the machine stands",
-    "a tether that is taut at the start pulls the machine over as it lifts",
+    "a taut tether tips the vehicle over at take-off",
 )
 CHECKS = (LINE, STRENGTH, SLACK)
 
@@ -58,5 +58,5 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     if slack_m >= tether.margin_m:
         yield SLACK.good(read, wanted)
     else:
-        fix = "carry the machine nearer to the anchor, or correct tether.length_m and tether.anchor_world_m"
+        fix = "move the vehicle nearer to the anchor, or correct tether.length_m and tether.anchor_world_m"
         yield SLACK.bad(read, wanted, fix)

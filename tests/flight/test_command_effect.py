@@ -175,7 +175,7 @@ FORGIVING = (
 def test_commands_while_it_goes_back_along_the_tether() -> None:
     flown = commanded((7.0, HOLD), (7.1, RESUME), (7.3, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"))
     assert flown.effects[:2] == [
-        (False, "not held: it goes back along the tether and lands"),
+        (False, "not held: it returns along the tether and lands"),
         (False, "nothing to resume: it goes back along the tether and lands"),
     ]
     assert flown.effects[2] == (True, "landing")
@@ -186,7 +186,7 @@ def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
     assert flown.effects == [(True, "too low to hold: landing")]
     begin_s = times_of(ordinary())["land"]
     flown = commanded((begin_s + 0.5, HOLD), (begin_s + 1.0, RESUME))
-    assert flown.effects == [(False, "not held: it is landing"), (True, "the landing goes on")]
+    assert flown.effects == [(False, "not held: it is landing"), (True, "the landing continues")]
     assert flown.outcome is Outcome.COMPLETED
 
 
@@ -195,7 +195,7 @@ def test_nothing_is_done_against_a_pilot() -> None:
         return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 7.0 else i
 
     flown = commanded((7.5, HOLD), (7.6, RESUME), (7.7, LAND), (7.8, ABORT), (7.9, START), change=change)
-    assert flown.effects == [(False, "a pilot has the vehicle: nothing is sent against them")] * 5
+    assert flown.effects == [(False, "a pilot has control: nothing is sent")] * 5
     assert flown.at(7.5).phase == "a pilot flies"
     assert all(o.attitude is None for o in flown.outputs if o.t_s > 7.1)
 
@@ -203,9 +203,9 @@ def test_nothing_is_done_against_a_pilot() -> None:
 def test_commands_while_px4_lands_on_its_own() -> None:
     blind = ("world.faults=[{kind: mocap_loss, t_s: 6.0}]",)
     flown = commanded((8.0, LAND), (8.1, ABORT), (8.2, HOLD), (8.3, RESUME), (8.4, START), sets=blind)
-    assert flown.effects[:2] == [(True, "recorded; PX4 is landing on its own, it goes on")] * 2
+    assert flown.effects[:2] == [(True, "recorded; PX4's own landing continues")] * 2
     assert [accepted for accepted, _ in flown.effects[2:]] == [False, False, False]
-    assert all("PX4 is landing on its own" in text for _, text in flown.effects)
+    assert all("PX4 is landing on its own" in text for _, text in flown.effects[2:])
 
 
 # -- before take-off -------------------------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
 
 def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
     flown = commanded((2.5, HOLD), (30.0, START), sets=WAITS)
-    assert flown.effects == [(True, "it stays on the ground until start is commanded"), (True, "taking off")]
+    assert flown.effects == [(True, "the vehicle stays on the ground until start is commanded"), (True, "taking off")]
     waiting = [o for o in flown.outputs if o.phase == "waits for start"]
     assert waiting[-1].t_s - waiting[0].t_s > 25.0
     assert all(o.attitude is None and o.arm_torque_nm is None and o.request.value == "none" for o in waiting)

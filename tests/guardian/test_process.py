@@ -317,5 +317,5 @@ def test_an_error_of_its_own_is_told_and_the_landing_goes_on(
         assert rig.result is not None and rig.result["landed"] is True
         errors = [message["text"] for message in rig.messages if message.get("id") == "guardian_error"]
         assert len(errors) == 1, "told once"
-        assert errors[0] == f"an error in {where} (ZeroDivisionError: a bug); the landing goes on"
+        assert errors[0] == f"an error in {where} (ZeroDivisionError: a bug); the landing continues"
         assert "Traceback" in rig.log.read_text()

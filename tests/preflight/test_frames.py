@@ -119,7 +119,7 @@ def test_a_machine_that_is_carried_is_not_judged() -> None:
     rows = watched("hand=true", "hand_t_s=1.5", until_s=5.0)
     assert [row.id for row in rows] == ["frames.rest"]
     assert rows[0].refuses
-    assert rows[0].fix == "hands off, and check again"
+    assert rows[0].fix == "do not touch the vehicle, and check again"
 
 
 def test_too_few_samples_are_not_judged() -> None:

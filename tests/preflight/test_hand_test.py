@@ -199,19 +199,19 @@ def test_wrong_distances_are_told() -> None:
 
 def test_it_ends_at_once_when_px4_is_armed() -> None:
     view = ran(replace(sample, armed=sample.t_s > 6.0) for sample in samples())
-    assert view.ended.startswith("PX4 says that it is armed")
+    assert view.ended.startswith("PX4 reports that it is armed")
     assert view.step is Step.LIFT
     assert view.result is None
 
 
 def test_it_does_not_begin_when_px4_is_armed() -> None:
     view = HandTest().update(replace(samples()[0], armed=True))
-    assert view.ended.startswith("PX4 says that it is armed")
+    assert view.ended.startswith("PX4 reports that it is armed")
 
 
 def test_it_ends_when_px4_does_not_say_whether_it_is_armed() -> None:
     view = ran(replace(sample, armed=None if sample.t_s > 3.0 else False) for sample in samples())
-    assert view.ended.startswith(f"PX4 has not said for {SILENCE_MAX_S:g} s whether it is armed")
+    assert view.ended.startswith(f"no report for {SILENCE_MAX_S:g} s on whether PX4 is armed")
 
 
 def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
@@ -232,7 +232,7 @@ def test_a_machine_that_nobody_lifts_is_told_after_the_time_limit() -> None:
     ("change", "words"),
     [
         (lambda sample: replace(sample, pose=None), "motion capture does not track the rigid body"),
-        (lambda sample: replace(sample, vehicle=None), "no state came from PX4"),
+        (lambda sample: replace(sample, vehicle=None), "no state from PX4"),
         (
             lambda sample: replace(sample, pose=sample.pose and replace(sample.pose, tracking_valid=False)),
             "motion capture does not track the rigid body",

@@ -104,7 +104,7 @@ def test_any_key_ends_it_and_the_terminal_is_as_before(config: SitlConfig, monke
     finally:
         os.close(keyboard)
         os.close(tty)
-    assert [(row.id, row.read, row.refuses) for row in rows] == [("hand.done", "ended by hand", True)]
+    assert [(row.id, row.read, row.refuses) for row in rows] == [("hand.done", "ended by the operator", True)]
 
 
 def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: SitlConfig) -> None:
@@ -121,7 +121,7 @@ def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: SitlConfig) -> No
         return rows
 
     (row,) = asyncio.run(both())
-    assert (row.id, row.read) == ("hand.done", "ended by hand")
+    assert (row.id, row.read) == ("hand.done", "ended by the operator")
 
 
 def test_a_whole_round_passes_and_is_kept(config: SitlConfig, tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_scripts_keep_their_standard_output(config: SitlConfig, capsys: pytest.C
             return await run_hand_test(edges, config, Console(), True)
 
     (row,) = asyncio.run(go())
-    assert row.read == "ended by hand"
+    assert row.read == "ended by the operator"
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "hand test" in captured.err

@@ -27,7 +27,7 @@ def checks_table(checks: Sequence[Check]) -> str:
     """One row per check."""
     lines = ["| row | what is looked at | wanted | otherwise |", "|---|---|---|---|"]
     for check in checks:
-        told = f"{check.why}{' (told, never refused)' if check.warns else ''}"
+        told = f"{check.why}{' (warns only)' if check.warns else ''}"
         lines.append(f"| `{check.id}` | {check.title} | {check.wanted} | {told} |")
     return "\n".join(lines)
 

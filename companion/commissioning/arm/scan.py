@@ -24,7 +24,7 @@ SYSFS: Final = Path("/sys/class/tty")
 SEARCHED: tuple[int, ...] = tuple(reversed(bus.BAUDS))
 """Baud rates of a full scan, in this order after the vehicle file's."""
 
-_NO_ARM = "no arm, no flight"
+_NO_ARM = "the flight needs the arm"
 IDS = Check("arm.scan.ids", "servo ids", "those of arm.joints[].servo_id", _NO_ARM)
 BAUD = Check("arm.scan.baud", "baud rate", "devices.arm.baud", "servos at another rate receive nothing")
 COLLISION = Check("arm.scan.collision", "one servo per id", "every answer is readable", "answers that collide are lost")
@@ -218,7 +218,7 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
             max(temperatures_c) < warn_c,
             _each(servos, [f"{temperature_c} degC" for temperature_c in temperatures_c]),
             f"below {warn_c:g} degC",
-            "let the arm cool down; look for a joint that jams or an arm that leans on something",
+            "let the arm cool down; look for a jammed joint or an arm under load",
         ),
     ]
 

@@ -29,7 +29,7 @@ OWN = Check(
     "mocap.own",
     "rigid body of the vehicle",
     "`devices.mocap.rigid_body_id` is streamed, and moves when the vehicle does",
-    "another body's pose would be flown",
+    "the pose of another body would be used",
 )
 STEADY = Check(
     "mocap.steady",

@@ -32,13 +32,13 @@ from companion.preflight.hand_test.run import TOLD, HandResult, HandSample, Hand
 LOOK_PERIOD_S: Final = 0.004
 ARM_PERIOD_S: Final = 0.02
 _ARM_TIMEOUT_S: Final = 0.003
-ENDED_BY_HAND: Final = "ended by hand"
+ENDED_BY_HAND: Final = "ended by the operator"
 _STEPS: Final = tuple(step for step in Step if step is not Step.DONE)
 
 RECORD = Check(
     "hand.record",
     "hand test: record",
-    "a passed test is written down",
+    "a passed test is recorded",
     "the next check will ask for the test again",
     warns=True,
 )
@@ -177,7 +177,7 @@ class _Screen:
 
     def __enter__(self) -> _Screen:
         self._console.print(
-            "[bold]hand test[/]  battery in, motors disarmed, propellers off; somebody carries the machine (any key ends it)"
+            "[bold]hand test[/]  battery in, motors disarmed, propellers off; the operator carries the vehicle (any key ends the test)"
         )
         self._progress.start()
         return self

@@ -17,32 +17,32 @@ from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import Motion, angle_rad, norm
 from companion.preflight.hand_test.run import HandResult
 
-_ASTRAY = "the controller would push into wrong directions"
-DONE = Check("hand.done", "hand test", "every step of it is recognised", "nothing is known of the axes")
+_ASTRAY = "the controller would push in wrong directions"
+DONE = Check("hand.done", "hand test", "every step is recognised", "the axes are not known")
 TOLD = Check(
     "hand.told",
-    "hand test: as told",
-    "the IMU felt it go up, forward and turn left",
-    "either it was moved elsewhere, or PX4's own axes are wrong",
+    "hand test: as instructed",
+    "the IMU measured up, forward and a turn to the left",
+    "either it was moved otherwise, or PX4's own axes are wrong",
 )
 LEVEL = Check("hand.level", "hand test: level", "gravity is vertical in the stream within 5 deg", _ASTRAY)
-LIFT = Check("hand.lift", "hand test: up", "felt and seen in the same direction within 20 deg", _ASTRAY)
+LIFT = Check("hand.lift", "hand test: up", "IMU and motion capture agree on the direction within 20 deg", _ASTRAY)
 FORWARD = Check(
     "hand.forward",
     "hand test: forward",
     "the same, and within 12 deg about the vertical",
-    "PX4 fuses this yaw and cannot notice: the machine would circle or fly off",
+    "PX4 fuses this yaw and cannot detect that it is wrong: the vehicle would circle or fly away",
 )
 TURN = Check(
     "hand.turn",
     "hand test: turn",
     "gyro and motion capture agree within 8 deg",
-    "a yaw that turns the wrong way never settles",
+    "a yaw with the wrong sign never settles",
 )
 SCALE = Check(
     "hand.scale",
     "hand test: distance",
-    "0.7 to 1.4 m seen for each metre felt",
+    "0.7 to 1.4 m by motion capture for each metre by the IMU",
     "every distance would be wrong by that",
 )
 CHECKS = (DONE, TOLD, LEVEL, LIFT, FORWARD, TURN, SCALE)
@@ -105,19 +105,19 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
         row(
             FORWARD,
             abs(yaw_deg) <= YAW_MAX_DEG and slant_deg <= AXIS_MAX_DEG,
-            f"felt {_way(forward.felt_m)}, seen {_way(forward.seen_m)}, the body's yaw is off by {yaw_deg:+.0f} deg",
+            f"IMU {_way(forward.felt_m)}, motion capture {_way(forward.seen_m)}, the body's yaw is off by {yaw_deg:+.0f} deg",
             f"within {YAW_MAX_DEG:g} deg",
         ),
         row(
             TURN,
             abs(seen_deg - felt_deg) <= TURN_MAX_DEG and axis_deg <= AXIS_MAX_DEG,
-            f"felt {felt_deg:+.0f} deg about its vertical, seen {seen_deg:+.0f} deg",
+            f"IMU {felt_deg:+.0f} deg about its vertical, motion capture {seen_deg:+.0f} deg",
             f"within {TURN_MAX_DEG:g} deg",
         ),
         row(
             SCALE,
             all(SCALE_SPAN[0] <= scale <= SCALE_SPAN[1] for scale in scales),
-            f"seen {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre felt",
+            f"motion capture saw {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre by the IMU",
             f"{SCALE_SPAN[0]:g} to {SCALE_SPAN[1]:g} m",
             far,
         ),
@@ -141,10 +141,10 @@ def _told(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) -> Row:
     standing_deg = math.degrees(angle_rad(up_body, _UP))
     ahead_deg = math.degrees(angle_rad(forward.felt_m, _AHEAD))
     left_deg = math.degrees(turn.felt_turn_rad[2])
-    read = f"the IMU felt {_way(lift.felt_m)}, then {_way(forward.felt_m)}, then a turn by {left_deg:+.0f} deg"
+    read = f"the IMU measured {_way(lift.felt_m)}, then {_way(forward.felt_m)}, then a turn by {left_deg:+.0f} deg"
     if max(up_deg, standing_deg, ahead_deg) <= TOLD_MAX_DEG and left_deg > 0.0:
         return TOLD.good(read, "up, forward, left")
-    return TOLD.bad(read, "up, forward, left", f"repeat the test; if it was moved as told, {_BOARD}")
+    return TOLD.bad(read, "up, forward, left", f"repeat the test; if it was moved as instructed, {_BOARD}")
 
 
 def _seen_as_told(result: HandResult) -> bool:

@@ -80,7 +80,7 @@ def measure(
     """
     count = int((end_s - start_s) / GRID_S)
     _no_gaps([pose.t_s for pose in poses], start_s, end_s, "motion capture lost the rigid body (markers covered?)")
-    _no_gaps([sample.t_s for sample in imu], start_s, end_s, "PX4's IMU was not heard")
+    _no_gaps([sample.t_s for sample in imu], start_s, end_s, "no data from PX4's IMU")
     times = [start_s + GRID_S * k for k in range(count + 1)]
     velocity, turned = _felt(imu, times, gyro_bias_rad_s)
     places = _places(poses, times)

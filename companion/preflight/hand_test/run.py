@@ -161,12 +161,12 @@ class HandTest:
     def _hear(self, sample: HandSample) -> None:
         assert self._heard_s is not None
         if sample.armed:
-            self._ended = "PX4 says that it is armed: put the machine down, disarm it, and begin again"
+            self._ended = "PX4 reports that it is armed: put the vehicle down, disarm it, and start again"
             return
         if sample.armed is not None:
             self._heard_s = sample.t_s
         elif sample.t_s - self._heard_s > SILENCE_MAX_S:
-            self._ended = f"PX4 has not said for {SILENCE_MAX_S:g} s whether it is armed: check the link"
+            self._ended = f"no report for {SILENCE_MAX_S:g} s on whether PX4 is armed: check the link"
             return
         pose, vehicle = sample.pose, sample.vehicle
         if pose is not None and pose.tracking_valid and pose.frame_number != self._frame:
@@ -192,11 +192,11 @@ class HandTest:
     def _why(self, t_s: float) -> str:
         for samples, what in (
             (self._poses, "motion capture does not track the rigid body"),
-            (self._imu, "no state came from PX4: its position, attitude and IMU are needed"),
+            (self._imu, "no state from PX4: position, attitude and IMU are needed"),
         ):
             if not samples or t_s - samples[-1].t_s > 1.0:
                 return what
-        return self._notice or f"seen: {self._seen or 'nothing'}"
+        return self._notice or f"motion capture: {self._seen or 'nothing'}"
 
     def _still(
         self, t_s: float, window_s: float = STILL_S, within_m: float = STILL_M, within_deg: float = STILL_DEG
@@ -220,7 +220,7 @@ class HandTest:
         rest = self._still(t_s, STAND_S, STAND_M, STAND_DEG)
         stood_s = 0.0 if self._still_since_s is None else t_s - max(self._still_since_s, self._step_s)
         self._progress = min(1.0, stood_s / STAND_S)
-        self._seen = "it stands" if self._still_since_s is not None else "it moves, or is not seen"
+        self._seen = "it stands" if self._still_since_s is not None else "it moves, or is not tracked"
         felt = self._imu[bisect_left(self._imu, t_s - STAND_S, key=lambda sample: sample.t_s) :]
         if rest is None or len(felt) < _POSES_MIN:
             return
@@ -254,13 +254,13 @@ class HandTest:
         start_s, end_s = before.to_s - 0.5 * STILL_S, after.from_s + 0.5 * STILL_S
         if end_s - start_s > MOVE_MAX_S:
             self._again(
-                after, f"the move took {end_s - start_s:.0f} s, too long for the IMU: do it in about two seconds"
+                after, f"the move took {end_s - start_s:.0f} s, too long for the IMU: repeat it in about two seconds"
             )
             return
         try:
             motion = measure(self._poses, self._imu, start_s, end_s, self._stood.rate_rad_s)
         except GapError as error:
-            self._again(after, f"{error}: do it once more")
+            self._again(after, f"{error}: repeat it")
             return
         self._motions[self._step] = motion
         self._go_on(t_s, after)
