@@ -82,7 +82,7 @@ class ForceTarget(Target):
     def feed(self, data: bytes) -> None:
         edge = self._edge
         edge._answers = {command: self._loop.create_future() for command in _ASKED}
-        before, received = edge.health(), edge._received_bytes
+        before, received = edge.counts(), edge._received_bytes
         # Behind any noise the scanner is in step again two packets later at the latest.
         sent = data + b"".join(self._marks)
         self._sensor.inject(sent)
@@ -95,12 +95,12 @@ class ForceTarget(Target):
         sample = edge.latest()
         if edge._scanner._tail or sample is None or sample.force_sensor_n[0] != _MARK_N:
             edge._scanner = rft.PacketScanner(rft.RESPONSE_BYTES)  # the next input starts afresh
-            raise Wrong(f"a valid packet behind it is not understood: {edge.health()}")
+            raise Wrong(f"a valid packet behind it is not understood: {edge.counts()}")
         self._check(before.samples, before.skipped_bytes, len(data))
         edge._latest = None
 
     def _check(self, samples_before: int, skipped_before: int, size: int) -> None:
-        edge, health = self._edge, self._edge.health()
+        edge, health = self._edge, self._edge.counts()
         sample = edge.latest()
         if sample is None or not all(map(math.isfinite, (*sample.force_sensor_n, *sample.torque_sensor_nm))):
             raise Wrong(f"a sample that is not finite: {sample}")

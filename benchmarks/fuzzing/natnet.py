@@ -137,7 +137,7 @@ class _Rig:
 
     def _check_state(self) -> None:
         edge, pose = self.edge, self.edge.latest()
-        health = edge.health()
+        health = edge.counts()
         if health.callback_error is not None:
             edge._callback_error = None
             raise Wrong(f"a pose that the autopilot edge refuses: {health.callback_error}")
@@ -164,7 +164,7 @@ class _Rig:
         self._send(encode_frame(self.version, number, 1.0, [body], 0.99, {_BODY_ID: "b"}))
         while (pose := edge.latest()) is None or pose.frame_number != number or pose.position_world_m[0] != x_m:
             if not self._wait():
-                raise Wrong(f"a valid frame behind it is not understood: {edge.health()}")
+                raise Wrong(f"a valid frame behind it is not understood: {edge.counts()}")
             edge._drain(self.socket)
 
     def _send(self, datagram: bytes) -> None:

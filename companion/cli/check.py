@@ -24,7 +24,7 @@ from rich.text import Text
 
 from companion.cli.campaign import wide_console
 from companion.config.loader import FlightConfig
-from companion.io.devices import open_what_opens
+from companion.io.devices import open_available
 from companion.io.protocols import DeviceError
 from companion.launcher.launcher import replace_device_settings
 from companion.launcher.sitl_process import SitlProcess
@@ -162,11 +162,11 @@ async def _unless_interrupted(look: Coroutine[Any, Any, list[Row]]) -> list[Row]
 
 async def _look(task: Task, config: FlightConfig, known: Observations, line: _Line, people: Console) -> list[Row]:
     clock, sitl = flight_clock(), task.sitl is not None
-    async with open_what_opens(config, clock, lambda device: line(f"opening: {device}")) as edges:
-        rows = await preflight.preflight(edges, config, clock, out=Path("flights"), tell=line, known=known, sitl=sitl)
+    async with open_available(config, clock, lambda device: line(f"opening: {device}")) as devices:
+        rows = await preflight.preflight(devices, config, clock, out=Path("flights"), tell=line, known=known, sitl=sitl)
         if task.hand:
             line.stop()
-            rows += await run_hand_test(edges, config, people, task.json, record=None if sitl else record_path())
+            rows += await run_hand_test(devices, config, people, task.json, record=None if sitl else record_path())
         return rows
 
 

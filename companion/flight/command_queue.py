@@ -149,7 +149,7 @@ class Operator:
         finally:
             land.cancel()
             task.cancel()  # does nothing to one that is done
-            await asyncio.wait((task, land))  # an edge that is opening takes itself back, within a deadline of its own
+            await asyncio.wait((task, land))  # a device that is opening closes itself again within its own deadline
         if task.cancelled():
             raise GivenUp
         return task.result()

@@ -27,7 +27,7 @@ from companion.flight.heartbeat import FlightGuard
 from companion.flight.startup import Checked, Refused, check_before_flight, with_hover_thrust
 from companion.flight.ticker import Ticker
 from companion.guardian.client import GuardianClient
-from companion.io.devices import Edges, open_edges
+from companion.io.devices import Devices, open_devices
 from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
 from companion.model.types import (
@@ -64,7 +64,7 @@ class Flight:
     def __init__(
         self,
         config: FlightConfig,
-        edges: Edges,
+        devices: Devices,
         recorder: RecorderProcess,
         channel: socket.socket,
         operator: Operator,
@@ -73,7 +73,7 @@ class Flight:
     ) -> None:
         self._mocap_rate_hz = config.vehicle.devices.mocap.rate_hz
         self._guardian = guardian
-        self._edges = edges
+        self._devices = devices
         self._recorder = recorder
         self._channel = channel
         self._operator = operator
@@ -89,12 +89,12 @@ class Flight:
     async def run(self) -> Outcome:
         """Run ticks until the core reports the end."""
         ticker = Ticker(self._period_s, self._clock, self._mocap_rate_hz)
-        self._edges.vision.on_frame = ticker.frame
-        arm = self._edges.arm
+        self._devices.vision.on_frame = ticker.frame
+        arm = self._devices.arm
         tick = 0
         before: Outputs | None = None
-        if self._edges.ground is not None:
-            self._tell_forwarding(self._clock(), self._edges.ground.line)
+        if self._devices.ground is not None:
+            self._tell_forwarding(self._clock(), self._devices.ground.line)
         while True:
             if arm is not None:
                 arm.begin_read(ticker.due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
@@ -106,46 +106,46 @@ class Flight:
             before = outputs
             self._missed += now.lateness_s > self._period_s
             self._report(tick, outputs, sent)
-            if self._edges.ground is not None:
-                self._edges.ground.tell(inputs, outputs)
+            if self._devices.ground is not None:
+                self._devices.ground.tell(inputs, outputs)
             if self._guardian is not None:
                 self._guardian.tick(inputs, outputs)
             if outputs.outcome is not None:
                 return outputs.outcome
-            if tick == 0 and self._edges.found_armed and not self._goes_on(outputs):
+            if tick == 0 and self._devices.found_armed and not self._goes_on(outputs):
                 return Outcome.ABORTED
             tick += 1
 
     async def _tick(
         self, tick: int, start_s: float, lateness_s: float, command: OperatorCommand
     ) -> tuple[Inputs, Outputs, Sent]:
-        edges = self._edges
-        arm_state = await edges.arm.read(JOINT_READ_TIMEOUT_S) if edges.arm is not None else None
+        devices = self._devices
+        arm_state = await devices.arm.read(JOINT_READ_TIMEOUT_S) if devices.arm is not None else None
         joint_read_s = self._clock()
         inputs = Inputs(
             tick=tick,
             t_s=joint_read_s,
-            vehicle=edges.autopilot.vehicle(),
-            status=edges.autopilot.status(),
-            mocap=edges.mocap.latest() if edges.mocap is not None else None,
+            vehicle=devices.autopilot.vehicle(),
+            status=devices.autopilot.status(),
+            mocap=devices.mocap.latest() if devices.mocap is not None else None,
             arm=arm_state,
-            force=edges.force.latest() if edges.force is not None else None,
+            force=devices.force.latest() if devices.force is not None else None,
             command=command,
             recorder_dropped=self._recorder.client.dropped,
             guardian_ready=self._guardian.ready if self._guardian is not None else None,
         )
         outputs = self._core.step(inputs)
-        edges.vision.open = outputs.mocap_trusted
+        devices.vision.open = outputs.mocap_trusted
         core_s = self._clock()
         # The setpoint first: handing over the currents wakes the bus thread, which wants the interpreter for itself.
-        attitude_sent = edges.autopilot.send_attitude(outputs.attitude)
+        attitude_sent = devices.autopilot.send_attitude(outputs.attitude)
         setpoint_s = self._clock()
         torque_sent: Vec2 | None = None
-        if outputs.arm_torque_nm is not None and edges.arm is not None:
-            torque_sent = edges.arm.write_torque(outputs.arm_torque_nm)
+        if outputs.arm_torque_nm is not None and devices.arm is not None:
+            torque_sent = devices.arm.write_torque(outputs.arm_torque_nm)
         current_s = self._clock()
         if outputs.request is not AutopilotRequest.NONE:
-            edges.autopilot.request(outputs.request)
+            devices.autopilot.request(outputs.request)
         sent = Sent(
             tick=tick,
             attitude_sent=attitude_sent,
@@ -180,7 +180,7 @@ class Flight:
         mission to fly.
         """
         goes_on = any(event.id == REATTACHED for event in outputs.events)
-        lines = [f"landing without it: {line}" for line in self._edges.failures]
+        lines = [f"landing without it: {line}" for line in self._devices.failures]
         if not goes_on:
             lines = [
                 "PX4 was armed when the companion started and has disarmed since; no take-off happened: start again to fly"
@@ -196,11 +196,11 @@ class Flight:
         if tick % STATUS_EVERY and outputs.outcome is None and outputs.phase == self._phase:
             return
         self._phase = outputs.phase
-        for text in self._edges.autopilot.take_messages():
+        for text in self._devices.autopilot.take_messages():
             self._recorder.client.text(outputs.t_s, Severity.WARNING, "px4", text)
             ipc.send(self._channel, {"type": "px4", "text": text})
-        if self._edges.ground is not None:
-            for text in self._edges.ground.take_messages():
+        if self._devices.ground is not None:
+            for text in self._devices.ground.take_messages():
                 self._tell_forwarding(outputs.t_s, text)
         self._tell_ground()
         ipc.send(self._channel, self._status(tick, outputs, sent))
@@ -283,12 +283,12 @@ async def fly(
     checked: Checked | None = None
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(operator.attention())
-        edges = await operator.unless_land(stack.enter_async_context(open_edges(config, clock)))
-        if edges.found_armed:  # it flies, perhaps: nothing is waited for
+        devices = await operator.unless_land(stack.enter_async_context(open_devices(config, clock)))
+        if devices.found_armed:  # it flies, perhaps: nothing is waited for
             config = unflown(config)
         else:
-            checked = await operator.unless_land(check_before_flight(edges, config, clock, out, channel, sitl))
-            config = await operator.unless_land(with_hover_thrust(config, edges.autopilot))
+            checked = await operator.unless_land(check_before_flight(devices, config, clock, out, channel, sitl))
+            config = await operator.unless_land(with_hover_thrust(config, devices.autopilot))
             if client is not None:
                 await operator.unless_land(client.wait_ready())
         try:
@@ -306,21 +306,21 @@ async def fly(
                 simulated=sitl,
             )
         except DeviceError as error:
-            if not edges.found_armed:
+            if not devices.found_armed:
                 raise
             print(error, file=sys.stderr)  # no log, but a landing
-            outcome = await land_without_core(edges.autopilot, channel, clock, None)
+            outcome = await land_without_core(devices.autopilot, channel, clock, None)
             ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
             return outcome
         try:
-            if not edges.found_armed:
-                recorder.client.metadata("autopilot", {"firmware": await edges.autopilot.firmware()})
+            if not devices.found_armed:
+                recorder.client.metadata("autopilot", {"firmware": await devices.autopilot.firmware()})
             if checked is not None:
                 checked.tell(recorder.client)
-            guardian = FlightGuard(client, edges.autopilot.identity(), origin_s) if client is not None else None
+            guardian = FlightGuard(client, devices.autopilot.identity(), origin_s) if client is not None else None
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
-            flight = Flight(config, edges, recorder, channel, operator, clock, guardian)
+            flight = Flight(config, devices, recorder, channel, operator, clock, guardian)
             computer = config.vehicle.computer
             got = str(claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory))
             recorder.client.metadata("realtime", {"got": got})
@@ -335,9 +335,9 @@ async def fly(
                     sys.stderr.flush()
                 if guardian is not None and guardian.would_take_over:
                     os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
-                outcome = await land_without_core(edges.autopilot, channel, clock, guardian)
+                outcome = await land_without_core(devices.autopilot, channel, clock, guardian)
             if guardian is not None and outcome is not Outcome.LOST:
-                guardian.goodbye(edges.autopilot.status())
+                guardian.goodbye(devices.autopilot.status())
         finally:
             report = await asyncio.to_thread(recorder.finish)
         recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.config.loader import FlightConfig
-from companion.io.devices import Edges
-from companion.io.protocols import DeviceError
-from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.devices import Devices
+from companion.io.protocols import Autopilot, DeviceError
 from companion.mission.plan import Plan
 from companion.model.observations import Observations
 from companion.model.rows import Row, refusals
@@ -56,7 +55,7 @@ def path_of(plan: Plan) -> list[Vec3]:
 
 
 async def check_before_flight(
-    edges: Edges, config: FlightConfig, clock: Clock, out: Path, channel: socket.socket, sitl: bool
+    devices: Devices, config: FlightConfig, clock: Clock, out: Path, channel: socket.socket, sitl: bool
 ) -> Checked:
     """Run the preflight, report it to the launcher and write `preflight.json`.
 
@@ -71,7 +70,7 @@ async def check_before_flight(
     # A path takes seconds to plan, once in a process: here, where motion capture goes on flowing meanwhile.
     plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
     known = Observations(0.0, 0.0, mission_s=plan.duration_s)
-    rows = await preflight.preflight(edges, config, clock, out=out, tell=tell, known=known, sitl=sitl)
+    rows = await preflight.preflight(devices, config, clock, out=out, tell=tell, known=known, sitl=sitl)
     ipc.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
     try:
         preflight.write(rows, out)
@@ -84,7 +83,7 @@ async def check_before_flight(
     return Checked(plan, tuple(rows))
 
 
-async def with_hover_thrust(config: FlightConfig, autopilot: MavsdkAutopilot) -> FlightConfig:
+async def with_hover_thrust(config: FlightConfig, autopilot: Autopilot) -> FlightConfig:
     """Return the effective configuration with the hover thrust from PX4 unless the vehicle file gives it.
 
     Raises:

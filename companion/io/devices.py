@@ -1,4 +1,4 @@
-"""All devices of the vehicle, opened together: for a flight every one of them, for a check whichever can be."""
+"""Opens the devices of the vehicle: all of them for a flight, those that can be opened for a check."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from companion.config.loader import FlightConfig
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.mocap.driver import NatNetMocap
-from companion.io.protocols import DeviceError
+from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.qgroundcontrol.station import GroundStation, check_address
 from companion.model.flight_stage import is_armed
@@ -19,137 +19,138 @@ from companion.model.types import MocapPose
 from companion.runtime.clock import Clock
 
 STATUS_TIMEOUT_S = 2.5
-"""Of PX4's heartbeat, which comes once a second."""
-ARM_PATIENCE_S = 1.5
-"""A vehicle in the air does not wait for its arm any longer."""
+"""PX4 sends a heartbeat once a second."""
+ARM_TIMEOUT_S = 1.5
+"""Timeout of the arm when PX4 was found armed and has to land."""
 
 
 @dataclass(slots=True)
-class VisionValve:
-    """Whether poses are passed on to PX4; the core shuts it while it does not believe them."""
+class VisionFilter:
+    """Forwards poses of motion capture to PX4 while it is open; the core closes it while it does not trust them."""
 
     open: bool = True
     watch: Callable[[MocapPose], None] | None = None
-    """Shown every pose as it arrives, whatever becomes of it."""
+    """Called with every pose on arrival, forwarded or not."""
     on_frame: Callable[[float], None] | None = None
-    """Told of every frame first: when it arrived."""
+    """Called first with the arrival time of every frame, s."""
 
 
 @dataclass(frozen=True, slots=True)
-class Edges:
-    """Everything on a wire, open. None: only beside a PX4 that was found armed, which has to land with what there is."""
+class Devices:
+    """All devices of a flight, open. None only if PX4 was found armed: then it lands with what could be opened."""
 
-    vision: VisionValve
-    autopilot: MavsdkAutopilot
-    mocap: NatNetMocap | None
-    arm: DynamixelArm | None
-    force: RobotousForceTorque | None
+    vision: VisionFilter
+    autopilot: Autopilot
+    mocap: Mocap | None
+    arm: Arm | None
+    force: ForceTorque | None
     found_armed: bool = False
     """PX4 was armed when its link was opened."""
     failures: tuple[str, ...] = ()
-    """Of devices that such a landing goes without: the edges' own lines."""
-    ground: GroundStation | None = None
-    """None: nothing is forwarded, because nobody asked for it or the vehicle was found armed."""
+    """Error lines of the devices that could not be opened, if PX4 was found armed."""
+    ground: GroundLink | None = None
+    """None if MAVLink is not forwarded."""
 
 
 @dataclass(slots=True)
-class SomeEdges:
-    """What could be opened; None: it could not, or is not yet."""
+class AvailableDevices:
+    """The devices that could be opened; None for the others."""
 
-    vision: VisionValve
-    autopilot: MavsdkAutopilot | None = None
-    mocap: NatNetMocap | None = None
-    arm: DynamixelArm | None = None
-    force: RobotousForceTorque | None = None
+    vision: VisionFilter
+    autopilot: Autopilot | None = None
+    mocap: Mocap | None = None
+    arm: Arm | None = None
+    force: ForceTorque | None = None
     failures: dict[str, str] = field(default_factory=dict)
-    """Device (`autopilot`, `mocap`, `arm`, `force`) and the edge's own line about it."""
+    """Error line by device: `autopilot`, `mocap`, `arm`, `force`."""
 
 
 @contextlib.asynccontextmanager
-async def open_edges(config: FlightConfig, clock: Clock) -> AsyncIterator[Edges]:
-    """Open every device; the arm, which gets torque, last. Motion capture flows to PX4 from the moment on at which its link is open.
+async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devices]:
+    """Open all devices, the arm last because it gets torque. Poses are forwarded to PX4 as soon as its link is open.
 
-    A PX4 that is armed already flies, perhaps: then what does not open is noted, and the force sensor is not waited for.
+    If PX4 is armed the vehicle may be flying: devices that fail are listed in `failures`, and the force sensor is left closed.
 
     Raises:
-        DeviceError: PX4 is not there, or it is not armed and another device is not there or not as it must be; the first such one.
-            All are closed again. So is the address of a ground station that is none, and that before anything is opened.
+        DeviceError: the ground station's address is invalid, PX4 cannot be opened, or it is disarmed and another device cannot be
+            opened. All devices are closed again.
     """
     ground_address = config.vehicle.ground.qgroundcontrol
     if ground_address is not None:
         check_address(ground_address)
-    some = SomeEdges(VisionValve())
+    available = AvailableDevices(VisionFilter())
     async with contextlib.AsyncExitStack() as stack:
         problem: DeviceError | None = None
         try:
-            some.mocap = await stack.enter_async_context(_mocap(config, clock, some))
+            available.mocap = await stack.enter_async_context(_mocap(config, clock, available))
         except DeviceError as error:
             problem = error
         try:
-            some.autopilot = autopilot = await stack.enter_async_context(_autopilot(config, clock))
+            available.autopilot = autopilot = await stack.enter_async_context(_autopilot(config, clock))
         except DeviceError as error:
             raise problem or error from None
-        armed = await _is_armed(autopilot)
-        if armed:
+        vision, mocap = available.vision, available.mocap
+        if await _is_armed(autopilot):
             failures = [] if problem is None else [str(problem)]
+            arm: Arm | None = None
             try:
-                async with asyncio.timeout(ARM_PATIENCE_S):
-                    some.arm = await stack.enter_async_context(_arm(config, clock))
+                async with asyncio.timeout(ARM_TIMEOUT_S):
+                    arm = await stack.enter_async_context(_arm(config, clock))
             except DeviceError as error:
                 failures.append(str(error))
             except TimeoutError:
-                failures.append(f"arm {config.vehicle.devices.arm.port}: not open within {ARM_PATIENCE_S:g} s")
+                failures.append(f"arm {config.vehicle.devices.arm.port}: not open within {ARM_TIMEOUT_S:g} s")
             if ground_address is not None:
                 failures.append(
                     f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded in a flight found under way"
                 )
-            yield Edges(some.vision, autopilot, some.mocap, some.arm, None, armed, tuple(failures))
+            yield Devices(vision, autopilot, mocap, arm, None, found_armed=True, failures=tuple(failures))
             return
         if problem is not None:
             raise problem
-        some.force = await stack.enter_async_context(_force(config, clock))
+        force = await stack.enter_async_context(_force(config, clock))
         ground = None
         if ground_address is not None:
             ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
-        some.arm = await stack.enter_async_context(_arm(config, clock))
-        yield Edges(some.vision, autopilot, some.mocap, some.arm, some.force, ground=ground)
+        arm = await stack.enter_async_context(_arm(config, clock))
+        yield Devices(vision, autopilot, mocap, arm, force, ground=ground)
 
 
 @contextlib.asynccontextmanager
-async def open_what_opens(
+async def open_available(
     config: FlightConfig, clock: Clock, tell: Callable[[str], None] = lambda _: None
-) -> AsyncIterator[SomeEdges]:
-    """The same, but a device that refuses is noted and the others are opened all the same.
+) -> AsyncIterator[AvailableDevices]:
+    """Open the devices that can be opened and list the errors of the others.
 
     Args:
         config: addresses and settings.
         clock: the flight clock.
-        tell: told what is being opened, a word or two for people.
+        tell: called with the name of each device before it is opened, for the operator.
     """
-    some = SomeEdges(VisionValve())
+    available = AvailableDevices(VisionFilter())
     async with contextlib.AsyncExitStack() as stack:
 
         @contextlib.contextmanager
-        def noted(device: str, words: str) -> Iterator[None]:
-            tell(words)
+        def noted(device: str, name: str) -> Iterator[None]:
+            tell(name)
             try:
                 yield
             except DeviceError as error:
-                some.failures[device] = str(error)
+                available.failures[device] = str(error)
 
         with noted("force", "force sensor"):
-            some.force = await stack.enter_async_context(_force(config, clock))
+            available.force = await stack.enter_async_context(_force(config, clock))
         with noted("mocap", "motion capture"):
-            some.mocap = await stack.enter_async_context(_mocap(config, clock, some))
+            available.mocap = await stack.enter_async_context(_mocap(config, clock, available))
         with noted("autopilot", "PX4"):
-            some.autopilot = await stack.enter_async_context(_autopilot(config, clock))
+            available.autopilot = await stack.enter_async_context(_autopilot(config, clock))
         with noted("arm", "arm"):
-            some.arm = await stack.enter_async_context(_arm(config, clock))
-        yield some
+            available.arm = await stack.enter_async_context(_arm(config, clock))
+        yield available
 
 
-async def _is_armed(autopilot: MavsdkAutopilot) -> bool:
-    """What PX4 says, which may take a second; False if it says nothing: then nothing takes off without its word either."""
+async def _is_armed(autopilot: Autopilot) -> bool:
+    """Wait for PX4's status; False if none arrives, because then nothing can take off."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(STATUS_TIMEOUT_S):
             while autopilot.status() is None:  # noqa: ASYNC110 - written by MAVSDK's threads
@@ -161,23 +162,23 @@ def _force(config: FlightConfig, clock: Clock) -> RobotousForceTorque:
     return RobotousForceTorque(config.vehicle.devices.force, clock)
 
 
-def _mocap(config: FlightConfig, clock: Clock, some: SomeEdges) -> NatNetMocap:
-    valve = some.vision
+def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> NatNetMocap:
+    vision = available.vision
 
-    def pass_on(pose: MocapPose) -> None:
-        autopilot = some.autopilot
-        if autopilot is not None and valve.open and pose.tracking_valid:
+    def forward(pose: MocapPose) -> None:
+        autopilot = available.autopilot
+        if autopilot is not None and vision.open and pose.tracking_valid:
             autopilot.send_vision(pose)
 
     def on_pose(pose: MocapPose) -> None:
-        if valve.on_frame is not None:
-            valve.on_frame(pose.stamp_s)
-            # A tick that this frame has started comes first; PX4's estimate waits for the pose some tenths of a millisecond.
-            asyncio.get_running_loop().call_soon(pass_on, pose)
+        if vision.on_frame is not None:
+            vision.on_frame(pose.stamp_s)
+            # The control tick that this frame starts comes first; PX4's estimate gets the pose some tenths of a millisecond later.
+            asyncio.get_running_loop().call_soon(forward, pose)
         else:
-            pass_on(pose)
-        if valve.watch is not None:
-            valve.watch(pose)
+            forward(pose)
+        if vision.watch is not None:
+            vision.watch(pose)
 
     return NatNetMocap(config.vehicle.devices.mocap, clock, on_pose)
 

@@ -1,32 +1,43 @@
-"""What the flight app asks of its devices. Real hardware and SITL differ in addresses only.
+"""The devices of a vehicle as flight and preflight see them. Hardware and SITL differ in addresses only.
 
-Every edge is an async context manager: entering opens and verifies the device within a deadline, leaving shuts it down safely (and
-never raises because the device is gone). Entering raises `DeviceError` whose text is one clear line: device, address, what was
-expected, what was found, how to fix it. `latest()` never blocks and never does I/O.
+A device is an async context manager: entering it opens and checks it within a deadline, leaving it shuts it down safely and never
+raises because the device is gone. Entering raises `DeviceError`. `latest()` never blocks and does no I/O.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from types import TracebackType
 from typing import Protocol, Self
 
+from companion.model.observations import (
+    EstimatorReport,
+    ForceCounts,
+    MocapCounts,
+    MocapServer,
+    ServoReport,
+    StateCounts,
+)
 from companion.model.types import (
     ArmState,
     AttitudeSetpoint,
     AutopilotRequest,
     AutopilotStatus,
     ForceSample,
+    Inputs,
+    LinkIdentity,
     MocapPose,
+    Outputs,
     Vec2,
     VehicleState,
 )
 
 
 class DeviceError(Exception):
-    """A device is not there or not as it must be: one line for the user, preflight refuses (exit 3)."""
+    """A device is absent or wrong. The text is one line: device, address, what was expected, what was found, how to fix it."""
 
 
-class Edge(Protocol):
+class Device(Protocol):
     """A device that is opened and closed."""
 
     async def __aenter__(self) -> Self: ...
@@ -36,54 +47,124 @@ class Edge(Protocol):
     ) -> None: ...
 
 
-class Autopilot(Edge, Protocol):
-    """PX4 through MAVSDK."""
+class Autopilot(Device, Protocol):
+    """PX4."""
 
     def vehicle(self) -> VehicleState | None:
-        """Latest fused state in world ENU / body FLU; None before the first complete one."""
+        """Return the latest fused state in world ENU / body FLU, or None before the first complete one."""
 
     def status(self) -> AutopilotStatus | None:
-        """Latest slow state."""
+        """Return the latest slow state, or None before the first heartbeat."""
+
+    def estimator(self) -> EstimatorReport | None:
+        """Return the latest report of PX4's estimator, or None before the first."""
+
+    def counts(self) -> StateCounts:
+        """Return the numbers of messages of the fast state since the link was opened."""
 
     def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
-        """Send at once, synchronously (hot path). None: from now on nothing leaves. False: nothing was sent."""
+        """Send a setpoint at once; with None no more setpoints are sent. Return False if nothing was sent."""
 
     def send_vision(self, pose: MocapPose) -> bool:
-        """Send VISION_POSITION_ESTIMATE at once, synchronously."""
+        """Send a pose of motion capture at once. Return False if nothing was sent."""
 
     def request(self, request: AutopilotRequest) -> None:
-        """Start carrying a request out in the background; a request already under way is not started twice."""
+        """Send a request without waiting for the answer, unless the same request is in progress."""
+
+    def take_messages(self) -> list[str]:
+        """Return the messages of PX4 and about its link since the last call, oldest first."""
+
+    def identity(self) -> LinkIdentity:
+        """Return the ids of both ends of the link."""
+
+    async def firmware(self) -> str:
+        """Return PX4's version as text.
+
+        Raises:
+            DeviceError: no answer.
+        """
+
+    async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
+        """Return PX4's parameters by name, int or float as PX4 stores them; a name that PX4 does not have is left out.
+
+        Raises:
+            DeviceError: no answer.
+        """
+
+    async def read_param(self, name: str) -> float | int:
+        """Return one parameter of PX4.
+
+        Raises:
+            DeviceError: no such parameter, or no answer.
+        """
 
 
-class Mocap(Edge, Protocol):
-    """OptiTrack through NatNet."""
+class Mocap(Device, Protocol):
+    """Motion capture of the vehicle's rigid body."""
 
     def latest(self) -> MocapPose | None:
-        """Newest frame of the rigid body."""
+        """Return the newest pose, or None before the first."""
+
+    def counts(self) -> MocapCounts:
+        """Return the numbers of frames since the device was opened."""
+
+    @property
+    def server(self) -> MocapServer | None:
+        """The server that streams the poses, or None before it has answered."""
+
+    @property
+    def bodies(self) -> dict[int, str]:
+        """Rigid bodies of the newest frame by streaming id; the name is empty if the server has not sent it."""
 
 
-class Arm(Edge, Protocol):
-    """The servo bus. One thread owns the bus; a cycle is `read`, then `write_torque`."""
+class Arm(Device, Protocol):
+    """The two servos of the arm. A cycle is `begin_read`, `read`, then `write_torque`."""
 
     def latest(self) -> ArmState | None:
-        """Newest joint state."""
+        """Return the newest joint state, or None before the first."""
+
+    @property
+    def servos(self) -> tuple[ServoReport, ...]:
+        """Identity and settings of the servos when they were opened."""
 
     @property
     def read_takes_s(self) -> float:
-        """Time within which most reads are done."""
+        """Time within which most reads complete, s."""
 
     def begin_read(self, at_s: float = 0.0) -> None:
-        """Begin the read that the next `read` waits for, at that time of the flight clock or as soon as it is wanted; never blocks."""
+        """Start the read that the next `read` waits for, at a time of the flight clock or at once; never blocks."""
 
     async def read(self, timeout_s: float) -> ArmState | None:
-        """One sync read; the newest state (its `read_failures` counts the misses). None before the first success."""
+        """Return the newest joint state, whose `read_failures` counts failed reads, or None before the first."""
 
     def write_torque(self, torque_nm: Vec2) -> Vec2:
-        """Hand one current command to the bus thread; returns what will really be sent, after rounding to counts and clipping, N m."""
+        """Command both joint torques, N m. Return the torques that are sent after clipping and rounding to counts."""
 
 
-class ForceTorque(Edge, Protocol):
+class ForceTorque(Device, Protocol):
     """The force-torque sensor."""
 
+    product_name: str
+    """As the sensor reports it."""
+    firmware: str
+    """Version of the sensor's firmware; empty if it does not report one."""
+
     def latest(self) -> ForceSample | None:
-        """Newest sample, as measured."""
+        """Return the newest sample as measured, or None before the first."""
+
+    def counts(self) -> ForceCounts:
+        """Return the numbers of samples and bad packets since the device was opened."""
+
+
+class GroundLink(Device, Protocol):
+    """MAVLink forwarding to a ground station."""
+
+    @property
+    def line(self) -> str:
+        """Where MAVLink is forwarded to, one line for the operator."""
+
+    def tell(self, inputs: Inputs, outputs: Outputs) -> None:
+        """Report one control tick to the ground station."""
+
+    def take_messages(self) -> list[str]:
+        """Return the changes of the link since the last call, oldest first."""

@@ -65,8 +65,47 @@ class Machine:
 
 
 @dataclass(frozen=True, slots=True)
+class MocapCounts:
+    """Counts of the motion-capture driver since it was opened."""
+
+    frames: int
+    """Frames that became a pose."""
+    superseded: int
+    """Frames that were read together with a newer one and therefore not delivered."""
+    out_of_order: int
+    malformed: int
+    foreign: int
+    """Datagrams from another address than the server's."""
+    last_malformed: str | None
+    callback_error: str | None
+    """First exception that the receiver of the poses raised."""
+
+
+@dataclass(frozen=True, slots=True)
+class MocapServer:
+    """The program that streams motion capture."""
+
+    name: str
+    """Program, its version and the protocol, such as `Motive 3.1, NatNet 4.1`."""
+    protocol_version: str
+    """Such as `4.1`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForceCounts:
+    """Counts of the force sensor's driver since the port was opened."""
+
+    samples: int
+    skipped_bytes: int
+    """Bytes that belong to no packet."""
+    bad_sums: int
+    lost: str | None
+    """Why the port is no longer read; None while it is."""
+
+
+@dataclass(frozen=True, slots=True)
 class MocapStream:
-    """What the motion-capture edge counted while it was watched."""
+    """What the motion-capture driver counted while it was watched."""
 
     frames: int
     """Frames of any kind that arrived."""
@@ -82,7 +121,7 @@ class MocapStream:
 
 @dataclass(frozen=True, slots=True)
 class ForceStream:
-    """What the force sensor's edge counted while it was watched."""
+    """What the force sensor's driver counted while it was watched."""
 
     samples: int
     bad_sums: int
@@ -142,7 +181,7 @@ class Observations:
     recorder: str | None = None
     """None: not tried. Empty: a log could be opened. Else why not."""
     failures: Mapping[str, str] = field(default_factory=dict)
-    """Device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`), and the edge's own line about it."""
+    """Device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`), and the driver's error line."""
 
 
 @dataclass(frozen=True, slots=True)

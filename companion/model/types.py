@@ -78,7 +78,7 @@ _ACTION_RANK = {action: rank for rank, action in enumerate(SafetyAction)}
 
 
 class AutopilotRequest(Enum):
-    """What the core asks of the autopilot beside setpoints. The edge carries it out and reports through `AutopilotStatus`."""
+    """What the core asks of the autopilot beside setpoints. The driver carries it out and reports through `AutopilotStatus`."""
 
     NONE = "none"
     OFFBOARD = "offboard"  # enter OFFBOARD (setpoints are streaming already)
@@ -135,7 +135,7 @@ class GroundCommand:
 @quick
 @dataclass(frozen=True, slots=True)
 class VehicleState:
-    """PX4's fused state, converted to world ENU / body FLU by the autopilot edge."""
+    """PX4's fused state, converted to world ENU / body FLU by the autopilot driver."""
 
     position_stamp_s: float
     attitude_stamp_s: float
@@ -370,7 +370,7 @@ class Outputs:
 @quick
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """What really left in one tick, and when: the edges' answer to `Outputs`."""
+    """What really left in one tick, and when: the drivers' answer to `Outputs`."""
 
     tick: int
     attitude_sent: bool

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from companion.config.loader import FlightConfig
-from companion.io.devices import Edges, SomeEdges
+from companion.io.devices import AvailableDevices, Devices
 from companion.io.dynamixel.registers import usb_latency_ms
-from companion.io.protocols import DeviceError
-from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.protocols import Autopilot, DeviceError
 from companion.model.observations import (
     EstimatorReport,
     ForceStream,
@@ -61,7 +60,7 @@ class _Counts:
 
 
 async def observe(
-    edges: Edges | SomeEdges,
+    devices: Devices | AvailableDevices,
     config: FlightConfig,
     clock: Clock,
     *,
@@ -76,7 +75,7 @@ async def observe(
     Meanwhile PX4's version and parameters are read, and the servo bus is read as in flight, which keeps its watchdogs from tripping.
 
     Args:
-        edges: open devices; for a device that could not be opened only the failure is reported.
+        devices: open devices; for a device that could not be opened only the failure is reported.
         config: the effective configuration.
         clock: the flight clock.
         out: folder of the flight's files, for the free disk space.
@@ -85,14 +84,14 @@ async def observe(
         tell: progress callback.
         known: facts from elsewhere: plan, recorder, mission length, hand test.
     """
-    watcher = _Watcher(edges, config, clock)
+    watcher = _Watcher(devices, config, clock)
     duration_s = config.vehicle.safety.preflight_s
     base = known or Observations(0.0, 0.0)
-    failures = dict(edges.failures) if isinstance(edges, SomeEdges) else {}
+    failures = dict(devices.failures) if isinstance(devices, AvailableDevices) else {}
     base = replace(base, machine=machine_of(config, out), failures=failures)
     async with asyncio.TaskGroup() as group:
-        asking = group.create_task(_ask(edges.autopilot, param_names)) if edges.autopilot is not None else None
-        edges.vision.watch = watcher.on_pose
+        asking = group.create_task(_ask(devices.autopilot, param_names)) if devices.autopilot is not None else None
+        devices.vision.watch = watcher.on_pose
         try:
             start_s = told_s = clock()
             waiting: Waiting | None = None
@@ -115,7 +114,7 @@ async def observe(
                 while clock() < again_s:
                     await watcher.look()
         finally:
-            edges.vision.watch = None
+            devices.vision.watch = None
 
 
 def _words(waiting: Waiting | None, elapsed_s: float, duration_s: float) -> tuple[str, float]:
@@ -137,7 +136,7 @@ class _Answers:
     failure: str | None
 
 
-async def _ask(autopilot: MavsdkAutopilot, names: Iterable[str]) -> _Answers:
+async def _ask(autopilot: Autopilot, names: Iterable[str]) -> _Answers:
     try:
         firmware = await autopilot.firmware()
         return _Answers(firmware, await autopilot.read_params(names), None)
@@ -154,8 +153,8 @@ def _with_answers(seen: Observations, answers: _Answers) -> Observations:
 class _Watcher:
     """Collector of what the devices deliver. Data before the queried interval is dropped."""
 
-    def __init__(self, edges: Edges | SomeEdges, config: FlightConfig, clock: Clock) -> None:
-        self._edges = edges
+    def __init__(self, devices: Devices | AvailableDevices, config: FlightConfig, clock: Clock) -> None:
+        self._devices = devices
         self._device = config.vehicle.devices.mocap
         self._clock = clock
         self._poses: deque[MocapPose] = deque()
@@ -173,9 +172,9 @@ class _Watcher:
 
     async def look(self) -> None:
         """Collect what is new, with one bus cycle of the arm."""
-        edges = self._edges
-        if edges.arm is not None:
-            state = await edges.arm.read(READ_TIMEOUT_S)
+        devices = self._devices
+        if devices.arm is not None:
+            state = await devices.arm.read(READ_TIMEOUT_S)
             if state is not None:
                 if not self._arm or state.stamp_s != self._arm[-1].stamp_s:
                     self._arm.append(state)
@@ -184,12 +183,12 @@ class _Watcher:
                     self._arm_missed += max(0, state.read_failures - self._arm[-1].read_failures)
                     self._arm_cycles += 1
                     self._arm[-1] = state
-        if edges.autopilot is not None:
-            _take(self._vehicle, edges.autopilot.vehicle())
-            _take(self._status, edges.autopilot.status())
-            _take(self._estimator, edges.autopilot.estimator())
-        if edges.force is not None:
-            _take(self._force, edges.force.latest())
+        if devices.autopilot is not None:
+            _take(self._vehicle, devices.autopilot.vehicle())
+            _take(self._status, devices.autopilot.status())
+            _take(self._estimator, devices.autopilot.estimator())
+        if devices.force is not None:
+            _take(self._force, devices.force.latest())
         now_s = self._clock()
         if now_s - self._counts[-1].t_s >= COUNT_PERIOD_S:
             self._counts.append(self._count())
@@ -201,7 +200,7 @@ class _Watcher:
         while len(self._counts) > 1 and self._counts[1].t_s <= now.t_s - duration_s:
             self._counts.popleft()
         first = self._counts[0]
-        edges, start_s = self._edges, first.t_s
+        devices, start_s = self._devices, first.t_s
         _forget(self._poses, lambda pose: pose.stamp_s < start_s)
         _forget(self._vehicle, lambda state: state.attitude_stamp_s < start_s)
         _forget(self._estimator, lambda report: report.stamp_s < start_s)
@@ -217,57 +216,53 @@ class _Watcher:
             mocap=tuple(self._poses),
             mocap_stream=self._mocap_stream(first, now),
             arm=tuple(self._arm),
-            servos=edges.arm.servos if edges.arm is not None else (),
+            servos=devices.arm.servos if devices.arm is not None else (),
             force=tuple(self._force),
-            state_counts=_between(first.state, now.state) if edges.autopilot is not None else None,
+            state_counts=_between(first.state, now.state) if devices.autopilot is not None else None,
             force_stream=self._force_stream(first, now),
             arm_reads=(now.arm_cycles - first.arm_cycles, now.arm_missed - first.arm_missed)
-            if edges.arm is not None
+            if devices.arm is not None
             else None,
         )
 
     def _count(self) -> _Counts:
-        edges = self._edges
+        devices = self._devices
         frames = numbers = 0
-        if edges.mocap is not None:
-            health, latest = edges.mocap.health(), edges.mocap.latest()
-            frames = health.frames + health.superseded
+        if devices.mocap is not None:
+            counts, latest = devices.mocap.counts(), devices.mocap.latest()
+            frames = counts.frames + counts.superseded
             numbers = latest.frame_number if latest is not None else 0
         return _Counts(
             self._clock(),
             frames,
             numbers,
-            edges.force.health().samples if edges.force is not None else 0,
-            edges.autopilot.counts() if edges.autopilot is not None else StateCounts(0, 0, 0),
+            devices.force.counts().samples if devices.force is not None else 0,
+            devices.autopilot.counts() if devices.autopilot is not None else StateCounts(0, 0, 0),
             self._arm_cycles,
             self._arm_missed,
         )
 
     def _mocap_stream(self, first: _Counts, now: _Counts) -> MocapStream | None:
-        mocap = self._edges.mocap
+        mocap = self._devices.mocap
         if mocap is None:
             return None
-        frames, info = now.mocap_frames - first.mocap_frames, mocap.server_info
+        frames, server = now.mocap_frames - first.mocap_frames, mocap.server
         own, bodies = self._device.rigid_body_id, mocap.bodies
-        application = ""
-        if info is not None:
-            version = ".".join(map(str, info.application_version)).removesuffix(".0").removesuffix(".0")
-            application = f"{info.application} {version}, NatNet {info.version}".strip()
         return MocapStream(
             frames=frames,
             lost=max(0, now.mocap_numbers - first.mocap_numbers - frames),
-            application=application,
+            application=server.name if server is not None else "",
             other_bodies=tuple(sorted(number for number in bodies if number != own)),
             body_name=bodies.get(own, ""),
         )
 
     def _force_stream(self, first: _Counts, now: _Counts) -> ForceStream | None:
-        force = self._edges.force
+        force = self._devices.force
         if force is None:
             return None
-        health = force.health()
+        counts = force.counts()
         product = f"{force.product_name}, firmware {force.firmware}" if force.firmware else force.product_name
-        return ForceStream(now.force_samples - first.force_samples, health.bad_sums, product, health.lost)
+        return ForceStream(now.force_samples - first.force_samples, counts.bad_sums, product, counts.lost)
 
 
 def _take(kept: deque[_T], newest: _T | None) -> None:

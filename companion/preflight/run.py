@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config.loader import FlightConfig
-from companion.io.devices import Edges, SomeEdges
+from companion.io.devices import AvailableDevices, Devices
 from companion.model.observations import Observations
 from companion.model.rows import Row, refusals
 from companion.preflight import evaluation
@@ -23,7 +23,7 @@ FILE = "preflight.json"
 
 
 async def preflight(
-    edges: Edges | SomeEdges,
+    devices: Devices | AvailableDevices,
     config: FlightConfig,
     clock: Clock,
     *,
@@ -35,17 +35,17 @@ async def preflight(
     """Observe the open devices and evaluate the data, with the priority and on the cores of a flight.
 
     Args:
-        edges, config, clock, out, tell, known: as for `companion.preflight.observe.observe`.
+        devices, config, clock, out, tell, known: as for `companion.preflight.observe.observe`.
         sitl: in SITL no record of the hand test is required.
     """
-    if not sitl and edges.mocap is not None and edges.mocap.server_info is not None:
-        passed, changed = _hand_test(config, edges.mocap.server_info.version)
+    if not sitl and devices.mocap is not None and devices.mocap.server is not None:
+        passed, changed = _hand_test(config, devices.mocap.server.protocol_version)
         known = replace(known, hand_test=passed, hand_test_changed=changed)
     computer = config.vehicle.computer
     # As in flight: else a busy computer is taken for a bad bus and a bad network.
     claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory)
     seen = await observe(
-        edges,
+        devices,
         config,
         clock,
         out=out,

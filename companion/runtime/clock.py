@@ -1,4 +1,4 @@
-"""The flight clock: monotonic seconds since the flight process started. Only edges and the app read it; the core never does."""
+"""The flight clock: monotonic seconds since the flight process started. Drivers and the flight process read it; the core never does."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ import serial
 from pymavlink import mavutil
 
 from companion.config.loader import load_flight
-from companion.io.devices import open_edges
+from companion.io.devices import open_devices
 from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.runtime.clock import flight_clock
@@ -164,7 +164,7 @@ def refused_at_opening(world: World, *options: str) -> str:
     config = load_flight(CATCH, overrides=[word for word in options if word != "--set"], hardware=True)
 
     async def opening() -> None:
-        async with open_edges(config, flight_clock()):
+        async with open_devices(config, flight_clock()):
             pass
 
     with pytest.raises(DeviceError) as caught:

@@ -202,7 +202,7 @@ def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -> None
                         assert sample.force_sensor_n == AWKWARD.force_n
                         assert sample.torque_sensor_nm == AWKWARD.torque_nm
                         assert sample.overload
-                assert edge.health().skipped_bytes >= 49
+                assert edge.counts().skipped_bytes >= 49
 
     asyncio.run(run())
 
@@ -254,7 +254,7 @@ def test_port_vanishes_in_flight() -> None:
         with pytest.raises(DeviceError, match="the port was lost"):
             await edge.tare_samples(10.0)
         assert edge.latest() == last
-        assert edge.health().lost is not None
+        assert edge.counts().lost is not None
         await edge.__aexit__(None, None, None)
 
     asyncio.run(run())

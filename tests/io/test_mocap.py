@@ -171,7 +171,7 @@ def test_multicast_of_another_sender_is_dropped_by_the_kernel() -> None:
                 for _ in range(20):
                     stranger.sendto(b"anything", (GROUP, server.data_port))
                     await inbox.next()
-            assert edge.health().foreign == 0
+            assert edge.counts().foreign == 0
 
     asyncio.run(run())
 
@@ -223,7 +223,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 def handled(edge: NatNetMocap) -> int:
     """Frames of every fate, so far."""
-    health = edge.health()
+    health = edge.counts()
     return health.frames + health.superseded + health.out_of_order + health.malformed
 
 
@@ -248,7 +248,7 @@ def test_newest_of_the_waiting_frames_wins() -> None:
                 witness.sendto(natnet.encode_connect(), ("127.0.0.1", server.command_port))
                 await until(lambda: len(server.unicast_clients) == 2)
                 inbox.clear()
-                before = edge.health()
+                before = edge.counts()
                 for k in range(5):
                     server.publish(10.0 + k, [BodyPose(1, (float(k), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))], None)
                 # The loop stands still here. Frames go to the edge first: when the witness has five, so has the edge's socket.
@@ -258,8 +258,8 @@ def test_newest_of_the_waiting_frames_wins() -> None:
                     witness.recv(65535)
             assert (await inbox.next()).position_world_m == (4.0, 0.0, 0.0)
             assert inbox.queue.empty()
-            assert edge.health().superseded - before.superseded == 4
-            assert edge.health().frames - before.frames == 1
+            assert edge.counts().superseded - before.superseded == 4
+            assert edge.counts().frames - before.frames == 1
 
     asyncio.run(run())
 
@@ -287,7 +287,7 @@ def test_old_and_repeated_frames_are_dropped() -> None:
             await send_and_wait(server, edge, *map(numbered, (100_000, 100_000, 99_998, 100_002)))
             assert [(await inbox.next()).frame_number for _ in range(2)] == [100_000, 100_002]
             assert inbox.queue.empty()
-            assert edge.health().out_of_order == 2
+            assert edge.counts().out_of_order == 2
 
     asyncio.run(run())
 
@@ -353,7 +353,7 @@ def test_malformed_datagrams_do_not_stop_reception() -> None:
                     sender.sendto(junk, server.unicast_clients[0])
             await send_and_wait(server, edge, whole[:60], frame + b"\xff" * 4, info + b"\0" * 4)
             assert inbox.queue.empty()
-            assert edge.health().malformed == 3
+            assert edge.counts().malformed == 3
             await send_and_wait(server, edge, whole)
             assert (await inbox.next()).frame_number == 100_000
 
@@ -376,7 +376,7 @@ def test_callback_that_fails_does_not_stop_reception(caplog: pytest.LogCaptureFi
             latest = edge.latest()
             assert latest is not None
             assert latest.frame_number == seen[-1]
-            assert edge.health().callback_error == "RuntimeError: link refused"
+            assert edge.counts().callback_error == "RuntimeError: link refused"
 
     with caplog.at_level(logging.ERROR):
         asyncio.run(run())

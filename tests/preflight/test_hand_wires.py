@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from companion.config.vehicle import MocapDevice
-from companion.io.devices import SomeEdges, VisionValve, open_what_opens
+from companion.io.devices import AvailableDevices, VisionFilter, open_available
 from companion.io.mocap.driver import NatNetMocap
 from companion.model.rows import Row
 from companion.model.types import AutopilotRequest, FlightMode
@@ -71,7 +71,7 @@ async def over_wires(
     beside: Callable[[], Coroutine[Any, Any, None]] | None = None,
 ) -> list[Row]:
     """The rows of a test on the world's wires; `beside` runs while it does."""
-    async with open_what_opens(config, flight_clock()) as edges:
+    async with open_available(config, flight_clock()) as edges:
         assert not edges.failures
         async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
             if beside is not None:
@@ -151,7 +151,7 @@ def test_it_is_refused_when_px4_is_armed() -> None:
             await half.until(lambda status: status.armed, "ARM")
             half.request = AutopilotRequest.NONE
             mocap = NatNetMocap(MocapDevice(server="127.0.0.1", rigid_body_id=1), flight_clock(), lambda _: None)
-            edges = SomeEdges(VisionValve(), half.autopilot, mocap)
+            edges = AvailableDevices(VisionFilter(), half.autopilot, mocap)
             return await run_hand_test(edges, config, terminal())
 
     (row,) = asyncio.run(go())
@@ -161,7 +161,7 @@ def test_it_is_refused_when_px4_is_armed() -> None:
 
 def test_without_motion_capture_or_px4_it_says_which() -> None:
     config = load_sitl(CATCH)
-    (row,) = asyncio.run(run_hand_test(SomeEdges(VisionValve()), config, terminal()))
+    (row,) = asyncio.run(run_hand_test(AvailableDevices(VisionFilter()), config, terminal()))
     assert row.read == "motion capture is not open"
 
 
@@ -170,7 +170,7 @@ def test_scripts_keep_their_standard_output(config: SitlConfig, capsys: pytest.C
         os.kill(os.getpid(), signal.SIGINT)
 
     async def go() -> list[Row]:
-        async with open_what_opens(config, flight_clock()) as edges, asyncio.TaskGroup() as group:
+        async with open_available(config, flight_clock()) as edges, asyncio.TaskGroup() as group:
             # Tasks begin at the first await: the test listens by then.
             group.create_task(interrupt())
             return await run_hand_test(edges, config, Console(), True)

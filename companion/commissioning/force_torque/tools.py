@@ -68,7 +68,7 @@ async def watch(session: Session) -> Watched:
     async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
         session.say(f"force sensor: {device.port}; {_EMPTY} for {WATCH_S:g} s")
         empty = await sensor.tare_samples(WATCH_S)
-        health = sensor.health()
+        health = sensor.counts()
         product = f"{sensor.product_name}, firmware {sensor.firmware}" if sensor.firmware else sensor.product_name
         stream = ForceStream(len(empty) - 1, health.bad_sums, product, health.lost)
         seen = Watched(empty, await angles_rad(), stream, usb_latency_ms(device.port), weight_kg)

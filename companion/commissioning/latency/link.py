@@ -1,4 +1,4 @@
-"""PX4's IMU with PX4's own stamps, and PX4's clock against ours: HIGHRES_IMU and TIMESYNC beside the autopilot's edge. I/O only.
+"""PX4's IMU with PX4's own stamps, and PX4's clock against ours: HIGHRES_IMU and TIMESYNC beside the autopilot driver. I/O only.
 
 HIGHRES_IMU says when its sample was taken (`time_usec`), so the way of the message does not matter. TIMESYNC with `tc1` 0 is answered
 with PX4's clock at once: half of the round trip is the way back.
@@ -42,7 +42,7 @@ class Sync:
 
 
 class LatencyLink(MavsdkAutopilot):
-    """The autopilot's edge, which also keeps every IMU sample and asks for PX4's clock ten times a second."""
+    """The autopilot driver, which also keeps every IMU sample and asks for PX4's clock ten times a second."""
 
     def __init__(self, device: AutopilotDevice, clock: Clock) -> None:
         super().__init__(device, clock)
@@ -73,7 +73,7 @@ class LatencyLink(MavsdkAutopilot):
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the questions, then as the edge does."""
+        """End the questions, then as the driver does."""
         if self._asking is not None:
             self._asking.cancel()
             await asyncio.wait((self._asking,))

@@ -117,28 +117,28 @@ class Carried:
 
 async def carry(session: Session) -> Carried:
     """Guide the user through the hand test, with poses forwarded to PX4."""
-    from companion.io.devices import SomeEdges, VisionValve  # imports MAVSDK
+    from companion.io.devices import AvailableDevices, VisionFilter  # imports MAVSDK
     from companion.io.mocap.driver import NatNetMocap
     from companion.io.px4.driver import MavsdkAutopilot
     from companion.preflight.hand_test.command import ENDED_BY_HAND, perform
 
     arguments = session.arguments
     config = load_flight(arguments.mission, arguments.vehicle, overrides=arguments.overrides)
-    clock, devices, edges = flight_clock(), config.vehicle.devices, SomeEdges(VisionValve())
+    clock, devices, opened = flight_clock(), config.vehicle.devices, AvailableDevices(VisionFilter())
 
     def forward(pose: MocapPose) -> None:
-        if edges.autopilot is not None and pose.tracking_valid:
-            edges.autopilot.send_vision(pose)
+        if opened.autopilot is not None and pose.tracking_valid:
+            opened.autopilot.send_vision(pose)
 
     session.say(
         "axes of motion capture, by hand: lift, forward, turn left; put the machine where the mission starts, nose as there"
     )
     try:
         async with (
-            NatNetMocap(devices.mocap, clock, forward) as edges.mocap,
-            MavsdkAutopilot(devices.autopilot, clock) as edges.autopilot,
+            NatNetMocap(devices.mocap, clock, forward) as opened.mocap,
+            MavsdkAutopilot(devices.autopilot, clock) as opened.autopilot,
         ):
-            outcome = await perform(edges, config, session.console, arguments.json)
+            outcome = await perform(opened, config, session.console, arguments.json)
     except DeviceError as error:
         outcome = str(error)
     if outcome == ENDED_BY_HAND:

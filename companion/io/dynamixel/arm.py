@@ -86,7 +86,7 @@ class DynamixelArm:
 
     async def __aenter__(self) -> Self:
         if self._thread is not None:
-            raise RuntimeError("an arm edge is entered once")
+            raise RuntimeError("the arm can be opened only once")
         self._loop = asyncio.get_running_loop()
         opened: asyncio.Future[DeviceError | None] = self._loop.create_future()
         self._finished = self._loop.create_future()
@@ -154,7 +154,7 @@ class DynamixelArm:
         if not reading.done:
             if not reading.begun:
                 self._jobs.put(_NOW)
-            assert self._loop is not None, "the arm edge is not entered"
+            assert self._loop is not None, "the arm is not open"
             waiter = reading.waiter = self._loop.create_future()
             if not reading.done:  # else the thread may have looked for a waiter before there was one
                 await asyncio.wait((waiter,), timeout=timeout_s)
@@ -175,7 +175,7 @@ class DynamixelArm:
         Raises:
             ValueError: a torque is not finite.
         """
-        assert self._scales is not None, "the arm edge is not entered"
+        assert self._scales is not None, "the arm is not open"
         first, second = self._scales
         counts = (first.current_counts(torque_nm[0]), second.current_counts(torque_nm[1]))
         self._goal_handed_s = time.monotonic()

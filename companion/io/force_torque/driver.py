@@ -8,7 +8,6 @@ import logging
 import math
 import os
 from contextlib import suppress
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
@@ -19,6 +18,7 @@ from companion.config.vehicle import ForceDevice
 from companion.io.force_torque import rft
 from companion.io.force_torque.rft import Command, PacketScanner
 from companion.io.protocols import DeviceError
+from companion.model.observations import ForceCounts
 from companion.model.types import ForceSample
 from companion.runtime.clock import Clock
 
@@ -28,18 +28,6 @@ _REPEAT_S: Final = 0.4
 _FIRST_SAMPLES: Final = 5
 _READ_BYTES: Final = 4096
 _MODEL: Final = "RFT60"
-
-
-@dataclass(frozen=True, slots=True)
-class ForceHealth:
-    """Counters since the port was opened."""
-
-    samples: int
-    skipped_bytes: int
-    """Bytes that belong to no packet."""
-    bad_sums: int
-    lost: str | None
-    """Why the port is no longer read; None while it is."""
 
 
 class RobotousForceTorque:
@@ -73,9 +61,9 @@ class RobotousForceTorque:
         """Return the newest raw sample; never blocks."""
         return self._latest
 
-    def health(self) -> ForceHealth:
+    def counts(self) -> ForceCounts:
         """Return the counters, for logs and preflight."""
-        return ForceHealth(self._samples, self._scanner.skipped_bytes, self._scanner.bad_sums, self._lost)
+        return ForceCounts(self._samples, self._scanner.skipped_bytes, self._scanner.bad_sums, self._lost)
 
     async def tare_samples(self, duration_s: float) -> list[ForceSample]:
         """Return the samples of the next `duration_s` (counted at the configured rate), for the caller to average.

@@ -1,4 +1,4 @@
-"""The motion-capture edge: OptiTrack Motive over NatNet 3.0 / 4.1, multicast or unicast."""
+"""The motion-capture driver: OptiTrack Motive over NatNet 3.0 / 4.1, multicast or unicast."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import logging
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Self
 
@@ -19,6 +18,7 @@ from companion.io.mocap.natnet import Frame, Malformed, Message, NatNetVersion, 
 from companion.io.mocap.natnet_source import join_source
 from companion.io.mocap.pose import VERSIONS, mocap_pose
 from companion.io.protocols import DeviceError
+from companion.model.observations import MocapCounts, MocapServer
 from companion.model.types import MocapPose
 from companion.runtime.clock import Clock
 from companion.safety.stream_watch import StreamWatch
@@ -31,23 +31,6 @@ _SILENCE_RECONNECT_S: Final = 1.0
 _MAX_DATAGRAMS_PER_WAKE: Final = 256
 """A flood must not keep the control loop from running."""
 _MAX_DATAGRAM_BYTES: Final = 65535
-
-
-@dataclass(frozen=True, slots=True)
-class MocapHealth:
-    """Counters since the edge was opened."""
-
-    frames: int
-    """Frames that became a pose."""
-    superseded: int
-    """Frames that were read together with a newer one and therefore not delivered."""
-    out_of_order: int
-    malformed: int
-    foreign: int
-    """Datagrams from another address than the server's."""
-    last_malformed: str | None
-    callback_error: str | None
-    """First exception that `on_pose` raised."""
 
 
 class NatNetMocap:
@@ -108,17 +91,22 @@ class NatNetMocap:
 
     @property
     def server_info(self) -> ServerInfo | None:
-        """What the server said about itself."""
+        """Return the server's own description, or None before it has answered."""
         return self._info
+
+    @property
+    def server(self) -> MocapServer | None:
+        """Return name and protocol of the server, or None before it has answered."""
+        return None if self._info is None else MocapServer(name=self._info.name, protocol_version=self._info.version)
 
     @property
     def bodies(self) -> dict[int, str]:
         """Rigid bodies of the newest frame by streaming id; the name is empty where the server did not tell it."""
         return {number: self._names.get(number, "") for number in self._seen_ids or ()}
 
-    def health(self) -> MocapHealth:
-        """Counters, for logs and preflight."""
-        return MocapHealth(
+    def counts(self) -> MocapCounts:
+        """Return the counts since the driver was opened."""
+        return MocapCounts(
             self._frames,
             self._superseded,
             self._out_of_order,

@@ -95,6 +95,12 @@ class ServerInfo:
         """Major and minor NatNet version, as "4.1"."""
         return f"{self.natnet_version[0]}.{self.natnet_version[1]}"
 
+    @property
+    def name(self) -> str:
+        """Program, its version and NatNet's, as "Motive 3.1, NatNet 4.1"."""
+        version = ".".join(map(str, self.application_version)).removesuffix(".0").removesuffix(".0")
+        return f"{self.application} {version}, NatNet {self.version}".strip()
+
 
 @dataclass(frozen=True, slots=True)
 class RigidBody:

@@ -336,7 +336,7 @@ class MavsdkAutopilot:
 
     def _require_open(self) -> None:
         if not self._open:
-            fix = "enter the edge first"
+            fix = "open it first"
             raise device_error(self._device.address, "an open link", "a closed one", fix)
 
     def _on_heartbeat(self) -> None:

@@ -21,7 +21,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 
 from companion.config.loader import FlightConfig
-from companion.io.devices import Edges, SomeEdges
+from companion.io.devices import AvailableDevices, Devices
 from companion.model.rows import Row, refusals
 from companion.model.types import AutopilotStatus, MocapPose, VehicleState
 from companion.preflight.checks import Check
@@ -45,33 +45,38 @@ RECORD = Check(
 
 
 async def run_hand_test(
-    edges: Edges | SomeEdges, config: FlightConfig, console: Console, json: bool = False, *, record: Path | None = None
+    devices: Devices | AvailableDevices,
+    config: FlightConfig,
+    console: Console,
+    json: bool = False,
+    *,
+    record: Path | None = None,
 ) -> list[Row]:
     """Guide the operator through the test and return its rows. Any key or Ctrl-C ends it.
 
     Args:
-        edges: open devices; poses need not be forwarded to PX4. An open arm is read meanwhile to keep its watchdogs from tripping.
+        devices: open devices; poses need not be forwarded to PX4. An open arm is read meanwhile to keep its watchdogs from tripping.
         config: the effective configuration.
         console: terminal of the operator.
         json: keep standard output free: everything for the operator goes to standard error.
         record: where a passed test is recorded (`hand_record.record_path()`); None for nowhere, as in SITL.
     """
-    outcome = await perform(edges, config, console, json)
+    outcome = await perform(devices, config, console, json)
     if isinstance(outcome, str):
         return [hand_test_evaluation.ended(outcome)]
     rows = hand_test_evaluation.rows(outcome, config.vehicle.devices.mocap.up_axis)
-    if record is not None and edges.mocap is not None and not refusals(rows):
-        info = edges.mocap.server_info
-        setup = hand_record.Setup.of(config.vehicle, info.version if info is not None else "")
+    if record is not None and devices.mocap is not None and not refusals(rows):
+        server = devices.mocap.server
+        setup = hand_record.Setup.of(config.vehicle, server.protocol_version if server is not None else "")
         rows.append(_keep(record, setup, rows))
     return rows
 
 
 async def perform(
-    edges: Edges | SomeEdges, config: FlightConfig, console: Console, json: bool = False
+    devices: Devices | AvailableDevices, config: FlightConfig, console: Console, json: bool = False
 ) -> HandResult | str:
     """Guide the operator through the test and return the measurements, or why there are none. Arguments as of `run_hand_test`."""
-    mocap, autopilot, arm = edges.mocap, edges.autopilot, edges.arm
+    mocap, autopilot, arm = devices.mocap, devices.autopilot, devices.arm
     if mocap is None or autopilot is None:
         missing = "motion capture" if mocap is None else "PX4"
         return f"{missing} is not open"

@@ -1,0 +1,220 @@
+"""A flight depends on the Protocols of `companion.io.protocols` only: here its devices are written in the test."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from companion.config.loader import FlightConfig, load_flight
+from companion.flight.command_queue import Operator
+from companion.flight.fallback_landing import unflown
+from companion.flight.main import Flight
+from companion.io.devices import Devices, VisionFilter
+from companion.model.observations import (
+    EstimatorReport,
+    ForceCounts,
+    MocapCounts,
+    MocapServer,
+    ServoReport,
+    StateCounts,
+)
+from companion.model.types import (
+    IDENTITY_QUAT,
+    ArmState,
+    AttitudeSetpoint,
+    AutopilotRequest,
+    AutopilotStatus,
+    FlightMode,
+    ForceSample,
+    LandedState,
+    LinkIdentity,
+    MocapPose,
+    Outcome,
+    Vec2,
+    Vec3,
+    VehicleState,
+)
+from companion.recorder.client import RecorderProcess
+from companion.runtime import ipc
+from companion.runtime.clock import Clock, flight_clock
+from tests.support import DEADLINE_S, HOVER
+
+ZERO = (0.0, 0.0, 0.0)
+RECORDED = MocapCounts(
+    frames=0, superseded=0, out_of_order=0, malformed=0, foreign=0, last_malformed=None, callback_error=None
+)
+
+
+class Standing:
+    """What all devices here know: the machine stands at the mission's start."""
+
+    def __init__(self, config: FlightConfig, clock: Clock) -> None:
+        start = config.mission.start
+        self.clock = clock
+        self.position_m: Vec3 = (*start.position_m, config.vehicle.airframe.ground_clearance_m)
+        self.arm_rad: Vec2 = (math.radians(start.arm_deg[0]), math.radians(start.arm_deg[1]))
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+
+class ObedientAutopilot(Standing):
+    on_armed: Callable[[], object]
+    armed = False
+    mode = FlightMode.OTHER
+    setpoints = 0
+
+    def vehicle(self) -> VehicleState | None:
+        now_s = self.clock()
+        return VehicleState(
+            position_stamp_s=now_s,
+            attitude_stamp_s=now_s,
+            imu_stamp_s=now_s,
+            position_world_m=self.position_m,
+            velocity_world_m_s=ZERO,
+            attitude_wxyz=IDENTITY_QUAT,
+            angular_rate_body_rad_s=ZERO,
+            specific_force_body_m_s2=(0.0, 0.0, 9.81),
+        )
+
+    def status(self) -> AutopilotStatus | None:
+        return AutopilotStatus(
+            heartbeat_stamp_s=self.clock(),
+            armed=self.armed,
+            mode=self.mode,
+            landed=LandedState.ON_GROUND,
+            battery_voltage_v=16.0,
+            battery_remaining=0.9,
+        )
+
+    def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
+        self.setpoints += setpoint is not None
+        return setpoint is not None
+
+    def request(self, request: AutopilotRequest) -> None:
+        if request is AutopilotRequest.OFFBOARD:
+            self.mode = FlightMode.OFFBOARD
+        elif request is AutopilotRequest.ARM:
+            self.armed = True
+            self.on_armed()
+        else:
+            self.armed = False
+
+    def take_messages(self) -> list[str]:
+        return []
+
+    def send_vision(self, pose: MocapPose) -> bool:
+        raise NotImplementedError
+
+    def estimator(self) -> EstimatorReport | None:
+        raise NotImplementedError
+
+    def counts(self) -> StateCounts:
+        raise NotImplementedError
+
+    def identity(self) -> LinkIdentity:
+        raise NotImplementedError
+
+    async def firmware(self) -> str:
+        raise NotImplementedError
+
+    async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
+        raise NotImplementedError
+
+    async def read_param(self, name: str) -> float | int:
+        raise NotImplementedError
+
+
+class OtherMocap(Standing):
+    server = MocapServer(name="another system", protocol_version="1")
+    frame = 0
+
+    @property
+    def bodies(self) -> dict[int, str]:
+        return {}
+
+    def counts(self) -> MocapCounts:
+        return RECORDED
+
+    def latest(self) -> MocapPose | None:
+        self.frame += 1
+        # No measurement is the same twice: the core would take it for a frozen stream.
+        x, y, z = self.position_m
+        return MocapPose(
+            stamp_s=self.clock(),
+            latency_s=0.005,
+            frame_number=self.frame,
+            position_world_m=(x + 1e-5 * (self.frame % 7), y, z),
+            attitude_wxyz=IDENTITY_QUAT,
+            tracking_valid=True,
+            marker_error_m=0.0002,
+        )
+
+
+class OtherArm(Standing):
+    servos: tuple[ServoReport, ...] = ()
+    read_takes_s = 0.001
+
+    def latest(self) -> ArmState | None:
+        return ArmState(
+            stamp_s=self.clock(),
+            angle_rad=self.arm_rad,
+            velocity_rad_s=(0.0, 0.0),
+            torque_nm=(0.0, 0.0),
+            hardware_error=(0, 0),
+            temperature_c=(30.0, 30.0),
+            read_failures=0,
+        )
+
+    def begin_read(self, at_s: float = 0.0) -> None:
+        pass
+
+    async def read(self, timeout_s: float) -> ArmState | None:
+        return self.latest()
+
+    def write_torque(self, torque_nm: Vec2) -> Vec2:
+        return torque_nm
+
+
+class OtherForceTorque(Standing):
+    product_name, firmware, sample = "another sensor", "", 0
+
+    def counts(self) -> ForceCounts:
+        return ForceCounts(samples=self.sample, skipped_bytes=0, bad_sums=0, lost=None)
+
+    def latest(self) -> ForceSample | None:
+        self.sample += 1
+        return ForceSample(self.clock(), (0.01 * (self.sample % 5), 0.0, 0.0), ZERO, False)
+
+
+def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) -> None:
+    config, clock = unflown(load_flight(HOVER)), flight_clock()
+    launcher, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    channel.setblocking(False)
+    autopilot, arm = ObedientAutopilot(config, clock), OtherArm(config, clock)
+    autopilot.on_armed = lambda: ipc.send(launcher, {"type": "land"})
+    devices = Devices(VisionFilter(), autopilot, OtherMocap(config, clock), arm, OtherForceTorque(config, clock))
+
+    async def flown() -> Outcome:
+        operator = Operator(channel)
+        with operator.attention():
+            async with asyncio.timeout(DEADLINE_S):
+                return await Flight(config, devices, recorder, channel, operator, clock, None).run()
+
+    with launcher, channel:
+        recorder = RecorderProcess.start(tmp_path / "a.mcap", config_json=config.model_dump_json(), epoch_offset_ns=0)
+        try:
+            assert asyncio.run(flown()) is Outcome.ABORTED
+        finally:
+            recorder.finish()
+    assert autopilot.mode is FlightMode.OFFBOARD and autopilot.setpoints > 0 and not autopilot.armed
