@@ -57,12 +57,12 @@ class Movie:
     """Index of the frame to show while paused: shortly before the catch."""
 
 
-def movie_of(log: FlightLog, payload_kg: float | None = None) -> Movie | None:
+def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
     """Return the animation of a flight; None if the vehicle did not take off or the logged configuration lacks its geometry.
 
     Args:
         log: log of the flight.
-        payload_kg: mass of the payload, or None if it is unknown.
+        summary: its summary: mass of the payload, and the simulated world.
     """
     flying = np.flatnonzero([o.phase_kind in _FLYING for o in log.outputs])
     moving = (log.columns.mocap_position_world_m, log.columns.arm_rad)
@@ -75,10 +75,11 @@ def movie_of(log: FlightLog, payload_kg: float | None = None) -> Movie | None:
     first, last = int(flying[0]), int(flying[-1])
     caught = metrics.catch_index(log)
     start_s, t_s = log.outputs[first].mission_t_s - log.columns.t_s[first], log.columns.t_s
-    track = _Track(log, scene, caught)
+    track = _Track(log, scene, caught, _throw_velocity_m_s(log, summary))
     axes, curves = _plots(log, t_s + start_s, slice(first, last + 1), caught)
     frames: list[Frame] = []
     still, target = 0, None
+    payload_kg = summary["payload_kg"]
     name = "payload" if payload_kg is None else f"{payload_kg:g} kg payload"
     for now_s, speed in _times(t_s[first], t_s[last], None if caught is None else t_s[caught]):
         k = min(int(np.searchsorted(t_s, now_s)), last)
@@ -121,16 +122,15 @@ def _times(first_s: float, last_s: float, catch_s: float | None) -> Iterator[tup
 class _Track:
     """Poses of vehicle, arm and payload. A missing measurement is replaced by the one before it."""
 
-    def __init__(self, log: FlightLog, scene: Scene, caught: int | None) -> None:
+    def __init__(self, log: FlightLog, scene: Scene, caught: int | None, throw_velocity_m_s: Array | None) -> None:
         columns = log.columns
         self._log, self._caught, self._t_s = log, caught, columns.t_s
         self._mocap = _filled(columns.mocap_position_world_m)
         self._arm = _filled(columns.arm_rad)
-        velocity = _throw_velocity_m_s(log)
         self._throw: tuple[Array, Array] | None = None
         """Position and velocity of the payload at the catch, world frame."""
-        if caught is not None and velocity is not None:
-            self._throw = scene.net_world_m(self.pose(caught)), velocity
+        if caught is not None and throw_velocity_m_s is not None:
+            self._throw = scene.net_world_m(self.pose(caught)), throw_velocity_m_s
 
     def pose(self, k: int) -> Pose:
         """Return the pose at an index of the log."""
@@ -162,16 +162,11 @@ def _filled(values: Array) -> Array:
     return filled
 
 
-def _throw_velocity_m_s(log: FlightLog) -> Array | None:
+def _throw_velocity_m_s(log: FlightLog, summary: dict[str, Any]) -> Array | None:
     """Return the payload's velocity at the net, from the simulated world's configuration; None for a real flight."""
-    world = log.config.get("world")
-    beside = log.path.with_name("sitl_config.json")
-    try:
-        if world is None:
-            world = json.loads(beside.read_text(encoding="utf-8"))["world"]
-        return np.array(world["throw_velocity_m_s"], dtype=np.float64).reshape(3)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    world = summary.get("world") or log.config.get("world") or {}
+    velocity = world.get("throw_velocity_m_s")
+    return None if velocity is None else np.array(velocity, dtype=np.float64)
 
 
 def _labels(log: FlightLog, k: int, mission_s: float, speed: float) -> list[Shape]:

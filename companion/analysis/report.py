@@ -86,7 +86,7 @@ def _page(log: FlightLog, summary: dict[str, Any], plots: list[Plot]) -> str:
 
 
 def _movie(log: FlightLog, summary: dict[str, Any]) -> str:
-    movie = movie_of(log, summary["payload_kg"])
+    movie = movie_of(log, summary)
     return "" if movie is None else player_html(movie)
 
 

@@ -186,7 +186,7 @@ def _write_gif(flight: Graded, path: Path) -> str | None:
         from companion.analysis.animation import movie_of, write_gif
     except ImportError:
         return "--gif needs matplotlib: pip install 'companion[analysis]'"
-    movie = movie_of(flight.log, flight.summary["payload_kg"])
+    movie = movie_of(flight.log, flight.summary)
     if movie is None:
         return f"{flight.log.path}: the vehicle did not take off, or the log lacks its geometry; there is no animation"
     try:

@@ -25,20 +25,20 @@ from tests.ground.page_browser import chromium
 from tests.support import ROOT
 
 VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")
-WORLD = {"throw_velocity_m_s": [-2.0, 0.15, -1.5]}
+SIMULATED = {"payload_kg": 0.2, "world": {"throw_velocity_m_s": [-2.0, 0.15, -1.5]}}
 
 
-def flown(world: dict[str, Any] = WORLD, phase: str | None = None) -> FlightLog:
+def flown(phase: str | None = None) -> FlightLog:
     rows = list(synthetic_flight(rate_hz=50.0))
     outputs = tuple(o if phase is None else replace(o, phase=phase) for _, o, _ in rows)
-    config = {**CONFIG, "vehicle": json.loads(VEHICLE.model_dump_json()), "world": world}
+    config = {**CONFIG, "vehicle": json.loads(VEHICLE.model_dump_json())}
     metadata = {"config": {"json": json.dumps(config)}}
     return FlightLog(Path("flight.mcap"), tuple(r[0] for r in rows), outputs, tuple(r[2] for r in rows), metadata, True)
 
 
 @pytest.fixture(scope="module")
 def movie() -> Movie:
-    made = movie_of(flown(), 0.2)
+    made = movie_of(flown(), SIMULATED)
     assert made is not None
     return made
 
@@ -58,13 +58,13 @@ def test_the_payload_is_thrown_and_then_caught(movie: Movie) -> None:
 
 
 def test_without_a_simulated_throw_the_payload_appears_in_the_net() -> None:
-    made = movie_of(flown(world={}))
+    made = movie_of(flown(), {"payload_kg": None, "world": None})
     assert made is not None
     assert {t for frame in texts(made) for t in frame if "payload" in t} == {"payload, caught"}
 
 
 def test_a_log_without_geometry_has_no_animation() -> None:
-    assert movie_of(replace(flown(), metadata={"config": {"json": json.dumps(CONFIG)}})) is None
+    assert movie_of(replace(flown(), metadata={"config": {"json": json.dumps(CONFIG)}}), SIMULATED) is None
 
 
 @pytest.mark.parametrize("arm_rad", [(math.radians(165), math.radians(140)), (1.2, -0.1)])
@@ -93,7 +93,7 @@ def test_the_gif_has_every_frame(movie: Movie, tmp_path: Path) -> None:
 
 
 def test_a_browser_plays_it_whatever_a_phase_is_called(tmp_path: Path) -> None:
-    made = movie_of(flown(phase="</script><b>phase"))
+    made = movie_of(flown(phase="</script><b>phase"), SIMULATED)
     assert made is not None
     page = tmp_path / "page.html"
     page.write_text(f"<!doctype html><meta charset='utf-8'>{player_html(made)}", encoding="utf-8")
