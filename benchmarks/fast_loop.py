@@ -34,7 +34,7 @@ from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.types import Inputs, Outcome, Reference
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.campaigns import flights as campaign
+from sitl.campaigns import compare
 from sitl.fast.loop import TICK_S, FastFlight, FastResult
 from sitl.world.world import PHYSICS_DT_S, World
 
@@ -165,7 +165,6 @@ def reference_us(repeats: int) -> float:
 
 def two_workers(config: SitlConfig) -> tuple[float, float]:
     """Flights per second of wall time by one worker process and by two, grading included, as `companion compare --jobs` flies them."""
-    text = config.model_dump_json()
     flight = {
         "controller": config.controller.law,
         "preset": config.controller.preset,
@@ -176,7 +175,7 @@ def two_workers(config: SitlConfig) -> tuple[float, float]:
 
     def rate(pool: ProcessPoolExecutor, jobs: int) -> float:
         start = time.perf_counter()
-        flights = [pool.submit(campaign.fly, text, flight) for _ in range(jobs * _WORKER_FLIGHTS)]
+        flights = [pool.submit(compare.fly, config, flight) for _ in range(jobs * _WORKER_FLIGHTS)]
         for done in flights:
             row = done.result()["row"]
             if row["error"] is not None:

@@ -1,27 +1,100 @@
-"""Elements that all HTML pages share. A page is one self-contained file that prints well."""
+"""HTML pages: one file each that holds its pictures, opens anywhere and prints well. `page.html` is their template.
+
+Needs jinja2 (extras `sitl` and `analysis`).
+"""
 
 from __future__ import annotations
 
 import base64
-from html import escape
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-_STYLE = """
-:root { --ink: #22303c; --soft: #5b6b79; --line: #dde3e8; --good: #1f8a5b; --bad: #c2255c; --card: #f6f8fa; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: var(--width); color: var(--ink); background: #fff;
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; }
-.sub { color: var(--soft); margin: .2rem 0 1.2rem; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-td, th { border-bottom: 1px solid var(--line); vertical-align: top; }
-th { color: var(--soft); font-weight: 600; font-size: .85rem; }
-figure { margin: 0 0 1.6rem; break-inside: avoid; } figure img { width: 100%; border: 1px solid var(--line); border-radius: .4rem; }
-figcaption { color: var(--soft); font-size: .88rem; }
-details { margin-top: .6rem; } summary { cursor: pointer; color: var(--soft); }
-pre { background: var(--card); padding: 1rem; border-radius: .5rem; overflow: auto; font-size: 12px; line-height: 1.4; }
-@media print { body { padding: 0; max-width: none; font-size: 11px; } details { display: none; } }
-"""
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from companion.analysis.table import Table
+
+_CSS = Path(__file__).with_name("page.css")
+_INDEX = re.compile(r"\b([eMK])_(p|q|z|α|d|tau)\b")
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A PNG file with its title and caption."""
+
+    path: Path
+    title: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of a page below a heading; empty parts are left out."""
+
+    title: str
+    lead: str = ""
+    """Text above the tables."""
+    tables: Sequence[Table] = ()
+    pictures: Sequence[Picture] = ()
+    text: str = ""
+    """Text below the tables and pictures."""
+    folded: Mapping[str, str] = field(default_factory=dict)
+    """Long texts by title, shown when the reader opens them."""
+
+
+def write_page(
+    path: Path,
+    title: str,
+    subtitle: str,
+    sections: Sequence[Section],
+    *,
+    notes: Sequence[str] = (),
+    verdict: str = "",
+    good: bool = True,
+    width_rem: int = 78,
+) -> None:
+    """Write a page.
+
+    Args:
+        path: HTML file.
+        title: heading of the page.
+        subtitle: below the heading.
+        sections: the page's parts, in order.
+        notes: remarks at the top: what the reader must know before the figures.
+        verdict: one sentence above the notes; empty for none.
+        good: whether the verdict is good.
+        width_rem: largest width of the text.
+
+    Raises:
+        OSError: the file cannot be written, or a picture cannot be read.
+    """
+    text = _environment().get_template("page.html").render(
+        title=title, subtitle=subtitle, sections=sections, notes=notes, verdict=verdict, good=good, width_rem=width_rem
+    )  # fmt: skip
+    path.write_text(text, encoding="utf-8")
+
+
+def _environment() -> Environment:
+    found = Environment(
+        loader=PackageLoader("companion.analysis", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.filters |= {"indices": _indices, "data": _data}
+    return found
+
+
+def _indices(text: str) -> Markup:
+    """Escape the text and show the indices of symbols such as e_p as such."""
+    return Markup(_INDEX.sub(r"\1<sub>\2</sub>", str(escape(text))))
+
+
+def _data(path: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def opening(title: str, style: str) -> str:
@@ -29,7 +102,7 @@ def opening(title: str, style: str) -> str:
     return (
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-        f"<title>{escape(title)}</title><style>{_STYLE}{style}</style></head><body>"
+        f"<title>{escape(title)}</title><style>{_CSS.read_text(encoding='utf-8')}{style}</style></head><body>"
     )
 
 

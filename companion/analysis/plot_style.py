@@ -1,4 +1,4 @@
-"""Common style of all plots: size, colours, axes, the mark of the catch. Needs matplotlib (extra `analysis`)."""
+"""The one style of every plot: size, colours, axes, legend, marks. Needs matplotlib (extra `analysis`)."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 DPI = 150
 WIDTH_IN = 9.0
 INK = "#22303c"
+SOFT = "#8b98a5"
 CATCH = "#c2255c"
 DASHED = (0, (4, 2))
-"""Line style of references and desired values."""
+"""Line style of a reference, beside what was flown."""
+COLOURS = ("#0072b2", "#d55e00", "#000000", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a5cc2", "#6b705c", "#a3b18a")
+"""The first six are of Okabe and Ito, "Color Universal Design": distinct with any colour blindness."""
 
 
 def new_figure(height_in: float) -> Figure:
@@ -23,12 +27,12 @@ def new_figure(height_in: float) -> Figure:
 
 
 def write_png(figure: Figure, path: Path) -> None:
-    """Write the figure to a file."""
+    """Write the figure as PNG."""
     FigureCanvasAgg(figure).print_png(path)
 
 
 def dress(ax: Any) -> None:
-    """Apply the common style: grid behind the data, no frame above and on the right, muted labels."""
+    """Draw the grid behind the data, no frame above and on the right, and quiet labels."""
     ax.grid(True, color="#e6eaee", lw=0.7)
     ax.set_axisbelow(True)
     ax.tick_params(colors=INK, labelsize=9, length=3)
@@ -41,8 +45,16 @@ def dress(ax: Any) -> None:
         label.set_size(9.5)
 
 
+def figure_legend(figure: Figure, title: str, handles: Sequence[Any], names: Sequence[str], columns: int) -> None:
+    """Write title and legend above the axes; a `$` in a name is shown as such."""
+    figure.legend(
+        handles, [name.replace("$", r"\$") for name in names], loc="outside upper left", ncols=min(columns, len(names)), fontsize=8.5,
+        frameon=False, handlelength=2.6, title=title, title_fontproperties={"size": 13, "weight": "bold"}, alignment="left",
+    ).get_title().set_color(INK)  # fmt: skip
+
+
 def mark_catch(axes: Sequence[Any], t_s: float) -> None:
-    """Mark the catch by a dashed vertical line through axes over time, labelled in the first one."""
+    """Draw a dashed vertical line through axes over time and name it in the first one."""
     for ax in axes:
         ax.axvline(t_s, color=CATCH, lw=1.3, ls=(0, (5, 3)), zorder=2)
     axes[0].annotate(
@@ -56,3 +68,10 @@ def mark_catch(axes: Sequence[Any], t_s: float) -> None:
         fontsize=9,
         color=CATCH,
     )
+
+
+def mark_end(ax: Any, x: Any, y: Any, colour: str) -> None:
+    """Mark the last known point of a line with a cross: the end of a flight that was not completed."""
+    known = np.flatnonzero(np.isfinite(y))
+    if len(known):
+        ax.plot(x[known[-1]], y[known[-1]], "x", color=colour, ms=9, mew=2.2, zorder=5, clip_on=False)

@@ -1,4 +1,4 @@
-"""The companion's end of a campaign: `python -m sitl.campaigns.flights` or another as a child, its results as they come."""
+"""The parent's side of a campaign: starts `python -m sitl.campaigns` and reads the results as the flights end."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 STALL_TIMEOUT_S = 300.0
-"""A flight takes seconds; a campaign that says nothing for so long hangs."""
+"""A flight takes seconds; a campaign without a result for this long hangs."""
 STOP_TIMEOUT_S = 3.0
 _POLL_S = 0.2
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -24,32 +24,31 @@ Message = dict[str, Any]
 
 
 class CampaignError(Exception):
-    """The campaign did not come to its end; one line."""
+    """The campaign cannot go on. The text is one line for the user."""
 
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)
         self.bad_input = bad_input
-        """What the user asked for cannot be had; nothing was flown."""
+        """Whether the user's input is the cause; then nothing was flown."""
 
 
 class CampaignProcess:
-    """A running campaign, with a process group of its own for its workers; a context manager, at whose end nobody is left.
+    """A running campaign in a process group of its own. As a context manager it ends the campaign and all its workers.
 
     Args:
-        job: as on standard input of the module.
-        log: where its standard error goes; removed again if it holds nothing of interest.
-        module: what is to be run.
+        job: see `sitl.campaigns`.
+        log: file for the campaign's standard error; deleted at the end if it is empty.
     """
 
-    def __init__(self, job: Message, log: Path, module: str = "sitl.campaigns.flights") -> None:
+    def __init__(self, job: Message, log: Path) -> None:
         self._log = log
         self._buffer = b""
         self._stop_asked = False
-        # Flights run beside each other, one per core: threads inside of them would only fight.
+        # One flight per core: more threads inside a flight only compete with the other flights.
         environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
         with open(log, "wb") as file:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", module],
+                [sys.executable, "-m", "sitl.campaigns"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,
@@ -57,12 +56,12 @@ class CampaignProcess:
                 start_new_session=True,
             )
         assert self._process.stdin is not None
-        # The pipe stays open: its end tells the campaign that we are gone.
+        # The pipe stays open: the campaign ends when it closes.
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(job).encode() + b"\n")
             self._process.stdin.flush()
 
-    def __enter__(self) -> CampaignProcess:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -77,19 +76,19 @@ class CampaignProcess:
                 with contextlib.suppress(OSError):
                     pipe.close()
         with contextlib.suppress(OSError):
-            # Workers that were stopped half way complain of it.
+            # Workers that are stopped during a flight write tracebacks.
             if self._stop_asked or self._log.stat().st_size == 0:
                 self._log.unlink()
 
     def ask_to_stop(self) -> None:
-        """`results` ends soon; safe in a signal handler."""
+        """Make `results` end soon. Safe in a signal handler."""
         self._stop_asked = True
 
     def results(self) -> Iterator[Message]:
-        """Flights as they end, until the last one or until asked to stop.
+        """Yield the result of each flight as it ends, until the last one or until asked to stop.
 
         Raises:
-            CampaignError: the campaign gave up, died or hangs.
+            CampaignError: the campaign reported an error, died or hangs.
         """
         assert self._process.stdout is not None
         fd = self._process.stdout.fileno()
@@ -97,26 +96,27 @@ class CampaignProcess:
         while not self._stop_asked:
             if not select.select([fd], [], [], _POLL_S)[0]:
                 if time.monotonic() - heard_s > STALL_TIMEOUT_S:
-                    raise CampaignError(f"campaign: no flight has ended within {STALL_TIMEOUT_S:g} s; see {self._log}")
+                    raise CampaignError(
+                        f"campaign: no flight has ended for {STALL_TIMEOUT_S:g} s; the campaign was stopped, see {self._log}"
+                    )
                 continue
             data = os.read(fd, 1 << 20)
             heard_s = time.monotonic()
             if not data:
-                self._check_end()
+                self._check_exit()
                 return
-            self._buffer += data
-            while b"\n" in self._buffer:
-                line, _, self._buffer = self._buffer.partition(b"\n")
+            *lines, self._buffer = (self._buffer + data).split(b"\n")
+            for line in lines:
                 message = json.loads(line)
                 if message["type"] == "error":
                     raise CampaignError(message["text"], bad_input=message["bad_input"])
                 yield message
 
-    def _check_end(self) -> None:
+    def _check_exit(self) -> None:
         try:
             code = self._process.wait(STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            return  # it has said all it had to say
+            return  # its output is complete
         if code == 0:
             return
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()

@@ -12,8 +12,8 @@ from typing import Any
 
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import summarise, write_summary
-from companion.campaigns.side_by_side import FLIGHTS_MAX, Comparison, NotAlignable, compare, jsonable
-from companion.campaigns.side_by_side_course import Flight, flight_of
+from companion.campaigns.side_by_side.comparison import FLIGHTS_MAX, Comparison, NotAlignable, compare, jsonable
+from companion.campaigns.side_by_side.flight import Flight, flight_of
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.model.types import Outcome
 from companion.runtime.console import tell
@@ -236,8 +236,8 @@ def write_page(comparison: Comparison, out: Path) -> Path:
         ImportError: matplotlib is missing.
         OSError: it cannot be written.
     """
-    from companion.campaigns.side_by_side_html import write_html
-    from companion.campaigns.side_by_side_plots import write_pictures
+    from companion.campaigns.side_by_side.page import write_html
+    from companion.campaigns.side_by_side.plots import write_pictures
 
     out.mkdir(parents=True, exist_ok=True)
     (out / RESULT).write_text(json.dumps(jsonable(comparison), indent=1, allow_nan=False) + "\n", encoding="utf-8")

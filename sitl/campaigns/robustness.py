@@ -1,22 +1,12 @@
-"""`python -m sitl.campaigns.robustness`: one mission flown in many worlds, each drawn at random. Started by `companion robustness`.
+"""Flights of `companion robustness`: {name, number, world}; a flight without a `world` is drawn at random by its number.
 
-Standard input: one line of JSON, then nothing; when it ends, so does the campaign.
-    config        effective configuration (`SitlConfig`)
-    seed          of the draws
-    first, count  numbers of the draws: a draw depends on the seed and its own number, not on how many are flown
-    fixed         keys of the world that are not drawn, nor a case's: as the configuration has them
-    cases         null, or {name, world} to be flown instead of draws
-    jobs          processes; null: one per core
-    scheduler     address of a Dask scheduler instead; null: this machine
-Standard output: JSON lines as from `sitl.campaigns.flights`; a row is described at `fly`.
+Further keys of the job: `seed` of the draws, and `fixed`, the keys of the world that keep their configured values.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import sys
-import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,14 +19,13 @@ from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.mission.plan import Plan
 from companion.model.types import Outcome, PhaseKind, SafetyAction
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns import flights as campaign
-from sitl.campaigns.flights import CampaignError, Data
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.campaigns.flights import Flown, fly_to_end, row_of, with_world
+from sitl.campaigns.runner import CampaignError, Data
 from sitl.world.world import _THROW_LEAD_S
 
 PAYLOAD_KG = (0.05, 0.4)
 THROW_SPEED_M_S = (0.5, 4.0)
-"""Horizontal part on arrival, from any side; downwards comes on top of it."""
+"""Horizontal speed at the catch, from any side; the descent adds to it."""
 DESCENT_MAX_M_S = 2.5
 HOVER_THRUST_ERROR = 0.10
 LINK_MASS_ERROR = 0.20
@@ -45,33 +34,33 @@ ARM_DELAY_S = (0.002, 0.010)
 ROTOR_LAG_S = (0.020, 0.060)
 WIND_MAX_M_S = 3.0
 FORCE_BIAS_N = (3.0, 12.0)
-"""Larger than the default knob's."""
+"""Larger than the default."""
 FORCE_BIASED, FORCE_MISSING = 0.5, 0.75
-"""Up to the first share of draws the force sensor is biased, up to the second it is silent from arming on, else from some time on."""
+"""Shares of the draws, cumulative: the force sensor is biased, or silent from arming on; in the rest it falls silent later."""
 
 ALONG_MIN_M_S = 0.08
-"""The payload is thrown at a vehicle that flies in the direction of +x; slower than this counts as standing."""
+"""Least speed of the vehicle in the direction of +x at a catch point."""
 END_MARGIN_M = 0.08
-"""Nearer to the ends of the line, a vehicle that the wind has pushed aside may never be seen to come past the catch point."""
+"""Distance of the catch points from the ends of the line: a vehicle displaced by the wind may not pass a point closer to them."""
 HAND_HEIGHT_M = 0.1
-"""The payload leaves a hand above the floor."""
+"""Least height above the floor at which the payload leaves the hand."""
 ROTORS_ABOVE_BODY_M = 0.03
 FELT_S = 0.05
-"""So long after the catch there must be a sample from after it."""
+"""Time after the catch by which the force sensor must have sent a sample taken after it."""
 _STEP_S = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Throw:
-    """A place on the flight line where a payload can arrive."""
+    """A point on the flight line at which a payload can be caught."""
 
     at_m: tuple[float, float]
     descent_m_s: tuple[float, float]
-    """Slowest: thrown from a hand above the floor. Fastest: the payload comes over the net without passing through the rotors."""
+    """Slowest: thrown from `HAND_HEIGHT_M`. Fastest: the payload reaches the net without passing through the rotors."""
 
 
 def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
-    """Catch points along the first pass in the direction of +x, in the order of the flight.
+    """Return the catch points along the first pass in the direction of +x, in the order of the flight.
 
     Raises:
         CampaignError: there is no such pass.
@@ -88,7 +77,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
     found: list[Throw] = []
     for t_s in line:
         now, later = plan.reference(t_s), plan.reference(t_s + _THROW_LEAD_S)
-        # Where the world expects it, by its speed when the payload is thrown.
+        # The simulated world extrapolates the vehicle from its speed at the throw.
         x_m = now.position_world_m[0] + now.velocity_world_m_s[0] * _THROW_LEAD_S
         if x_m > plan.reference(line[-1]).position_world_m[0] - END_MARGIN_M:
             break
@@ -111,7 +100,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
 
 
 def draw(seed: int, number: int, places: list[Throw]) -> Data:
-    """Knobs of the world of one draw, rounded so that a command line can repeat them to the bit.
+    """Draw a world; return its keys, rounded so that a command line can repeat them exactly.
 
     Args:
         seed: of the whole campaign.
@@ -123,10 +112,10 @@ def draw(seed: int, number: int, places: list[Throw]) -> Data:
     def between(span: tuple[float, float], digits: int = 4) -> float:
         return round(float(rng.uniform(*span)), digits)
 
-    # Everything is drawn every time, in this order: what one draw does not use shifts nothing in it.
+    # Every quantity is drawn every time and in this order, so that an unused one does not change the others.
     payload_kg = between(PAYLOAD_KG, 3)
     speed, to_rad = between(THROW_SPEED_M_S), between((-math.pi, math.pi))
-    # By place, not by time, or the slow ends of the line would have most of the catches.
+    # Uniform in position, not in time: otherwise most catches would be at the slow ends of the line.
     x_m = between((places[0].at_m[0], places[-1].at_m[0]))
     place = min(places, key=lambda one: abs(one.at_m[0] - x_m))
     descent = between(place.descent_m_s)
@@ -153,56 +142,57 @@ def draw(seed: int, number: int, places: list[Throw]) -> Data:
     return knobs
 
 
-def fly(config_json: str, flight: Data) -> Data:
-    """One flight: {row, wall_s}.
+def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
+    """Return the flights of the job, each with its world.
 
-    The row has: name, number (of the draw), world (the knobs drawn), outcome, why (what ended the mission early), error (what ended
-    the flight from within), thrown, caught (truly), felt (the force sensor lived to tell), caught_s and noticed_s (mission clock),
-    e_p_m (RMS after the catch; of the whole flight if nothing was caught), pre_e_p_m, e_q_deg, e_alpha_deg, peak_e_p_m, final_e_z_m,
-    tilt_max_deg, slack_min_m, home_m (from the start, at the end), events. Where nothing was measured a value is None.
-
-    Args:
-        config_json: effective configuration.
-        flight: {name, number, world}.
+    Raises:
+        CampaignError: nothing can be thrown at the vehicle in this mission.
     """
-    begun_s = time.perf_counter()
-    data = json.loads(config_json)
-    data["world"].update(flight["world"])
-    config = SitlConfig.model_validate_json(json.dumps(data))
-    result, error = FastResult(), None
-    thrown = felt = False
-    caught_t_s: float | None = None
-    try:
-        fast = FastFlight(config)
-        result = fast.run()
-        config = fast.config
-        thrown, caught_t_s = fast.plant.world.thrown_t_s is not None, fast.plant.world.caught_t_s
-        felt = caught_t_s is not None and _felt(result, caught_t_s)
-    # A law that cannot go on ends its flight process: that flight is lost, and the others are flown all the same.
-    except Exception as failure:
-        error = f"{type(failure).__name__}: {failure}"
-    graded, log = campaign.row_of(config.flight, result, caught_t_s, error)
-    row = {
-        **{key: flight[key] for key in ("name", "number", "world")},
-        **_row(graded, log, result),
-        "thrown": thrown,
-        "caught": caught_t_s is not None,
-        "felt": felt,
-        "caught_s": _mission_s(result, caught_t_s),
+    (config,), flights = configs, job["flights"]
+    draws = any(flight["world"] is None for flight in flights)
+    places = throws(config.mission, config.vehicle) if draws else []
+    fixed = {key: job["configs"][0]["world"][key] for key in job["fixed"]}
+
+    def world_of(flight: Data) -> Data:
+        world: Data = draw(job["seed"], flight["number"], places) if flight["world"] is None else flight["world"]
+        return world | fixed
+
+    return [{**flight, "world": world_of(flight)} for flight in flights]
+
+
+def fly(config: SitlConfig, flight: Data) -> Data:
+    """Fly one flight; return its row.
+
+    The row has: name, number (of the draw), world (the keys drawn), outcome, why (event that ended the mission early), error (exception
+    that ended the flight), thrown, caught (truly), felt (the force sensor still worked), caught_s and noticed_s (mission clock), e_p_m
+    (RMS after the catch, or of the whole flight if nothing was caught), pre_e_p_m, e_q_deg, e_alpha_deg, peak_e_p_m, final_e_z_m,
+    tilt_max_deg, slack_min_m, home_m (distance of the landing from the start), events. A value that was not measured is None.
+    """
+    flown = fly_to_end(with_world(config, flight["world"]))
+    caught_t_s = flown.caught_t_s
+    return {
+        "row": {
+            **{key: flight[key] for key in ("name", "number", "world")},
+            **_graded(flown),
+            "thrown": flown.fast is not None and flown.fast.plant.world.thrown_t_s is not None,
+            "caught": caught_t_s is not None,
+            "felt": caught_t_s is not None and _felt(flown, caught_t_s),
+            "caught_s": _mission_s(flown, caught_t_s),
+        }
     }
-    return {"row": row, "wall_s": time.perf_counter() - begun_s}
 
 
-def _felt(result: FastResult, caught_t_s: float) -> bool:
-    """Whether the force sensor lived to tell of the catch."""
-    after = next((i for i in result.inputs if i.t_s >= caught_t_s + FELT_S), None)
+def _felt(flown: Flown, caught_t_s: float) -> bool:
+    """Return whether the force sensor still worked after the catch."""
+    after = next((i for i in flown.result.inputs if i.t_s >= caught_t_s + FELT_S), None)
     return after is not None and after.force is not None and after.force.stamp_s > caught_t_s
 
 
-def _row(graded: Data, log: FlightLog, result: FastResult) -> Data:
-    events = [event for outputs in result.outputs for event in outputs.events]
+def _graded(flown: Flown) -> Data:
+    graded, log = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error)
+    events = [event for outputs in flown.result.outputs for event in outputs.events]
     gave_up = [event for event in events if event.action.rank >= SafetyAction.HOLD.rank]
-    # What made it land tells more than what made it stop and wait before.
+    # The event that made it land says more than an earlier one that made it hold.
     gave_up.sort(key=lambda event: event.action.rank < SafetyAction.LAND.rank)
     ended = gave_up[0] if gave_up and graded["outcome"] != Outcome.COMPLETED.value else None
     noticed = next((event.t_s for event in events if event.id == "catch"), None)
@@ -212,7 +202,7 @@ def _row(graded: Data, log: FlightLog, result: FastResult) -> Data:
         "outcome": graded["outcome"],
         "why": f"{ended.id}: {ended.text}" if ended is not None else None,
         "error": graded["error"],
-        "noticed_s": _mission_s(result, noticed),
+        "noticed_s": _mission_s(flown, noticed),
         "e_p_m": whole["e_p_m"],
         "pre_e_p_m": before["e_p_m"],
         "e_q_deg": whole["e_q_deg"],
@@ -225,7 +215,7 @@ def _row(graded: Data, log: FlightLog, result: FastResult) -> Data:
 
 
 def _extremes(log: FlightLog) -> Data:
-    """What shows how near to the edge a flight was."""
+    """Return how close to its limits a flight came."""
     nothing = {"tilt_max_deg": None, "slack_min_m": None, "home_m": None}
     if not log.inputs:
         return nothing
@@ -242,39 +232,7 @@ def _extremes(log: FlightLog) -> Data:
     }
 
 
-def _mission_s(result: FastResult, t_s: float | None) -> float | None:
-    """A time of the flight on the mission clock."""
-    begun = next((o.t_s - o.mission_t_s for o in result.outputs if o.mission_t_s > 0), None)
+def _mission_s(flown: Flown, t_s: float | None) -> float | None:
+    """Convert a time from the flight clock to the mission clock."""
+    begun = next((o.t_s - o.mission_t_s for o in flown.result.outputs if o.mission_t_s > 0), None)
     return None if t_s is None or begun is None else t_s - begun
-
-
-def grid(job: Data) -> tuple[list[str], list[Data]]:
-    """Configurations and flights of a job.
-
-    Raises:
-        CampaignError: nothing can be thrown at the mission.
-    """
-    config = SitlConfig.model_validate_json(json.dumps(job["config"]))
-    if job["cases"] is not None:
-        flights = [{"name": case["name"], "number": None, "world": case["world"]} for case in job["cases"]]
-    else:
-        places = throws(config.mission, config.vehicle)
-        numbers = range(job["first"], job["first"] + job["count"])
-        flights = [{"name": f"draw {n}", "number": n, "world": draw(job["seed"], n, places)} for n in numbers]
-    fixed = {key: job["config"]["world"][key] for key in job["fixed"]}
-    for flight in flights:
-        flight["world"] |= fixed
-        flight["variant"] = 0
-    return [config.model_dump_json()], flights
-
-
-def main() -> int:
-    """Fly what standard input asks for."""
-    return campaign.serve(grid, fly)
-
-
-if __name__ == "__main__":
-    # Workers find the functions by the module's name, which is not __main__ for them.
-    from sitl.campaigns import robustness
-
-    sys.exit(robustness.main())

@@ -2,50 +2,38 @@
 
 from __future__ import annotations
 
-import csv
 import shlex
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from companion.campaigns import robustness
-from companion.campaigns.robustness import Kept, Row, as_cases, held_against, read_cases, worst, write_cases
-from companion.campaigns.robustness_plots import write_distribution
+from companion.campaigns.robustness.cases import (
+    Cases,
+    Kept,
+    as_cases,
+    fly_command,
+    name_of,
+    read_cases,
+    worse_than,
+    write_cases,
+)
+from companion.campaigns.robustness.draws import influence, sensor_of, thirds, worst
+from companion.campaigns.robustness.plots import write_distribution
+from companion.campaigns.runner import Row
 from companion.config.document import ConfigError
 from companion.model.types import Outcome
 from companion.sitl_config.loader import load_sitl
+from tests.campaigns.made_up import WORLD
+from tests.campaigns.made_up import draw_row as row
 from tests.support import CATCH
-
-WORLD: dict[str, Any] = {
-    "payload_kg": 0.38,
-    "throw_velocity_m_s": [3.5, 0.4, -1.2],
-    "catch_at_m": [0.1, 0.0],
-    "hover_thrust_error": 0.01,
-    "link_mass_error": [0.1, -0.05],
-    "setpoint_delay_s": 0.055,
-    "arm_delay_s": 0.003,
-    "rotor_lag_s": 0.03,
-    "wind_m_s": [0.3, -0.4, 0.0],
-    "seed": 12,
-    "faults": [{"kind": "force_loss", "t_s": 7.25}],
-}
-
-
-def row(number: int, e_p_m: float | None, outcome: str = "completed", caught: bool = True, **world: Any) -> Row:
-    return {
-        "name": f"draw {number}", "number": number, "world": {**WORLD, **world}, "outcome": outcome, "why": None, "error": None,
-        "thrown": True, "caught": caught, "felt": caught, "caught_s": 6.5 if caught else None, "noticed_s": None, "e_p_m": e_p_m,
-        "events": ["takeoff", "touchdown"],
-    }  # fmt: skip
 
 
 def test_a_name_says_what_is_hard() -> None:
-    assert robustness.name_of(WORLD) == "heavy_fast_from_behind_force_lost_slow_setpoints"
+    assert name_of(WORLD) == "heavy_fast_from_behind_force_lost_slow_setpoints"
     gentle = {**WORLD, "payload_kg": 0.06, "throw_velocity_m_s": [0.1, -0.6, -1.0], "wind_m_s": [2.9, 0.0, 0.0]}
     gentle = {**gentle, "faults": [{"kind": "force_loss", "t_s": 0.0}], "setpoint_delay_s": 0.01}
-    assert robustness.name_of(gentle) == "light_gentle_from_left_no_force_windy"
-    assert robustness.name_of({"payload_kg": 0.2}) == "plain"
+    assert name_of(gentle) == "light_gentle_from_left_no_force_windy"
+    assert name_of({"payload_kg": 0.2}) == "plain"
 
 
 def test_the_worst_are_those_that_crashed_then_gave_up_then_were_off() -> None:
@@ -66,7 +54,7 @@ def test_cases_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
         row(1, None, "aborted"),
         row(2, 0.031, caught=False, force_bias_n=[1.0, 2.0, 11.5], faults=[]),
     ]
-    cases = robustness.Cases(mission="a.yaml", controller="adaptive", preset="recommended", cases=as_cases(rows))
+    cases = Cases(mission="a.yaml", controller="adaptive", preset="recommended", cases=as_cases(rows))
     path = tmp_path / "cases.yaml"
     write_cases(cases, path, "two lines\nof remark")
     assert read_cases(path) == cases
@@ -82,7 +70,7 @@ def test_cases_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
 
 def test_a_file_of_cases_takes_any_name_of_a_mission(tmp_path: Path) -> None:
     mission = "my flights: #1/on the \x85 line.yaml"
-    cases = robustness.Cases(mission=mission, controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
+    cases = Cases(mission=mission, controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
     write_cases(cases, tmp_path / "cases.yaml", "")
     assert read_cases(tmp_path / "cases.yaml") == cases
 
@@ -97,7 +85,7 @@ def test_a_file_of_cases_takes_any_name_of_a_mission(tmp_path: Path) -> None:
 )
 def test_a_mistake_in_a_file_of_cases_is_told_with_its_place(tmp_path: Path, old: str, new: str, why: str) -> None:
     path = tmp_path / "cases.yaml"
-    cases = robustness.Cases(mission="a.yaml", controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
+    cases = Cases(mission="a.yaml", controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
     write_cases(cases, path, "")
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(ConfigError, match=why):
@@ -105,7 +93,7 @@ def test_a_mistake_in_a_file_of_cases_is_told_with_its_place(tmp_path: Path, old
 
 
 def test_the_printed_command_flies_the_same_world() -> None:
-    line = robustness.fly_command(str(CATCH), "adaptive", "recommended", WORLD, ["controller.rho_max=5.0"])
+    line = fly_command(str(CATCH), "adaptive", "recommended", WORLD, ["controller.rho_max=5.0"])
     words = shlex.split(line)
     assert words[:4] == ["companion", "fly", str(CATCH), "--sitl"]
     config = load_sitl(CATCH, None, "adaptive", "recommended", words[words.index("--set") + 1 :])
@@ -128,45 +116,34 @@ def test_the_printed_command_flies_the_same_world() -> None:
     ],
 )
 def test_worse_than_kept(now: Row, kept: Kept, why: str | None) -> None:
-    found = held_against(now, kept)
+    found = worse_than(now, kept)
     assert found is None if why is None else found is not None and why in found
 
 
 def test_thirds_are_of_payload_and_grade_only_what_was_caught_and_completed() -> None:
     rows = [row(n, 0.01 * (1 + n), payload_kg=0.1 + 0.05 * n) for n in range(7)]
     rows += [row(7, 0.9, payload_kg=0.12, caught=False), row(8, None, "aborted", payload_kg=0.4)]
-    first, second, third = robustness.thirds(rows)
-    assert (first.low_kg, third.high_kg) == pytest.approx((0.1, 0.4))
+    first, second, third = thirds(rows)
+    assert (first.payload_kg[0], third.payload_kg[1]) == pytest.approx((0.1, 0.4))
     assert [part.flights for part in (first, second, third)] == [3, 2, 4]
     assert [part.caught for part in (first, second, third)] == [2, 2, 4]
-    assert (first.p50_m, first.max_m) == pytest.approx((0.015, 0.02))
-    assert (third.p50_m, third.max_m) == pytest.approx((0.06, 0.07))
-    assert robustness.outcomes(rows) == {"completed": 8, "aborted": 1}
+    assert first.e_p_m == pytest.approx({"p50": 0.015, "p90": 0.019, "max": 0.02})
+    assert third.e_p_m == pytest.approx({"p50": 0.06, "p90": 0.068, "max": 0.07})
 
 
 def test_flights_are_told_apart_by_what_the_force_sensor_was_like() -> None:
     silent = row(0, 0.02)
-    assert robustness.sensor_of(silent) == "lost after the catch"
-    assert robustness.sensor_of({**silent, "felt": False}) == "missing at the catch"
-    assert robustness.sensor_of(row(1, 0.02, faults=[], force_bias_n=[9.0, 0.0, 0.0])) == "biased"
+    assert sensor_of(silent) == "lost after the catch"
+    assert sensor_of({**silent, "felt": False}) == "missing at the catch"
+    assert sensor_of(row(1, 0.02, faults=[], force_bias_n=[9.0, 0.0, 0.0])) == "biased"
 
 
 def test_what_drives_the_error_is_found() -> None:
     rows = [row(n, 0.01 + 0.001 * n, wind_m_s=[0.1 * n, 0.0, 0.0], rotor_lag_s=0.06 - 0.0001 * n**2) for n in range(20)]
-    found = dict(robustness.influence(rows))
+    found = influence(rows)
     assert found == pytest.approx({"wind_speed_m_s": 1.0, "rotor_lag_s": -1.0})
 
 
-def test_csv_and_picture(tmp_path: Path) -> None:
-    rows = [row(n, 0.01 + 0.001 * n, payload_kg=0.1 + 0.01 * n) for n in range(12)] + [row(12, None, "aborted")]
-    robustness.write_csv(rows, tmp_path / "draws.csv")
-    with open(tmp_path / "draws.csv", newline="", encoding="utf-8") as file:
-        read = list(csv.DictReader(file))
-    assert len(read) == 13
-    assert float(read[3]["payload_kg"]) == pytest.approx(0.13)
-    assert float(read[3]["throw_from_deg"]) == pytest.approx(173.48, abs=0.01)
-    assert (read[12]["outcome"], read[12]["e_p_m"]) == ("aborted", "")
-    assert write_distribution(rows, "a title", tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").stat().st_size > 10_000
-    assert not write_distribution(rows[12:], "nothing", tmp_path / "none.png")
+def test_without_a_completed_catch_there_is_no_plot(tmp_path: Path) -> None:
+    assert not write_distribution([row(12, None, "aborted")], "nothing", tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()

@@ -19,11 +19,11 @@ from companion.analysis import plots
 from companion.analysis.log import FlightLog
 from companion.analysis.metrics import min_slack_m
 from companion.analysis.summary import summarise
-from companion.campaigns import side_by_side_plots
-from companion.campaigns.side_by_side import Comparison, Figure, NotAlignable, compare, jsonable
-from companion.campaigns.side_by_side_course import Flight, flight_of, slack_m
-from companion.campaigns.side_by_side_html import write_html
-from companion.campaigns.side_by_side_plots import LINES, write_pictures
+from companion.campaigns.side_by_side import plots as side_by_side_plots
+from companion.campaigns.side_by_side.comparison import Comparison, Figure, NotAlignable, compare, jsonable
+from companion.campaigns.side_by_side.flight import Flight, flight_of, slack_m
+from companion.campaigns.side_by_side.page import write_html
+from companion.campaigns.side_by_side.plots import LINES, write_pictures
 from companion.cli.main import main
 from companion.cli.report import names_of
 from companion.launcher import run as flight_module
@@ -238,7 +238,7 @@ def test_the_world_of_a_flight_on_the_vehicle_says_nothing() -> None:
     comparison = compare(flights)
     assert keys(comparison) == set()
     assert dict(comparison.about)["seed"] == ("–", "–")
-    assert comparison.cautions == ("The payload of A, B is not known: nobody can say whether it was the same.",)
+    assert comparison.cautions == ("The payload of A, B is not known; it may differ.",)
 
 
 # Whether it is a fair comparison
@@ -279,7 +279,7 @@ def test_whatever_else_differs_is_said_on_top(changes: dict[str, Any], caution: 
         ]
     comparison = compare([made("A"), made("B", config=config, **changes)])
     assert caution in comparison.cautions
-    assert "and not they alone" in comparison.fair
+    assert "and so does what is listed below" in comparison.fair
 
 
 def test_different_missions_are_not_marked_better_or_worse_but_their_timing_is() -> None:
@@ -437,12 +437,12 @@ def test_the_page_tells_the_figures_the_settings_and_the_events(tmp_path: Path) 
         "controller.rho_max",
         "7.25",
         "(+200\u00a0%)",
-        ">worse<",
+        "worse</small>",
         "payload in the net",
     ):
         assert told in page, told
     assert page.count("data:image/png;base64,") == 4
-    assert "nan" not in re.sub(r"base64,[^']*", "", page)
+    assert "nan" not in re.sub(r'base64,[^"]*', "", page)
 
 
 # The command

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from companion.analysis.summary import empty_summary
-from companion.campaigns.faults_table import kinds_markdown
 from companion.cli.main import _normalised, _parser
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import PRESETS, load_flight
@@ -25,6 +24,7 @@ from companion.sitl_config.faults import KINDS
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import Fault, World
 from sitl.autopilot.params import Params
+from tools.docs.faults import kinds_markdown
 from tools.docs.safety import tables as safety_tables
 from tools.docs.tables import written
 

@@ -5,32 +5,37 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from companion.campaigns import compare_plots, robustness_plots
+from companion.campaigns.compare import plots as compare_plots
+from companion.campaigns.robustness import plots as robustness_plots
+from companion.campaigns.runner import Row
 from companion.cli.main import main
-from tests.support import SHORT_CATCH
+from tests.campaigns.made_up import compare_row, draw_row, fault_row, fly_made_up
+from tests.support import CATCH
 from tools.docs import compare as compare_doc
-from tools.docs import faults as faults_table
+from tools.docs import faults as faults_doc
 from tools.docs import robustness as robustness_doc
 from tools.docs.tables import flown_by
 
-COMPARED = "--controllers adaptive --presets recommended --payloads 0.2 --seeds 1 --ablation"
 RUNS = {
-    "compare": (
-        "compare.json",
-        ["--mission", str(SHORT_CATCH), *shlex.split(COMPARED)],
-    ),
-    "robustness": ("robustness.json", [str(SHORT_CATCH), "--draws", "2"]),
-    "faults": ("faults.json", [str(SHORT_CATCH), "--kinds", "force_loss", "--phases", "line"]),
+    "compare": ["--mission", str(CATCH), "--payloads", "0.2", "--seeds", "1", "--ablation"],
+    "robustness": [str(CATCH), "--draws", "2"],
+    "faults": [str(CATCH), "--kinds", "force_loss", "--phases", "line"],
+}
+ROWS: dict[str, Callable[[dict[str, Any]], Row]] = {
+    "compare": compare_row,
+    "robustness": lambda flight: draw_row(flight["number"], 0.02),
+    "faults": fault_row,
 }
 PAGES = {
     "compare": (("laws", "ablation"), compare_doc.main),
     "robustness": (("result",), robustness_doc.main),
-    "faults": (("kinds", "campaign"), faults_table.main),
+    "faults": (("kinds", "campaign"), faults_doc.main),
 }
 
 
@@ -38,12 +43,13 @@ PAGES = {
 def test_a_campaign_notes_its_command_and_the_page_prints_it(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (compare_plots, robustness_plots):  # nobody looks at the pictures
+    for module in (compare_plots, robustness_plots):  # nobody looks at the plots
         monkeypatch.setattr(module, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
-    file, options = RUNS[name]
-    words = [name, *options, "--jobs", "1", "--out", str(tmp_path)]
+    fly_made_up(monkeypatch, ROWS[name])
+    words = [name, *RUNS[name], "--out", str(tmp_path)]
     assert main(words) == 0
-    results = json.loads((tmp_path / file).read_text(encoding="utf-8"))
+    file = tmp_path / f"{name}.json"
+    results = json.loads(file.read_text(encoding="utf-8"))
     command = shlex.join(["companion", *words])
     assert results["settings"]["command"] == command
     tables, write = PAGES[name]
@@ -51,7 +57,7 @@ def test_a_campaign_notes_its_command_and_the_page_prints_it(
     page.write_text(
         "".join(f"<!-- table: {table} -->\nthe old one\n<!-- end: {table} -->\n" for table in tables), encoding="utf-8"
     )
-    assert write([str(page), str(tmp_path / file)]) == 0
+    assert write([str(page), str(file)]) == 0
     text = page.read_text(encoding="utf-8")
     assert "the old one" not in text
     shown = re.sub(r" --out \S+", "", command)

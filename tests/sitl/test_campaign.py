@@ -22,14 +22,17 @@ import pytest
 
 from companion.analysis import metrics
 from companion.campaigns.process import CampaignProcess
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import Outcome, PhaseKind
-from companion.sitl_config.loader import load_sitl
-from sitl.campaigns import flights as campaign
+from companion.sitl_config.loader import SitlConfig, load_sitl
+from sitl.campaigns import compare, faults, flights, robustness
+from sitl.campaigns.flights import Flown
+from sitl.campaigns.runner import Fly
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, position_error_m, sandbox_in, wait_until
 
-CONFIG = load_sitl(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.2", "world.seed=3"))
+CONFIG = load_sitl(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
+"""With another payload and seed than `FLIGHT`, which sets its own."""
 FLIGHT: dict[str, Any] = {
     "variant": 0,
     "controller": "adaptive",
@@ -40,48 +43,64 @@ FLIGHT: dict[str, Any] = {
 }
 
 
-@pytest.fixture(scope="module")
-def fast() -> tuple[FastFlight, FastResult]:
-    """The flight of `FLIGHT`, flown without the campaign."""
-    flight = FastFlight(CONFIG)
-    return flight, flight.run()
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """A flight of a campaign: what the campaign made of it, and the flight itself."""
+
+    made: dict[str, Any]
+    flown: Flown
+
+    @property
+    def result(self) -> FastResult:
+        return self.flown.result
+
+    @property
+    def caught_t_s(self) -> float:
+        assert self.flown.caught_t_s is not None
+        return self.flown.caught_t_s
 
 
 @pytest.fixture(scope="module")
-def result() -> dict[str, Any]:
-    """The same flight, flown by the campaign from a configuration with another payload and seed."""
-    other = load_sitl(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
-    return campaign.fly(other.model_dump_json(), FLIGHT)
+def seen() -> Seen:
+    """`FLIGHT`, flown once for all tests."""
+    flown: list[Flown] = []
+
+    def fly_to_end(config: SitlConfig) -> Flown:
+        flown.append(flights.fly_to_end(config))
+        return flown[-1]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(compare, "fly_to_end", fly_to_end)
+        made = compare.fly(CONFIG, FLIGHT)
+    return Seen(made, flown[0])
 
 
-def test_a_row_is_what_the_flight_was(fast: tuple[FastFlight, FastResult], result: dict[str, Any]) -> None:
-    _, flown = fast
-    row = result["row"]
-    assert {key: row[key] for key in ("controller", "preset", "payload_kg", "seed")} == {
-        "controller": "adaptive",
-        "preset": "recommended",
-        "payload_kg": 0.2,
-        "seed": 3,
-    }
+def test_a_row_is_what_the_flight_was(seen: Seen) -> None:
+    row, result = seen.made["row"], seen.result
+    head = {key: FLIGHT[key] for key in ("controller", "preset", "payload_kg", "seed")}
+    assert {key: row[key] for key in head} == head
+    assert (seen.flown.config.world.payload_kg, seen.flown.config.world.seed) == (0.2, 3)
     assert (row["outcome"], row["error"]) == ("completed", None)
-    catch = next(event for outputs in flown.outputs for event in outputs.events if event.id == "catch")
+    catch = next(event for outputs in result.outputs for event in outputs.events if event.id == "catch")
     parts: dict[str, list[float]] = {"pre": [], "post": []}
-    for i, o in zip(flown.inputs, flown.outputs, strict=True):
+    for i, o in zip(result.inputs, result.outputs, strict=True):
         if o.phase_kind is PhaseKind.FLIGHT:
             parts["post" if o.t_s >= catch.t_s - 1e-9 else "pre"].append(position_error_m(i, o))
     for part, errors in parts.items():
         rms = math.sqrt(math.fsum(error**2 for error in errors) / len(errors))
         assert row["rms"][part]["e_p_m"] == pytest.approx(rms, rel=1e-9)
     assert row["peak_e_p_m"] == pytest.approx(max(parts["pre"] + parts["post"]), rel=1e-9)
-    torques = [o.arm_torque_nm for o in flown.outputs if o.phase_kind is PhaseKind.FLIGHT]
+    assert row["catch_t_s"] == pytest.approx(2.45, abs=0.05)
+    assert 0.0 < row["impedance_error"]["arm_nm"] < 1.0
+    torques = [o.arm_torque_nm for o in result.outputs if o.phase_kind is PhaseKind.FLIGHT]
     changes = [math.dist(a, b) for a, b in itertools.pairwise(torques) if a is not None and b is not None]
     assert row["torque_activity_nm"] == pytest.approx(
         math.sqrt(math.fsum(c * c for c in changes) / len(changes)), rel=1e-9
     )
 
 
-def test_a_series_is_the_course_of_the_flight(fast: tuple[FastFlight, FastResult], result: dict[str, Any]) -> None:
-    series, (_, flown) = result["series"], fast
+def test_a_series_is_the_course_of_the_flight(seen: Seen) -> None:
+    series, flown = seen.made["series"], seen.result
     t_s = series["t_s"]
     assert t_s == sorted(t_s)
     assert t_s[1] - t_s[0] == pytest.approx(0.02)
@@ -94,11 +113,11 @@ def test_a_series_is_the_course_of_the_flight(fast: tuple[FastFlight, FastResult
     assert [series["alpha_deg"][j][k] for j in range(2)] == pytest.approx(
         [math.degrees(a) for a in arm.angle_rad], abs=1e-5
     )
-    assert series["catch_t_s"] == result["row"]["catch_t_s"]
+    assert series["catch_t_s"] == seen.made["row"]["catch_t_s"]
 
 
-def test_a_catch_that_nobody_noticed_still_parts_before_from_after(fast: tuple[FastFlight, FastResult]) -> None:
-    flight, flown = fast
+def test_a_catch_that_nobody_noticed_still_parts_before_from_after(seen: Seen) -> None:
+    flown, caught_t_s = seen.result, seen.caught_t_s
     blind = FastResult(
         inputs=flown.inputs,
         outputs=[
@@ -106,25 +125,21 @@ def test_a_catch_that_nobody_noticed_still_parts_before_from_after(fast: tuple[F
             for o in flown.outputs
         ],
     )
-    caught_t_s = flight.plant.world.caught_t_s
-    assert caught_t_s is not None
-    row, log = campaign.row_of(flight.config, blind, caught_t_s)
+    row, log = flights.row_of(seen.flown.config.flight, blind, caught_t_s)
     index = metrics.catch_index(log)
     assert index is not None
     assert log.outputs[index].t_s == pytest.approx(caught_t_s, abs=0.006)
-    seen, _ = campaign.row_of(flight.config, flown, caught_t_s)
-    assert row["catch_t_s"] == pytest.approx(seen["catch_t_s"], abs=0.1)
-    assert row["rms"]["post"]["e_p_m"] == pytest.approx(seen["rms"]["post"]["e_p_m"], rel=0.1)
+    noticed, _ = flights.row_of(seen.flown.config.flight, flown, caught_t_s)
+    assert row["catch_t_s"] == pytest.approx(noticed["catch_t_s"], abs=0.1)
+    assert row["rms"]["post"]["e_p_m"] == pytest.approx(noticed["rms"]["post"]["e_p_m"], rel=0.1)
 
 
-def test_what_was_not_flown_to_its_end_is_not_graded(fast: tuple[FastFlight, FastResult]) -> None:
-    flight, flown = fast
-    caught_t_s = flight.plant.world.caught_t_s
-    assert caught_t_s is not None
+def test_what_was_not_flown_to_its_end_is_not_graded(seen: Seen) -> None:
+    flown, caught_t_s = seen.result, seen.caught_t_s
     for end_s, graded in ((caught_t_s - 1.0, set()), (caught_t_s + 2.0, {"pre"})):
         count = sum(o.t_s <= end_s for o in flown.outputs)
         short = FastResult(inputs=flown.inputs[:count], outputs=flown.outputs[:count], crashed=True)
-        row, _ = campaign.row_of(flight.config, short, caught_t_s)
+        row, _ = flights.row_of(seen.flown.config.flight, short, caught_t_s)
         assert row["outcome"] == Outcome.CRASHED.value
         assert {part for part, rms in row["rms"].items() if rms["e_p_m"] is not None} == graded
         for name in ("final_e_z_m", "peak_e_p_m", "torque_activity_nm"):
@@ -132,14 +147,24 @@ def test_what_was_not_flown_to_its_end_is_not_graded(fast: tuple[FastFlight, Fas
         assert set(row["impedance_error"].values()) == {None}
 
 
-def test_a_law_that_breaks_loses_its_flight_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("fly", "flight"),
+    [
+        (compare.fly, FLIGHT),
+        (robustness.fly, {"name": "draw 0", "number": 0, "world": {"payload_kg": 0.1}}),
+        (faults.fly, {"kind": "gust", "size": 4.0, "duration_s": None, "phase": "line"}),
+    ],
+)
+def test_a_law_that_breaks_loses_its_flight_and_no_other(
+    monkeypatch: pytest.MonkeyPatch, fly: Fly, flight: dict[str, Any]
+) -> None:
     def breaks(_: FastFlight) -> FastResult:
         raise ZeroDivisionError("float division by zero")
 
     monkeypatch.setattr(FastFlight, "run", breaks)
-    row = campaign.fly(CONFIG.model_dump_json(), FLIGHT)["row"]
+    row = fly(CONFIG, flight)["row"]
     assert (row["outcome"], row["error"]) == ("lost", "ZeroDivisionError: float division by zero")
-    assert row["rms"]["pre"]["e_p_m"] is None
+    assert row.get("e_p_m") is None and row.get("peak_e_p_m") is None
 
 
 # -- over cores and machines -------------------------------------------------------------------------------------------
@@ -155,18 +180,19 @@ TINY = (
     *("compare", "--mission", SHORT_CATCH, "--payloads", "0.2", "--controllers", "adaptive"),
     *("--presets", "paper,recommended", "--json"),
 )
-PAPER = load_sitl(SHORT_CATCH, preset="paper", overrides=("world.payload_kg=0.2", "world.seed=3"))
+PAPER = load_sitl(SHORT_CATCH, preset="paper")
 
 
 @pytest.fixture(scope="module")
-def expected(result: dict[str, Any]) -> list[dict[str, Any]]:
+def expected(seen: Seen) -> list[dict[str, Any]]:
     """`FLIGHT` and the same with the paper's preset, one after the other in this process."""
-    return [result, campaign.fly(PAPER.model_dump_json(), {**FLIGHT, "preset": "paper"})]
+    return [seen.made, compare.fly(PAPER, {**FLIGHT, "preset": "paper"})]
 
 
 def flown_by(folder: Path, jobs: int | None, scheduler: str | None) -> list[dict[str, Any]]:
     """The flights of `expected`, flown by a campaign."""
     job = {
+        "campaign": "compare",
         "configs": [config.model_dump(mode="json") for config in (CONFIG, PAPER)],
         "flights": [FLIGHT, {**FLIGHT, "variant": 1, "preset": "paper"}],
         "jobs": jobs,
@@ -187,7 +213,7 @@ def test_two_processes_fly_the_same_rows(expected: list[dict[str, Any]], tmp_pat
 
 def test_a_dask_cluster_flies_the_same_rows(expected: list[dict[str, Any]], place: Sandbox, tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed (extra cluster)")
-    with cluster(place, tmp_path, workers=2) as address:
+    with cluster(place, tmp_path) as address:
         assert_same_flights(flown_by(tmp_path, None, address), expected)
 
 
@@ -227,10 +253,15 @@ def test_ctrl_c_ends_the_workers_and_shows_what_is_there(place: Sandbox) -> None
 
 
 def test_a_campaign_leaves_with_whoever_started_it(place: Sandbox) -> None:
-    flights = [{**FLIGHT, "seed": seed, "series": False} for seed in range(1, 500)]
-    job = {"configs": [CONFIG.model_dump(mode="json")], "flights": flights, "jobs": 2, "scheduler": None}
+    job = {
+        "campaign": "compare",
+        "configs": [CONFIG.model_dump(mode="json")],
+        "flights": [{**FLIGHT, "seed": seed, "series": False} for seed in range(1, 500)],
+        "jobs": 2,
+        "scheduler": None,
+    }
     with subprocess.Popen(
-        [sys.executable, "-m", "sitl.campaigns.flights"],
+        [sys.executable, "-m", "sitl.campaigns"],
         cwd=place.cwd,
         env=place.environment,
         stdin=subprocess.PIPE,
@@ -246,6 +277,33 @@ def test_a_campaign_leaves_with_whoever_started_it(place: Sandbox) -> None:
         process.wait(DEADLINE_S)
     assert process.returncode != 0
     place.assert_nobody_left(DEADLINE_S)
+
+
+def test_a_draw_is_flown_again_as_a_case(place: Sandbox) -> None:
+    options = ("--jobs", "1", "--json")
+    ended = place.run("robustness", SHORT_CATCH, "--draws", "1", *options, "--out", "draws")
+    assert ended.code == EXIT_OK, ended.err
+    place.assert_nobody_left(DEADLINE_S)
+    (draw,) = json.loads(ended.out)["rows"]
+    assert draw["outcome"] == "completed" and draw["e_p_m"] is not None
+    again = place.run("robustness", "--cases", "draws/worst.yaml", *options, "--out", "cases")
+    assert again.code == EXIT_OK, again.err
+    (case,) = json.loads(again.out)["rows"]
+    assert {**case, "name": "", "number": 0} == {**draw, "name": ""}
+
+
+def test_a_fault_is_flown_by_a_campaign(place: Sandbox) -> None:
+    ended = place.run(
+        "faults", SHORT_CATCH, "--kinds", "kill_flight", "--phases", "landing", "--json", "--out", "fault"
+    )
+    assert ended.code == EXIT_OK, ended.err
+    place.assert_nobody_left(DEADLINE_S)
+    table = json.loads(ended.out)
+    assert table["summary"]["bad"] == 0
+    (row,) = table["rows"]
+    assert (row["fault"], row["phase"], row["outcome"]) == ("kill_flight", "landing", "landed")
+    for key in ("size", "detected_s", "action", "worst_tilt_deg", "min_height_m", "min_slack_m"):
+        assert key in row
 
 
 @contextlib.contextmanager
@@ -269,8 +327,8 @@ def terminal() -> Iterator[tuple[int, bytearray]]:
 
 
 @contextlib.contextmanager
-def cluster(place: Sandbox, folder: Path, workers: int) -> Iterator[str]:
-    """A Dask scheduler and its workers, one thread each; its address."""
+def cluster(place: Sandbox, folder: Path) -> Iterator[str]:
+    """A Dask scheduler and a worker; the address of the scheduler."""
     file = folder / "scheduler.json"
     with contextlib.ExitStack() as stack:
         log = stack.enter_context(open(folder / "dask.log", "wb"))
@@ -290,6 +348,5 @@ def cluster(place: Sandbox, folder: Path, workers: int) -> Iterator[str]:
         start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
         wait_until(lambda: file.exists() and file.stat().st_size > 0, lambda: (folder / "dask.log").read_text())
         address = str(json.loads(file.read_text(encoding="utf-8"))["address"])
-        for _ in range(workers):
-            start("dask_worker", address, "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny")
+        start("dask_worker", address, "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny")
         yield address

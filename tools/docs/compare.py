@@ -1,4 +1,4 @@
-"""The tables of docs/compare.md from a comparison: `python -m tools.docs.compare docs/compare.md compare.json`."""
+"""Writes the tables of docs/compare.md: `python -m tools.docs.compare docs/compare.md compare.json`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tools.docs.tables import flown_by, write_results
+from companion.campaigns.compare.grid import LESS, is_ablation
+from tools.docs.tables import flown_by, markdown, write_results
 
 ABLATION_KG = 0.2
-"""The payload of the table of what each option is worth."""
+"""Payload of the table of ablations."""
 _LAWS = ("payload", "law/preset", "e_p before, m", "e_p after, m", "e_q after, deg", "e_alpha after, deg", "arm dI, N m",
          "final e_z, m")  # fmt: skip
-_TAKEN_AWAY = (
+_ABLATIONS = (
     "taken away",
     "e_p before, m",
     "e_p after, m",
@@ -25,40 +26,30 @@ _TAKEN_AWAY = (
 
 
 def laws_markdown(aggregate: Sequence[dict[str, Any]]) -> str:
-    """One line per payload and preset, mean of the seeds; what something was taken away from is not among them."""
-    lines = _head(_LAWS)
+    """Return one line per payload and preset, without the ablations: means over the seeds."""
+    rows = []
     for cell in aggregate:
-        if _taken_away(cell) is None:
+        if not is_ablation(cell["preset"]):
             mean, before, after = _mean(cell)
-            lines.append(
-                f"| {cell['payload_kg']:g} kg | {cell['controller']}/{cell['preset']} | {before['e_p_m']:.4f} | {after['e_p_m']:.4f} "
-                f"| {after['e_q_deg']:.2f} | {after['e_alpha_deg']:.1f} | {mean['impedance_error']['arm_nm']:.3f} "
-                f"| {mean['final_abs_e_z_m']:.3f} |"
-            )
-    return "\n".join(lines)
+            rows.append((
+                f"{cell['payload_kg']:g} kg", f"{cell['controller']}/{cell['preset']}", f"{before['e_p_m']:.4f}",
+                f"{after['e_p_m']:.4f}", f"{after['e_q_deg']:.2f}", f"{after['e_alpha_deg']:.1f}",
+                f"{mean['impedance_error']['arm_nm']:.3f}", f"{mean['final_abs_e_z_m']:.3f}",
+            ))  # fmt: skip
+    return markdown(_LAWS, rows)
 
 
 def ablation_markdown(aggregate: Sequence[dict[str, Any]]) -> str:
-    """One line per thing that was taken away, mean of the seeds at `ABLATION_KG`."""
-    lines = _head(_TAKEN_AWAY)
+    """Return one line per ablation with `ABLATION_KG`: means over the seeds."""
+    rows = []
     for cell in aggregate:
-        name = _taken_away(cell)
-        if name is not None and cell["payload_kg"] == ABLATION_KG:
+        if is_ablation(cell["preset"]) and cell["payload_kg"] == ABLATION_KG:
             mean, before, after = _mean(cell)
-            lines.append(
-                f"| {name} | {before['e_p_m']:.4f} | {after['e_p_m']:.4f} | {after['e_alpha_deg']:.1f} "
-                f"| {mean['impedance_error']['arm_nm']:.3f} | {mean['torque_activity_nm']:.3f} |"
-            )
-    return "\n".join(lines)
-
-
-def _head(names: Sequence[str]) -> list[str]:
-    return [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]
-
-
-def _taken_away(cell: dict[str, Any]) -> str | None:
-    _, dash, name = cell["preset"].partition(" - ")
-    return name if dash else None
+            rows.append((
+                cell["preset"].partition(LESS)[2], f"{before['e_p_m']:.4f}", f"{after['e_p_m']:.4f}", f"{after['e_alpha_deg']:.1f}",
+                f"{mean['impedance_error']['arm_nm']:.3f}", f"{mean['torque_activity_nm']:.3f}",
+            ))  # fmt: skip
+    return markdown(_ABLATIONS, rows)
 
 
 def _mean(cell: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The result in docs/robustness.md: `python -m tools.docs.robustness docs/robustness.md robustness.json`."""
+"""Writes the result into docs/robustness.md: `python -m tools.docs.robustness docs/robustness.md robustness.json`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.campaigns.robustness import graded
+from companion.campaigns.robustness.draws import graded
 from tools.docs.tables import flown_by, write_results
 
 

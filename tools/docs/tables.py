@@ -1,20 +1,20 @@
-"""Tables of the docs that are made from the code, each in its place: between `<!-- table: NAME -->` and `<!-- end: NAME -->`."""
+"""Writes generated tables into pages of the docs, between `<!-- table: NAME -->` and `<!-- end: NAME -->`."""
 
 from __future__ import annotations
 
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 
 def written(text: str, tables: Mapping[str, str]) -> str:
-    """The page with these tables in their places.
+    """Return the page with these tables in their places.
 
     Raises:
-        ValueError: a table's place is not marked in it.
+        ValueError: the place of a table is not marked in the page.
     """
     for name, table in tables.items():
         begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->\n"
@@ -26,8 +26,14 @@ def written(text: str, tables: Mapping[str, str]) -> str:
     return text
 
 
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
+    return "\n".join([lines[0], f"|{'---|' * len(head)}", *lines[1:]])
+
+
 def write_page(page: Path, tables: Mapping[str, str]) -> int:
-    """Write the tables into the page; an exit code, the reason on standard error."""
+    """Write the tables into the page; return an exit code and print the reason of a failure on standard error."""
     try:
         page.write_text(written(page.read_text(encoding="utf-8"), tables), encoding="utf-8")
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""What is drawn of a flight beside others, as arrays: the ticks need not be kept, so that six long logs fit into the memory of one."""
+"""One flight of a side-by-side report: its summary and the arrays that are drawn. The ticks of its log are not kept in memory."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ _FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
 
 @dataclass(frozen=True)
 class Course:
-    """What is drawn of a flight: one row per kept tick, NaN where a value was not known. World ENU; times on the flight clock."""
+    """Time series of a flight: one row per tick read, NaN where a value is not known. World ENU; times on the flight clock."""
 
     t_s: Array
     flying: metrics.Mask
-    """From take-off to touch-down."""
+    """From take-off to touchdown."""
     graded: metrics.Mask
-    """The phases that the RMS figures are of."""
+    """The phases that the RMS figures cover."""
     e_p_m: Array
-    """Norm of the position error, by mocap."""
+    """Norm of the position error, by motion capture."""
     e_q_deg: Array
     e_alpha_deg: Array
     thrust_percent: Array
     rho: Array
-    """NaN throughout for a law without one, which logs 0."""
+    """Switching gain; all NaN for a law without one, which logs 0."""
     slack_m: Array
     flown_world_m: Array
     reference_world_m: Array
     lateness_s: Array
-    """Of every recorded tick, also of those that are not kept."""
+    """Of every recorded tick, also of those that were skipped when reading."""
     catch: int | None
-    """Row of the (first) catch."""
+    """Row of the first catch."""
     takeoff_s: float | None
-    """Of the take-off command."""
+    """Time of the take-off command."""
 
 
 def slack_m(log: FlightLog) -> Array:
-    """Tether length minus distance from the anchor to the attachment point, by mocap; NaN on the ground and where it is not known."""
+    """Return the tether length minus the distance from anchor to attachment point, by mocap; NaN on the ground and if unknown."""
     blank = np.full(len(log.inputs), np.nan)
     tether = (log.config.get("vehicle") or {}).get("tether")
     if not isinstance(tether, dict) or not {"anchor_world_m", "length_m"} <= tether.keys():
@@ -61,7 +61,7 @@ def slack_m(log: FlightLog) -> Array:
 
 
 def course_of(log: FlightLog) -> Course:
-    """What is drawn of a log."""
+    """Return the time series of a log."""
     if not log.inputs:
         none, three = np.empty(0), np.empty((0, 3))
         mask = np.empty(0, dtype=np.bool_)
@@ -96,14 +96,14 @@ def _norm(rows: Array) -> Array:
 
 @dataclass(frozen=True)
 class Flight:
-    """One of the flights of a comparison."""
+    """One flight of the report."""
 
     letter: str
     name: str
     path: str
-    """As the user named it."""
+    """Log file, as the user named it."""
     digest: str
-    """Of the file's bytes: the same log named twice is known by it."""
+    """SHA-256 of the log file; equal for the same log given twice."""
     summary: dict[str, Any]
     config: dict[str, Any]
     metadata: dict[str, dict[str, str]]
@@ -111,15 +111,15 @@ class Flight:
 
     @property
     def title(self) -> str:
-        """For legends."""
+        """Text for legends."""
         return f"{self.letter}  {self.name}: {self.summary['controller']} ({self.summary['preset']})"
 
     @property
     def completed(self) -> bool:
-        """Whether the mission was."""
+        """Whether the mission was completed."""
         return bool(self.summary["outcome"] == "completed")
 
 
 def flight_of(letter: str, name: str, path: str, digest: str, log: FlightLog, summary: dict[str, Any]) -> Flight:
-    """What a comparison needs of a flight; the ticks of the log are not kept."""
+    """Return the flight of a log."""
     return Flight(letter, name, path, digest, summary, effective_config(log, summary), log.metadata, course_of(log))

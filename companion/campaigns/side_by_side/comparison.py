@@ -1,7 +1,4 @@
-"""Flights held against each other: what was flown, what was set differently, every figure, and whether that is a fair comparison.
-
-Pure: logs and summaries in, a `Comparison` out.
-"""
+"""Compares flights by their logs and summaries: what was flown, which settings differ, every figure, and whether that is fair."""
 
 from __future__ import annotations
 
@@ -10,23 +7,23 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from companion.campaigns.side_by_side_course import Flight
-from companion.campaigns.side_by_side_settings import Setting, fairness, payload_kg, settings_of, simulated
+from companion.campaigns.side_by_side.flight import Flight
+from companion.campaigns.side_by_side.settings import Setting, fairness, payload_kg, settings_of, simulated
 
 Align = Literal["catch", "takeoff", "start"]
 FLIGHTS_MAX = 6
-"""So many can be told apart in one picture."""
+"""More flights cannot be told apart in one plot."""
 MARKED_FROM = 0.05
-"""A difference below this share of the larger value is marked neither better nor worse: one flight each is no statistics."""
+"""Share of the larger value below which a difference is not marked better or worse: single flights scatter."""
 
 
 class NotAlignable(Exception):
-    """A flight lacks the moment that was asked for: one line for the user."""
+    """A flight lacks the requested moment; one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure of summary.json, of every flight; None where it was not measured."""
+    """One figure of summary.json for every flight; None where it was not measured."""
 
     key: str
     """Dotted, as in summary.json."""
@@ -34,35 +31,35 @@ class Figure:
     digits: int
     values: tuple[float | None, ...]
     differences: tuple[float | None, ...]
-    """To the first flight."""
+    """From the first flight."""
     verdicts: tuple[str | None, ...]
-    """better or worse than the first flight's, where smaller is plainly better."""
+    """`better` or `worse` than the first flight, for figures of which a smaller value is certainly better."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Everything that is told of the flights."""
+    """The content of the report."""
 
     flights: tuple[Flight, ...]
     align: Align
     zeros_s: tuple[float, ...]
-    """Of each flight, on its flight clock: where the common time axis begins to count."""
+    """Zero of the common time axis on the flight clock of each flight."""
     fair: str
-    """One sentence: in what the flights differ."""
+    """One sentence on how the flights differ."""
     cautions: tuple[str, ...]
-    """Why the figures must be read with care; empty if they need not."""
+    """Reasons to read the figures with care; empty if there are none."""
     notes: tuple[str, ...]
     about: tuple[tuple[str, tuple[str, ...]], ...]
-    """What was flown: name of a fact, and what it is for each flight."""
+    """What was flown: the name of each fact and its text for each flight."""
     settings: tuple[Setting, ...]
-    """Keys of the effective configuration that differ."""
+    """Settings that differ."""
     addresses: tuple[Setting, ...]
-    """Differing addresses of simulated devices: chosen anew for each flight, they mean nothing."""
+    """Differing addresses of simulated devices, which the simulated world chooses anew for each flight."""
     figures: tuple[Figure, ...]
 
 
 _KNOWN: tuple[tuple[str, str, int, str], ...] = (
-    # key, label, digits, who judges: "flight" and "machine" where smaller is plainly better.
+    # key, label, digits; smaller is certainly better: "flight" for completed flights of one mission, "machine" for all
     ("payload_kg", "payload [kg]", 3, ""),
     ("catch_t_s", "catch at, mission time [s]", 2, ""),
     ("rms.pre.e_p_m", "position error before the catch, RMS [m]", 4, "flight"),
@@ -70,7 +67,7 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
     ("rms.pre.e_alpha_deg", "arm error before the catch, RMS [deg]", 2, "flight"),
     ("rms.post.e_p_m", "position error after the catch, RMS [m]", 4, "flight"),
     ("rms.post.e_q_deg", "attitude error after the catch, RMS [deg]", 2, "flight"),
-    ("rms.post.e_alpha_deg", "arm error after the catch, RMS [deg]", 2, ""),  # giving way is what the arm is for
+    ("rms.post.e_alpha_deg", "arm error after the catch, RMS [deg]", 2, ""),  # the arm is meant to comply
     ("final_e_z_m", "height error at the end [m]", 4, ""),
     ("impedance_error.position_n", "impedance error, position [N]", 3, ""),
     ("impedance_error.arm_nm", "impedance error, arm [N m]", 4, ""),
@@ -97,25 +94,25 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
 
 
 def compare(flights: Sequence[Flight], align: Align | None = None) -> Comparison:
-    """Hold two or more flights against the first of them.
+    """Compare two or more flights with the first of them.
 
     Args:
-        flights: in the order in which they are shown.
-        align: moment at which the time axes agree; None: the catch if every flight has one, else the take-off, else the start.
+        flights: in the order of the report.
+        align: zero of the common time axis; None for the catch if every flight has one, else the take-off, else the start.
 
     Raises:
-        NotAlignable: a flight lacks the moment that `align` asks for.
+        NotAlignable: a flight lacks this moment.
     """
     chosen, notes = _alignment(flights, align)
     settings, addresses = settings_of([flight.config for flight in flights])
     fair, cautions, same_mission = fairness(flights, settings)
     if any(flight.summary["graded_every"] > 1 for flight in flights):
         notes.append(
-            "Long flights: of "
+            "Long flights: "
             + ", ".join(
                 f"{f.letter} every {f.summary['graded_every']}th tick" for f in flights if f.summary["graded_every"] > 1
             )
-            + " is graded and drawn; the timing is that of every tick."
+            + " is graded and drawn; the timing covers every tick."
         )
     zeros = [_zero_s(flight, chosen) for flight in flights]
     return Comparison(
@@ -133,7 +130,7 @@ def compare(flights: Sequence[Flight], align: Align | None = None) -> Comparison
 
 
 def jsonable(comparison: Comparison) -> dict[str, Any]:
-    """For scripts: everything but the courses. None where a value is not known; `absent` lists flights that lack a key."""
+    """Return everything but the time series, for scripts. Unknown values are None; `absent` lists the flights that lack a key."""
 
     def rows(settings: Sequence[Setting]) -> list[dict[str, Any]]:
         letters = [flight.letter for flight in comparison.flights]
@@ -270,7 +267,7 @@ def _figures(flights: Sequence[Flight], same_mission: bool) -> tuple[Figure, ...
 
 
 def _leaves(summary: dict[str, Any]) -> dict[str, float | None]:
-    """Numbers of a summary by dotted key, and how many events of each severity there are."""
+    """Return the numbers of a summary by dotted key, and the number of events of each severity."""
     out: dict[str, float | None] = {}
 
     def walk(tree: dict[str, Any], prefix: str) -> None:

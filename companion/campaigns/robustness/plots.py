@@ -1,4 +1,4 @@
-"""The distribution of e_p over random draws, and what it depends on, as one picture.
+"""The plot of a robustness campaign: the distribution of e_p over random draws and what it depends on.
 
 Needs matplotlib (extra `analysis`).
 """
@@ -11,28 +11,27 @@ from typing import Any
 
 import numpy as np
 
-from companion.analysis.plot_style import CATCH, INK, dress, new_figure, write_png
-from companion.campaigns.robustness import DRIVERS, Row, drivers, graded, influence, sensor_of
+from companion.analysis.plot_style import CATCH, COLOURS, INK, SOFT, dress, figure_legend, new_figure, write_png
+from companion.campaigns.robustness.draws import DRIVERS, drivers, graded, influence, sensor_of
+from companion.campaigns.runner import Row
 
-_SOFT = "#8a949d"
-_COLOURS = {"biased": "#1f6fb4", "lost after the catch": "#2e9d6b", "missing at the catch": "#e07b22"}
+_COLOURS = dict(zip(("biased", "lost after the catch", "missing at the catch"), COLOURS, strict=False))
 _AGAINST = ("payload_kg", "throw_speed_m_s", "setpoint_delay_s", "catch_x_m")
 BARS = 10
 
 
 def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
-    """Draw the picture; False if no flight caught its payload and completed.
+    """Draw the plot; return False if no flight caught its payload and was completed.
 
     Args:
         rows: of all flights.
         title: what was flown.
-        path: PNG.
+        path: PNG file.
     """
     flown = graded(rows)
     if not flown:
         return False
     figure = new_figure(6.0)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
     axes = figure.subplots(2, 3)
     sensors = [sensor_of(row) for row in flown]
     error_mm = np.array([row["e_p_m"] for row in flown]) * 1e3
@@ -42,10 +41,9 @@ def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
         _scatter(ax, values, error_mm, sensors)
         ax.set_xlabel(DRIVERS[key])
         ax.set_ylabel(r"RMS $\|e_p\|$ [mm]")
-    _bars(axes[1, 2], influence(rows))
+    _bars(axes[1, 2], list(influence(rows).items()))
     handles = [axes[0, 1].plot([], [], "o", color=colour, ms=5)[0] for colour in _COLOURS.values()]
-    names = [f"force sensor {name}" for name in _COLOURS]
-    figure.legend(handles, names, loc="outside lower left", ncols=3, fontsize=9, frameon=False)
+    figure_legend(figure, title, handles, [f"force sensor {name}" for name in _COLOURS], columns=3)
     write_png(figure, path)
     return True
 
@@ -74,8 +72,8 @@ def _scatter(ax: Any, values: Any, error_mm: Any, sensors: Sequence[str]) -> Non
 
 def _bars(ax: Any, found: Sequence[tuple[str, float]]) -> None:
     shown = list(found[:BARS])[::-1]
-    ax.barh(range(len(shown)), [value for _, value in shown], color=_SOFT, height=0.7)
-    # Beside the bar, on the other side of zero: before the axis they would take the room of a whole picture.
+    ax.barh(range(len(shown)), [value for _, value in shown], color=SOFT, height=0.7)
+    # Labels stand beside zero: left of the axis they would take half of the width.
     for at, (key, value) in enumerate(shown):
         left = value > 0
         ax.text(

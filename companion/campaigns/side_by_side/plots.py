@@ -1,4 +1,4 @@
-"""Pictures of several flights over each other: errors, actuation, path, lateness. Flights are told apart by colour, and by dashes too.
+"""Plots of several flights over each other: errors, actuation, path, lateness. Flights differ in colour and in dashes.
 
 Needs matplotlib (extra `analysis`).
 """
@@ -6,7 +6,6 @@ Needs matplotlib (extra `analysis`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,72 +15,59 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from companion.analysis.log import Array
-from companion.analysis.plot_style import INK, dress, mark_catch, new_figure, write_png
-from companion.campaigns.side_by_side import Comparison
-from companion.campaigns.side_by_side_course import Flight
+from companion.analysis.page import Picture
+from companion.analysis.plot_style import (
+    COLOURS,
+    INK,
+    SOFT,
+    dress,
+    figure_legend,
+    mark_catch,
+    mark_end,
+    new_figure,
+    write_png,
+)
+from companion.analysis.table import Line
+from companion.campaigns.side_by_side.comparison import Comparison
+from companion.campaigns.side_by_side.flight import Flight
 
 AXIS = {
     "catch": "time since the catch [s]",
     "takeoff": "time since the take-off command [s]",
     "start": "time since the first tick of the log [s]",
 }
-_ZERO = {"takeoff": "take-off", "start": "start"}
-_SOFT = "#8b98a5"
+LINES = tuple(
+    Line(colour, dashes)
+    for colour, dashes in zip(
+        COLOURS,
+        ((), (4.5, 1.6), (1.2, 1.4), (6.0, 1.5, 1.2, 1.5), (9.0, 3.0), (3.5, 1.2, 1.0, 1.2, 1.0, 1.2)),
+        strict=False,
+    )
+)
+"""One per flight."""
 _EVENT_MARKS = {"info": ("|", 7.0), "warning": ("^", 6.0), "critical": ("X", 7.5)}
 _NAME_SHARE = 0.0074
 """Width of one character of an event's name, as a share of the axis."""
-
 _CROWD_SHARE = 0.015
-"""Marks that are closer than that, as a share of the axis, lie on each other."""
-_GRAVITY = {"warning": 1, "critical": 2}
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """How one flight is drawn. `dashes` in points of a line 1 point wide, ink and gap in turn; empty: solid."""
-
-    colour: str
-    dashes: tuple[float, ...]
-
-    @property
-    def style(self) -> Any:
-        """For matplotlib."""
-        return (0, self.dashes) if self.dashes else "-"
-
-
-LINES = (
-    Line("#0072b2", ()),
-    Line("#d55e00", (4.5, 1.6)),
-    Line("#000000", (1.2, 1.4)),
-    Line("#009e73", (6.0, 1.5, 1.2, 1.5)),
-    Line("#cc79a7", (9.0, 3.0)),
-    Line("#e69f00", (3.5, 1.2, 1.0, 1.2, 1.0, 1.2)),
-)
-"""Colours of Okabe and Ito, "Color Universal Design": distinct with any colour blindness; each with a dash of its own."""
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """One written picture."""
-
-    path: Path
-    title: str
-    caption: str
+"""Distance below which event marks overlap, as a share of the axis."""
+_SEVERITY = {"warning": 1, "critical": 2}
 
 
 def write_pictures(comparison: Comparison, out_dir: Path) -> list[Picture]:
-    """Draw everything that there is data for, as PNG into `out_dir`; no name is one of a single flight's plots."""
-    zero = {"catch": "the catch", "takeoff": "the take-off command", "start": "the log's first tick"}[comparison.align]
-    lane = f"Time counts from {zero}. Lowest: events of each flight, | info, triangle warning, cross critical."
-    ends = " A cross on a line: where a flight ended that was not completed."
+    """Write everything that there is data for as PNG into `out_dir`, under names that the plots of a single flight do not have."""
+    zero = {"catch": "the catch", "takeoff": "the take-off command", "start": "the first tick of the log"}[
+        comparison.align
+    ]
+    lane = f"Time counts from {zero}. Bottom: the events of each flight; bar info, triangle warning, cross critical."
+    ends = " Cross on a line: the end of a flight that was not completed."
     makers: tuple[tuple[str, str, str, Callable[[Comparison], Figure | None]], ...] = (
-        ("errors", "Errors", f"By motion capture against the reference; e_q against the law's setpoint. {lane}{ends}", _errors),
+        ("errors", "Errors", f"By motion capture against the reference; e_q against the attitude setpoint. {lane}{ends}", _errors),
         ("actuation", "Thrust, gain and tether", f"Commanded thrust, switching gain, tether slack. {lane}{ends}", _actuation),
         ("path", "Path", "By motion capture, from above and from the side; grey: references; circles: catches.", _path),
         (
             "lateness",
             "Lateness",
-            "Share of all ticks that started later than so many milliseconds: the lower and the further left, the better.",
+            "Share of the ticks that started later than a given time; lower and further left is better.",
             _lateness,
         ),
     )  # fmt: skip
@@ -128,7 +114,7 @@ def _over_time(
     *,
     from_zero: bool,
 ) -> Figure | None:
-    """Axes above each other over the common time, events of every flight below; panes without any data are left out."""
+    """Draw axes over the common time with the events of every flight below; panes without data are left out."""
     flights = comparison.flights
     kept = [(label, of) for label, of in panes if any(np.isfinite(of(f)[f.course.flying]).any() for f in flights)]
     if not kept:
@@ -153,14 +139,14 @@ def _over_time(
             seen = values[course.graded if course.graded.any() else course.flying]
             graded.append(seen[np.isfinite(seen)])
         if from_zero:
-            # The take-off's transient would hide the flight itself.
+            # Scaled without the take-off, whose transient is larger than all errors in flight.
             most = max((float(seen.max()) for seen in graded if len(seen)), default=0.0)
             ax.set_ylim(0.0, 1.12 * max(most, 1e-3))
         else:
             ax.margins(y=0.1)
     _lane(lane, comparison)
     _mark_zero(comparison, [*axes, lane])
-    _mark_grave_events(comparison, axes)
+    _mark_severe_events(comparison, axes)
     lane.set_xlabel(AXIS[comparison.align])
     figure.align_ylabels([*axes, lane])
     _title(figure, comparison, title)
@@ -168,16 +154,18 @@ def _over_time(
 
 
 def _draw(ax: Any, t: Array, values: Array, n: int, flight: Flight) -> None:
-    line = LINES[n]
-    # The first flight lies below: dashes over a solid line show both where they agree.
-    ax.plot(t, values, color=line.colour, ls=line.style, lw=1.25, zorder=3 + 0.1 * n)
-    known = np.flatnonzero(np.isfinite(values))
-    if not flight.completed and len(known):
-        ax.plot(t[known[-1]], values[known[-1]], "x", color=line.colour, ms=9, mew=2.2, zorder=5, clip_on=False)
+    # The first flight is at the bottom: dashes over a solid line show both where they agree.
+    ax.plot(t, values, **_style(n), lw=1.25, zorder=3 + 0.1 * n)
+    if not flight.completed:
+        mark_end(ax, t, values, LINES[n].colour)
+
+
+def _style(n: int) -> dict[str, Any]:
+    return {"color": LINES[n].colour, "ls": (0, LINES[n].dashes) if LINES[n].dashes else "-"}
 
 
 def _lane(ax: Any, comparison: Comparison) -> None:
-    """One row of events for each flight, named where there is room."""
+    """Draw one row of events for each flight, with names where there is room."""
     dress(ax)
     count = len(comparison.flights)
     low, high = ax.get_xlim()
@@ -198,7 +186,7 @@ def _lane(ax: Any, comparison: Comparison) -> None:
 
 
 def _names(ax: Any, events: list[tuple[float, str, str]], height: float, low: float, high: float) -> None:
-    """Name each crowd of marks by its gravest event, where that covers no other mark."""
+    """Name each crowd of marks by its most severe event, where the name covers no other mark."""
     crowds: list[list[tuple[float, str, str]]] = []
     for event in events:
         if crowds and event[0] - crowds[-1][-1][0] < _CROWD_SHARE * (high - low):
@@ -207,7 +195,9 @@ def _names(ax: Any, events: list[tuple[float, str, str]], height: float, low: fl
             crowds.append([event])
     free_from = low
     for k, crowd in enumerate(crowds):
-        name = max(crowd, key=lambda event: _GRAVITY.get(event[1], 0))[2] + (f" +{len(crowd) - 1}" if crowd[1:] else "")
+        name = max(crowd, key=lambda event: _SEVERITY.get(event[1], 0))[2] + (
+            f" +{len(crowd) - 1}" if crowd[1:] else ""
+        )
         width = (high - low) * _NAME_SHARE * (len(name) + 2)
         first, last = crowd[0][0], crowd[-1][0]
         if last >= free_from and last + width <= (crowds[k + 1][0][0] if k + 1 < len(crowds) else high):
@@ -222,7 +212,7 @@ def _names(ax: Any, events: list[tuple[float, str, str]], height: float, low: fl
 
 def _name(ax: Any, text: str, t: float, height: float, side: Literal["left", "right"]) -> None:
     ax.annotate(
-        _plain(text),
+        text.replace("$", r"\$"),
         (t, height),
         xytext=(6 if side == "left" else -6, 0),
         textcoords="offset points",
@@ -238,11 +228,11 @@ def _mark_zero(comparison: Comparison, axes: list[Any]) -> None:
         mark_catch(axes, 0.0)
         return
     for ax in axes:
-        ax.axvline(0.0, color=_SOFT, lw=1.0, zorder=2)
+        ax.axvline(0.0, color=SOFT, lw=1.0, zorder=2)
 
 
-def _mark_grave_events(comparison: Comparison, axes: list[Any]) -> None:
-    """Warnings and worse reach up into the panes: what comes after them is no undisturbed flight."""
+def _mark_severe_events(comparison: Comparison, axes: list[Any]) -> None:
+    """Draw lines through the panes at warnings and critical events."""
     low, high = axes[0].get_xlim()
     for n, (flight, zero_s) in enumerate(zip(comparison.flights, comparison.zeros_s, strict=True)):
         for event in flight.summary["events"]:
@@ -262,20 +252,19 @@ def _path(comparison: Comparison) -> Figure | None:
         dress(ax)
         seen: list[Array] = []
         for n, flight in enumerate(comparison.flights):
-            course, line = flight.course, LINES[n]
+            course, colour = flight.course, LINES[n].colour
             flown = np.where(course.flying[:, None], course.flown_world_m, np.nan)
             wanted = np.where(course.flying[:, None], course.reference_world_m, np.nan)
             ax.plot(wanted[:, 0], wanted[:, row], color="#b7c0c8", lw=3.0, zorder=2, solid_capstyle="round")
-            ax.plot(flown[:, 0], flown[:, row], color=line.colour, ls=line.style, lw=1.35, zorder=3 + 0.1 * n)
+            ax.plot(flown[:, 0], flown[:, row], **_style(n), lw=1.35, zorder=3 + 0.1 * n)
             if course.catch is not None:
-                ax.plot(*flown[course.catch, [0, row]], "o", ms=7, mfc="white", mec=line.colour, mew=1.8, zorder=5)
-            known = np.flatnonzero(np.isfinite(flown[:, row]))
-            if not flight.completed and len(known):
-                ax.plot(*flown[known[-1], [0, row]], "x", color=line.colour, ms=9, mew=2.2, zorder=5)
+                ax.plot(*flown[course.catch, [0, row]], "o", ms=7, mfc="white", mec=colour, mew=1.8, zorder=5)
+            if not flight.completed:
+                mark_end(ax, flown[:, 0], flown[:, row], colour)
             seen += [flown[:, row], wanted[:, row]]
         every = np.concatenate(seen)
         every = every[np.isfinite(every)]
-        # A straight path gets room: noise of millimetres is not to look like a slalom.
+        # At least 0.6 m of height: millimetres of noise on a straight path must not look large.
         middle, half = (every.min() + every.max()) / 2, max(0.3, 0.62 * float(np.ptp(every)))
         ax.set_ylim(middle - half, middle + half)
         ax.set_ylabel(f"{name} [m]")
@@ -287,7 +276,7 @@ def _path(comparison: Comparison) -> Figure | None:
 
 
 def _lateness(comparison: Comparison) -> Figure | None:
-    """Share of ticks later than a time, over that time: tails, which a histogram hides, are what matters."""
+    """Draw the share of ticks later than a time over that time: unlike a histogram it shows the tail."""
     lateness = [1e3 * f.course.lateness_s[np.isfinite(f.course.lateness_s)] for f in comparison.flights]
     if not any(len(values) for values in lateness):
         return None
@@ -298,14 +287,13 @@ def _lateness(comparison: Comparison) -> Figure | None:
         if len(late_ms):
             ordered = np.sort(late_ms)
             share = 1.0 - np.arange(len(ordered)) / len(ordered)
-            # Some thousand steps draw the same line as all of them; the tail keeps every one.
+            # 4000 points draw the same line as all of them; the tail keeps every point.
             body, tail = np.linspace(0, len(ordered) - 1, 4000).astype(int), np.arange(len(ordered))[-500:]
             kept = np.unique(np.concatenate([body, tail]))
             ax.plot(
                 ordered[kept],
                 100.0 * share[kept],
-                color=LINES[n].colour,
-                ls=LINES[n].style,
+                **_style(n),
                 lw=1.5,
                 drawstyle="steps-pre",
                 zorder=3 + 0.1 * n,
@@ -315,7 +303,7 @@ def _lateness(comparison: Comparison) -> Figure | None:
     known = np.concatenate(lateness)
     typical, late, most = (float(np.percentile(known, percent)) for percent in (50, 99, 100))
     if typical > 0.0 and most > 10.0 * late:
-        # One stall would press everything else against the axis.
+        # A linear axis would press everything but one stall against zero.
         ax.set_xscale("log")
         ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         ax.set_xlim(left=typical / 3.0)
@@ -335,22 +323,5 @@ def _span(flight: Flight, zero_s: float) -> tuple[float, float] | None:
 
 
 def _title(figure: Figure, comparison: Comparison, title: str) -> None:
-    handles = [
-        Line2D([], [], color=LINES[n].colour, ls=LINES[n].style, lw=1.6, label=_plain(flight.title))
-        for n, flight in enumerate(comparison.flights)
-    ]
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=2,
-        fontsize=8.5,
-        frameon=False,
-        handlelength=3.2,
-        title=title,
-        title_fontproperties={"size": 13, "weight": "bold"},
-    ).get_title().set_color(INK)
-
-
-def _plain(text: str) -> str:
-    """Never read as a formula."""
-    return text.replace("$", r"\$")
+    handles = [Line2D([], [], **_style(n), lw=1.6) for n in range(len(comparison.flights))]
+    figure_legend(figure, title, handles, [flight.title for flight in comparison.flights], columns=2)

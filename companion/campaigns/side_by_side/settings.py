@@ -1,4 +1,4 @@
-"""In what the effective configurations of flights differ, key by key, and what that means for comparing them."""
+"""The keys in which the effective configurations of flights differ, and whether the flights can be compared."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.campaigns.side_by_side_course import Flight
+from companion.campaigns.side_by_side.flight import Flight
 
 _ADDRESSES = frozenset(
     f"vehicle.devices.{key}"
@@ -22,16 +22,16 @@ _ADDRESSES = frozenset(
         "force.port",
     )
 )
-"""What the simulated world chooses anew for each flight."""
+"""Keys that the simulated world sets anew for each flight."""
 _NOT_SETTINGS = ("sources.phases", "sources.overrides")
-"""Where a value came from; what it is stands under its own key."""
+"""Where values came from; the values have keys of their own."""
 
 _NAMES = ("sources.", "mission.vehicle")
-"""Files by name: what is in them stands under its own keys."""
+"""Names of files; their content has keys of its own."""
 
 _SECTIONS = ("mission", "controller", "vehicle", "world", "sources")
 _KEYS_TOLD = 4
-"""In a sentence; the table has all of them."""
+"""Number of keys that a sentence names; the table has all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,17 +41,17 @@ class Setting:
     key: str
     values: tuple[Any, ...]
     present: tuple[bool, ...]
-    """Whether the flight's configuration has the key at all."""
+    """Whether the configuration of each flight has the key."""
 
 
 def simulated(config: dict[str, Any]) -> bool:
-    """Whether the flight was one in the simulated world: its arm hung on a pseudo-terminal, which no USB adapter is."""
+    """Return whether the flight was simulated: its arm is at a pseudo-terminal, which a USB adapter never is."""
     devices = _part(_part(config, "vehicle"), "devices")
     return str(_part(devices, "arm").get("port", "")).startswith("/dev/pts/")
 
 
 def payload_kg(flight: Flight) -> float | None:
-    """What was thrown, if anybody knows: the launcher of a simulated flight, else its configuration."""
+    """Return the mass thrown, from the summary of a simulated flight or else from its configuration; None if unknown."""
     known = flight.summary["payload_kg"]
     if known is None and simulated(flight.config):
         known = _part(flight.config, "world").get("payload_kg")
@@ -59,30 +59,30 @@ def payload_kg(flight: Flight) -> float | None:
 
 
 def settings_of(configs: Sequence[dict[str, Any]]) -> tuple[list[Setting], list[Setting]]:
-    """Keys that differ, and apart from them those of addresses that the simulated world chose by itself.
+    """Return the settings that differ, and separately the differing addresses that the simulated world chose.
 
-    The section `world` of a flight on the vehicle says nothing and is left out.
+    The section `world` of a flight on the vehicle has no meaning and is left out.
     """
     in_world = [simulated(config) for config in configs]
     flat = [_flat(config if real else _without_world(config)) for config, real in zip(configs, in_world, strict=True)]
     keys = list(dict.fromkeys(key for one in flat for key in one))
     settings: list[Setting] = []
     addresses: list[Setting] = []
-    # Sections in their own order; a key that only a later flight has goes to the end of its section.
+    # Sections keep their order; a key that only a later flight has goes to the end of its section.
     for key in sorted(keys, key=lambda key: _rank(key.partition(".")[0])):
         present = tuple(key in one for one in flat)
         values = tuple(one.get(key) for one in flat)
         if key.startswith(_NOT_SETTINGS) or (all(present) and all(_same(value, values[0]) for value in values)):
             continue
         if not any(values) and any(other.startswith((f"{key}.", f"{key}[")) for other in keys):
-            continue  # nothing there in one flight, and in another one what stands under the keys below it
+            continue  # empty in one flight; the keys below it show what another flight has there
         chosen = key in _ADDRESSES and all(in_world)
         (addresses if chosen else settings).append(Setting(key, values, present))
     return settings, addresses
 
 
 def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[str, list[str], bool]:
-    """One sentence on what the flights differ in; why care is needed, if it is; whether all flew the same mission."""
+    """Return one sentence on how the flights differ, the reasons for care, and whether all flew the same mission."""
     kinds: dict[str, list[Setting]] = {}
     for setting in settings:
         if not setting.key.startswith(_NAMES):
@@ -100,23 +100,25 @@ def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[st
     if len(set(digests)) == 1:
         fair = f"The same recording {len(flights)} times: nothing differs."
     elif not law and not cautions:
-        fair = "Nothing that was set differs: what differs below is the flights' own scatter."
+        fair = "No setting differs: the differences below are scatter between flights."
     elif not law:
         fair = "The law and its gains are the same."
     elif not cautions:
         fair = f"Only the law or its gains differ ({_count(law)})."
     else:
-        fair = f"The law or its gains differ ({_count(law)}), and not they alone: the figures show the sum of everything below."
+        fair = (
+            f"The law or its gains differ ({_count(law)}), and so does what is listed below: the figures show the sum."
+        )
     failed = [f"{flight.letter} ({flight.summary['outcome']})" for flight in flights if not flight.completed]
     if failed:
-        cautions.append(f"Not completed: {', '.join(failed)}. RMS figures of a part of the mission are not marked.")
+        cautions.append(f"Not completed: {', '.join(failed)}. RMS figures of an incomplete mission are not marked.")
     if not same_mission:
         cautions.append("RMS figures of different missions are not marked better or worse.")
     return fair, cautions, same_mission
 
 
 def text_of(value: Any) -> str:
-    """A value as the files write it."""
+    """Return a value as in a configuration file."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -151,28 +153,28 @@ def _caution(flights: Sequence[Flight], kind: str, settings: Sequence[Setting]) 
 
 
 def _circumstances(flights: Sequence[Flight], payload_told: bool) -> list[str]:
-    """What no configuration holds."""
+    """Return the differences that no configuration holds."""
     out: list[str] = []
 
-    def told(what: str, texts: Sequence[str]) -> None:
+    def differ(what: str, texts: Sequence[str]) -> None:
         if len(set(texts)) > 1:
             out.append(f"{what}: {', '.join(f'{f.letter} {text}' for f, text in zip(flights, texts, strict=True))}.")
 
     in_world = [simulated(flight.config) for flight in flights]
-    told("Flown in different places", ["in the simulated world" if one else "on the vehicle" for one in in_world])
+    differ("Flown in different places", ["in the simulated world" if one else "on the vehicle" for one in in_world])
     payloads = [payload_kg(flight) for flight in flights]
     if not payload_told and None not in payloads:
-        told("Different payload", [f"{payload:g} kg" for payload in payloads])
+        differ("Different payload", [f"{payload:g} kg" for payload in payloads])
     elif not payload_told:
         unknown = ", ".join(f.letter for f, payload in zip(flights, payloads, strict=True) if payload is None)
-        out.append(f"The payload of {unknown} is not known: nobody can say whether it was the same.")
+        out.append(f"The payload of {unknown} is not known; it may differ.")
     autopilots = [flight.summary.get("autopilot") or {} for flight in flights]
-    told("Different autopilots", [f"{a.get('kind') or '–'}, {a.get('firmware') or 'unknown'}" for a in autopilots])
+    differ("Different autopilots", [f"{a.get('kind') or '–'}, {a.get('firmware') or 'unknown'}" for a in autopilots])
     rates = [flight.summary["loop"]["rate_hz"] for flight in flights]
     if all(rates) and max(rates) > 1.02 * min(rates):
-        told("Different rates of the control loop", [f"{rate:.0f} Hz" for rate in rates])
+        differ("Different rates of the control loop", [f"{rate:.0f} Hz" for rate in rates])
     abouts = [flight.metadata.get("companion", {}) for flight in flights]
-    told(
+    differ(
         "Different versions of companion",
         [f"{a.get('version_companion', '–')} {a.get('version_git', '')[:12]}".strip() for a in abouts],
     )
@@ -209,7 +211,7 @@ def _without_world(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key; a list of plain values is one value."""
+    """Return values by dotted key; a list of plain values is one value."""
     if isinstance(tree, dict) and tree:
         parts = [(f"{prefix}.{key}" if prefix else key, value) for key, value in tree.items()]
     elif isinstance(tree, list) and any(isinstance(value, dict) for value in tree):

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 SOURCE = "paper.tex, RMS_table"
 
 
 @dataclass(frozen=True, slots=True)
 class Printed:
-    """One cell of the table, before or after the catch."""
+    """Figures of one flight before or after the catch."""
 
     e_p_m: float
     """RMS of ||e_p||."""
     e_q_deg: float
-    """RMS of ||e_q||; the table names no unit, the figures of the same section are in degrees."""
+    """RMS of ||e_q||. The table names no unit; the figures of the same section are in degrees."""
+
+    def jsonable(self) -> dict[str, float]:
+        """Return the figures by key."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
 class PrintedFlight:
-    """One controller at one payload."""
+    """One controller with one payload."""
 
     title: str
-    """The controller's name in the table's head."""
+    """The controller's name in the head of the table."""
     pre: Printed
     post: Printed | None
-    """None: printed as "Crashed"."""
+    """None is printed as "Crashed"."""
 
 
 _CSC, _PSC, _PROPOSED = "CSC, Cataldi et al.", "PSC, Wang et al.", "proposed"
@@ -40,9 +44,9 @@ TABLE: dict[tuple[str, float], PrintedFlight] = {
     ("adaptive", 0.2): PrintedFlight(_PROPOSED, Printed(0.0906, 2.6097), Printed(0.1654, 3.1190)),
     ("adaptive", 0.3): PrintedFlight(_PROPOSED, Printed(0.0726, 2.6866), Printed(0.1728, 3.2031)),
 }
-"""By law and payload in kg. The paper's flights are single ones, with its hardware."""
+"""By law and payload in kg. Each is a single flight with the paper's hardware."""
 
 
 def printed(controller: str, payload_kg: float) -> PrintedFlight | None:
-    """What the paper prints for a law at a payload; None where it prints nothing."""
+    """Return what the paper prints for a law and a payload; None if it prints nothing."""
     return TABLE.get((controller, round(payload_kg, 6)))

@@ -1,4 +1,4 @@
-"""Faults over real wires: each with a `companion fly --sitl` of its own, judged by its log and by what the world saw."""
+"""Faults over real wires: one `companion fly --sitl` per fault, judged by its log and by the simulated world's own record."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from companion.analysis.log import FlightLog, LogError
-from companion.campaigns.faults import Flown, Point, Row, Tick, Variant, row_of
+from companion.campaigns.faults.judge import FaultFlight, Point, Tick, row_of
+from companion.campaigns.faults.variants import Variant
+from companion.campaigns.process import Message
+from companion.campaigns.runner import Row
 from companion.config.loader import FlightConfig
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
@@ -22,25 +25,34 @@ from companion.sitl_config.faults import FlightPhase
 
 FLIGHT_TIMEOUT_S = 240.0
 LEAVE_TIMEOUT_S = 60.0
-"""After it was asked to land."""
+"""From the request to land to the end of the process."""
 WITNESS = "world.json"
-"""What the world writes into the flight's folder when it has faults."""
+"""File in the flight's folder with the record of a simulated world that has faults."""
 NEAR_FRAMES = 3
-"""A tick sees the newest frame only."""
+"""Number of frames that are compared: a tick sees only the newest one."""
 _POLL_S = 0.5
 
 
 class WireFlights:
-    """Some flights, `jobs` at a time.
+    """Flights over real wires, `jobs` at a time.
 
     Args:
-        options: of `companion fly`: mission and what else is the same for all.
+        flights: the faults.
+        options: arguments of `companion fly` that all flights share, the mission first.
         config: effective configuration, for the judgement.
-        out: every flight gets a folder in here.
-        jobs: flights at the same time.
+        out: folder in which every flight gets a folder of its own.
+        jobs: number of flights at the same time.
     """
 
-    def __init__(self, options: Sequence[str], config: FlightConfig, out: Path, jobs: int) -> None:
+    def __init__(
+        self,
+        flights: Sequence[tuple[Variant, FlightPhase]],
+        options: Sequence[str],
+        config: FlightConfig,
+        out: Path,
+        jobs: int,
+    ) -> None:
+        self._flights = list(flights)
         self._options = list(options)
         self._config = config
         self._out = out
@@ -48,24 +60,30 @@ class WireFlights:
         self._running: set[subprocess.Popen[bytes]] = set()
         self._stop_asked = False
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ask_to_stop()
+
     def ask_to_stop(self) -> None:
-        """Those in the air land, the others stay on the ground; safe in a signal handler."""
+        """Make the vehicles in the air land and start no other flight. Safe in a signal handler."""
         self._stop_asked = True
         for process in tuple(self._running):
             process.send_signal(signal.SIGINT)
 
-    def results(self, flights: Sequence[tuple[Variant, FlightPhase]]) -> Iterator[tuple[int, Row]]:
-        """Rows as flights end, each with its number."""
+    def results(self) -> Iterator[Message]:
+        """Yield the result of each flight as it ends."""
         with ThreadPoolExecutor(self._jobs) as pool:
             waiting: dict[Future[Row | None], int] = {
-                pool.submit(self._fly, n, variant, phase): n for n, (variant, phase) in enumerate(flights)
+                pool.submit(self._fly, n, variant, phase): n for n, (variant, phase) in enumerate(self._flights)
             }
             while waiting:
                 done, _ = wait(waiting, _POLL_S, FIRST_COMPLETED)
                 for future in done:
                     number, row = waiting.pop(future), future.result()
                     if row is not None:
-                        yield number, row
+                        yield {"index": number, "row": row}
 
     def _fly(self, number: int, variant: Variant, phase: FlightPhase) -> Row | None:
         if self._stop_asked:
@@ -87,12 +105,12 @@ class WireFlights:
         if code == EXIT_BAD_INPUT or code is None:
             last = (self._out / f"{folder.name}.txt").read_text(encoding="utf-8", errors="replace").strip()
             why = "it did not end" if code is None else last.rpartition("\n")[2]
-            return row_of(variant, phase, _nothing(why), self._config.vehicle)
+            return row_of(variant, phase, _lost(why), self._config.vehicle)
         return row_of(variant, phase, flown(folder, self._config), self._config.vehicle)
 
     @staticmethod
     def _wait(process: subprocess.Popen[bytes]) -> int | None:
-        """Its exit code; None: it had to be killed."""
+        """Return its exit code; None if it had to be killed."""
         for timeout_s, number in ((FLIGHT_TIMEOUT_S, signal.SIGINT), (LEAVE_TIMEOUT_S, signal.SIGKILL)):
             try:
                 return process.wait(timeout_s)
@@ -102,18 +120,18 @@ class WireFlights:
         return None
 
 
-def _nothing(why: str) -> Flown:
-    return Flown(Outcome.LOST.value, None, (), (), (), False, False, why)
+def _lost(why: str) -> FaultFlight:
+    return FaultFlight(Outcome.LOST.value, None, (), (), (), False, False, why)
 
 
-def flown(folder: Path, config: FlightConfig) -> Flown:
-    """A flight over wires as the table judges it."""
+def flown(folder: Path, config: FlightConfig) -> FaultFlight:
+    """Read the record of a flight from its folder; a flight that left none is lost."""
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         world = json.loads((folder / WITNESS).read_text(encoding="utf-8"))
         log = FlightLog.read(folder / "flight.mcap") if (folder / "flight.mcap").exists() else None
     except (OSError, ValueError, LogError) as error:
-        return _nothing(str(error))
+        return _lost(str(error))
     begun_s = world["fault_begun_s"]
     ticks, events = _ticks(log), _events(log, summary)
     offset_s = _offset_s(log.inputs if log is not None else (), world["mocap_frames"], begun_s or 0.0)
@@ -122,14 +140,14 @@ def flown(folder: Path, config: FlightConfig) -> Flown:
         for t_s, (x, y, z), tilt_rad, slack_m, tension_n in world["course"]
     ]
     low_m = config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
-    stands = bool(course) and course[-1].position_world_m[2] < low_m and not world["armed"]
+    landed = bool(course) and course[-1].position_world_m[2] < low_m and not world["armed"]
     outcome = Outcome.CRASHED.value if world["crashed"] else summary["outcome"]
     fault_s = None if begun_s is None else begun_s + offset_s
-    return Flown(outcome, fault_s, course, ticks, events, stands, bool(world["caught"]))
+    return FaultFlight(outcome, fault_s, course, ticks, events, landed, bool(world["caught"]))
 
 
 def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], begun_s: float) -> float:
-    """Flight clock less world's clock. Both sides know motion-capture frames by their numbers; the one nearest to the fault counts."""
+    """Return the flight clock minus the world's clock, by the motion-capture frame nearest to the fault that both sides know."""
     stamps = {i.mocap.frame_number: i.mocap.stamp_s for i in inputs if i.mocap is not None}
     for number, world_s in sorted(frames, key=lambda frame: abs(frame[1] - begun_s)):
         for near in range(number, number + NEAR_FRAMES):
@@ -148,7 +166,7 @@ def _ticks(log: FlightLog | None) -> list[Tick]:
 
 
 def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:
-    """Of the core, as logged, and of the guardian; of a core whose recorder died, as it told the launcher."""
+    """Return the core's events from the log, and from the summary those of the guardian and of a core whose recorder died."""
     found = [event for o in log.outputs for event in o.events] if log is not None else []
     known = {event.id for event in found}
     for event in summary["events"]:
@@ -159,5 +177,5 @@ def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:
 
 
 def default_jobs() -> int:
-    """Flights at the same time: one needs about two cores."""
+    """Return the number of flights at the same time: each needs about two cores."""
     return max(1, (os.cpu_count() or 1) // 2)

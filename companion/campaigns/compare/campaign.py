@@ -1,0 +1,184 @@
+"""`companion compare` as a campaign: the tables of a comparison, on the terminal and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.measure import Measurement
+
+from companion.analysis.page import Picture, Section
+from companion.analysis.table import Cell, Column, Table, for_terminal, table
+from companion.campaigns.compare.aggregate import MISSED, Group, aggregate, flat
+from companion.campaigns.compare.grid import Variant, is_ablation, short_label
+from companion.campaigns.compare.printed import SOURCE
+from companion.campaigns.process import Message
+from companion.campaigns.runner import Campaign, Report, Row
+
+EXPLAINED = (
+    "RMS, mean ± standard deviation over seeds. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
+    "control law. Impedance: RMS after the catch of M_d e'' + K_d e' + K_p e - e_tau with the gains of each preset, which is the "
+    "deviation from the desired impedance; PSC defines none for the base. Torque activity: RMS change of the commanded joint torques "
+    "from one tick to the next. A flight that was not completed is counted, but its errors are not averaged."
+)
+_PARTS = {"pre": "before", "post": "after"}
+_E_P, _E_Q, _E_ALPHA = ("e_p_m", "‖e_p‖", "m", 4), ("e_q_deg", "‖e_q‖", "deg", 2), ("e_alpha_deg", "‖e_α‖", "deg", 2)
+_COMPLIANCE = (
+    ("rms.post.e_alpha_deg", *_E_ALPHA[1:]),
+    ("impedance_error.arm_nm", "arm\nimpedance", "N m", 3),
+    ("impedance_error.position_n", "base\nimpedance", "N", 2),
+    ("peak_e_p_m", "peak ‖e_p‖", "m", 3),
+    ("final_abs_e_z_m", "final |e_z|", "m", 4),
+    ("torque_activity_nm", "torque\nactivity", "N m", 4),
+)
+"""Shown beside the errors, which a stiff or a chattering arm can make look good."""
+
+
+@dataclass(kw_only=True)
+class Compare(Campaign):
+    """A grid of controllers, presets, payloads and seeds."""
+
+    name = "compare"
+    csv_name = "compare.csv"
+
+    variants: Sequence[Variant]
+    payloads_kg: Sequence[float]
+    seeds: Sequence[int]
+
+    def settings(self) -> dict[str, Any]:
+        """Return what was flown, for the record."""
+        return {
+            **super().settings(),
+            "payloads_kg": list(self.payloads_kg),
+            "seeds": list(self.seeds),
+            "variants": [
+                {
+                    "controller": variant.controller,
+                    "preset": variant.preset,
+                    "file": config.sources.controller,
+                    "overrides": list(variant.overrides),
+                }
+                for variant, config in zip(self.variants, self.configs, strict=True)
+            ],
+            "jobs": self.jobs,
+            "scheduler": self.scheduler,
+        }
+
+    def label(self, row: Row) -> str:
+        """Return what tells a flight from the others."""
+        return f"{row['controller']}/{row['preset']} {row['payload_kg']:g} kg seed {row['seed']}"
+
+    def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """Return the means and deviations over seeds."""
+        return {"aggregate": [group.jsonable() for group in aggregate(rows)]}
+
+    def csv_row(self, row: Row) -> Mapping[str, Any]:
+        """Return the row with nested names joined by dots."""
+        return dict(flat(row))
+
+    def report(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Report:
+        """Return both tables and the pictures."""
+        groups = by_payload(aggregate(rows))
+        lead = f"RMS, mean ± standard deviation over seeds. Grey: as printed in the paper ({SOURCE})."
+        sections = [
+            Section("Tracking", lead, [tracking_table(groups)]),
+            Section("After the catch", tables=[compliance_table(groups)], text=EXPLAINED),
+            *([Section("Pictures", pictures=pictures)] if pictures else []),
+        ]
+        seeds = ", ".join(map(str, self.seeds))
+        mission = self.configs[0].sources.mission
+        return Report(
+            "Comparison of controllers", f"{mission} · {len(rows)} flights in the fast loop · seeds {seeds}", sections
+        )
+
+    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
+        """Write the time series and the overview."""
+        from companion.campaigns.compare.plots import write_pictures
+
+        return write_pictures(messages, aggregate(message["row"] for message in messages), out)
+
+    def show(self, rows: Sequence[Row], console: Console) -> None:
+        """Print both tables."""
+        print_tables(aggregate(rows), console)
+        console.print(f"{EXPLAINED} Paper: {SOURCE}.", style="dim", highlight=False, markup=False)
+        for row in rows:
+            if row["error"]:
+                console.print(f"{self.label(row)}: {row['error']}", style="red", highlight=False, markup=False)
+
+
+def by_payload(groups: Sequence[Group]) -> list[Group]:
+    """Sort the groups by payload."""
+    return sorted(groups, key=lambda group: group.payload_kg)
+
+
+def print_tables(groups: Sequence[Group], console: Console) -> None:
+    """Print both tables, without the deviations where the terminal is too narrow. No figure is ever cut off."""
+    groups, width = by_payload(groups), console.width
+    unlimited = console.options.update(max_width=10_000)
+    for make in (tracking_table, compliance_table):
+        shown = for_terminal(make(groups))
+        if Measurement.get(console, unlimited, shown).maximum > width:
+            shown = for_terminal(make(groups, deviation=False))
+        console.width = max(width, Measurement.get(console, unlimited, shown).maximum)
+        console.print(shown, highlight=False)
+        console.width = width
+
+
+def tracking_table(groups: Sequence[Group], *, deviation: bool = True) -> Table:
+    """Return the paper's table, each figure with the printed one beside it."""
+    columns = []
+    for part, word in _PARTS.items():
+        for key, title, unit, digits in (_E_P, _E_Q):
+            name = f"rms.{part}.{key}"
+            # A failure takes the place of the figures that it cost.
+            ours = _ours(name, f"{word}\n{title}", unit, digits, deviation, failures=(part, key) == ("post", "e_p_m"))
+            columns += [ours, _paper(part, key, digits)]
+    return _table("Tracking before and after the catch", columns, groups)
+
+
+def compliance_table(groups: Sequence[Group], *, deviation: bool = True) -> Table:
+    """Return what the tracking errors do not show."""
+    columns = [_ours(*of, deviation, failures=position == 0) for position, of in enumerate(_COMPLIANCE)]
+    return _table("After the catch", columns, groups)
+
+
+def _table(title: str, columns: Sequence[Column], groups: Sequence[Group]) -> Table:
+    head = [
+        Column("payload", lambda group: f"{group.payload_kg:g} kg", left=True),
+        Column(
+            "controller",
+            lambda group: Cell(
+                short_label(group.controller, group.preset), "soft" if is_ablation(group.preset) else ""
+            ),
+            left=True,
+        ),
+    ]
+    return table([*head, *columns], groups, title=title, group=lambda group: group.payload_kg)
+
+
+def _ours(name: str, title: str, unit: str, digits: int, deviation: bool, *, failures: bool) -> Column:
+    def show(group: Group) -> Cell:
+        spread = group.spread(name)
+        if spread is None:
+            text = "" if group.failures else "–"
+        elif spread.std is None or not deviation:
+            text = f"{spread.mean:.{digits}f}"
+        else:
+            text = f"{spread.mean:.{digits}f}±{f'{spread.std:.{digits}f}'.removeprefix('0') or '0'}"
+        note_kind = "warning" if set(group.failures) == {MISSED} else "bad"
+        return Cell(text, note=group.failure_text if failures else "", note_kind=note_kind)
+
+    return Column(f"{title}\n[{unit}]", show)
+
+
+def _paper(part: str, key: str, digits: int) -> Column:
+    def show(group: Group) -> str:
+        if group.printed is None:
+            return ""
+        figures = group.printed.pre if part == "pre" else group.printed.post
+        return "crashed" if figures is None else f"{getattr(figures, key):.{digits}f}"
+
+    return Column("paper", show, kind="soft")

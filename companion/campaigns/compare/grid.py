@@ -1,0 +1,108 @@
+"""The grid of a comparison: controllers with their presets, payloads and seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from companion.campaigns.process import Message
+
+ABLATED = ("adaptive", "recommended")
+LESS = " - "
+ABLATIONS: dict[str, tuple[str, ...]] = {
+    # rho = min(H . b + zeta, rho_max): removes all that H and zeta learn.
+    "adaptation off": ("controller.rho_max=1.0e-9",),
+    "H3 uncapped": ("controller.acceleration_cap=1.0e9",),
+    "S = I": ("controller.row_weights_s=[1, 1, 1, 0, 0, 0, 1, 1]",),
+    "base feed-forward off": ("controller.force_feedforward_xyz=[0, 0, 0]",),
+    # The base does not comply with a force that it compensates by feed-forward.
+    "base rows on": ("controller.base_compliance_xyz=[1, 1, 1]", "controller.force_feedforward_xyz=[0, 0, 0]"),
+    "F_d off": ("controller.desired_force_time_s=null",),
+    "disturbance observer off": ("controller.disturbance_time_xyz_s=[0, 0, 0]",),
+    "lead off": ("controller.feedforward_lead_s=0",),
+    "arm inertia and friction off": ("controller.arm_inertia_nominal=false", "controller.arm_friction_share=0"),
+}
+"""What an ablation removes from `ABLATED`, as overrides. The attitude rows stay masked: PX4 closes that loop."""
+
+
+def is_ablation(preset: str) -> bool:
+    """Whether the name is that of a preset from which something was removed."""
+    return LESS in preset
+
+
+def short_label(controller: str, preset: str) -> str:
+    """Return ` - F_d off` for an ablation, otherwise `law/preset`."""
+    _, less, what = preset.partition(LESS)
+    return f"{less}{what}" if less else f"{controller}/{preset}"
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A control law with its gains: one line of the table."""
+
+    controller: str
+    preset: str
+    """The name in the table: a preset, or a preset minus what was removed from it."""
+    base_preset: str
+    """The preset to load."""
+    overrides: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """`law/preset`."""
+        return f"{self.controller}/{self.preset}"
+
+
+def variants_of(
+    available: Mapping[str, Sequence[str]], controllers: Sequence[str], presets: Sequence[str], ablation: bool
+) -> list[Variant]:
+    """Return the lines of the table.
+
+    A law that has some of the requested presets flies those; a law that has none of them flies all of its own.
+
+    Args:
+        available: presets of each law.
+        controllers: requested laws; empty for all.
+        presets: requested presets; empty for all.
+        ablation: add `ABLATED` with one thing at a time removed.
+
+    Raises:
+        ValueError: there is no such law or preset, or nothing to ablate; one line.
+    """
+    for law in controllers:
+        if law not in available:
+            raise ValueError(f"--controllers {law}: no such controller; available: {', '.join(available)}")
+    laws = list(dict.fromkeys(controllers)) or list(available)
+    known = list(dict.fromkeys(preset for law in laws for preset in available[law]))
+    for preset in presets:
+        if preset not in known:
+            raise ValueError(f"--presets {preset}: no such preset of {', '.join(laws)}; available: {', '.join(known)}")
+    if ablation and ABLATED[0] not in laws:
+        raise ValueError(f"--ablation: applies to {'/'.join(ABLATED)}, but --controllers leaves it out")
+    found = []
+    for law in laws:
+        chosen = [preset for preset in available[law] if preset in presets] or list(available[law])
+        if ablation and law == ABLATED[0] and ABLATED[1] not in chosen:
+            chosen.append(ABLATED[1])  # an ablation means something only beside the whole preset
+        for preset in chosen:
+            found.append(Variant(law, preset, preset))
+            if ablation and (law, preset) == ABLATED:
+                found += [Variant(law, f"{preset}{LESS}{what}", preset, less) for what, less in ABLATIONS.items()]
+    return found
+
+
+def flights_of(variants: Sequence[Variant], payloads_kg: Sequence[float], seeds: Sequence[int]) -> list[Message]:
+    """Return the flights in the order of the table: payload, variant, seed. The first seed's flights record a time series."""
+    return [
+        {
+            "variant": position,
+            "controller": variant.controller,
+            "preset": variant.preset,
+            "payload_kg": payload_kg,
+            "seed": seed,
+            "series": seed == seeds[0],
+        }
+        for payload_kg in payloads_kg
+        for position, variant in enumerate(variants)
+        for seed in seeds
+    ]

@@ -1,0 +1,215 @@
+"""Judges a flight with a fault: how it ended, how soon it was detected, and whether anything happened that must not.
+
+A row holds the results of one flight, as `companion faults --json` prints it; docs/faults.md describes its keys.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from companion.campaigns.faults.variants import Variant
+from companion.campaigns.runner import Row
+from companion.config.vehicle import Vehicle
+from companion.model.types import Event, Outcome, PhaseKind, SafetyAction, Vec3
+from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
+
+COLUMNS = (
+    "fault", "phase", "size", "unit", "duration_s", "outcome", "detected_s", "event", "reacted_s", "action", "worst_tilt_deg",
+    "min_height_m", "min_slack_m", "drift_m", "caught", "problems", "events", "error",
+)  # fmt: skip
+GOOD = ("completed", "landed")
+TAUT_N = 0.5
+"""Tension above which the tether is taut; less is noise of the contact solver."""
+STOPPING_S = 1.0
+OUTWARD_M = 0.15
+"""Limit of the way outward on a taut tether, from `STOPPING_S` after the reaction on."""
+HARD_M_S = 1.8
+"""Sink rate at the floor above which a landing counts as a crash."""
+NEAR_FLOOR_M = 0.1
+_PULLS_BY_ITSELF: frozenset[FaultKind] = frozenset({"tether_taut", "tether_snag"})
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """The true state of the machine at one time."""
+
+    t_s: float
+    """Flight clock."""
+    position_world_m: Vec3
+    tilt_rad: float
+    slack_m: float
+    """Of the tether with its configured length."""
+    tension_n: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """What the companion decided in one tick."""
+
+    t_s: float
+    kind: PhaseKind
+    action: SafetyAction
+    reference_world_m: Vec3 | None
+
+
+@dataclass(frozen=True, slots=True)
+class FaultFlight:
+    """The record of a flight with a fault."""
+
+    outcome: str
+    """As in summary.json."""
+    begun_s: float | None
+    """Flight clock at the begin of the fault; None if it never began."""
+    course: Sequence[Point]
+    ticks: Sequence[Tick]
+    events: Sequence[Event]
+    """Of the core and of the guardian."""
+    landed: bool
+    """Whether it ended on the floor with its rotors stopped."""
+    caught: bool
+    error: str | None = None
+    """The exception that ended the flight, if any."""
+
+
+def row_of(variant: Variant, phase: FlightPhase, flown: FaultFlight, vehicle: Vehicle) -> Row:
+    """Return the row of a flight.
+
+    Args:
+        variant: the fault.
+        phase: phase in which it was injected.
+        flown: the flight.
+        vehicle: for its limits.
+    """
+    begun_s = flown.begun_s
+    outcome = "landed" if flown.outcome == "aborted" and flown.landed else flown.outcome
+    impact_m_s = _impact_m_s(flown.course, vehicle.airframe.ground_clearance_m)
+    if impact_m_s > HARD_M_S:
+        outcome = Outcome.CRASHED.value
+    over_s = _over_s(flown.ticks)
+    since = [event for event in flown.events if begun_s is not None and begun_s - 1e-6 <= event.t_s <= over_s]
+    named = next((event for event in since if event.id in KINDS[variant.kind].named_by), None)
+    reacted = next((event for event in since if event.action.rank >= SafetyAction.HOLD.rank), None)
+    abort = next((event for event in since if event.action.rank >= SafetyAction.RETRACT.rank), None)
+    actions = [tick.action for tick in flown.ticks if begun_s is not None and begun_s <= tick.t_s <= over_s]
+    actions += [event.action for event in since]
+    course = [point for point in flown.course if begun_s is not None and point.t_s >= begun_s]
+    size, unit = variant.shown
+    row: Row = {
+        "fault": variant.kind,
+        "phase": phase,
+        "size": size,
+        "unit": unit,
+        "duration_s": variant.duration_s,
+        "outcome": outcome,
+        "detected_s": _after(begun_s, named),
+        "event": named.id if named is not None else None,
+        "reacted_s": _after(begun_s, reacted),
+        "action": max(actions, key=lambda action: action.rank, default=SafetyAction.NOMINAL).value,
+        "worst_tilt_deg": math.degrees(max(point.tilt_rad for point in course)) if course else None,
+        "min_height_m": _min_height_m(flown, course),
+        "min_slack_m": min(point.slack_m for point in course) if course else None,
+        "drift_m": _drift_m(flown, course, abort) if outcome != "refused" else None,
+        "caught": flown.caught,
+        "problems": [],
+        "events": list(dict.fromkeys(event.id for event in since)),
+        "error": flown.error,
+    }
+    row["problems"] = _problems(row, variant, phase, course, abort, vehicle)
+    return row
+
+
+def _impact_m_s(course: Sequence[Point], standing_m: float) -> float:
+    """Return the largest sink rate just above the floor."""
+    fastest = 0.0
+    for before, after in itertools.pairwise(course):
+        if after.position_world_m[2] < standing_m + NEAR_FLOOR_M and after.t_s > before.t_s:
+            sink_m_s = (before.position_world_m[2] - after.position_world_m[2]) / (after.t_s - before.t_s)
+            fastest = max(fastest, sink_m_s)
+    return fastest
+
+
+def _over_s(ticks: Sequence[Tick]) -> float:
+    """Return the time of the touchdown after the flight; later events are no reaction to the fault."""
+    flew = False
+    for tick in ticks:
+        flew = flew or tick.kind not in (PhaseKind.GROUND, PhaseKind.DONE)
+        if flew and tick.kind is PhaseKind.DONE:
+            return tick.t_s
+    return math.inf
+
+
+def _after(begun_s: float | None, event: Event | None) -> float | None:
+    return None if begun_s is None or event is None else round(event.t_s - begun_s, 4)
+
+
+def _min_height_m(flown: FaultFlight, course: Sequence[Point]) -> float | None:
+    """Return the least height while the machine was meant to be up: from the fault or the end of the take-off to the landing."""
+    up = [
+        tick.t_s for tick in flown.ticks if tick.kind is PhaseKind.FLIGHT and tick.action.rank < SafetyAction.LAND.rank
+    ]
+    if not up or not course:
+        return None
+    heights = [point.position_world_m[2] for point in course if up[0] <= point.t_s <= up[-1]]
+    return min(heights, default=None)
+
+
+def _drift_m(flown: FaultFlight, course: Sequence[Point], abort: Event | None) -> float | None:
+    """Return the horizontal distance from the abort to the place of landing, or the largest error of a mission that went on."""
+    if not course:
+        return None
+    if abort is not None:
+        times = [point.t_s for point in course]
+        at = course[min(len(course) - 1, bisect_left(times, abort.t_s))]
+        return math.dist(at.position_world_m[:2], course[-1].position_world_m[:2])
+    times = [tick.t_s for tick in flown.ticks]
+    worst: float | None = None
+    for point in course:
+        k = bisect_left(times, point.t_s - 1e-6)
+        reference = flown.ticks[k].reference_world_m if k < len(times) else None
+        if reference is not None:
+            worst = max(worst or 0.0, math.dist(point.position_world_m[:2], reference[:2]))
+    return worst
+
+
+def _problems(
+    row: Row, variant: Variant, phase: FlightPhase, course: Sequence[Point], abort: Event | None, vehicle: Vehicle
+) -> list[str]:
+    """Return what must not happen but did."""
+    found = []
+    if row["outcome"] not in GOOD and not (row["outcome"] == "refused" and phase == "ground"):
+        found.append(str(row["outcome"]))
+    if row["error"] is not None:
+        found.append("error of its own")
+    if not course and phase != "ground":
+        found.append("the fault never began")
+    if variant.kind not in _PULLS_BY_ITSELF and any(point.tension_n > TAUT_N for point in course):
+        found.append("tether taut by its own motion")
+    elif variant.kind == "tether_taut" and abort is not None and _outward_m(course, abort) > OUTWARD_M:
+        found.append("outward on a taut tether")
+    if any(_outside(point.position_world_m, vehicle) for point in course):
+        found.append("left the geofence")
+    return found
+
+
+def _outward_m(course: Sequence[Point], abort: Event) -> float:
+    """Return how much further from the anchor it went once it had time to stop."""
+    slack = [point.slack_m for point in course if point.t_s >= abort.t_s + STOPPING_S]
+    return slack[0] - min(slack) if slack else 0.0
+
+
+def _outside(position_m: Vec3, vehicle: Vehicle) -> bool:
+    room, inset_m = vehicle.room, vehicle.airframe.radius_m - vehicle.safety.geofence_tolerance_m
+    (x, y, z), spans = position_m, (room.x_m, room.y_m)
+    sideways = any(
+        not low + inset_m <= value <= high - inset_m for value, (low, high) in zip((x, y), spans, strict=True)
+    )
+    return sideways or z > room.z_m[1]
+
+
+def good(row: Row) -> bool:
+    """Return whether nothing happened that must not."""
+    return not row["problems"]

@@ -1,0 +1,146 @@
+"""The faults that a campaign injects, one per flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from companion.sitl_config.faults import KINDS, PHASES, FaultKind, FlightPhase
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One kind and size of fault, in whatever phase."""
+
+    kind: FaultKind
+    size: float | None = None
+    """None for a kind without a size."""
+    duration_s: float | None = None
+    """None if the fault lasts to the end of the flight."""
+
+    @property
+    def phases(self) -> tuple[FlightPhase, ...]:
+        """The phases in which a campaign injects it."""
+        return KINDS[self.kind].phases
+
+    @property
+    def shown(self) -> tuple[float | None, str]:
+        """The value of the column `size` and its unit: the size, or the duration of a kind without a size."""
+        if KINDS[self.kind].size is not None:
+            return self.size, KINDS[self.kind].unit
+        return self.duration_s, "s"
+
+    def fault(self, phase: FlightPhase) -> dict[str, Any]:
+        """Return an entry of `world.faults`."""
+        found: dict[str, Any] = {"kind": self.kind, "phase": phase}
+        if self.size is not None:
+            found["size"] = self.size
+        if self.duration_s is not None:
+            found["duration_s"] = self.duration_s
+        return found
+
+
+def _durations(kind: FaultKind, *durations_s: float | None) -> list[Variant]:
+    return [Variant(kind, None, duration_s) for duration_s in durations_s]
+
+
+def _sizes(kind: FaultKind, *sizes: float, duration_s: float | None = None) -> list[Variant]:
+    return [Variant(kind, size, duration_s) for size in sizes]
+
+
+VARIANTS: tuple[Variant, ...] = (
+    *_durations("mocap_loss", 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, None),
+    *_durations("mocap_occluded", 0.1, None),
+    *_sizes("mocap_jump", 0.08, 0.3),
+    *_sizes("mocap_jump", 1.0, duration_s=0.05),
+    *_sizes("mocap_drag", 1.0),
+    *_sizes("mocap_swap", 1.0),
+    *_sizes("mocap_swap", 0.6, duration_s=0.08),
+    *_durations("mocap_freeze", 0.08, None),
+    *_sizes("mocap_latency", 0.05, 0.2),
+    *_sizes("mocap_rate", 60.0, 5.0),
+    *_durations("link_loss", 0.1, 0.5, None),
+    *_sizes("link_delay", 0.03, 0.15),
+    *_sizes("autopilot_reboot", 2.0),
+    *_durations("offboard_refused", None),
+    *_durations("arming_refused", None),
+    *_durations("servo_loss", 0.05, None),
+    *_durations("servo_overload", None),
+    *_sizes("servo_hot", 70.0, 85.0),
+    *_sizes("servo_angle", 10.0, 40.0),
+    *_sizes("bus_noise", 0.1, 0.6),
+    *_durations("force_loss", 0.2, None),
+    *_durations("force_stuck", None),
+    *_sizes("force_bias", 2.0, 10.0),
+    *_sizes("motor_weak", 0.1, 0.4),
+    *_sizes("battery_sag", 2.0, 4.0),
+    *_sizes("gust", 4.0, duration_s=2.0),
+    *_sizes("gust", 8.0, duration_s=0.7),
+    *_sizes("tether_taut", 0.05, 0.15),
+    *_sizes("tether_snag", 0.05, 0.3),
+    *_durations("tether_cut", None),
+    *_sizes("payload_missed", 0.4),
+    *_sizes("payload_double", 0.2),
+    *_durations("payload_dropped", None),
+    *_sizes("payload_heavy", 0.6),
+    *_durations("disk_full", None),
+    *_sizes("clock_step", 5.0),
+    *_durations("stall_loop", 0.06, None),
+    *_durations("hold_gil", None),
+    *_durations("stop_flight", 0.08, None),
+    *_durations("kill_flight", None),
+    *_durations("kill_recorder", None),
+    *_durations("kill_guardian", None),
+    *_sizes("pilot_takeover", 3.0),
+)
+"""What a campaign flies in the fast loop, each in every phase of its kind."""
+
+WIRES: tuple[tuple[Variant, FlightPhase], ...] = (
+    (Variant("mocap_loss", None, 0.1), "line"),
+    (Variant("mocap_loss"), "line"),
+    (Variant("mocap_jump", 0.3), "return"),
+    (Variant("mocap_drag", 1.0), "line"),
+    (Variant("mocap_swap", 1.0), "catch"),
+    (Variant("mocap_freeze"), "line"),
+    (Variant("mocap_latency", 0.2), "return"),
+    (Variant("link_loss"), "catch"),
+    (Variant("link_delay", 0.03), "line"),
+    (Variant("offboard_refused"), "return"),
+    (Variant("arming_refused"), "ground"),
+    (Variant("servo_loss"), "catch"),
+    (Variant("servo_overload"), "return"),
+    (Variant("bus_noise", 0.1), "takeoff"),
+    (Variant("force_loss"), "catch"),
+    (Variant("motor_weak", 0.1), "line"),
+    (Variant("battery_sag", 4.0), "return"),
+    (Variant("tether_snag", 0.05), "line"),
+    (Variant("payload_heavy", 0.6), "catch"),
+    (Variant("disk_full"), "line"),
+    (Variant("kill_recorder"), "line"),
+    (Variant("kill_guardian"), "takeoff"),
+    (Variant("kill_flight"), "catch"),
+    (Variant("stall_loop"), "return"),
+    (Variant("pilot_takeover", 3.0), "line"),
+)
+"""What `--wires` flies over real wires."""
+
+
+def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False) -> list[tuple[Variant, FlightPhase]]:
+    """Return what to fly, in the order of the table.
+
+    Args:
+        kinds: requested kinds; empty for all.
+        phases: requested phases; empty for all. A kind requested in a phase is flown there even if campaigns do not.
+        wires: choose from `WIRES`.
+    """
+    if wires:
+        everything = list(WIRES)
+    else:
+        asked = bool(kinds and phases)
+        everything = [(v, phase) for v in VARIANTS for phase in PHASES if asked or phase in v.phases]
+    return [
+        (variant, phase)
+        for variant, phase in everything
+        if (not kinds or variant.kind in kinds) and (not phases or phase in phases)
+    ]

@@ -1,0 +1,235 @@
+"""`companion robustness` as a campaign: one mission in many worlds, drawn at random or kept as cases."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from companion.analysis.page import Picture, Section
+from companion.analysis.table import Cell, Column, Table, for_terminal, number, table
+from companion.campaigns.process import Message
+from companion.campaigns.robustness.cases import Case, Cases, as_cases, fly_command, worse_than, write_cases
+from companion.campaigns.robustness.draws import DRIVERS, SAFE, drivers, influence, thirds, worst
+from companion.campaigns.runner import Campaign, Report, Row, counted, outcomes
+from companion.model.types import Outcome
+
+
+@dataclass(kw_only=True)
+class Robustness(Campaign):
+    """Draws of worlds, or the cases of a file."""
+
+    name = "robustness"
+    csv_name = "draws.csv"
+
+    mission: str
+    """As the user named it."""
+    seed: int
+    """Of the draws."""
+    cases: Sequence[Case] = ()
+    """Empty for draws."""
+    cases_file: str | None = None
+    keep: str | None = None
+    """File to which the worst flights, or the flown cases, are written."""
+
+    @property
+    def law(self) -> tuple[str, str]:
+        """Control law and preset."""
+        controller = self.configs[0].controller
+        return controller.law, controller.preset
+
+    def job(self) -> Message:
+        """Return the job for `sitl.campaigns`."""
+        fixed = [key for override in self.overrides if (key := world_key(override))]
+        return {**super().job(), "seed": self.seed, "fixed": fixed}
+
+    def settings(self) -> dict[str, Any]:
+        """Return what was flown, for the record."""
+        law, preset = self.law
+        own = {"mission": self.mission, "controller": law, "preset": preset}
+        return {**super().settings(), **own, "seed": None if self.cases else self.seed, "cases": self.cases_file}
+
+    def label(self, row: Row) -> str:
+        """Return what tells a flight from the others."""
+        return str(row["name"])
+
+    def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """Return outcomes, catches, the distribution of the error and what it depends on."""
+        return {
+            "summary": {
+                "flights": len(rows),
+                "outcomes": outcomes(rows),
+                "caught": sum(bool(row["caught"]) for row in rows),
+                "missed": _missed(rows),
+                "not_thrown": sum(not row["thrown"] for row in rows),
+                "thirds": [{**asdict(third), "payload_kg": list(third.payload_kg)} for third in thirds(rows)],
+                "influence": influence(rows),
+            }
+        }
+
+    def csv_row(self, row: Row) -> Mapping[str, Any]:
+        """Return the results, then what was drawn."""
+        results = {key: value for key, value in row.items() if key not in ("world", "events")}
+        return {**results, "events": " ".join(row["events"]), "seed": row["world"].get("seed"), **drivers(row["world"])}
+
+    def report(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Report:
+        """Return the distribution, its plot and the hardest flights."""
+        law, preset = self.law
+        unsafe = sum(row["outcome"] not in SAFE for row in rows)
+        return Report(
+            "Robustness",
+            f"{self.mission} · {law}/{preset} · {len(rows)} worlds in the fast loop",
+            [
+                Section("Distribution of the error", self._dependence(rows), [thirds_table(rows)], pictures),
+                Section("Flights", tables=[self._flights_table(rows)]),
+            ],
+            f"{self._result(rows)}. {f'{unsafe} flights crashed or were lost.' if unsafe else 'Every flight ended safely.'}",
+            not unsafe,
+        )
+
+    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
+        """Write the distribution."""
+        from companion.campaigns.robustness.plots import write_distribution
+
+        rows, path, (law, preset) = [message["row"] for message in messages], out / "distribution.png", self.law
+        title = f"{self.configs[0].mission.name}, {law}/{preset}: {len(rows)} worlds"
+        caption = "RMS of ‖e_p‖ after the catch of the flights that caught the payload and were completed."
+        return [Picture(path, title, caption)] if write_distribution(rows, title, path) else []
+
+    def write_more(self, rows: Sequence[Row], out: Path) -> None:
+        """Write the worst flights as cases, and those to keep."""
+        self._write_cases(worst(rows), out / "worst.yaml")
+        if self.keep is not None:
+            self._write_cases(rows if self.cases else worst(rows), Path(self.keep))
+
+    def show(self, rows: Sequence[Row], console: Console) -> None:
+        """Print the distribution, the hardest flights and the command that flies the worst one over real wires."""
+        law, preset = self.law
+        console.print(f"{law}/{preset}, {self._result(rows)}", highlight=False)
+        console.print(for_terminal(thirds_table(rows)), highlight=False)
+        console.print(f"{self._dependence(rows)}\n", highlight=False)
+        console.print(for_terminal(self._flights_table(rows)), highlight=False)
+        for row in rows:
+            if row["outcome"] != Outcome.COMPLETED.value:
+                text = f"{row['name']}: {row['outcome']}: {row['error'] or row['why'] or 'no event gives a reason'}"
+                console.print(text, style="yellow" if row["outcome"] in SAFE else "red", highlight=False, markup=False)
+        sets = [override for override in self.overrides if not world_key(override)]
+        line = fly_command(self.mission, law, preset, worst(rows)[0]["world"], sets)
+        console.print(f"the worst one over real wires:\n{line}", highlight=False, markup=False, soft_wrap=True)
+
+    def good(self, rows: Sequence[Row]) -> bool:
+        """Return whether every flight ended safely."""
+        return all(row["outcome"] in SAFE for row in rows)
+
+    def _result(self, rows: Sequence[Row]) -> str:
+        caught = sum(bool(row["caught"]) for row in rows)
+        return f"{len(rows)} worlds: {counted(rows)}; {caught} caught, {_missed(rows)} missed the net"
+
+    def _dependence(self, rows: Sequence[Row]) -> str:
+        strongest = list(influence(rows).items())[:5]
+        text = ", ".join(f"{DRIVERS[key]} {value:+.2f}" for key, value in strongest)
+        return f"Rank correlation with e_p: {text or 'too few flights'}."
+
+    def _flights_table(self, rows: Sequence[Row]) -> Table:
+        """Return the cases that were flown, or the worst draws."""
+        if self.cases:
+            return flights_table(rows, self.cases)
+        hardest = worst(rows)
+        # The names that the worst flights have in worst.yaml.
+        names = [case.name for case in as_cases(hardest)]
+        return flights_table([{**row, "name": name} for row, name in zip(hardest, names, strict=True)])
+
+    def _write_cases(self, rows: Sequence[Row], path: Path) -> None:
+        law, preset = self.law
+        remark = (
+            "The worlds that were hardest for this law in the fast loop, with its results.\n"
+            f"To fly them again: companion robustness --cases {path.name} (--case NAME for one; --keep FILE to keep the new results)."
+        )
+        if not self.cases:
+            first, last = self.flights[0]["number"], self.flights[-1]["number"]
+            remark += f"\nThe worst of draws {first} to {last}, seed {self.seed}."
+        cases = Cases(mission=self.mission, controller=law, preset=preset, cases=as_cases(rows))
+        write_cases(cases, path, remark)
+
+
+def world_key(override: str) -> str:
+    """Return `wind_m_s` for `world.wind_m_s[0]=1`; empty for another section."""
+    section, _, key = override.partition("=")[0].strip().partition(".")
+    return key.partition("[")[0].partition(".")[0] if section == "world" else ""
+
+
+def _missed(rows: Sequence[Row]) -> int:
+    return sum(bool(row["thrown"]) and not row["caught"] for row in rows)
+
+
+def thirds_table(rows: Sequence[Row]) -> Table:
+    """Return the distribution of e_p by payload."""
+
+    def percentile(key: str) -> Column:
+        return Column(key, lambda third: number(third.e_p_m[key], ".4f", "–"))
+
+    columns = (
+        Column("payload", lambda third: "{:.2f} to {:.2f} kg".format(*third.payload_kg), left=True),
+        Column("flights", lambda third: str(third.flights)),
+        Column("caught", lambda third: str(third.caught)),
+        *map(percentile, ("p50", "p90", "max")),
+    )
+    return table(columns, thirds(rows), title="RMS of e_p after the catch, m")
+
+
+def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
+    """Return one line per flight: its result and what was drawn.
+
+    Args:
+        rows: of the flights.
+        cases: the cases flown, each under the name of its row; empty for draws.
+    """
+
+    def drawn(key: str, form: str, scale: float = 1.0) -> Any:
+        def show(row: Row) -> str:
+            value = drivers(row["world"])[key]
+            return number(None if value is None else value * scale, form, "–")
+
+        return show
+
+    speed, from_deg = drawn("throw_speed_m_s", ".1f"), drawn("throw_from_deg", ".0f")
+    columns = [
+        Column("draw", lambda row: "" if row["number"] is None else str(row["number"])),
+        Column("name", lambda row: str(row["name"]), left=True),
+        Column("e_p\nm", _error_text),
+        Column("payload\nkg", drawn("payload_kg", ".2f")),
+        Column("throw\nm/s", lambda row: f"{speed(row)} @ {from_deg(row)}°"),
+        Column("catch x\nm", drawn("catch_x_m", ".2f")),
+        Column("delay\nms", drawn("setpoint_delay_s", ".0f", 1e3)),
+        Column("lag\nms", drawn("rotor_lag_s", ".0f", 1e3)),
+        Column("wind\nm/s", drawn("wind_speed_m_s", ".1f")),
+        Column("hover", drawn("hover_thrust_error", "+.0%")),
+        Column("force sensor", _sensor_text, left=True),
+        Column("seed", lambda row: str(row["world"].get("seed", ""))),
+    ]
+    kept = {case.name: case.kept for case in cases}
+    if kept:
+
+        def against_kept(row: Row) -> Cell:
+            worse = worse_than(row, kept[row["name"]])
+            return Cell(worse, "bad") if worse else Cell(number(kept[row["name"]].e_p_m, ".4f", "–"))
+
+        columns.append(Column("kept\nm", against_kept))
+    return table(columns, rows, title="The cases" if kept else "The worst")
+
+
+def _error_text(row: Row) -> str:
+    known = row["outcome"] == Outcome.COMPLETED.value and row["e_p_m"] is not None
+    error = f"{row['e_p_m']:.4f}" if known else row["outcome"]
+    return error if row["caught"] else f"{error} (missed)"
+
+
+def _sensor_text(row: Row) -> str:
+    drawn = drivers(row["world"])
+    lost_s, bias_n = drawn["force_lost_s"], drawn["force_bias_n"]
+    if lost_s is not None:
+        return f"lost {lost_s:g} s" if lost_s > 0 else "missing"
+    return "–" if bias_n is None else f"{bias_n:.0f} N bias"

@@ -1,0 +1,184 @@
+"""Named cases: worlds that were hard to fly in, with the results they had when they were kept, in a YAML file."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from companion.campaigns.robustness.draws import SAFE, drivers
+from companion.campaigns.runner import Row
+from companion.config.base import Model, NonNegative
+from companion.config.document import ConfigError, problem_lines
+from companion.config.explain import validate
+from companion.config.yaml_strict import read_document
+from companion.config.yaml_text import flow_text
+from companion.model.types import Outcome
+from companion.sitl_config.world import World
+
+WORSE_THAN_KEPT = 1.25
+"""Largest allowed ratio of a case's error to its kept error."""
+_HARD_FROM = 0.4
+"""Share of the way from the middle of a range to its hard end at which a name mentions the quantity."""
+_WORDS = (
+    # key, middle and hard end of its range, word
+    ("setpoint_delay_s", 0.03, 0.06, "slow_setpoints"),
+    ("arm_delay_s", 0.006, 0.01, "slow_arm"),
+    ("rotor_lag_s", 0.04, 0.06, "slow_rotors"),
+    ("wind_speed_m_s", 1.5, 3.0, "windy"),
+    ("hover_thrust_error", 0.0, 0.1, "hover_too_high"),
+    ("hover_thrust_error", 0.0, -0.1, "hover_too_low"),
+    ("catch_x_m", 0.0, 1.0, "caught_late"),
+    ("catch_x_m", 0.0, -1.0, "caught_early"),
+    ("force_bias_n", 6.0, 12.0, "biased"),
+)
+
+
+class Kept(Model):
+    """The results of a case when it was kept."""
+
+    outcome: Outcome
+    caught: bool
+    e_p_m: NonNegative | None = None
+    """RMS after the catch, or of the whole flight if nothing was caught; absent if the mission was not completed."""
+
+
+class Case(Model):
+    """One world that was hard to fly in."""
+
+    name: str
+    world: World
+    kept: Kept
+
+    def knobs(self) -> dict[str, Any]:
+        """Return the keys of the world that the case sets."""
+        knobs: dict[str, Any] = self.world.model_dump(mode="json", exclude_unset=True)
+        return knobs
+
+
+class Cases(Model):
+    """A file of cases."""
+
+    mission: str
+    controller: str
+    preset: str
+    cases: tuple[Case, ...]
+
+    def named(self, names: Sequence[str]) -> tuple[Case, ...]:
+        """Return the cases of these names in the order of the file; all of them for no names.
+
+        Raises:
+            ConfigError: there is no such case.
+        """
+        known = [case.name for case in self.cases]
+        if missing := [name for name in names if name not in known]:
+            raise ConfigError([f"--case {name}: no such case; there are: {', '.join(known)}" for name in missing])
+        return tuple(case for case in self.cases if not names or case.name in names)
+
+
+def read_cases(path: Path) -> Cases:
+    """Read a file of cases.
+
+    Raises:
+        ConfigError: one line per problem, with file, line and column.
+    """
+    document = read_document(path)
+    cases = validate(Cases, document)
+    if cases is None:
+        raise ConfigError(problem_lines(document.problems))
+    names = [case.name for case in cases.cases]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigError([f"{path}: cases: expected distinct names, but there are several of {', '.join(twice)}"])
+    return cases
+
+
+def write_cases(cases: Cases, path: Path, remark: str) -> None:
+    """Write a file that `read_cases` reads.
+
+    Args:
+        cases: what to write.
+        path: YAML file.
+        remark: comment lines at the head of the file.
+    """
+    lines = [f"# {line}".rstrip() for line in remark.splitlines()]
+    lines += [*(f"{key}: {flow_text(getattr(cases, key))}" for key in ("mission", "controller", "preset")), "cases:"]
+    for case in cases.cases:
+        lines += ["", f"  - name: {flow_text(case.name)}", "    world:"]
+        lines += [f"      {key}: {flow_text(value)}" for key, value in case.knobs().items()]
+        lines.append(f"    kept: {flow_text(case.kept.model_dump(mode='json', exclude_none=True))}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def fly_command(mission: str, controller: str, preset: str, world: Mapping[str, Any], sets: Sequence[str] = ()) -> str:
+    """Return the command that flies the same world over real wires.
+
+    Args:
+        mission: file.
+        controller: law.
+        preset: gains.
+        world: keys of the world.
+        sets: further overrides.
+    """
+    words = ["companion", "fly", mission, "--sitl", "--controller", controller, "--preset", preset, "--set", *sets]
+    for key, value in world.items():
+        text = flow_text(value)
+        words.append(f"world.{key}={text if key == 'faults' else text.replace(' ', '')}")
+    return shlex.join(words)
+
+
+def name_of(world: Mapping[str, Any]) -> str:
+    """Return what is hard about a world in a few words, such as `heavy_fast_from_behind_slow_setpoints`."""
+    drawn = drivers(world)
+
+    def hardness(key: str, middle: float, end: float) -> float:
+        """Return 0 at the middle of the range, 1 at its hard end."""
+        value = drawn[key]
+        return 0.0 if value is None else (value - middle) / (end - middle)
+
+    def either(share: float, high: str, low: str) -> list[str]:
+        return [high] if share > _HARD_FROM else [low] if share < -_HARD_FROM else []
+
+    words = either(hardness("payload_kg", 0.225, 0.4), "heavy", "light")
+    words += either(hardness("throw_speed_m_s", 2.25, 4.0), "fast", "gentle")
+    from_deg = drawn["throw_from_deg"]
+    if from_deg is not None:
+        side = "left" if world["throw_velocity_m_s"][1] < 0 else "right"
+        words.append(f"from_{'ahead' if from_deg < 45 else 'behind' if from_deg > 135 else side}")
+    if drawn["force_lost_s"] is not None:
+        words.append("no_force" if drawn["force_lost_s"] == 0.0 else "force_lost")
+    hard = [(hardness(key, middle, end), word) for key, middle, end, word in _WORDS]
+    words += [word for share, word in sorted(hard, reverse=True)[:2] if share > _HARD_FROM]
+    return "_".join(words) or "plain"
+
+
+def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
+    """Return rows as cases to keep; a draw is named by what is hard about it."""
+    taken: dict[str, int] = {}
+    cases = []
+    for row in rows:
+        name = row["name"] if row["number"] is None else name_of(row["world"])
+        taken[name] = taken.get(name, 0) + 1
+        unique = name if taken[name] == 1 else f"{name}_{taken[name]}"
+        error_m = row["e_p_m"] if row["outcome"] == Outcome.COMPLETED.value else None
+        kept = Kept(
+            outcome=Outcome(row["outcome"]),
+            caught=row["caught"],
+            e_p_m=None if error_m is None else round(error_m, 4),
+        )
+        cases.append(Case(name=unique, world=World.model_validate(row["world"]), kept=kept))
+    return tuple(cases)
+
+
+def worse_than(row: Row, kept: Kept) -> str | None:
+    """Return what is worse than when the case was kept; None if nothing is."""
+    outcome, why = row["outcome"], row["why"] or row["error"] or "no event gives a reason"
+    if outcome != kept.outcome.value and outcome != Outcome.COMPLETED.value:
+        return f"{outcome} ({why}), kept as {kept.outcome.value}"
+    if outcome not in SAFE:
+        return f"{outcome} ({why})"
+    if kept.caught and not row["caught"]:
+        return "the payload was not caught any more"
+    if kept.e_p_m is not None and row["e_p_m"] is not None and row["e_p_m"] > WORSE_THAN_KEPT * kept.e_p_m:
+        return f"e_p {row['e_p_m']:.4f} m, more than {WORSE_THAN_KEPT:g} times the kept {kept.e_p_m:.4f} m"
+    return None

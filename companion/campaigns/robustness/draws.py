@@ -1,0 +1,139 @@
+"""Flights in worlds drawn at random: what was drawn, how the position error is distributed and what it depends on.
+
+A row holds the results of one flight, as `companion robustness --json` prints it; docs/robustness.md describes its keys.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from companion.campaigns.runner import Row
+from companion.model.types import Outcome
+
+WORST = 10
+"""Number of the hardest flights that are kept."""
+SAFE = (Outcome.COMPLETED.value, Outcome.ABORTED.value, Outcome.REFUSED.value)
+"""Outcomes that end with the machine on the floor in one piece."""
+_SEVERITY = {Outcome.CRASHED.value: 4, Outcome.LOST.value: 3, Outcome.REFUSED.value: 2, Outcome.ABORTED.value: 1}
+DRIVERS: dict[str, str] = {
+    "payload_kg": "payload, kg",
+    "throw_speed_m_s": "horizontal throw speed, m/s",
+    "throw_from_deg": "thrown from, deg off the line",
+    "descent_m_s": "descent at the catch, m/s",
+    "catch_x_m": "catch point, m along the line",
+    "hover_thrust_error": "hover-thrust error",
+    "link1_mass_error": "mass error of link 1",
+    "link2_mass_error": "mass error of link 2",
+    "setpoint_delay_s": "setpoint delay, s",
+    "arm_delay_s": "arm delay, s",
+    "rotor_lag_s": "rotor lag, s",
+    "wind_speed_m_s": "wind, m/s",
+    "force_bias_n": "bias of the force sensor, N",
+    "force_lost_s": "force sensor lost at, s",
+}
+"""The drawn quantities as single numbers, each with its label."""
+
+
+def drivers(world: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return what was drawn, by the keys of `DRIVERS`; None where a quantity does not apply.
+
+    Args:
+        world: keys of the world that a draw or a case sets.
+    """
+    vx, vy, vz = world.get("throw_velocity_m_s", (math.nan,) * 3)
+    wx, wy, _ = world.get("wind_m_s", (math.nan,) * 3)
+    link1, link2 = world.get("link_mass_error", (math.nan,) * 2)
+    values: dict[str, float | None] = {
+        "throw_speed_m_s": math.hypot(vx, vy),
+        # 0: from ahead, 180: from behind.
+        "throw_from_deg": abs(math.degrees(math.atan2(-vy, -vx))),
+        "descent_m_s": -vz,
+        "catch_x_m": world.get("catch_at_m", (None,))[0],
+        "link1_mass_error": link1,
+        "link2_mass_error": link2,
+        "wind_speed_m_s": math.hypot(wx, wy),
+        "force_bias_n": math.hypot(*world["force_bias_n"]) if "force_bias_n" in world else None,
+        "force_lost_s": next(
+            (fault["t_s"] for fault in world.get("faults", ()) if fault["kind"] == "force_loss"), None
+        ),
+    }
+    found = {key: values[key] if key in values else world.get(key) for key in DRIVERS}
+    return {key: None if value is None or math.isnan(value) else float(value) for key, value in found.items()}
+
+
+def sensor_of(row: Row) -> str:
+    """Return the state of the force sensor when the payload came: biased, lost later, or missing."""
+    if drivers(row["world"])["force_lost_s"] is None:
+        return "biased"
+    return "lost after the catch" if row["felt"] else "missing at the catch"
+
+
+def graded(rows: Sequence[Row]) -> list[Row]:
+    """Return the flights that caught the payload and were completed: only they count for the distribution of e_p."""
+    return [
+        row for row in rows if row["outcome"] == Outcome.COMPLETED.value and row["caught"] and row["e_p_m"] is not None
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Third:
+    """The flights of one third of the payload range."""
+
+    payload_kg: tuple[float, float]
+    flights: int
+    caught: int
+    e_p_m: dict[str, float | None]
+    """p50, p90 and max of the RMS after the catch, over the flights of `graded`."""
+
+
+def thirds(rows: Sequence[Row]) -> list[Third]:
+    """Split the payload range into three parts of equal width."""
+    payloads = [row["world"]["payload_kg"] for row in rows if "payload_kg" in row["world"]]
+    if not payloads:
+        return []
+    edges = [float(edge) for edge in np.linspace(min(payloads), max(payloads), 4)]
+    found = []
+    for low, high in itertools.pairwise(edges):
+        last = high == edges[-1]
+        these = [
+            r for r in rows if low <= r["world"]["payload_kg"] < high or (last and r["world"]["payload_kg"] == high)
+        ]
+        errors = [row["e_p_m"] for row in graded(these)]
+        shares = np.percentile(errors, [50, 90, 100]).tolist() if errors else (None, None, None)
+        caught = sum(bool(row["caught"]) for row in these)
+        found.append(Third((low, high), len(these), caught, dict(zip(("p50", "p90", "max"), shares, strict=True))))
+    return found
+
+
+def influence(rows: Sequence[Row]) -> dict[str, float]:
+    """Return the rank correlation (Spearman) of e_p after the catch with each drawn quantity, the strongest first."""
+    flown = graded(rows)
+    known = [drivers(row["world"]) for row in flown]
+    found = {}
+    for key in DRIVERS:
+        pairs = [(d[key], row["e_p_m"]) for d, row in zip(known, flown, strict=True) if d[key] is not None]
+        if len(pairs) >= 10:
+            x, y = np.array(pairs, dtype=np.float64).T
+            if np.ptp(x) > 0 and np.ptp(y) > 0:
+                found[key] = float(np.corrcoef(_ranks(x), _ranks(y))[0, 1])
+    return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
+
+
+def _ranks(values: Any) -> Any:
+    """Return ranks from 0; equal values share the mean of their ranks."""
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ends = np.cumsum(counts)
+    return (ends - (counts + 1) / 2.0)[inverse]
+
+
+def worst(rows: Sequence[Row], count: int = WORST) -> list[Row]:
+    """Return the hardest flights, the worst first: by outcome, then by error, then by number."""
+    return sorted(
+        rows, key=lambda row: (-_SEVERITY.get(row["outcome"], 0), -(row["e_p_m"] or 0.0), row["number"] or 0)
+    )[:count]

@@ -1,0 +1,296 @@
+"""The one runner of campaigns: fly, summarise, write CSV, JSON and HTML, print. A `Campaign` says what and how."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib.metadata
+import json
+import signal
+import sys
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from companion.analysis.page import Picture, Section, write_page
+from companion.campaigns.process import CampaignError, CampaignProcess, Message
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
+from companion.runtime.console import tell
+from companion.sitl_config.loader import SitlConfig
+
+Row = dict[str, Any]
+"""The results of one flight as plain data, as `--json` prints it."""
+
+
+class Flights(Protocol):
+    """Flights that are being flown."""
+
+    def results(self) -> Iterator[Message]:
+        """Yield `{index, row, ...}` as each flight ends, in any order. Raises `CampaignError` if it cannot go on."""
+
+    def ask_to_stop(self) -> None:
+        """Make `results` end soon. Safe in a signal handler."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The content of a campaign's HTML page."""
+
+    title: str
+    subtitle: str
+    sections: Sequence[Section]
+    verdict: str = ""
+    good: bool = True
+
+
+@dataclass(kw_only=True)
+class Campaign(ABC):
+    """What one campaign flies and how it shows its results."""
+
+    name: ClassVar[str]
+    """Of the command and of its result files."""
+    csv_name: ClassVar[str]
+
+    configs: Sequence[SitlConfig]
+    """Effective configurations; each flight names one by its position."""
+    flights: Sequence[Message]
+    """Each flight as `sitl.campaigns` expects it."""
+    command: str
+    """The command line, for the record."""
+    overrides: Sequence[str] = ()
+    jobs: int | None = None
+    """Number of processes; None for one per core."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler; None to fly on this machine."""
+
+    def job(self) -> Message:
+        """Return the job for `sitl.campaigns`."""
+        return {
+            "campaign": self.name,
+            "configs": [config.model_dump(mode="json") for config in self.configs],
+            "flights": list(self.flights),
+            "jobs": self.jobs,
+            "scheduler": self.scheduler,
+        }
+
+    def start(self, out: Path) -> AbstractContextManager[Flights]:
+        """Start the flights; `out` is the folder of the results."""
+        return CampaignProcess(self.job(), out / "campaign.log")
+
+    def settings(self) -> dict[str, Any]:
+        """Return what was flown, for the record."""
+        sources = self.configs[0].sources
+        return {
+            "command": self.command,
+            "mission": sources.mission,
+            "vehicle": sources.vehicle,
+            "overrides": list(self.overrides),
+        }
+
+    @abstractmethod
+    def label(self, row: Row) -> str:
+        """Return what tells a flight from the others."""
+
+    @abstractmethod
+    def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """Return what stands beside `rows` in the JSON output."""
+
+    @abstractmethod
+    def csv_row(self, row: Row) -> Mapping[str, Any]:
+        """Return the row as columns of the CSV file."""
+
+    @abstractmethod
+    def report(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Report:
+        """Return the content of the HTML page."""
+
+    @abstractmethod
+    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
+        """Write the plots; raises ImportError without matplotlib."""
+
+    @abstractmethod
+    def show(self, rows: Sequence[Row], console: Console) -> None:
+        """Print the results."""
+
+    def write_more(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027 (most campaigns have no more files)
+        """Write the files that only this campaign has."""
+
+    def good(self, rows: Sequence[Row]) -> bool:
+        """Return False to end with exit code 5."""
+        return True
+
+
+@dataclass
+class Flown:
+    """The outcome of a whole campaign."""
+
+    messages: list[Message]
+    """In the order of the campaign."""
+    notes: list[str] = field(default_factory=list)
+    """Why results are missing."""
+    code: int = EXIT_OK
+
+    @property
+    def rows(self) -> list[Row]:
+        """The row of each flight."""
+        return [message["row"] for message in self.messages]
+
+
+def run(campaign: Campaign, out: Path, console: Console | None) -> int:
+    """Fly the campaign, write its files into `out` and print its results.
+
+    Args:
+        campaign: what to fly.
+        out: an existing folder; stays empty if no flight ended.
+        console: where tables go; None to print the rows and their summary as JSON instead.
+
+    Returns:
+        The exit code.
+    """
+    flown = fly(campaign, out)
+    if flown.messages:
+        _publish(campaign, flown, out, console)
+    for note in flown.notes:
+        tell(f"companion {campaign.name}: {note}")
+    if flown.messages and not campaign.good(flown.rows):
+        return EXIT_LOST
+    return flown.code
+
+
+def fly(campaign: Campaign, out: Path) -> Flown:
+    """Fly the campaign behind a progress bar. Ctrl-C and SIGTERM end it; the flights that have ended are kept."""
+    results: dict[int, Message] = {}
+    notes: list[str] = []
+    code, whole, bad = EXIT_OK, len(campaign.flights), 0
+    console = Console(stderr=True)
+    bar = Progress(
+        TextColumn("flying"),
+        BarColumn(bar_width=32),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("[dim]{task.description}[/]"),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    with campaign.start(out) as flights, _interrupted_by(flights.ask_to_stop), bar:
+        task = bar.add_task("", total=whole)
+        try:
+            for message in flights.results():
+                results[message["index"]] = message
+                bad += not campaign.good([message["row"]])
+                bar.update(task, advance=1, description=_progress(campaign, message, bad))
+        except CampaignError as error:
+            notes.append(str(error))
+            code = EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
+    if len(results) < whole and code != EXIT_BAD_INPUT:
+        if not notes:
+            notes.append("interrupted")
+            code = EXIT_ABORTED
+        notes.append(f"{len(results)} of {whole} flights were flown")
+    return Flown([results[index] for index in sorted(results)], notes, code)
+
+
+def _progress(campaign: Campaign, newest: Message, bad: int) -> str:
+    row = newest["row"]
+    return f"{campaign.label(row)}: {row['outcome']}" + (f"; {bad} bad" if bad else "")
+
+
+@contextlib.contextmanager
+def _interrupted_by(stop: Callable[[], None]) -> Iterator[None]:
+    handlers = {number: signal.signal(number, lambda *_: stop()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def _publish(campaign: Campaign, flown: Flown, out: Path, console: Console | None) -> None:
+    table = {"rows": flown.rows, **campaign.summary(flown.rows)}
+    try:
+        _write(campaign, flown, table, out)
+    except OSError as error:
+        tell(f"companion {campaign.name}: {error.filename or out}: cannot be written: {error.strerror}")
+        flown.code = flown.code or EXIT_LOST
+    if console is None:
+        sys.stdout.write(to_json(table))
+        sys.stdout.flush()
+        return
+    campaign.show(flown.rows, console)
+    page = out / f"{campaign.name}.html"
+    console.print(f"\nreport  {page}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -> None:
+    rows, settings, used = flown.rows, campaign.settings(), versions()
+    write_csv((campaign.csv_row(row) for row in rows), out / campaign.csv_name)
+    try:
+        pictures = campaign.draw(flown.messages, out)
+    except ImportError:
+        tell(f"companion {campaign.name}: plots need matplotlib: pip install 'companion[analysis]'")
+        pictures = []
+    report = campaign.report(rows, pictures)
+    errors = [f"{campaign.label(row)}: {row['error']}" for row in rows if row["error"]]
+    record = {
+        "Internal errors": "\n".join(errors),
+        "Settings": json.dumps(settings, indent=2),
+        "Versions": json.dumps(used, indent=2),
+    }
+    write_page(
+        out / f"{campaign.name}.html",
+        report.title,
+        report.subtitle,
+        [*report.sections, Section("Record", folded=record)],
+        notes=flown.notes,
+        verdict=report.verdict,
+        good=report.good,
+    )
+    campaign.write_more(rows, out)
+    wall_s = [message["wall_s"] for message in flown.messages]
+    # The last file: where it exists, all the others do.
+    whole = {**table, "settings": settings, "versions": used, "notes": flown.notes, "wall_s": wall_s}
+    (out / f"{campaign.name}.json").write_text(to_json(whole), encoding="utf-8")
+
+
+def outcomes(rows: Iterable[Row]) -> dict[str, int]:
+    """Count the flights by outcome."""
+    return dict(Counter(row["outcome"] for row in rows))
+
+
+def counted(rows: Iterable[Row]) -> str:
+    """Return the outcomes as text: `12 landed, 1 crashed`."""
+    return ", ".join(f"{count} {name}" for name, count in outcomes(rows).items())
+
+
+def to_json(data: Any) -> str:
+    """Format plain data for files and scripts; raises ValueError for NaN."""
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
+def write_csv(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
+    """Write one line per row; the first row names the columns, an unknown value is empty."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer: csv.DictWriter[str] | None = None
+        for row in rows:
+            if writer is None:
+                writer = csv.DictWriter(file, list(row))
+                writer.writeheader()
+            writer.writerow(row)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that a campaign's results depend on."""
+    from companion.recorder.versions import versions as of_flight
+
+    found = of_flight()
+    for package in ("mujoco", "joblib", "distributed"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[package] = importlib.metadata.version(package)
+    return found

@@ -1,0 +1,101 @@
+"""Flies the flights of a campaign over the cores of this machine (joblib) or over the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from typing import Any
+
+from companion.sitl_config.loader import SitlConfig
+
+SCHEDULER_TIMEOUT_S = 10.0
+WORKERS_TIMEOUT_S = 30.0
+
+Data = dict[str, Any]
+Fly = Callable[[SitlConfig, Data], Data]
+"""Flies one flight of a job and returns its `row`, and a `series` if it has one; a function of a module, so that workers find it."""
+
+
+class CampaignError(Exception):
+    """The campaign cannot go on. The text is one line for the user."""
+
+    def __init__(self, text: str, *, bad_input: bool = False) -> None:
+        super().__init__(text)
+        self.bad_input = bad_input
+        """Whether the user's input is the cause; then nothing was flown."""
+
+
+def fly_all(
+    fly: Fly, configs: Sequence[SitlConfig], flights: Sequence[Data], jobs: int | None, scheduler: str | None
+) -> Generator[Data, None, None]:
+    """Fly all flights; yield results with their `index` and `wall_s` in the order in which the flights end.
+
+    Raises:
+        CampaignError: there is no scheduler or no worker, or a worker died.
+    """
+    texts = [config.model_dump_json() for config in configs]
+    tasks = [(fly, index, texts[flight["variant"]], flight) for index, flight in enumerate(flights)]
+    if scheduler is not None:
+        return _over_machines(tasks, scheduler)
+    return _over_cores(tasks, jobs or os.cpu_count() or 1)
+
+
+def _fly(fly: Fly, index: int, config_json: str, flight: Data) -> Data:
+    begin_s = time.perf_counter()
+    result = fly(SitlConfig.model_validate_json(config_json), flight)
+    return {"index": index, **result, "wall_s": time.perf_counter() - begin_s}
+
+
+def _over_cores(tasks: Sequence[tuple[Fly, int, str, Data]], jobs: int) -> Generator[Data, None, None]:
+    from joblib import Parallel, delayed, parallel_config
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    jobs = min(jobs, len(tasks))
+    if jobs <= 1:
+        yield from (_fly(*task) for task in tasks)
+        return
+    with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
+        try:
+            yield from Parallel(return_as="generator_unordered", batch_size=1)(delayed(_fly)(*task) for task in tasks)
+        except TerminatedWorkerError:
+            raise CampaignError(
+                "a worker process died (killed, or out of memory?); fewer --jobs need less memory"
+            ) from None
+
+
+def _over_machines(tasks: Sequence[tuple[Fly, int, str, Data]], scheduler: str) -> Generator[Data, None, None]:
+    try:
+        from distributed import Client, as_completed
+        from distributed.scheduler import KilledWorker
+    except ImportError:
+        raise CampaignError("--scheduler needs Dask: pip install 'companion[cluster]'", bad_input=True) from None
+    try:
+        client = Client(scheduler, timeout=SCHEDULER_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        raise CampaignError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there ({_first_line(error)})", bad_input=True
+        ) from None
+    with closing(client):
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
+        except TimeoutError:
+            raise CampaignError(
+                f"--scheduler {scheduler}: no worker has joined it; start some: dask worker {scheduler}", bad_input=True
+            ) from None
+        futures = [client.submit(_fly, *task, pure=False) for task in tasks]
+        try:
+            for _, result in as_completed(futures, with_results=True):
+                yield result
+        except KilledWorker:
+            raise CampaignError(f"--scheduler {scheduler}: its workers die again and again; see their logs") from None
+        except ImportError as error:
+            raise CampaignError(
+                f"--scheduler {scheduler}: a worker lacks the program ({error}); install companion[sitl,cluster] there"
+            ) from None
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__

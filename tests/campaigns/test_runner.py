@@ -1,0 +1,235 @@
+"""The runner of all campaigns: files, output and exit codes, with flights that are made up."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.campaigns.compare.aggregate import flat
+from companion.campaigns.process import CampaignError
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
+from tests.campaigns.made_up import compare_row, draw_row, fault_row, fly_made_up
+from tests.support import CATCH, HOVER, run_here
+
+EVIL = "<script>alert('$x$')</script>"
+T_S = [0.02 * k for k in range(50)]
+SERIES: dict[str, Any] = {
+    "t_s": T_S, "e_p_m": T_S, "e_q_deg": T_S, "alpha_deg": [T_S, T_S], "alpha_reference_deg": [T_S, [None] * 50], "catch_t_s": 0.4,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+class Page(HTMLParser):
+    """Rejects tags that are not closed in their order; collects text, tags and pictures."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.text = ""
+        self.pictures: list[bytes] = []
+        self.feed(path.read_text(encoding="utf-8"))
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        if tag == "img":
+            source = dict(attrs)["src"] or ""
+            self.pictures.append(base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True))
+        if tag not in ("img", "meta", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+COMPARE = ("compare", "--mission", str(CATCH), "--payloads", "0.2", "--controllers", "adaptive", "--out", "out")
+
+
+def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def row(flight: dict[str, Any]) -> dict[str, Any]:
+        return compare_row(flight, None if flight["preset"] == "paper" else 0.05, error=EVIL)
+
+    fly_made_up(monkeypatch, row, series=SERIES)
+    ended = run_here(*COMPARE, "--seeds", "2", "--first-seed", "7", "--json")
+    assert (ended.code, ended.err) == (EXIT_OK, ""), "a crash is a result"
+    table = json.loads(ended.out)
+    assert list(table) == ["rows", "aggregate"]
+    assert [(r["preset"], r["seed"]) for r in table["rows"]] == [
+        (preset, seed) for preset in ("paper", "recommended") for seed in (7, 8)
+    ]
+    whole = json.loads(Path("out/compare.json").read_text(encoding="utf-8"))
+    assert {key: whole[key] for key in table} == table
+    assert whole["settings"]["payloads_kg"] == [0.2] and whole["settings"]["seeds"] == [7, 8]
+    assert {"companion", "python", "numpy", "mujoco"} <= set(whole["versions"])
+    with open("out/compare.csv", newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    assert lines == [{key: "" if v is None else str(v) for key, v in flat(row)} for row in table["rows"]]
+    pictures = {"errors.png", "tracking_0.2kg.png"}
+    assert {path.name for path in Path("out").iterdir()} == {"compare.json", "compare.csv", "compare.html"} | pictures
+    page = Page(Path("out/compare.html"))
+    assert sorted(page.pictures) == sorted(Path("out", name).read_bytes() for name in pictures)
+    assert all(picture.startswith(b"\x89PNG") for picture in page.pictures)
+    for wanted in ("0.0500±.0000", "0.1654", "crashed 2 of 2", "adaptive/paper"):
+        assert wanted in page.text
+    assert EVIL in page.text and "script" not in page.tags
+
+
+def test_the_terminal_shows_tables_and_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.campaigns.compare.plots.write_png", lambda figure, path: path.write_bytes(b"drawn"))
+    fly_made_up(monkeypatch, lambda flight: compare_row(flight, None))
+    ended = run_here(*COMPARE, "--seeds", "1")
+    line = next(line for line in ended.out.splitlines() if "adaptive/paper" in line)
+    assert re.search(r"0\.0906 .*crashed 1 of 1 +0\.1654", line)
+    assert ended.out.endswith("report  out/compare.html\n")
+
+
+def test_a_campaign_that_breaks_off_keeps_what_was_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    error = CampaignError("a worker process died")
+    fly_made_up(monkeypatch, lambda flight: fault_row(flight) if flight["size"] != 85.0 else None, error)
+    ended = run_here("faults", str(CATCH), "--kinds", "servo_hot", "--phases", "line", "--out", "out", "--json")
+    assert ended.code == EXIT_LOST
+    assert ended.err_lines == [
+        "companion faults: a worker process died",
+        "companion faults: 1 of 2 flights were flown",
+    ]
+    assert [row["size"] for row in json.loads(ended.out)["rows"]] == [70.0]
+    assert json.loads(Path("out/faults.json").read_text())["notes"] == [
+        "a worker process died", "1 of 2 flights were flown"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(CampaignError("no such phase", bad_input=True), EXIT_BAD_INPUT), (CampaignError("died"), EXIT_LOST), (None, EXIT_ABORTED)],
+)  # fmt: skip
+def test_a_campaign_without_a_flight_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, error: CampaignError | None, code: int, tmp_path: Path
+) -> None:
+    fly_made_up(monkeypatch, lambda flight: None, error)
+    ended = run_here("faults", str(CATCH), "--kinds", "gust", "--phases", "line")
+    assert ended.code == code
+    assert ended.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bad_flight_with_a_fault_is_shown_and_is_exit_code_5(monkeypatch: pytest.MonkeyPatch) -> None:
+    def row(flight: dict[str, Any]) -> dict[str, Any]:
+        bad = flight["phase"] == "return"
+        return fault_row(flight, outcome="crashed", problems=["crashed"], error=EVIL) if bad else fault_row(flight)
+
+    fly_made_up(monkeypatch, row)
+    words = ("faults", str(CATCH), "--kinds", "tether_cut", "--phases", "line,return", "--out", "out")
+    ended = run_here(*words)
+    assert ended.code == EXIT_LOST
+    assert f"tether_cut in return: crashed; {EVIL}" in ended.out
+    found = json.loads(Path("out/faults.json").read_text())
+    assert (found["summary"]["bad"], found["summary"]["outcomes"]) == (1, {"landed": 1, "crashed": 1})
+    with open("out/faults.csv", encoding="utf-8") as file:
+        assert [(line["outcome"], line["problems"]) for line in csv.DictReader(file)] == [
+            ("landed", ""), ("crashed", "crashed")
+        ]  # fmt: skip
+    page = Page(Path("out/faults.html"))
+    assert "1 of 2 flights did what no flight may do." in page.text
+    assert page.tags.count("tr") == (1 + 1) + (1 + 2), "the bad one, then both"
+    assert "script" not in page.tags
+
+
+def test_draws_are_written_as_table_and_cases_and_a_crash_is_exit_code_5(monkeypatch: pytest.MonkeyPatch) -> None:
+    def row(flight: dict[str, Any]) -> dict[str, Any]:
+        n = flight["number"]
+        return draw_row(n, *((None, "crashed") if n == 14 else (0.01 + 0.001 * n,)), payload_kg=0.1 + 0.01 * n)
+
+    fly_made_up(monkeypatch, row)
+    ended = run_here("robustness", str(CATCH), "--draws", "12", "--first", "3", "--out", "out", "--keep", "kept.yaml")
+    assert ended.code == EXIT_LOST
+    assert "12 worlds: 11 completed, 1 crashed; 12 caught, 0 missed the net" in ended.out
+    assert "payload, kg +1.00" in ended.out
+    assert "companion fly" in ended.out and " 'world.faults=[{kind: force_loss, t_s: 7.25}]'" in ended.out
+    names = {"draws.csv", "robustness.json", "robustness.html", "worst.yaml", "distribution.png"}
+    assert {path.name for path in Path("out").iterdir()} == names
+    assert Path("kept.yaml").read_text().count("- name:") == 10
+    assert "The worst of draws 3 to 14, seed 1." in Path("out/worst.yaml").read_text()
+    with open("out/draws.csv", newline="", encoding="utf-8") as file:
+        read = list(csv.DictReader(file))
+    assert len(read) == 12
+    assert float(read[3]["payload_kg"]) == pytest.approx(0.16)
+    assert float(read[3]["throw_from_deg"]) == pytest.approx(173.48, abs=0.01)
+    assert (read[11]["outcome"], read[11]["e_p_m"], read[11]["events"]) == ("crashed", "", "takeoff touchdown")
+    page = Page(Path("out/robustness.html"))
+    assert page.pictures == [Path("out/distribution.png").read_bytes()]
+    assert "1 flights crashed or were lost." in page.text
+    summary = json.loads(Path("out/robustness.json").read_text())["summary"]
+    assert summary["thirds"][0]["flights"] == 4 and set(summary["thirds"][0]["e_p_m"]) == {"p50", "p90", "max"}
+
+
+CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("compare", "--controllers", "foo"), r"^companion compare: --controllers foo: no such controller; available: adaptive"),
+        (("compare", "--presets", "foo"), r"^companion compare: --presets foo: no such preset"),
+        (("compare", "--payloads", "0.1,x"), r"^companion compare: .*--payloads: .*kg.*'0\.1,x'"),
+        (("compare", "--payloads", "nan"), r"^companion compare: .*--payloads"),
+        (("compare", "--seeds", "0"), r"^companion compare: .*--seeds: .*from 1"),
+        (("compare", "--jobs", "-1"), r"^companion compare: .*--jobs"),
+        (("compare", "--set", "world.seed=2"), r"^companion compare: --set world\.seed: .*--seeds"),
+        (("compare", "--set", "controller.rho_maxx=2"), r"^--set controller\.rho_maxx: unknown key"),
+        (("compare", "--mission", "nofile.yaml"), r"^nofile\.yaml: no such file$"),
+        (("compare", "--out", ""), r"^companion compare: --out .*empty"),
+        (("compare", "--out", "taken"), r"^companion compare: --out taken: there is a compare\.json already"),
+        (("faults", "--kinds", "mocap_los"), r"there is no kind of fault 'mocap_los'; did you mean 'mocap_loss'\?"),
+        (("faults", "--phases", "lunch"), r"there is no phase 'lunch'"),
+        (("faults", "--set", "world.faults=[]"), r"the campaign sets it; use --kinds and --phases"),
+        (("faults", "--wires", "--kinds", "gust"), r"with --wires there is no gust in phase any to be flown"),
+        (("robustness", "--case", "heavy"), r"--case needs --cases FILE"),
+        (("robustness", "--cases", "nowhere.yaml"), r"nowhere\.yaml: no such file"),
+        (("robustness", "--cases", "empty.yaml"), r"empty\.yaml: cases: expected at least one case"),
+        (("robustness", "--draws", "0"), r"expected a number from 1 to 10000"),
+        (("robustness", "--set", "world.wind=3"), r"wind"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_nothing_flies(tmp_path: Path, words: tuple[str, ...], why: str) -> None:
+    Path("taken").mkdir()
+    Path("taken/compare.json").write_text("{}", encoding="utf-8")
+    Path("empty.yaml").write_text(CASES, encoding="utf-8")
+    before = sorted(tmp_path.rglob("*"))
+    mission = ("--mission", str(CATCH)) if words[0] == "compare" else () if "--cases" in words else (str(CATCH),)
+    ended = run_here(words[0], *mission, *words[1:])
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1 and re.search(why, ended.err), ended.err
+    assert ended.out == ""
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("robustness",), "mission 'hover' never flies in the direction of +x"),
+        (("faults", "--kinds", "gust", "--phases", "return"), "mission 'hover' has no return"),
+    ],
+)
+def test_a_mission_that_cannot_be_flown_so_is_refused_by_the_campaign(
+    tmp_path: Path, words: tuple[str, ...], why: str
+) -> None:
+    ended = run_here(words[0], str(HOVER), *words[1:])
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1 and why in ended.err
+    assert not any(tmp_path.iterdir())
