@@ -38,8 +38,8 @@ from tests.support import DEADLINE_S
 
 START_M = (-0.2, 0.0)
 OFFBOARD = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-STREAM_S, MODE_S, ARM_S, UP_S = 0.3, 1.0, 1.1, 1.4
-END_STEPS = 1800
+STREAM_S, MODE_S, ARM_S, UP_S = 0.3, 0.5, 0.6, 0.75
+END_STEPS = 1500
 """Steps of the physics in which all is over, the catch included."""
 PERIOD_STEPS = 5
 _LAST_BYTES_S = 0.05

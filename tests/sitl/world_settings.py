@@ -1,7 +1,7 @@
-"""Every knob of `world.*`, found in the pydantic models: a pair of worlds that differ in this knob alone.
+"""Every setting of `world.*`, found in the pydantic models: a pair of worlds that differ in this setting alone.
 
-A new knob is walked without a word here if its type says what else it may be. A knob whose other values cannot be guessed, or that
-acts only together with another, has an entry in `VALUES` or `TOGETHER`; without one the walk fails and names the knob.
+A new setting needs no entry here if its type says what other values it takes. A setting whose other values cannot be guessed, or that
+acts only together with another, needs an entry in `VALUES` or `TOGETHER`; without one the test fails and names the setting.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ Settings = dict[str, Any]
 
 
 class Pair(NamedTuple):
-    """Two worlds that differ in one knob."""
+    """Two worlds that differ in one setting."""
 
-    knob: str
+    setting: str
     usual: Settings
     changed: Settings
+    acts: int = 0
+    """When it acts at the earliest: 0 from the start, 1 with turning rotors, 2 late in a flight."""
 
 
 EXAMPLES: dict[type[Model], Settings] = {
@@ -52,7 +54,7 @@ VALUES: dict[str, Any] = {
     "faults.size": 3.0,
     "faults.after": "start",
 }
-"""Other values of knobs whose type or default does not say enough."""
+"""Other values of settings whose type or default does not say enough."""
 
 _HANDLED: Settings = {"hand": True, "hand_t_s": 0.0}
 _HANDLED_FOR_LONG: Settings = {**_HANDLED, "px4_params": {"EKF2_EV_CTRL": 0}}
@@ -62,19 +64,22 @@ TOGETHER: dict[str, Settings] = {
     "hand_t_s": _HANDLED,
     "hand_taps": _HANDLED_FOR_LONG,
     "hand_tap_n": {**_HANDLED_FOR_LONG, "hand_taps": 3},
-    "net_weight_kg": {"net_weight_t_s": 1.0},
-    "net_weight_t_s": {"net_weight_kg": 0.5, "net_weight_t_s": 1.0},
+    "net_weight_kg": {"net_weight_t_s": 0.4},
+    "net_weight_t_s": {"net_weight_kg": 0.5, "net_weight_t_s": 0.4},
     "accel_vibration_hz": {"accel_vibration_m_s2": 5.0},
     "keep_s": {"throws": 2, "keep_s": 0.2},
     "throws": {"keep_s": 0.2},
 }
-"""What else is set, in both worlds, so that the knob acts early in a flight."""
+"""What else is set, in both worlds, so that the setting acts early in a flight."""
 
 TOGETHER_IN_PART: dict[str, Settings] = {
     "faults.phase": {"t_s": None, "phase": "line"},
     "faults.servo": {"kind": "servo_overload"},
 }
 """The same for a field of a part: the part's other fields."""
+
+ACTS_LATE = frozenset({"throws", "keep_s", "hand_taps", "hand_tap_n", "faults.phase"})
+"""Settings that act late in a flight."""
 
 _NEVER = {"kind": "gust", "t_s": 1000.0}
 BESIDE: dict[str, Settings] = {"tether_cut": {"kind": "tether_taut", "t_s": 0.0, "size": 0.02}}
@@ -86,7 +91,7 @@ SIZES: dict[str, float] = {"payload_missed": 0.0, "autopilot_reboot": 0.1}
 
 
 def pairs() -> Iterator[Pair]:
-    """Return a pair for each knob, for each component of a vector, and for each field of each part."""
+    """Return a pair for each setting, for each component of a vector, and for each field of each part."""
     for name, field in World.model_fields.items():
         parts = [part for part in _models(field.annotation) if part in EXAMPLES]
         unknown = [part for part in _models(field.annotation) if part not in EXAMPLES]
@@ -96,20 +101,25 @@ def pairs() -> Iterator[Pair]:
         if not parts:
             together = TOGETHER.get(name, {})
             for number, changed in _changes(name, field, together, World):
-                yield Pair(name + number, together, {**together, **changed})
+                yield Pair(name + number, together, {**together, **changed}, _acts(name))
 
 
 def fault_pairs() -> Iterator[Pair]:
     """Return a pair for each kind of fault that may begin, and one for each kind that has a size."""
     for kind, about in KINDS.items():
         after = "catch" if kind.startswith("payload_") else "arming" if kind in IN_THE_AIR else "start"
+        acts = ("start", "arming", "catch").index(after)
         fault = {"kind": kind, "t_s": 0.1, "after": after}
         if kind not in ("payload_missed", "payload_heavy"):  # those act from the start, whatever t_s says
             with_it = BESIDE.get(kind, _NEVER)
-            yield Pair(f"faults.kind {kind}", {"faults": [with_it]}, {"faults": [with_it, fault]})
+            yield Pair(f"faults.kind {kind}", {"faults": [with_it]}, {"faults": [with_it, fault]}, acts)
         if about.default is not None and kind != "pilot_takeover":
             other = {**fault, "size": SIZES.get(kind, 0.5 * about.default)}
-            yield Pair(f"faults.size {kind}", {"faults": [fault]}, {"faults": [other]})
+            yield Pair(f"faults.size {kind}", {"faults": [fault]}, {"faults": [other]}, acts)
+
+
+def _acts(setting: str) -> int:
+    return 2 if setting in ACTS_LATE else 0
 
 
 def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
@@ -126,6 +136,7 @@ def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
                     path + number + suffix,
                     {name: _placed(field, part, usual, place)},
                     {name: _placed(field, part, {**usual, **changed}, place)},
+                    _acts(path),
                 )
 
 
@@ -164,7 +175,9 @@ def _accepted(
         except ValidationError:
             continue
         return whole
-    raise AssertionError(f"world.{path}: say in tests/sitl/knobs.py, VALUES, what else it may be than {value!r}")
+    raise AssertionError(
+        f"world.{path}: say in tests/sitl/world_settings.py, VALUES, what else it may be than {value!r}"
+    )
 
 
 def _others(value: Any, annotation: Any) -> list[Any]:
