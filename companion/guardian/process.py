@@ -232,7 +232,7 @@ class Guardian:
         try:
             beside = not self._flight.wait(0.0)
             if beside and not is_udp(address):
-                raise OSError(errno.EBUSY, "the killed flight process still holds the device")
+                raise OSError(errno.EBUSY, "the killed flight process still holds the link")
             wire = open_wire(address, last.local_port, last.peer, beside=beside)
         except OSError as error:
             self._report_no_link(last, error.strerror or str(error))

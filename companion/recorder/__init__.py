@@ -1,1 +1,1 @@
-"""The inside of the recorder process: disk, log, channel."""
+"""The recorder process: writes the flight's log and holds its telemetry session."""

@@ -11,18 +11,18 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 FLUSH_PERIOD_S = 0.4
-"""A chunk is closed so often: what a recorder that is killed itself loses. Not much more often: the writer keeps 180 bytes of each
-for the index at the end of the file, and with chunks of 16 kB it grew by 30 MB in an hour.
+"""Period at which a chunk is closed; the data since then is lost if the recorder itself is killed. A shorter period is costly: the
+index at the end of the file takes 180 bytes per chunk, and with chunks of 16 kB it grew by 30 MB in an hour.
 """
 _QUEUE_PACKETS = 8192
 _RECEIVE_BYTES = 2**20
 
 
 class Channel:
-    """Reads the flight's packets in a thread of its own, so that a slow disk does not fill the socket.
+    """Reads the flight's packets in its own thread, so that a slow disk does not fill the socket.
 
     Attributes:
-        copy_to: if set, given every packet as soon as it is read; must not wait and not raise.
+        copy_to: called with every packet as soon as it is read, if set; must neither wait nor raise.
     """
 
     def __init__(self, channel: socket.socket) -> None:
@@ -32,11 +32,11 @@ class Channel:
         self._thread = threading.Thread(target=self._read, name="channel", daemon=True)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start reading."""
         self._thread.start()
 
     def packets(self) -> Iterator[bytes | None]:
-        """Packets in order; None when none came for a flush period; ends with the channel."""
+        """Yield packets in order, and None when none arrived for a flush period; ends with the channel."""
         while True:
             try:
                 packet = self._packets.get(timeout=FLUSH_PERIOD_S)
@@ -48,12 +48,12 @@ class Channel:
             yield packet
 
     def stop(self) -> None:
-        """Read what the socket still holds and end."""
+        """Read what the socket still holds, then end."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RD)
 
-    def say(self, message: dict[str, Any]) -> bool:
-        """Let the flight know; never waits. False: it is gone, or has not listened for long."""
+    def send(self, message: dict[str, Any]) -> bool:
+        """Send a message to the flight process; never waits. Return False if the process is gone or does not read."""
         try:
             self._socket.send(json.dumps(message).encode(), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
         except OSError:
@@ -61,7 +61,7 @@ class Channel:
         return True
 
     def inject(self, packet: bytes) -> bool:
-        """A packet of this process, as if the flight had sent it; never waits. False: no room for it."""
+        """Queue a packet of this process as if the flight had sent it; never waits. Return False if the queue is full."""
         try:
             self._packets.put_nowait(packet)
         except queue.Full:
@@ -73,7 +73,7 @@ class Channel:
             try:
                 packet = self._socket.recv(_RECEIVE_BYTES)
             except ConnectionResetError:
-                continue  # the flight died with a word of ours unread; its packets are still there
+                continue  # the flight process died before it read a message; its packets are still there
             except OSError:
                 packet = b""
             if packet and self.copy_to is not None:

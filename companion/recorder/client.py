@@ -1,10 +1,10 @@
-"""The flight process's side of the recorder: a bounded channel that never waits, and the recorder process's life.
+"""The flight process's side of the recorder: a bounded channel that never waits, and the recorder process's life cycle.
 
-On the same channel the recorder tells what it hears: that the disk is full, commands from the ground, how its telemetry is.
+The recorder answers on the same channel: a full disk, commands from the ground, the state of its telemetry.
 
-The channel is a Unix SOCK_SEQPACKET pair; packets are `marshal` data of one interpreter (`companion.model.codec`). When it is full the
-packet is dropped and counted. When the recorder is dead everything is counted as dropped and the flight goes on. When the flight
-is killed, what it had sent is still in the socket: the recorder writes it, closes the log and exits.
+The channel is a Unix SOCK_SEQPACKET pair; packets are `marshal` data of one interpreter (`companion.model.codec`). If the channel is
+full the packet is dropped and counted. If the recorder is dead every packet is counted as dropped and the flight goes on. If the
+flight process is killed, its packets are still in the socket: the recorder writes them, closes the log and exits.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from companion.model.types import GroundCommand, Inputs, OperatorCommand, Output
 from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK
 
 _BUFFER_BYTES = 8 * 2**20
-_HEARD_MAX_BYTES = 4096
-_HEARD_PER_TICK = 16
-"""More at once waits for the next tick."""
+_MESSAGE_MAX_BYTES = 4096
+_MESSAGES_PER_TICK = 16
+"""Further messages are read in the next tick."""
 _COMMANDS = {command.value: command for command in OperatorCommand if command is not OperatorCommand.NONE}
 _SO_SNDBUFFORCE = 32
 
 
 class RecorderClient:
-    """Sends ticks, texts and metadata to the recorder; no call waits or raises because of it.
+    """Sends ticks, texts and metadata to the recorder; no call waits, and none raises when the recorder fails.
 
     Attributes:
-        samples: ticks handed over.
-        dropped: packets that did not fit into the channel or found no recorder.
-        error: why recording stopped, in the recorder's words (a full disk, a dead recorder), or None.
-        ground: how its telemetry is, in the recorder's words (`connected to mqtt://...`), or None: it has not said.
+        samples: ticks sent.
+        dropped: packets that did not fit into the channel, or found no recorder.
+        error: why recording stopped (a full disk, a dead recorder), or None.
+        telemetry_status: state of the telemetry (`connected to mqtt://...`), or None if the recorder has not reported it.
     """
 
     def __init__(self, channel: socket.socket | int) -> None:
@@ -54,27 +54,27 @@ class RecorderClient:
         self.samples = 0
         self.dropped = 0
         self.error: str | None = None
-        self.ground: str | None = None
+        self.telemetry_status: str | None = None
         self._commands: list[GroundCommand] = []
 
     def record(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> bool:
-        """Hand one tick over, and hear what the recorder has to say. False: the tick was dropped (and counted)."""
+        """Send one tick, then read the recorder's messages. Return False if the tick was dropped (and counted)."""
         taken = self._send((TICK, self._offered, plain(inputs), plain(outputs), plain(sent)))
         self.samples += taken
         try:
-            heard = self._socket.recv(_HEARD_MAX_BYTES)
-        except OSError:  # nothing, nearly always; or nobody, which sending finds out
+            data = self._socket.recv(_MESSAGE_MAX_BYTES)
+        except OSError:  # usually no message; a dead recorder is detected by sending
             return taken
-        self._hear(heard)
+        self._read_messages(data)
         return taken
 
     @property
     def gone(self) -> bool:
-        """There is no recorder process any more."""
+        """Whether the recorder process has ended."""
         return self._dead
 
     def take_commands(self) -> list[GroundCommand]:
-        """Commands that have come since the last call, in their order: signed, fresh, for this flight, all of it verified."""
+        """Return the commands since the last call, in order. The recorder has verified each: signature, age, session and nonce."""
         commands = self._commands
         if commands:
             self._commands = []
@@ -91,32 +91,32 @@ class RecorderClient:
         phase: str,
         action: SafetyAction,
     ) -> bool:
-        """What came of a command.
+        """Send the result of a command.
 
         Args:
-            nonce, operator, command: of the command, as `take_commands` gave it.
-            accepted: it did something, or what it asks for is done already.
+            nonce, operator, command: of the command, as `take_commands` returned it.
+            accepted: the command took effect, or its effect was already there.
             text: what was done, or why nothing was.
-            t_s: flight clock of the tick in which it was judged.
+            t_s: flight clock of the tick that handled it.
             phase, action: of that tick's `Outputs`.
         """
         what = (nonce, operator, command.value, accepted, text, t_s, phase, action.value)
         return self._send((ACK, self._offered, *what))
 
     def text(self, t_s: float, severity: Severity, source: str, text: str) -> bool:
-        """A line for people in the log's `/log` channel; `t_s` on the flight clock."""
+        """Write a line to the log's `/log` channel; `t_s` is the flight clock."""
         return self._send((TEXT, self._offered, t_s, severity.value, source, text))
 
     def metadata(self, name: str, values: Mapping[str, str]) -> bool:
-        """A metadata record for what becomes known only during the flight (autopilot version, parameters, ...)."""
+        """Write a metadata record that becomes known only during the flight (autopilot version, parameters, ...)."""
         return self._send((METADATA, self._offered, name, dict(values)))
 
     def fileno(self) -> int:
-        """The socket, for those who may wait until it is writable (a flight may not)."""
+        """Return the socket's descriptor, for callers that may wait until it is writable (the flight may not)."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """End of the log: the recorder writes what is under way and closes the file."""
+        """End the log: the recorder writes the packets that it has received and closes the file."""
         if not self._dead:
             self._send((CLOSE, self._offered))
         self._dead = True
@@ -130,29 +130,29 @@ class RecorderClient:
                 return True
             except BlockingIOError:
                 pass  # full
-            except ValueError as error:  # marshal: a value that is no plain data
+            except ValueError as error:  # marshal: a value that is not plain data
                 self.error = f"recorder: a record could not be packed: {error}"
             except OSError as error:
                 if isinstance(error, (BrokenPipeError, ConnectionError)):
                     self._dead = True
-                    self.error = self.error or "recorder: the recorder process is gone; nothing more is recorded"
+                    self.error = self.error or "recorder: the recorder process has ended; nothing more is recorded"
         self.dropped += 1
         return False
 
-    def _hear(self, heard: bytes) -> None:
-        """A message, and those right behind it; no bytes: the end."""
-        left = _HEARD_PER_TICK
+    def _read_messages(self, data: bytes) -> None:
+        """Handle a message and those right behind it; empty bytes mean the end of the channel."""
+        left = _MESSAGES_PER_TICK
         with contextlib.suppress(OSError):
-            while heard:
-                self._take(heard)
+            while data:
+                self._handle(data)
                 left -= 1
                 if not left:
                     return
-                heard = self._socket.recv(_HEARD_MAX_BYTES)
+                data = self._socket.recv(_MESSAGE_MAX_BYTES)
 
-    def _take(self, heard: bytes) -> None:
+    def _handle(self, data: bytes) -> None:
         try:
-            message = json.loads(heard)
+            message = json.loads(data)
         except (ValueError, RecursionError):
             return
         match message:
@@ -163,29 +163,29 @@ class RecorderClient:
             ):
                 self._commands.append(GroundCommand(_COMMANDS[name], operator, nonce, hold))
             case {"ground": str(text)}:
-                self.ground = text
+                self.telemetry_status = text
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderReport:
-    """What the recorder says at its end."""
+    """Final report of the recorder."""
 
     samples: int
     """Ticks in the log."""
     dropped: int
-    """Packets that were offered and are not in the log."""
+    """Packets that were sent and are not in the log."""
     error: str | None
 
 
 class RecorderProcess:
-    """A running recorder process and the client that feeds it.
+    """A running recorder process and its client.
 
     Args of `start`:
-        path: the log to write; must not exist yet.
-        config_json: effective configuration, stored as it is.
+        path: the log to write; must not exist.
+        config_json: effective configuration, stored unchanged.
         epoch_offset_ns: wall clock (ns since 1970) at zero of the flight clock; see `epoch_offset_ns`.
-        metadata: more key-value pairs for the log's `flight` metadata record (controller, mission, ...).
-        simulated: the devices are those of the simulated world; ground stations are told.
+        metadata: further key-value pairs of the log's `flight` metadata record (controller, mission, ...).
+        simulated: the devices are those of the simulated world; ground stations show that.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], client: RecorderClient, path: Path) -> None:
@@ -206,7 +206,7 @@ class RecorderProcess:
         simulated: bool = False,
         deadline_s: float = 15.0,
     ) -> RecorderProcess:
-        """Start it and wait until the log is open. Blocks for some 0.3 s: not for the control tick.
+        """Start the process and wait until the log is open. Blocks for about 0.3 s: not for the control tick.
 
         Raises:
             DeviceError: the log cannot be opened, or the process is not ready within the deadline.
@@ -243,20 +243,20 @@ class RecorderProcess:
                 reason = (answer or {}).get("error") or f"recorder: {path}: not ready within {deadline_s:g} s"
                 raise DeviceError(str(reason))
         except BaseException:
-            recorder._abandon()
+            recorder._end()
             raise
         return recorder
 
     def finish(self, deadline_s: float = 10.0) -> RecorderReport:
-        """Close the channel and wait for the log to be closed. Blocks: use a thread from asyncio. Never raises; a second
-        call returns the same report.
+        """Close the channel and wait for the log to be closed. Blocks: call in a thread from asyncio. Never raises; a second call
+        returns the same report.
 
-        A recorder that is not done within the deadline is killed; the log then lacks its summary only.
+        A recorder that has not finished at the deadline is killed; the log then lacks only its summary.
         """
         if self._report is None:
             self.client.close()
             answer = self._answer(time.monotonic() + deadline_s)
-            code = self._abandon()
+            code = self._end()
             if answer is None:
                 reason = self.client.error or f"recorder: {self.path}: ended without a report (exit code {code})"
                 self._report = RecorderReport(self.client.samples, self.client.dropped, reason)
@@ -265,7 +265,7 @@ class RecorderProcess:
         return self._report
 
     def _answer(self, deadline_s: float) -> dict[str, Any] | None:
-        """The next JSON line of the process; None if it ended or the deadline passed without one."""
+        """Return the next JSON line of the process, or None if it ended or the deadline passed."""
         assert self.process.stdout is not None
         fd = self.process.stdout.fileno()
         while b"\n" not in self._output:
@@ -283,8 +283,8 @@ class RecorderProcess:
             return None
         return answer if isinstance(answer, dict) else None
 
-    def _abandon(self) -> int:
-        """Make sure that the process is gone; its exit code."""
+    def _end(self) -> int:
+        """Make sure that the process has ended; return its exit code."""
         self.client.close()
         try:
             code = self.process.wait(2.0)
@@ -297,12 +297,12 @@ class RecorderProcess:
 
 
 def epoch_offset_ns(flight_clock_s: float) -> int:
-    """Wall clock (ns since 1970) at zero of a flight clock that reads `flight_clock_s` now."""
+    """Return the wall clock (ns since 1970) at zero of a flight clock that reads `flight_clock_s` now."""
     return time.time_ns() - round(flight_clock_s * 1e9)
 
 
 def _enlarge(channel: socket.socket) -> None:
-    """Ask for a send buffer of some seconds; the kernel caps it for users without CAP_NET_ADMIN."""
+    """Request a send buffer for some seconds of ticks; the kernel limits it for users without CAP_NET_ADMIN."""
     try:
         channel.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, _BUFFER_BYTES)
     except OSError:

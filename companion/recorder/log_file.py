@@ -1,4 +1,4 @@
-"""The log file under the MCAP writer."""
+"""The log file below the MCAP writer."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import os
 from pathlib import Path
 
 
-class Disk:
-    """The log file under the MCAP writer: appends whole pieces, and after the first failure swallows everything.
+class LogFile:
+    """File object for the MCAP writer: appends whole pieces, and discards everything after the first failure.
 
-    On a failure the file is cut back to where it was whole the last time (`commit`), so that it stays readable.
+    On a failure the file is truncated to the last complete log (`commit`), so that it stays readable.
     """
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self._path = path
-        self._whole_bytes = 0
-        self._told_bytes = 0
+        self._committed_bytes = 0
+        self._position_bytes = 0
         self.error: str | None = None
 
     def write(self, data: bytes | bytearray) -> int:
-        """Append all of it, or note the error; says that it is written either way."""
-        self._told_bytes += len(data)
+        """Append all data, or record the error; return the length in both cases."""
+        self._position_bytes += len(data)
         if self.error is None:
             rest = memoryview(data)
             try:
@@ -33,21 +33,25 @@ class Disk:
         return len(data)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Only tells the position: the writer is asked not to seek."""
-        if (offset, whence) not in ((0, os.SEEK_CUR), (self._told_bytes, os.SEEK_SET)):
+        """Return the position; the writer is configured not to seek.
+
+        Raises:
+            OSError: a seek to any other position was requested.
+        """
+        if (offset, whence) not in ((0, os.SEEK_CUR), (self._position_bytes, os.SEEK_SET)):
             raise OSError(f"cannot seek to {offset} ({whence})")
-        return self._told_bytes
+        return self._position_bytes
 
     def flush(self) -> None:
-        """Nothing is buffered here."""
+        """Do nothing: there is no buffer."""
 
     def commit(self) -> None:
-        """What is written so far is a whole log."""
+        """Mark the data so far as a complete log."""
         if self.error is None:
-            self._whole_bytes = self._told_bytes
+            self._committed_bytes = self._position_bytes
 
     def sync(self) -> None:
-        """Bring what is written onto the medium: a fallen vehicle may lose its power."""
+        """Write the data to the medium: a vehicle that crashes may lose its power."""
         if self.error is None:
             try:
                 os.fdatasync(self._fd)
@@ -60,6 +64,6 @@ class Disk:
         os.close(self._fd)
 
     def _fail(self, error: OSError) -> None:
-        self.error = f"recorder: {self._path}: {error.strerror}; the log ends here, the flight goes on without it"
+        self.error = f"recorder: {self._path}: {error.strerror}; the log ends here and the flight continues"
         with contextlib.suppress(OSError):
-            os.ftruncate(self._fd, self._whole_bytes)
+            os.ftruncate(self._fd, self._committed_bytes)

@@ -1,8 +1,8 @@
-"""Packets of the flight process as messages of one MCAP file.
+"""Writes the flight process's packets as messages of one MCAP file.
 
-Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; ``/events``, a message each. For viewers, typed and
-thinned out: those of `companion.recorder.viewer_channels`, and ``/log``. Every message is stamped with the wall clock of its tick: log
-time, publish time and the header's are one.
+Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; ``/events`` with one message per event. Typed
+channels at a lower rate, for viewers: those of `companion.recorder.viewer_channels`, and ``/log``. Every message carries the wall
+clock of its tick as log time, publish time and header stamp.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from foxglove.messages import Log, LogLevel
 from companion.ground.protocol.messages import EventLine
 from companion.model.codec import json_schema, json_text, jsonable_from_plain
 from companion.model.types import Inputs, Outputs, Sent
-from companion.recorder.log_file import Disk
+from companion.recorder.log_file import LogFile
 from companion.recorder.viewer_channels import ViewerChannels, timestamp
 
 _LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}
 _STAMP_MAX_NS = 2**32 * 1_000_000_000 - 1
-"""Seconds of a header's time stamp have 32 bits."""
+"""The seconds of a header's time stamp have 32 bits."""
 
 
 class LogWriter:
-    """Turns packets into messages of one MCAP file.
+    """Converts packets to messages of one MCAP file.
 
     Attributes:
-        viewer_error: why the viewers' messages of a tick were left out, for the first such tick; None: they never were.
+        viewer_error: why the viewer messages of a tick were left out, for the first such tick; None if that never happened.
     """
 
-    def __init__(self, disk: Disk, epoch_offset_ns: int, *, chunk_bytes: int) -> None:
+    def __init__(self, log_file: LogFile, epoch_offset_ns: int, *, chunk_bytes: int) -> None:
         self._epoch_offset_ns = epoch_offset_ns
         self._context = foxglove.Context()
         # Chunks are closed by `flush`, between ticks and not within one.
         options = MCAPWriteOptions(profile="companion", chunk_size=None, disable_seeking=True, compression_threads=0)
         self._chunk_bytes = chunk_bytes
-        self._mcap = foxglove.open_mcap(disk, context=self._context, writer_options=options)
+        self._mcap = foxglove.open_mcap(log_file, context=self._context, writer_options=options)
         self._inputs = self._json_channel("/inputs", Inputs)
         self._outputs = self._json_channel("/outputs", Outputs)
         self._sent = self._json_channel("/sent", Sent)
@@ -51,21 +51,21 @@ class LogWriter:
 
     @property
     def chunk_is_full(self) -> bool:
-        """Time to flush."""
+        """Whether the open chunk should be flushed."""
         return self._unflushed_bytes >= self._chunk_bytes
 
     def tick(self, inputs_plain: Any, outputs_plain: Any, sent_plain: Any) -> None:
-        """One tick: three full-rate messages, its events, and now and then the viewers' messages."""
+        """Write one tick: three full-rate messages, its events, and the viewer messages that are due."""
         inputs = jsonable_from_plain(Inputs, inputs_plain)
         outputs = jsonable_from_plain(Outputs, outputs_plain)
         sent = jsonable_from_plain(Sent, sent_plain)
-        # All texts first: a record that cannot be written leaves no half tick behind.
+        # Encode all records first: one that cannot be encoded must not leave half a tick behind.
         texts = [json_text(record).encode() for record in (inputs, outputs, sent)]
         stamp_ns = self._stamp_ns(inputs["t_s"])
         for channel, text in zip((self._inputs, self._outputs, self._sent), texts, strict=True):
             channel.log(text, log_time=stamp_ns)
             self._unflushed_bytes += len(text)
-        # The tick is recorded; whatever may be wrong with it, it is not to count as lost because of its pictures.
+        # The tick is recorded; an error in its viewer messages must not count it as lost.
         try:
             for event in outputs["events"]:
                 self._event(stamp_ns, outputs["mission_t_s"], event)
@@ -73,14 +73,14 @@ class LogWriter:
         except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
             if self.viewer_error is None:
                 self.viewer_error = f"tick {inputs['tick']}: {type(error).__name__}: {error}"
-                self._line(stamp_ns, "warning", "recorder", f"no viewer messages of {self.viewer_error}")
+                self._line(stamp_ns, "warning", "recorder", f"viewer messages left out: {self.viewer_error}")
 
     def text(self, t_s: float, severity: str, source: str, text: str) -> None:
-        """One line of the `/log` channel."""
+        """Write one line of the `/log` channel."""
         self._line(self._stamp_ns(t_s), severity, source, text)
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """One metadata record. Of `config` and `plan` the viewers' picture is made, as far as it can be."""
+        """Write one metadata record. The viewer scene is built from `config` and `plan`, as far as they are valid."""
         self._mcap.write_metadata(name, values)
         if name in ("config", "plan"):
             try:
@@ -93,13 +93,13 @@ class LogWriter:
                 self._viewers.plan(content)
 
     def flush(self) -> None:
-        """Write the open chunk, if it holds anything."""
+        """Write the open chunk if it holds data."""
         if self._unflushed_bytes:
             self._unflushed_bytes = 0
             self._mcap.flush()
 
     def close(self) -> None:
-        """Write the summary; the file is complete."""
+        """Write the summary, which completes the file."""
         self._mcap.close()
 
     def _json_channel(self, topic: str, cls: type) -> foxglove.Channel:
@@ -119,11 +119,11 @@ class LogWriter:
     def _stamp_ns(self, t_s: float) -> int:
         try:
             stamp_ns = self._epoch_offset_ns + round(t_s * 1e9)
-        except (ValueError, OverflowError):  # not finite: a sick tick is worth recording too
+        except (ValueError, OverflowError):  # not finite: record the tick all the same
             stamp_ns = self._epoch_offset_ns
         return min(max(0, stamp_ns), _STAMP_MAX_NS)
 
 
 def _clean(text: str) -> str:
-    """Text that UTF-8 can hold: what came over a wire may have half characters in it."""
+    """Return text that UTF-8 can encode: text from a device may contain lone surrogates."""
     return text.encode("utf-8", "replace").decode()

@@ -1,13 +1,13 @@
-"""The recorder process: reads ticks from the flight's channel and writes an MCAP log; outlives the flight to close the log.
+"""The recorder process: reads ticks from the flight's channel and writes an MCAP log; outlives the flight process to close the log.
 
-Where the vehicle file names a broker it holds the telemetry session as well: telemetry out, signed commands in
+If the vehicle file names a broker the recorder also holds the telemetry session: telemetry out, signed commands in
 (`companion.recorder.telemetry`).
 
-Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; for viewers, typed and thinned out:
+Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; typed channels at a lower rate, for viewers:
 `companion.recorder.viewer_channels`. Metadata records: ``companion`` (log format, epoch offset, versions), ``config`` (effective
-configuration as JSON), ``flight``, ``plan``, ``preflight`` (given by the caller) and at the end ``recorder`` (counts).
+configuration as JSON), ``flight``, ``plan``, ``preflight`` (from the flight process) and at the end ``recorder`` (counts).
 
-Every chunk of the file holds whole ticks and is appended in one piece: the file can be read up to its last moment even when this
+Every chunk of the file holds whole ticks and is appended in one piece: the file is readable up to its last chunk even if this
 process is killed.
 """
 
@@ -27,29 +27,29 @@ from typing import Any
 from companion.model.codec import fingerprint, unpack_plain
 from companion.model.types import Inputs, Outputs, Sent
 from companion.recorder.channel import FLUSH_PERIOD_S, Channel
-from companion.recorder.log_file import Disk
+from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
-from companion.recorder.telemetry import Telemetry, wanted
+from companion.recorder.telemetry import TelemetryThread, broker_configured
 from companion.recorder.versions import versions
 from companion.runtime.cores import keep_off
 from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK, UNNUMBERED
 
 LOG_FORMAT = "1"
 SYNC_PERIOD_S = 1.0
-FAREWELL_S = 1.5
-"""For telemetry's last words, after the log is closed."""
+TELEMETRY_END_TIMEOUT_S = 1.5
+"""Time for the last telemetry messages after the log is closed."""
 
 
 class Recorder:
-    """The loop: packets to messages, flushes, counts."""
+    """The main loop: writes packets, flushes chunks, counts losses."""
 
-    def __init__(self, channel: Channel, writer: LogWriter, disk: Disk) -> None:
+    def __init__(self, channel: Channel, writer: LogWriter, log_file: LogFile) -> None:
         self._channel = channel
         self._writer = writer
-        self._disk = disk
-        self.telemetry: Telemetry | None = None
+        self._log_file = log_file
+        self.telemetry: TelemetryThread | None = None
         self._expected = 0
-        self._told = False
+        self._error_reported = False
         self._in_chunk = 0
         self._closed = False
         self.samples = 0
@@ -57,13 +57,13 @@ class Recorder:
         self.error: str | None = None
 
     def run(self) -> None:
-        """Until the channel is said to be closed, or ends with the last process that holds it."""
+        """Run until a CLOSE packet arrives, or the last process that holds the channel ends."""
         flushed_s = synced_s = time.monotonic()
         for packet in self._channel.packets():
             if packet is not None:
-                self._take(packet)
+                self._handle(packet)
                 if self._closed:
-                    self._channel.stop()  # the guardian may hold the other end a little longer
+                    self._channel.stop()  # the guardian may keep the other end open a little longer
                     break
             now_s = time.monotonic()
             if now_s - flushed_s >= FLUSH_PERIOD_S or self._writer.chunk_is_full:
@@ -71,27 +71,27 @@ class Recorder:
                 self._flush()
             if now_s - synced_s >= SYNC_PERIOD_S:
                 synced_s = now_s
-                self._disk.sync()
+                self._log_file.sync()
         self._flush()
         if self.telemetry is not None:
             self.telemetry.end(in_order=self._closed)
-        if self._disk.error is None:
-            told = self.telemetry.counts if self.telemetry is not None else {}
-            self._writer.metadata("recorder", {"samples": str(self.samples), "dropped": str(self.dropped), **told})
+        if self._log_file.error is None:
+            counts = self.telemetry.counts if self.telemetry is not None else {}
+            self._writer.metadata("recorder", {"samples": str(self.samples), "dropped": str(self.dropped), **counts})
         self._writer.close()
         self._flush()
 
     def state(self) -> tuple[int, str | None]:
-        """Records lost, and why nothing is recorded any more; for another thread."""
+        """Return the number of lost records, and why recording stopped (or None). Called from another thread."""
         return self.dropped, self.error
 
-    def _take(self, packet: bytes) -> None:
+    def _handle(self, packet: bytes) -> None:
         kind, number, *rest = unpack_plain(packet)
         if number != UNNUMBERED:
             self.dropped += number - self._expected
             self._expected = number + (kind != CLOSE)
         self._closed = kind == CLOSE
-        if self._disk.error is not None:
+        if self._log_file.error is not None:
             self.dropped += kind != CLOSE
             return
         try:
@@ -103,53 +103,53 @@ class Recorder:
             elif kind == METADATA:
                 self._writer.metadata(*rest)
             elif kind == ACK:
-                self._answered(*rest)
+                self._log_ack(*rest)
         except (ValueError, TypeError, LookupError, OverflowError, RuntimeError) as error:
             self.dropped += 1
             self.error = (
                 self.error or f"recorder: packet {number} could not be written: {type(error).__name__}: {error}"
             )
 
-    def _answered(
+    def _log_ack(
         self, nonce: str, operator: str, command: str, accepted: bool, text: str, t_s: float, phase: str, action: str
     ) -> None:
         severity = "info" if accepted else "warning"
         self._writer.text(t_s, severity, "ground", f"{command} of {operator}: {text} ({nonce})")
 
     def _flush(self) -> None:
-        """Close the chunk; only what the disk took counts as recorded."""
+        """Close the chunk; only ticks that reached the disk count as recorded."""
         self._writer.flush()
-        self._disk.commit()
-        if self._disk.error is None:
+        self._log_file.commit()
+        if self._log_file.error is None:
             self.samples += self._in_chunk
         else:
             self.dropped += self._in_chunk
-            if not self._told:
-                self._told = True
-                self.error = self._disk.error
+            if not self._error_reported:
+                self._error_reported = True
+                self.error = self._log_file.error
                 print(self.error, file=sys.stderr, flush=True)
-                self._channel.say({"error": self.error})
+                self._channel.send({"error": self.error})
         self._in_chunk = 0
 
 
 def _read_config(source: str) -> str:
-    """Text of a file, or of an open file descriptor given by its number."""
+    """Return the text of a file, or of an open file descriptor given by its number."""
     with open(int(source) if source.isdecimal() else source, encoding="utf-8") as file:
         return file.read()
 
 
-def _yield_to_flight(config_json: str) -> None:
-    """The control tick has the first claim on the processor; neither its real-time priority nor its cores are ours."""
+def _lower_priority(config_json: str) -> None:
+    """Give the control tick precedence: leave its cores and its real-time priority."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
         os.nice(5)
-    with contextlib.suppress(ValueError, LookupError, TypeError):  # a configuration that names none
+    with contextlib.suppress(ValueError, LookupError, TypeError):  # a configuration without cores
         keep_off(json.loads(config_json)["vehicle"]["computer"]["cpus"])
 
 
-def _say(answer: dict[str, Any]) -> None:
-    """One JSON line for whoever started us, if it is still there."""
+def _print_json(answer: dict[str, Any]) -> None:
+    """Write one JSON line for the parent process, if it still exists."""
     with contextlib.suppress(OSError):
         os.write(1, json.dumps(answer).encode() + b"\n")
 
@@ -160,28 +160,36 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="log to write; must not exist")
     parser.add_argument("--config", required=True, help="effective configuration (JSON): a file or an open descriptor")
     parser.add_argument("--epoch-offset-ns", type=int, required=True, help="wall clock at zero of the flight clock")
-    parser.add_argument("--metadata", type=json.loads, default={}, help="JSON object of strings")
+    parser.add_argument(
+        "--metadata", type=json.loads, default={}, help="metadata record `flight`: a JSON object of strings"
+    )
     parser.add_argument("--simulated", action="store_true", help="the devices are those of the simulated world")
     parser.add_argument("--chunk-bytes", type=int, default=2**19, help="largest size of an MCAP chunk")
     return parser.parse_args(argv)
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run until the channel ends. First line on stdout: {"ready": true}; last line: the report. 0, or 1 if the log is not whole."""
+    """Run until the channel ends. The first line on stdout is {"ready": true}, the last the report. Return 0, or 1 if the log is
+    incomplete.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     arguments = _arguments(argv)
     try:
         config_json = _read_config(arguments.config)
-        _yield_to_flight(config_json)
-        disk = Disk(arguments.out)
+        _lower_priority(config_json)
+        log_file = LogFile(arguments.out)
     except FileExistsError:
-        _say({"samples": 0, "dropped": 0, "error": f"recorder: {arguments.out} exists already; choose another --out"})
+        _print_json(
+            {"samples": 0, "dropped": 0, "error": f"recorder: {arguments.out} already exists; choose another --out"}
+        )
         return 1
     except OSError as error:
         name = error.filename if isinstance(error.filename, str) else arguments.out
-        _say({"samples": 0, "dropped": 0, "error": f"recorder: {name}: {error.strerror}; choose a writable --out"})
+        _print_json(
+            {"samples": 0, "dropped": 0, "error": f"recorder: {name}: {error.strerror}; choose a writable --out"}
+        )
         return 1
-    writer = LogWriter(disk, arguments.epoch_offset_ns, chunk_bytes=arguments.chunk_bytes)
+    writer = LogWriter(log_file, arguments.epoch_offset_ns, chunk_bytes=arguments.chunk_bytes)
     about = {
         "log_format": LOG_FORMAT,
         "records": fingerprint(Inputs, Outputs, Sent),
@@ -191,26 +199,26 @@ def main(argv: list[str] | None = None) -> int:
     writer.metadata("config", {"json": config_json})
     writer.metadata("flight", arguments.metadata)
     writer.flush()
-    disk.commit()
+    log_file.commit()
     with socket.socket(fileno=arguments.fd) as flight:
         channel = Channel(flight)
         signal.signal(signal.SIGTERM, lambda *_: channel.stop())
-        recorder = Recorder(channel, writer, disk)
-        telemetry: Telemetry | None = None
-        if wanted(config_json):
-            telemetry = recorder.telemetry = Telemetry(
+        recorder = Recorder(channel, writer, log_file)
+        telemetry: TelemetryThread | None = None
+        if broker_configured(config_json):
+            telemetry = recorder.telemetry = TelemetryThread(
                 config_json, simulated=arguments.simulated, flight=channel, recorder_state=recorder.state
             )
             channel.copy_to = telemetry.offer
             telemetry.start()
         channel.start()
-        _say({"ready": True})
+        _print_json({"ready": True})
         recorder.run()
-    disk.close()
-    _say({"samples": recorder.samples, "dropped": recorder.dropped, "error": recorder.error})
+    log_file.close()
+    _print_json({"samples": recorder.samples, "dropped": recorder.dropped, "error": recorder.error})
     code = 0 if recorder.error is None else 1
-    if telemetry is not None and not telemetry.ended(FAREWELL_S):
-        os._exit(code)  # a thread that waits for an unreachable broker would hold us for seconds
+    if telemetry is not None and not telemetry.join(TELEMETRY_END_TIMEOUT_S):
+        os._exit(code)  # a thread that waits for an unreachable broker would delay the exit by seconds
     return code
 
 

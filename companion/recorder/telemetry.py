@@ -1,7 +1,7 @@
-"""Telemetry's thread in the recorder process: copies of the flight's packets in, nothing that ever waits or grows.
+"""The recorder's telemetry thread: receives copies of the flight's packets through a bounded queue, and never delays the log.
 
 The thread imports what it needs by itself (asyncio, aiomqtt, the configuration's models): a recorder without a broker in its vehicle
-file never loads them, and one with it is ready before they are. What runs in it: `companion.recorder.telemetry_link`.
+file never loads them, and one with a broker is ready before they are loaded. The thread runs `companion.recorder.telemetry_link`.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     from companion.recorder.telemetry_link import Counts, FlightSide
 
 PACKETS_MAX = 8192
-"""Copies that wait for the thread: 40 s of flight. Beyond that they are counted and left out, the log has them all the same."""
+"""Packets that wait for the thread: 40 s of flight. Further packets are counted and skipped; the log has them all the same."""
 
 
-def wanted(config_json: str) -> bool:
-    """The configuration names a broker."""
+def broker_configured(config_json: str) -> bool:
+    """Whether the configuration names a broker."""
     try:
         return bool(json.loads(config_json)["vehicle"]["ground"]["mqtt"])
     except (ValueError, LookupError, TypeError):
         return False
 
 
-class Telemetry:
-    """The thread and its inbox.
+class TelemetryThread:
+    """The thread and its packet queue.
 
     Args:
         config_json: effective configuration of the flight.
         simulated: the devices are those of the simulated world.
-        flight: the way to the flight process and into the log.
-        recorder_state: records lost, and why the recorder records no more; called from the thread.
+        flight: connection to the flight process and to the log.
+        recorder_state: returns the number of lost records, and why recording stopped; called from the thread.
     """
 
     def __init__(
@@ -49,9 +49,9 @@ class Telemetry:
         recorder_state: Callable[[], tuple[int, str | None]],
     ) -> None:
         self.session = secrets.token_hex(8)
-        """Of this flight: commands name it."""
-        self.left_out = 0
-        """Packets that it never saw."""
+        """Session id of this flight, which commands name."""
+        self.dropped = 0
+        """Packets that the queue had no room for."""
         self._config_json = config_json
         self._simulated = simulated
         self._flight = flight
@@ -63,34 +63,34 @@ class Telemetry:
         self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def offer(self, packet: bytes) -> None:
-        """A packet of the flight; from any thread, never waits."""
+        """Queue a packet of the flight; callable from any thread, never waits."""
         if self._done:
             return
         if len(self._packets) < PACKETS_MAX:
             self._packets.append((time.monotonic(), packet))
         else:
-            self.left_out += 1
+            self.dropped += 1
 
     def end(self, *, in_order: bool) -> None:
-        """No more packets come; say so to the ground. Does not wait.
+        """End the session: no more packets come. Does not wait.
 
         Args:
-            in_order: the flight said that it is over; else it died.
+            in_order: the flight ended normally; False if its process died.
         """
         self._ending = in_order
 
-    def ended(self, within_s: float) -> bool:
-        """Wait until everything is said, or nobody is there; False: it takes longer."""
+    def join(self, within_s: float) -> bool:
+        """Wait until the last message is sent or no broker is connected; return False if that takes longer."""
         self._thread.join(within_s)
         return not self._thread.is_alive()
 
     @property
     def counts(self) -> dict[str, str]:
-        """For the log's metadata."""
+        """Counts for the log's metadata."""
         counts = self._counts
         if counts is None:
             return {}
@@ -104,7 +104,7 @@ class Telemetry:
         }
 
     def _run(self) -> None:
-        """Whatever happens in here, the log is written all the same."""
+        """Run the event loop. The log does not depend on anything that happens here."""
         try:
             from companion.config.document import ConfigError
             from companion.recorder import telemetry_link
@@ -122,18 +122,18 @@ class Telemetry:
                     self._counts,
                 )
             except ConfigError as error:
-                self._tell(f"no telemetry: {error.lines[0]}")
+                self._report(f"no telemetry: {error.lines[0]}")
         except Exception as error:
-            self._tell(f"no telemetry any more: {type(error).__name__}: {error}")
+            self._report(f"telemetry has failed: {type(error).__name__}: {error}")
             if not isinstance(error, ImportError):
                 sys.excepthook(type(error), error, error.__traceback__)
         finally:
             self._done = True
             self._packets.clear()
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         from companion.model.codec import pack_plain
         from companion.runtime.packets import TEXT, UNNUMBERED
 
-        self._flight.say({"ground": text})
+        self._flight.send({"ground": text})
         self._flight.inject(pack_plain((TEXT, UNNUMBERED, 0.0, "warning", "ground", text)))

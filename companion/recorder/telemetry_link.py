@@ -1,4 +1,4 @@
-"""The event loop of telemetry: packets in, messages out, whatever the broker does. Runs in the recorder's telemetry thread only."""
+"""The event loop of the telemetry: packets in, MQTT messages out, whatever the broker does. Runs in the telemetry thread only."""
 
 from __future__ import annotations
 
@@ -21,65 +21,65 @@ from companion.ground.protocol.connection import Connection, why
 from companion.ground.protocol.keys import load_operators
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, RETAINED, STREAM_PERIOD_S, Command, Topic
 from companion.model.codec import pack_plain
-from companion.recorder.telemetry_session import INFO, WARNING, GroundDesk, Outgoing
+from companion.recorder.telemetry_session import INFO, WARNING, Outgoing, TelemetrySession
 from companion.runtime.packets import TEXT, UNNUMBERED
 
 ANSWER_S = 4.0
-"""For each answer of the broker."""
+"""Timeout for each answer of the broker."""
 COMMAND_PACKET_MAX_BYTES = 16_384
-"""The broker keeps larger messages to itself: sixteen times a command, so that one too large is seen and told."""
+"""Maximum Packet Size for the broker: sixteen times a command, so that a somewhat oversized one is received and reported."""
 SEND_BUFFER_BYTES = 65_536
-"""About a second of the stream: what a slow broker has not taken by then would be old anyway."""
+"""About one second of the stream; data that a slow broker takes later than that is stale."""
 PAUSE_MIN_S, PAUSE_MAX_S = 0.2, 2.0
-"""Between two attempts to reach the broker."""
-FAREWELL_S = 1.0
-"""For the last words, if there is a broker."""
+"""Pause between two connection attempts."""
+END_TIMEOUT_S = 1.0
+"""Time for the last messages of the session, if a broker is connected."""
 FLOOD_PER_S = 1500
-"""Refused messages that are taken in a second as fast as they come; more of them are taken at `FLOOD_STEP / FLOOD_PAUSE_S` a second."""
+"""Refused messages per second that are processed at full speed; beyond that `FLOOD_STEP / FLOOD_PAUSE_S` a second."""
 FLOOD_STEP, FLOOD_PAUSE_S = 30, 0.02
 _ACKS_MAX = 200
 
 
 class FlightSide(Protocol):
-    """What telemetry may do to the rest of the recorder; neither waits."""
+    """What the telemetry may do to the rest of the recorder; neither call waits."""
 
-    def say(self, message: dict[str, Any]) -> bool:
-        """Tell the flight process. False: it does not listen."""
+    def send(self, message: dict[str, Any]) -> bool:
+        """Send a message to the flight process. Return False if it does not read."""
 
     def inject(self, packet: bytes) -> bool:
-        """Into the log, as if the flight had sent it. False: no room."""
+        """Write a packet to the log as if the flight had sent it. Return False if the queue is full."""
 
 
 @dataclass(slots=True)
 class Counts:
-    """Of one session."""
+    """Counts of one session."""
 
     connections: int = 0
     stream_sent: int = 0
     stream_dropped: int = 0
-    """Made while there was a broker that did not take them."""
+    """Stream messages that a connected broker did not take in time."""
     commands: int = 0
-    """Handed to the flight."""
+    """Commands forwarded to the flight process."""
     refused: int = 0
 
 
 class Outbox:
-    """What is to be sent: of everything that is retained, and of the stream, the newest only. Never grows."""
+    """Messages to send: the newest of each retained topic, the newest of the stream, and acks. Bounded."""
 
     def __init__(self) -> None:
         self.stream: bytes | None = None
         self.stream_there = asyncio.Event()
         self.kept: dict[Topic, bytes] = {}
-        """Newest of each retained topic."""
+        """Newest payload of each retained topic."""
         self.due: dict[Topic, None] = {}
-        """Retained topics that the broker does not have yet, in the order in which they changed."""
+        """Retained topics that the broker does not have yet, in the order of their changes."""
         self.acks: deque[bytes] = deque(maxlen=_ACKS_MAX)
         self.wake = asyncio.Event()
         self.sent = asyncio.Event()
-        """Nothing with QoS 1 is left to send."""
+        """Set when no message with QoS 1 is left to send."""
 
     def put(self, out: Outgoing) -> None:
-        """Take what is new; a message that is too large for the other end is left out."""
+        """Add new messages; drop a message that is too large for receivers."""
         for topic, payload in out.retained.items():
             if len(payload) <= MESSAGE_MAX_BYTES:
                 self.kept[topic] = payload
@@ -90,7 +90,7 @@ class Outbox:
             self.wake.set()
 
     def begin(self) -> None:
-        """A new connection: the broker may have forgotten everything."""
+        """Start a new connection: the broker may have lost everything."""
         self.stream = None
         self.stream_there.clear()
         self.due = dict.fromkeys(sorted(self.kept, key=lambda topic: topic is not Topic.STATE))
@@ -99,21 +99,21 @@ class Outbox:
 
 
 class Uplink:
-    """Telemetry of one flight.
+    """Connects one telemetry session to its broker.
 
     Args:
-        desk: what is told, and what becomes of commands.
+        session: builds the messages and verifies the commands.
         access: the broker.
         flight: the rest of the recorder.
-        packets: filled by another thread: when it was received (CLOCK_MONOTONIC), packet.
-        recorder_state: records lost, and why it records no more.
-        ending: None: the flight goes on; else whether it ended in order.
-        counts: filled in.
+        packets: queue filled by another thread: time of receipt (CLOCK_MONOTONIC), packet.
+        recorder_state: returns the number of lost records, and why recording stopped.
+        ending: returns None while the flight goes on, else whether it ended normally.
+        counts: updated while the session runs.
     """
 
     def __init__(
         self,
-        desk: GroundDesk,
+        session: TelemetrySession,
         access: BrokerAccess,
         flight: FlightSide,
         packets: deque[tuple[float, bytes]],
@@ -121,7 +121,7 @@ class Uplink:
         ending: Callable[[], bool | None],
         counts: Counts,
     ) -> None:
-        self._desk = desk
+        self._session = session
         self._access = access
         self._flight = flight
         self._packets = packets
@@ -130,45 +130,45 @@ class Uplink:
         self._counts = counts
         self._outbox = Outbox()
         self._connected = False
-        self._told: str | None = None
-        self._not_let: set[Topic] = set()
+        self._last_reported: str | None = None
+        self._refused_topics: set[Topic] = set()
         self._flood_began_s, self._flood_before = 0.0, 0
-        self._command_topic = Topic.COMMAND.of(desk.vehicle)
+        self._command_topic = Topic.COMMAND.of(session.vehicle)
 
     async def run(self) -> None:
-        """Until the flight has ended and that is told, or there is nobody to tell."""
+        """Run until the flight has ended and that is published, or no broker is connected."""
         async with asyncio.TaskGroup() as group:
             staying = group.create_task(self._stay_connected())
             await self._pump()
             if self._connected:
                 try:
-                    async with asyncio.timeout(FAREWELL_S):
+                    async with asyncio.timeout(END_TIMEOUT_S):
                         await self._outbox.sent.wait()
                 except TimeoutError:
-                    pass  # the broker is too slow: its last will says that we are gone
+                    pass  # the broker is too slow; it publishes the last will instead
             staying.cancel()
 
     async def _pump(self) -> None:
-        """20 times a second: take what has come, make what is to be sent."""
+        """Process packets and build messages, 20 times a second."""
         due_s = time.monotonic()
         while True:
             ending = self._ending()
             while self._packets:
                 for _ in range(min(200, len(self._packets))):
-                    self._desk.take(*self._packets.popleft())
+                    self._session.take_packet(*self._packets.popleft())
                 await asyncio.sleep(0)
             if ending is not None:
-                self._desk.end(in_order=ending)
+                self._session.end(in_order=ending)
             dropped, error = self._recorder_state()
-            self._give(self._desk.collect(time.monotonic(), time.time(), dropped=dropped, recorder_error=error))
+            self._queue(self._session.collect(time.monotonic(), time.time(), dropped=dropped, recorder_error=error))
             if ending is not None:
                 return
             due_s = max(due_s + STREAM_PERIOD_S, time.monotonic())
             await asyncio.sleep(due_s - time.monotonic())
 
-    def _give(self, out: Outgoing) -> None:
+    def _queue(self, out: Outgoing) -> None:
         outbox = self._outbox
-        self._counts.refused = self._desk.refused
+        self._counts.refused = self._session.refused
         for t_s, severity, text in out.log:
             self._flight.inject(pack_plain((TEXT, UNNUMBERED, t_s, severity, "ground", text)))
         outbox.put(out)
@@ -179,13 +179,13 @@ class Uplink:
 
     async def _stay_connected(self) -> None:
         pause_s = PAUSE_MIN_S
-        will = aiomqtt.Will(Topic.STATE.of(self._desk.vehicle), self._desk.last_will(), qos=1, retain=True)
-        identifier = f"companion-{self._desk.vehicle}-{self._desk.session}"
+        will = aiomqtt.Will(Topic.STATE.of(self._session.vehicle), self._session.last_will(), qos=1, retain=True)
+        identifier = f"companion-{self._session.vehicle}-{self._session.session}"
         while True:
             client = Connection(
                 self._access,
                 identifier,
-                self._message,
+                self._on_message,
                 packet_max_bytes=COMMAND_PACKET_MAX_BYTES,
                 answer_s=ANSWER_S,
                 will=will,
@@ -200,26 +200,26 @@ class Uplink:
                 reason = why(error)
             finally:
                 self._connected = False
-                said = self._desk.over and self._outbox.sent.is_set()
-                await client.drop(with_will=not said)
-            self._tell_change(WARNING, f"no broker at {self._access.address}, trying: {reason}")
+                complete = self._session.over and self._outbox.sent.is_set()
+                await client.drop(with_will=not complete)
+            self._report_change(WARNING, f"no broker at {self._access.address}, trying: {reason}")
             await asyncio.sleep(pause_s)
             pause_s = min(PAUSE_MAX_S, pause_s * 1.6)
 
     async def _serve(self, client: Connection) -> None:
-        """As long as the connection holds.
+        """Serve one connection.
 
         Raises:
-            aiomqtt.MqttError: it holds no more.
+            aiomqtt.MqttError: the connection was lost.
         """
         self._counts.connections += 1
-        self._tell_change(INFO, f"connected to {self._access.address}")
-        if self._desk.hears_commands:
+        self._report_change(INFO, f"connected to {self._access.address}")
+        if self._session.accepts_commands:
             refusal = await client.hear(self._command_topic, 1)
-            text = f"the broker does not let this vehicle hear commands: {refusal}"
+            text = f"the broker does not let this vehicle subscribe to commands: {refusal}"
             if refusal is not None:
-                self._desk.tell(time.monotonic(), WARNING, text)
-            self._desk.commands_heard(refusal is None, text)
+                self._session.notify(time.monotonic(), WARNING, text)
+            self._session.set_commands_available(refusal is None, text)
         self._outbox.begin()
         self._connected = True
         parts = {
@@ -238,8 +238,8 @@ class Uplink:
                     part.exception()
 
     async def _send_stream(self, client: Connection) -> None:
-        """One message at a time: as long as the system takes none, the newest replaces the one that waits."""
-        outbox, topic = self._outbox, Topic.STREAM.of(self._desk.vehicle)
+        """Send one stream message at a time; while the socket is full the newest replaces the one that waits."""
+        outbox, topic = self._outbox, Topic.STREAM.of(self._session.vehicle)
         while True:
             await outbox.stream_there.wait()
             payload, outbox.stream = outbox.stream, None
@@ -249,7 +249,7 @@ class Uplink:
                 self._counts.stream_sent += 1
 
     async def _send_kept(self, client: Connection) -> None:
-        """Answers first, then what is retained; each is kept until the broker has it."""
+        """Send acks first, then retained messages; each is kept until the broker has it."""
         outbox = self._outbox
         while True:
             await outbox.wake.wait()
@@ -267,56 +267,58 @@ class Uplink:
             outbox.sent.set()
 
     async def _send(self, client: Connection, topic: Topic, payload: bytes) -> None:
-        refusal = await client.send(topic.of(self._desk.vehicle), payload, qos=1, retain=topic in RETAINED)
+        refusal = await client.send(topic.of(self._session.vehicle), payload, qos=1, retain=topic in RETAINED)
         if refusal is None:
-            self._not_let.discard(topic)
-        elif topic not in self._not_let:
-            text = f"the broker does not let this vehicle say its {topic.value}: {refusal}"
-            self._desk.tell(time.monotonic(), WARNING, text)
-            if not self._not_let:  # one line in the terminal is enough for a wrong login
-                self._flight.say({"ground": text})
-            self._not_let.add(topic)
+            self._refused_topics.discard(topic)
+        elif topic not in self._refused_topics:
+            text = f"the broker does not let this vehicle publish its {topic.value}: {refusal}"
+            self._session.notify(time.monotonic(), WARNING, text)
+            if not self._refused_topics:  # a wrong login affects all topics; report one
+                self._flight.send({"ground": text})
+            self._refused_topics.add(topic)
 
-    def _message(self, topic: str, payload: bytes, retained: bool) -> None:
+    def _on_message(self, topic: str, payload: bytes, retained: bool) -> None:
         if topic != self._command_topic:
             return
         now_s = time.monotonic()
-        command = self._desk.hear(payload, retained, now_s)
+        command = self._session.receive_command(payload, retained, now_s)
         if command is not None:
-            self._hand_over(command, now_s)
+            self._forward_command(command, now_s)
         else:
             self._slow_down(now_s)
 
     def _slow_down(self, now_s: float) -> None:
-        """Whoever floods us is not to have the processor that the flight needs: the rest waits at the broker, and is dropped there."""
+        """Limit the processor time that a flood of invalid commands takes from the flight; excess messages wait at the broker and are
+        dropped there.
+        """
         if now_s - self._flood_began_s >= 1.0:
-            self._flood_began_s, self._flood_before = now_s, self._desk.refused
-        many = self._desk.refused - self._flood_before
+            self._flood_began_s, self._flood_before = now_s, self._session.refused
+        many = self._session.refused - self._flood_before
         if many > FLOOD_PER_S and many % FLOOD_STEP == 0:
-            time.sleep(FLOOD_PAUSE_S)  # the whole loop, on purpose: reading must stop
+            time.sleep(FLOOD_PAUSE_S)  # blocks the event loop on purpose, so that reading stops
 
-    def _hand_over(self, command: Command, now_s: float) -> None:
+    def _forward_command(self, command: Command, now_s: float) -> None:
         message = {
             "command": command.command.value,
             "operator": command.operator,
             "nonce": command.nonce,
             "hold": command.hold,
         }
-        if self._flight.say(message):
+        if self._flight.send(message):
             self._counts.commands += 1
             return
-        text = "the flight process does not listen; use Ctrl-C or the pilot's switch"
-        self._desk.answer(command, text, now_s)
-        self._desk.tell(now_s, WARNING, f"{command.command.value} of {command.operator}: {text}")
+        text = "the flight process does not read commands; use Ctrl-C or the pilot's switch"
+        self._session.reject(command, text, now_s)
+        self._session.notify(now_s, WARNING, f"{command.command.value} of {command.operator}: {text}")
 
-    def _tell_change(self, severity: str, text: str) -> None:
-        """Once per change: of a broker that is away, the first reason stands for all that follow."""
+    def _report_change(self, severity: str, text: str) -> None:
+        """Report a change of the connection once; while the broker is away only the first reason is reported."""
         kind = text.split(", ")[0]
-        if kind == self._told:
+        if kind == self._last_reported:
             return
-        self._told = kind
-        self._desk.tell(time.monotonic(), severity, text, event=False)
-        self._flight.say({"ground": text})
+        self._last_reported = kind
+        self._session.notify(time.monotonic(), severity, text, event=False)
+        self._flight.send({"ground": text})
 
 
 def run(
@@ -329,11 +331,11 @@ def run(
     ending: Callable[[], bool | None],
     counts: Counts,
 ) -> None:
-    """Telemetry of one flight, from the first packet to the last word; returns at once if it cannot be. See `Uplink`.
+    """Run the telemetry of one flight until it ends; return at once if no broker is configured. See `Uplink`.
 
     Raises:
-        ConfigError: what the vehicle file names cannot be used; one line for the user.
-        ValueError: the configuration is no flight's.
+        ConfigError: a setting of the vehicle file cannot be used; one line for the user.
+        ValueError: the configuration is not that of a flight.
     """
     config = FlightConfig.model_validate(json.loads(config_json))
     mqtt = config.vehicle.ground.mqtt
@@ -341,25 +343,28 @@ def run(
         return
     access = broker_access(mqtt.url, mqtt.login_file, mqtt.ca_file, KEYS)
 
-    async def all_of_it() -> None:
+    async def run_session() -> None:
         verifier, no_commands = _verifier(config, mqtt, session)
-        desk = GroundDesk(config, session, simulated=simulated, verifier=verifier, no_commands=no_commands)
+        telemetry = TelemetrySession(config, session, simulated=simulated, verifier=verifier, no_commands=no_commands)
         if no_commands is not None:
-            desk.tell(time.monotonic(), WARNING if mqtt.commands else INFO, no_commands, event=False)
-        await Uplink(desk, access, flight, packets, recorder_state, ending, counts).run()
+            telemetry.notify(time.monotonic(), WARNING if mqtt.commands else INFO, no_commands, event=False)
+        await Uplink(telemetry, access, flight, packets, recorder_state, ending, counts).run()
 
-    asyncio.run(all_of_it())
+    asyncio.run(run_session())
 
 
 def _verifier(config: FlightConfig, mqtt: Mqtt, session: str) -> tuple[Verifier | None, str | None]:
-    """Who judges commands; or why none are heard."""
+    """Return the command verifier, or why commands are not accepted."""
     if not mqtt.commands:
-        return None, "commands are switched off in the vehicle file (ground.mqtt.commands)"
+        return None, "commands are disabled in the vehicle file (ground.mqtt.commands)"
     address = mqtt.address
     if not (address.loopback or address.tls):
-        return None, f"commands are not heard over a plain connection to another computer ({address}); use mqtts://"
+        return (
+            None,
+            f"commands are not accepted over an unencrypted connection to another computer ({address}); use mqtts://",
+        )
     try:
         operators = load_operators(mqtt.operators_file)
     except ConfigError as error:
-        return None, f"commands are not heard: {error.lines[0]}"
+        return None, f"commands are not accepted: {error.lines[0]}"
     return Verifier(operators, topic_name(config.vehicle.ground.topic, config.vehicle.name), session), None

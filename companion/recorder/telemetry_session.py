@@ -1,6 +1,6 @@
-"""What the ground is told, and what becomes of what it says: packets of the flight to messages, payloads to commands. No I/O.
+"""One flight's telemetry session: packets of the flight become messages, payloads from the ground become commands. No I/O.
 
-Times are those of CLOCK_MONOTONIC, which is the same in all processes: the flight clock is found from it by the ticks themselves.
+Times are CLOCK_MONOTONIC, which all processes share; the ticks relate it to the flight clock.
 """
 
 from __future__ import annotations
@@ -27,53 +27,53 @@ from companion.ground.protocol.messages import (
 )
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
-from companion.ground.telemetry.stream import StreamMaker, shortened
+from companion.ground.telemetry.stream import StreamBuilder, shortened
 from companion.model.codec import restore, unpack_plain
 from companion.model.types import Inputs, Outcome, Outputs, Sent
 from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK
 
 SILENT_S = 0.5
-"""No tick for so long while the flight is not over: it is told."""
+"""Time without a tick after which the vehicle is reported as silent."""
 STATE_PERIOD_S = 2.0
-"""The state is said again so often: what another client or an old last will has put there does not stay."""
-TELL_PERIOD_S = 1.0
-"""Refused commands of one kind are one line in so long."""
+"""Period of the retained state, which replaces what another client or an old last will published."""
+REFUSAL_PERIOD_S = 1.0
+"""Refused commands of one reason are reported once in this time."""
 WARNING, INFO = "warning", "info"
-_SILENT = "the flight process says nothing; the guardian lands what flies"
-_LOST = "the flight process, or its recorder, ended without a word; the guardian lands what flies"
+_SILENT = "the flight process sends nothing; in the air the guardian lands the vehicle"
+_LOST = "the flight process or its recorder ended without notice; in the air the guardian lands the vehicle"
 
 
 @dataclass(slots=True)
 class _Refusals:
-    """Of one reason."""
+    """Refused commands of one reason."""
 
     count: int = 0
-    """Not told yet."""
+    """Refusals that have not been reported."""
     text: str = ""
-    told_s: float = -math.inf
+    reported_s: float = -math.inf
 
 
 @dataclass(slots=True)
 class Outgoing:
-    """What is to be sent now."""
+    """Messages to send now."""
 
     retained: dict[Topic, bytes] = field(default_factory=dict)
-    """Newest of each, of those that changed."""
+    """Payload of each retained topic that changed."""
     acks: list[bytes] = field(default_factory=list)
     stream: bytes | None = None
     log: list[tuple[float, str, str]] = field(default_factory=list)
-    """Flight clock, severity, text: lines for the log's `/log` channel."""
+    """Lines for the log's `/log` channel: flight clock, severity, text."""
 
 
-class GroundDesk:
-    """One flight's.
+class TelemetrySession:
+    """Builds the messages of one flight and verifies commands.
 
     Args:
         config: effective configuration.
-        session: drawn at random for this flight.
+        session: random id of this flight.
         simulated: the devices are those of the simulated world.
-        verifier: judges commands; None: none are heard.
-        no_commands: then why, for people.
+        verifier: verifies commands; None if commands are not accepted.
+        no_commands: why commands are not accepted.
     """
 
     def __init__(
@@ -88,16 +88,16 @@ class GroundDesk:
         self.vehicle = topic_name(config.vehicle.ground.topic, config.vehicle.name)
         self._config = config
         self._verifier = verifier
-        self._maker = StreamMaker(config, session)
+        self._stream = StreamBuilder(config, session)
         self._clock_s = math.inf
-        """CLOCK_MONOTONIC less the flight clock: the least that was seen, of the packet that came the fastest."""
+        """CLOCK_MONOTONIC minus flight clock: the smallest difference seen, from the packet with the least delay."""
         self._tick_s: float | None = None
         """CLOCK_MONOTONIC of the newest tick."""
         self._new_ticks = False
         self._outcome: Outcome | None = None
         self._over = False
-        self._broken: str | None = None
-        """A packet that could not be read: a fault of the program, told once."""
+        self._packet_error: str | None = None
+        """Error of the first malformed packet (a defect of the program); empty once it has been reported."""
         self._refusals: dict[str, _Refusals] = {}
         self._acks: deque[Ack] = deque(maxlen=200)
         self._log: deque[tuple[float, str, str]] = deque(maxlen=200)
@@ -115,47 +115,47 @@ class GroundDesk:
             text=no_commands,
         )
         self._no_commands = no_commands
-        self._state_said_s = -math.inf
+        self._state_sent_s = -math.inf
         self._scene = scene_of(config, session)
         self._preflight = Preflight(VERSION, session, ())
-        self._events_said = -1
+        self._events_sent = -1
         self._changed = {Topic.SCENE, Topic.PREFLIGHT}
         self.refused = 0
-        """Commands, of all reasons."""
+        """Number of refused commands."""
 
     @property
     def session(self) -> str:
-        """Of this flight."""
+        """Session id of this flight."""
         return self._state.session
 
     @property
-    def hears_commands(self) -> bool:
-        """Somebody is there to judge them."""
+    def accepts_commands(self) -> bool:
+        """Whether commands are verified and forwarded."""
         return self._verifier is not None
 
     @property
     def over(self) -> bool:
-        """The flight has ended, one way or another."""
+        """Whether the flight has ended."""
         return self._over
 
     def flight_s(self, now_s: float) -> float | None:
-        """The flight clock at a time of CLOCK_MONOTONIC; None before the first tick."""
+        """Return the flight clock at a CLOCK_MONOTONIC time, or None before the first tick."""
         return None if self._clock_s == math.inf else now_s - self._clock_s
 
     def last_will(self) -> bytes:
-        """What the broker says when this process is gone without a word."""
-        text = "the connection to the vehicle broke without a word"
+        """Return the state that the broker publishes if this process disappears."""
+        text = "the connection to the vehicle was lost"
         return encode(replace(self._state, presence=Presence.LOST, wall_s=0.0, commands=False, text=text))
 
-    def take(self, received_s: float, packet: bytes) -> None:
-        """One packet of the flight's channel, or of the guardian's. Never raises: the log has it in any case."""
+    def take_packet(self, received_s: float, packet: bytes) -> None:
+        """Process one packet of the flight's or the guardian's channel. Never raises: the log has the packet in any case."""
         try:
             kind, _, *rest = unpack_plain(packet)
             if kind == TICK:
                 self._tick(received_s, *rest)
             elif kind == TEXT:
                 t_s, severity, source, text = rest
-                self._maker.tell(t_s, severity, source, text)
+                self._stream.add_line(t_s, severity, source, text)
             elif kind == ACK:
                 self._ack(*rest)
             elif kind == METADATA:
@@ -163,36 +163,36 @@ class GroundDesk:
             elif kind == CLOSE:
                 self.end(in_order=True)
         except (ValueError, TypeError, LookupError, AttributeError, EOFError, OverflowError) as error:
-            self._broken = self._broken or f"telemetry: a packet could not be read: {type(error).__name__}: {error}"
+            self._packet_error = self._packet_error or f"telemetry: malformed packet: {type(error).__name__}: {error}"
 
-    def tell(self, now_s: float, severity: str, text: str, *, event: bool = True) -> None:
-        """A line about the telemetry itself, for the log and, if `event`, for the list of events."""
+    def notify(self, now_s: float, severity: str, text: str, *, event: bool = True) -> None:
+        """Add a line about the telemetry itself to the log and, if `event`, to the list of events."""
         t_s = self.flight_s(now_s) or 0.0
         self._log.append((t_s, severity, text))
         if event:
-            self._maker.tell(t_s, severity, "ground", text)
+            self._stream.add_line(t_s, severity, "ground", text)
 
-    def commands_heard(self, heard: bool, why_not: str | None = None) -> None:
-        """Whether the broker delivers commands."""
+    def set_commands_available(self, available: bool, why_not: str | None = None) -> None:
+        """Set whether the broker delivers commands, and if not, why."""
         if self._verifier is not None:
-            self._no_commands = None if heard else why_not
-            self._set_state(commands=heard)
+            self._no_commands = None if available else why_not
+            self._set_state(commands=available)
 
-    def hear(self, payload: bytes, retained: bool, now_s: float) -> Command | None:
-        """Judge what came on the command topic; the command if it is to be followed."""
+    def receive_command(self, payload: bytes, retained: bool, now_s: float) -> Command | None:
+        """Verify a payload of the command topic; return the command if it is accepted."""
         if self._verifier is None or self._over:
             return None
         verdict = self._verifier.check(payload, retained, self.flight_s(now_s))
         if isinstance(verdict, Accepted):
             return verdict.command
-        self._refused(verdict.reason.value, verdict.text)
+        self._count_refusal(verdict.reason.value, verdict.text)
         if verdict.command is not None:
-            self.answer(verdict.command, f"refused: {verdict.text}", now_s)
+            self.reject(verdict.command, f"refused: {verdict.text}", now_s)
         return None
 
-    def answer(self, command: Command, text: str, now_s: float) -> None:
-        """Tell the sender of a well-signed command that nothing was done."""
-        newest = self._maker.newest_outputs
+    def reject(self, command: Command, text: str, now_s: float) -> None:
+        """Answer a well-signed command that was not carried out."""
+        newest = self._stream.newest_outputs
         self._acks.append(
             Ack(
                 v=VERSION,
@@ -209,10 +209,10 @@ class GroundDesk:
         )
 
     def end(self, *, in_order: bool) -> None:
-        """No more ticks come.
+        """End the session: no more ticks come.
 
         Args:
-            in_order: the flight said so; else its process died.
+            in_order: the flight ended normally; False if its process died.
         """
         if self._over:
             return
@@ -224,34 +224,34 @@ class GroundDesk:
             self._set_state(presence=Presence.LOST, commands=False, outcome=outcome, text=_LOST)
 
     def collect(self, now_s: float, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Outgoing:
-        """What is new since the last call.
+        """Return the messages that are new since the last call.
 
         Args:
             now_s: CLOCK_MONOTONIC.
             wall_s: seconds since 1970.
             dropped: records that the recorder lost.
-            recorder_error: why it records no more.
+            recorder_error: why recording stopped, or None.
         """
         self._presence(now_s)
-        self._tell_refusals(now_s)
-        if self._broken:
-            self.tell(now_s, WARNING, self._broken)
-            self._broken = ""  # not None: told
+        self._report_refusals(now_s)
+        if self._packet_error:
+            self.notify(now_s, WARNING, self._packet_error)
+            self._packet_error = ""  # not None: reported
         out = Outgoing()
-        if now_s - self._state_said_s >= STATE_PERIOD_S:
-            self._state_said_s = now_s
+        if now_s - self._state_sent_s >= STATE_PERIOD_S:
+            self._state_sent_s = now_s
             self._state = replace(self._state, wall_s=round(wall_s, 3))
             out.retained[Topic.STATE] = encode(self._state)
         for topic, record in ((Topic.SCENE, self._scene), (Topic.PREFLIGHT, self._preflight)):
             if topic in self._changed:
                 out.retained[topic] = encode(record)
         self._changed.clear()
-        if self._events_said != self._maker.count:
-            self._events_said = self._maker.count
-            out.retained[Topic.EVENTS] = encode(self._maker.events_record())
+        if self._events_sent != self._stream.count:
+            self._events_sent = self._stream.count
+            out.retained[Topic.EVENTS] = encode(self._stream.events_message())
         if self._new_ticks:
             self._new_ticks = False
-            stream = self._maker.make(wall_s, dropped=dropped, recorder_error=recorder_error)
+            stream = self._stream.build(wall_s, dropped=dropped, recorder_error=recorder_error)
             keys = self._verifier.operators.keys if self._verifier is not None else ()
             out.stream = encode(with_proofs(stream, self.vehicle, keys))
         out.acks = [encode(self._proven(ack)) for ack in self._acks]
@@ -263,7 +263,7 @@ class GroundDesk:
     def _tick(self, received_s: float, inputs_plain: object, outputs_plain: object, sent_plain: object) -> None:
         inputs = restore(Inputs, inputs_plain)  # type: ignore[arg-type]
         outputs = restore(Outputs, outputs_plain)  # type: ignore[arg-type]
-        self._maker.take(inputs, outputs, restore(Sent, sent_plain))  # type: ignore[arg-type]
+        self._stream.add_tick(inputs, outputs, restore(Sent, sent_plain))  # type: ignore[arg-type]
         self._new_ticks = True
         self._tick_s = received_s
         if math.isfinite(inputs.t_s):
@@ -279,7 +279,7 @@ class GroundDesk:
         )
 
     def _proven(self, ack: Ack) -> Ack:
-        """With the proof for the operator who commanded."""
+        """Return the ack with a proof for the operator who sent the command."""
         key = self._verifier.operators.find(ack.operator) if self._verifier is not None else None
         return ack if key is None else with_proof(ack, self.vehicle, key)
 
@@ -300,7 +300,7 @@ class GroundDesk:
         if self._over:
             return
         if self._tick_s is None:
-            self._tick_s = now_s  # the first look: from now on a tick is awaited
+            self._tick_s = now_s  # first call: from now on a tick is expected
         silent = now_s - self._tick_s > SILENT_S
         text = _SILENT if silent else self._no_commands
         self._set_state(presence=Presence.SILENT if silent else Presence.FLYING, text=text)
@@ -309,22 +309,24 @@ class GroundDesk:
         state = replace(self._state, **values)  # type: ignore[arg-type]
         if state != self._state:
             self._state = state
-            self._state_said_s = -math.inf
+            self._state_sent_s = -math.inf
 
-    def _refused(self, reason: str, text: str) -> None:
+    def _count_refusal(self, reason: str, text: str) -> None:
         refusals = self._refusals.setdefault(reason, _Refusals())
         self.refused += 1
         refusals.count += 1
         refusals.text = text
 
-    def _tell_refusals(self, now_s: float) -> None:
-        """The first at once, the others counted: people see an attack, the log does not drown in it, no event is pushed out."""
+    def _report_refusals(self, now_s: float) -> None:
+        """Report the first refusal of a reason at once and count the following: an attack is visible, does not flood the log and
+        displaces no other event.
+        """
         for reason, refusals in self._refusals.items():
-            if not refusals.count or now_s - refusals.told_s < TELL_PERIOD_S:
+            if not refusals.count or now_s - refusals.reported_s < REFUSAL_PERIOD_S:
                 continue
             commands = "a command" if refusals.count == 1 else f"{refusals.count} commands in the last second"
             text = f"refused {commands}: {reason}: {refusals.text}"
-            refusals.count, refusals.told_s = 0, now_s
+            refusals.count, refusals.reported_s = 0, now_s
             t_s = self.flight_s(now_s) or 0.0
             self._log.append((t_s, WARNING, text))
-            self._maker.tell(t_s, WARNING, f"command_refused_{reason}", text, instead=True)
+            self._stream.add_line(t_s, WARNING, f"command_refused_{reason}", text, instead=True)

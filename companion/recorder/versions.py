@@ -1,4 +1,4 @@
-"""Versions of everything that has a say in what a flight does."""
+"""Versions of the software that determines a flight."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PACKAGES = ("mavsdk", "pymavlink", "dynamixel-sdk", "pyserial", "numpy", "pydan
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that has a say in what the flight does."""
+    """Return the version of the companion, Python, the platform, and each package that a flight depends on."""
     found = {"companion": __version__, "python": platform.python_version(), "platform": platform.platform()}
     for package in _PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -24,7 +24,7 @@ def versions() -> dict[str, str]:
 
 
 def _git_revision() -> str | None:
-    """Commit of the working copy that this module is in, with `-dirty`; None outside of one."""
+    """Return the commit of this module's working copy, with `-dirty` if it was changed; None outside of one."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None

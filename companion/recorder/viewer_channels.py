@@ -1,18 +1,18 @@
-"""Typed, thinned-out channels of the log, for people's viewers (Foxglove, PlotJuggler); no reader of the companion needs them.
+"""Typed channels of the log at lower rates, for viewers (Foxglove, PlotJuggler); no reader of the companion needs them.
 
 ================  ==========================  =========================================================================
 ``/tf``           foxglove.FrameTransform     world -> body, 50 Hz
 ``/tf_arm``       foxglove.FrameTransforms    body -> link1 -> link2 -> net, 50 Hz
-``/pose``         foxglove.PoseInFrame        motion capture, as it came, 50 Hz
-``/reference``    foxglove.PoseInFrame        where the vehicle should be, 50 Hz
+``/pose``         foxglove.PoseInFrame        motion capture as received, 50 Hz
+``/reference``    foxglove.PoseInFrame        reference pose, 50 Hz
 ``/scene``        foxglove.SceneUpdate        the tether, 20 Hz
 ``/scene_path``   foxglove.SceneUpdate        flown and reference path so far, every 2 s
 ``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and when the plan is known
 ================  ==========================  =========================================================================
 
-A viewer that jumps in time asks for the newest message of each topic and no more: what is said once, and what is said at another
-rate, has a topic of its own. Vehicle, arm and net are drawn once, locked to their frames; the frames move.
-Values that are not finite are never passed on: their message is left out.
+A viewer that jumps in time asks only for the newest message of each topic; so data with different rates, and data sent once, have
+topics of their own. Vehicle, arm and net are drawn once and locked to their frames; the frames move. A message with a value that is
+not finite is left out.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from companion.recorder.viewer_scene import (
     machine_of,
     path_of,
     point3,
-    standing_entities,
+    static_entities,
     tether_colour,
     trail,
 )
@@ -60,11 +60,11 @@ PERIOD_S = 0.02
 SCENE_PERIOD_S = 0.05
 PATH_PERIOD_S = 2.0
 _EARLY_S = 0.0025
-"""A message that is due within half a tick is sent in this one."""
+"""A message that is due within half a tick is sent in this tick."""
 _LIFETIME = Duration(0, 500_000_000)
-"""Of what moves: gone from the picture half a second after the last word of it."""
+"""Lifetime of moving entities: they disappear half a second after their last update."""
 _FRESH_S = 0.1
-"""An older pose of motion capture is not where the vehicle is."""
+"""An older motion-capture pose is stale."""
 _FLOWN = Color(r=0.12, g=0.44, b=0.71, a=1.0)
 _REFERENCE = Color(r=0.88, g=0.48, b=0.13, a=0.9)
 _TRAIL_POINTS = 256
@@ -73,7 +73,7 @@ _STRAIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
 
 class ViewerChannels:
-    """Makes the viewers' messages of a tick, each at its own rate."""
+    """Writes the viewer messages of a tick, each at its own rate."""
 
     def __init__(self, context: foxglove.Context) -> None:
         self._tf = FrameTransformChannel("/tf", context=context)
@@ -88,24 +88,24 @@ class ViewerChannels:
         self._planned: tuple[Vec3, ...] = ()
         self._static_due = False
         self._due_s = self._scene_due_s = self._path_due_s = -math.inf
-        self._flown, self._wanted = _Trail(), _Trail()
+        self._flown_trail, self._reference_trail = _Trail(), _Trail()
 
     def configure(self, config: Any) -> None:
-        """The effective configuration as nested dicts; of anything else the picture is empty."""
+        """Set the effective configuration (nested dicts); the scene of an invalid one is empty."""
         self._machine = machine_of(config)
         self._joints = _Joints(self._machine)
         self._static_due = True
 
     def plan(self, path: Any) -> None:
-        """The planned path, [[x, y, z], ...] in the world."""
+        """Set the planned path, [[x, y, z], ...] in the world."""
         self._planned = path_of(path)
         self._static_due = True
 
     def tick(self, t_s: float, stamp_ns: int, inputs: dict[str, Any], outputs: dict[str, Any]) -> None:
-        """What is due of one tick.
+        """Write the messages that are due in this tick.
 
         Args:
-            t_s: flight clock; a clock that went back starts anew.
+            t_s: flight clock; after a step back everything is due.
             stamp_ns: wall clock of the tick, for every message and its header.
             inputs, outputs: the tick's records in their jsonable form.
         """
@@ -115,29 +115,29 @@ class ViewerChannels:
         stamp = timestamp(stamp_ns)
         if self._static_due:
             self._static_due = False
-            entities = standing_entities(self._machine, self._planned, stamp)
+            entities = static_entities(self._machine, self._planned, stamp)
             self._static.log(SceneUpdate(entities=entities), log_time=stamp_ns)
-        where = _whereabouts(t_s, inputs)
+        pose = _vehicle_pose(t_s, inputs)
         if frames_due:
             self._due_s = t_s
-            self._frames(stamp, stamp_ns, where, inputs, outputs)
+            self._frames(stamp, stamp_ns, pose, inputs, outputs)
         if scene_due:
             self._scene_due_s = t_s
-            if where is not None:
-                self._tether(stamp, stamp_ns, where, outputs.get("tether"))
-            self._paths(t_s, stamp, stamp_ns, where, outputs.get("reference"))
+            if pose is not None:
+                self._tether(stamp, stamp_ns, pose, outputs.get("tether"))
+            self._paths(t_s, stamp, stamp_ns, pose, outputs.get("reference"))
 
     def _frames(
         self,
         stamp: Timestamp,
         stamp_ns: int,
-        where: tuple[Vec3, Quat] | None,
+        pose: tuple[Vec3, Quat] | None,
         inputs: dict[str, Any],
         outputs: dict[str, Any],
     ) -> None:
         mocap, arm, reference = inputs.get("mocap"), inputs.get("arm"), outputs.get("reference")
-        if where is not None:
-            (x, y, z), (w, i, j, k) = where
+        if pose is not None:
+            (x, y, z), (w, i, j, k) = pose
             message = FrameTransform(
                 timestamp=stamp,
                 parent_frame_id="world",
@@ -155,13 +155,11 @@ class ViewerChannels:
             turned = (math.cos(half), 0.0, 0.0, math.sin(half)) if math.isfinite(half) else (math.nan,) * 4
             _log_pose(self._reference, stamp, stamp_ns, reference["position_world_m"], turned)
 
-    def _tether(
-        self, stamp: Timestamp, stamp_ns: int, where: tuple[Vec3, Quat], watched: dict[str, Any] | None
-    ) -> None:
+    def _tether(self, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat], watched: dict[str, Any] | None) -> None:
         tether = self._machine.tether
         if tether is None:
             return
-        (px, py, pz), attitude = where
+        (px, py, pz), attitude = pose
         bx, by, bz = quat_rotate(attitude, tether.attachment_body_m)
         end = (px + bx, py + by, pz + bz)
         slack_m = tether.length_m - math.dist(tether.anchor_world_m, end)
@@ -176,19 +174,22 @@ class ViewerChannels:
         t_s: float,
         stamp: Timestamp,
         stamp_ns: int,
-        where: tuple[Vec3, Quat] | None,
+        pose: tuple[Vec3, Quat] | None,
         reference: dict[str, Any] | None,
     ) -> None:
-        if where is not None:
-            self._flown.add(t_s, where[0])
+        if pose is not None:
+            self._flown_trail.add(t_s, pose[0])
         if reference is not None:
-            self._wanted.add(t_s, reference["position_world_m"])
+            self._reference_trail.add(t_s, reference["position_world_m"])
         if not _due(t_s, self._path_due_s, PATH_PERIOD_S):
             return
         self._path_due_s = t_s
         entities = [
             SceneEntity(timestamp=stamp, frame_id="world", id=name, lines=[trail(one.points, colour)])
-            for name, one, colour in (("flown", self._flown, _FLOWN), ("reference", self._wanted, _REFERENCE))
+            for name, one, colour in (
+                ("flown", self._flown_trail, _FLOWN),
+                ("reference", self._reference_trail, _REFERENCE),
+            )
             if len(one.points) > 1
         ]
         if entities:
@@ -196,7 +197,7 @@ class ViewerChannels:
 
 
 class _Joints:
-    """The arm's frames: what is constant of them is made once."""
+    """Writes the arm's frames; their constant parts are built once."""
 
     def __init__(self, machine: Machine) -> None:
         arm = machine.arm
@@ -208,7 +209,7 @@ class _Joints:
         self._elbow, self._tip = (Vector3(x=length, y=0.0, z=0.0) for length in arm.link_lengths_m)
 
     def log(self, channel: FrameTransformsChannel, stamp: Timestamp, stamp_ns: int, angle_rad: Sequence[float]) -> None:
-        """All frames in one message: alpha_1 turns link 1 down about the body's y, alpha_2 turns link 2 the other way."""
+        """Write all frames in one message: alpha_1 turns link 1 down about the body's y axis, alpha_2 turns link 2 the other way."""
         half_1, half_2 = 0.5 * angle_rad[0], -0.5 * angle_rad[1]
         if not self._known or not math.isfinite(half_1) or not math.isfinite(half_2):
             return
@@ -228,7 +229,7 @@ class _Joints:
 
 
 class _Trail:
-    """A path so far, with at most so many points: when there are more, every second one goes and fewer come."""
+    """A path with a bounded number of points: when it is full every second point is removed and the sampling period doubles."""
 
     def __init__(self) -> None:
         self.points: list[Point3] = []
@@ -236,7 +237,7 @@ class _Trail:
         self._last_s = -math.inf
 
     def add(self, t_s: float, position: Sequence[float]) -> None:
-        """Where it is now."""
+        """Add the position if the sampling period has passed."""
         if 0.0 <= t_s - self._last_s < self._period_s or not all(map(math.isfinite, position)):
             return
         self._last_s = t_s
@@ -263,17 +264,17 @@ def _log_pose(
 
 
 def _due(t_s: float, last_s: float, period_s: float) -> bool:
-    """True too if the clock went back, or was not finite."""
+    """Whether a period has passed; also true if the clock went back or was not finite."""
     return not 0.0 <= t_s - last_s < period_s - _EARLY_S
 
 
 def timestamp(stamp_ns: int) -> Timestamp:
-    """The header's form of a wall clock in ns."""
+    """Return a wall clock in ns as a Foxglove time stamp."""
     return Timestamp(stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
 
 
-def _whereabouts(t_s: float, inputs: dict[str, Any]) -> tuple[Vec3, Quat] | None:
-    """Position and attitude by motion capture, by PX4 where that is old, invalid or not finite; None: not known."""
+def _vehicle_pose(t_s: float, inputs: dict[str, Any]) -> tuple[Vec3, Quat] | None:
+    """Return position and attitude from motion capture, or from PX4 if that is stale, untracked or not finite; None if both are."""
     mocap, vehicle = inputs.get("mocap"), inputs.get("vehicle")
     if mocap is not None and mocap["tracking_valid"] and t_s - mocap["stamp_s"] <= _FRESH_S:
         if _usable(mocap["position_world_m"], mocap["attitude_wxyz"]):
@@ -284,7 +285,7 @@ def _whereabouts(t_s: float, inputs: dict[str, Any]) -> tuple[Vec3, Quat] | None
 
 
 def _usable(position: Sequence[float], attitude: Sequence[float]) -> bool:
-    """Finite, and the attitude is a rotation."""
+    """Whether the values are finite and the attitude is a unit quaternion."""
     x, y, z = position
     w, i, j, k = attitude
     return math.isfinite(x + y + z) and abs(w * w + i * i + j * j + k * k - 1.0) < 0.01

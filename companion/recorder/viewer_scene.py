@@ -1,7 +1,7 @@
-"""What a 3D viewer draws of the machine and its room: geometry from the configuration, shapes, the hanging tether. No I/O.
+"""Scene of a 3D viewer: geometry from the configuration, shapes of the machine and its room, the slack tether. No I/O.
 
-World ENU, body FLU, metres. The arm's frames are those of `companion.control.manipulator`: x of ``link1`` points from the shoulder to
-the elbow, x of ``link2`` from the elbow to the net's centre, y of both is the body's.
+World ENU, body FLU, metres. The arm's frames are those of `companion.control.manipulator`: x of ``link1`` points from the shoulder
+to the elbow, x of ``link2`` from the elbow to the net's centre, y of both is the body's.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NEARLY_TAUT = Color(r=0.93, g=0.62, b=0.10, a=1.0)
 TAUT = Color(r=0.85, g=0.15, b=0.15, a=1.0)
 
 _ROTOR_PITCH = 1.0 + 1.05 * math.sqrt(2.0)
-"""Reach over radius of four disks in a square that nearly touch."""
+"""Ratio of reach to disk radius for four disks in a square that nearly touch."""
 _ALONG_X = Quaternion(w=math.sqrt(0.5), x=0.0, y=math.sqrt(0.5), z=0.0)
 _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
@@ -55,7 +55,7 @@ class ArmShape:
 
 @dataclass(frozen=True, slots=True)
 class TetherShape:
-    """The tether, and when it is shown as short."""
+    """The tether and the thresholds of its colours."""
 
     anchor_world_m: Vec3
     attachment_body_m: Vec3
@@ -66,12 +66,12 @@ class TetherShape:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Geometry for a picture; None where the configuration does not tell."""
+    """Geometry of the machine; None where the configuration has no valid value."""
 
     arm: ArmShape | None
     tether: TetherShape | None
     radius_m: float | None
-    """Horizontal reach, rotor disks included."""
+    """Horizontal reach including the rotor disks."""
     ground_clearance_m: float | None
     room_min_world_m: Vec3 | None
     room_max_world_m: Vec3 | None
@@ -83,7 +83,7 @@ class Machine:
 
 
 def machine_of(config: Any) -> Machine:
-    """Geometry from an effective configuration (nested dicts); what is missing or no number is None."""
+    """Return the geometry of an effective configuration (nested dicts); missing and invalid values become None."""
     shoulder = _numbers(config, 3, "vehicle", "arm", "shoulder_body_m")
     links = _numbers(config, 2, "vehicle", "arm", "link_lengths_m")
     arm = None
@@ -114,15 +114,15 @@ def machine_of(config: Any) -> Machine:
 
 
 def path_of(data: Any, most: int = 1000) -> tuple[Vec3, ...]:
-    """Points of a path, [[x, y, z], ...]; empty if it is anything else."""
+    """Return the points of a path [[x, y, z], ...]; empty if the data is anything else."""
     if not isinstance(data, list) or len(data) > most:
         return ()
     points = [_numbers(point, 3) for point in data]
     return tuple(_vec3(point) for point in points if point is not None) if None not in points else ()
 
 
-def standing_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestamp: Timestamp) -> list[SceneEntity]:
-    """Everything that keeps its shape, each in the frame that it is rigid in; it lasts until it is replaced."""
+def static_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestamp: Timestamp) -> list[SceneEntity]:
+    """Return the entities of constant shape, each locked to the frame that it moves with."""
     entities: list[SceneEntity] = []
 
     def add(name: str, frame: str, **shapes: Any) -> None:
@@ -145,26 +145,28 @@ def standing_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestam
 
 
 def tether_colour(tether: TetherShape, slack_m: float, *, held: bool) -> Color:
-    """Green: more slack than the margin; amber: less; red: taut, or `held` (taut or snagged by the watch)."""
+    """Return green for more slack than the margin, amber for less, red if the tether is taut, or taut or snagged by the tether monitor
+    (`held`).
+    """
     if held or slack_m <= tether.taut_slack_m:
         return TAUT
     return NEARLY_TAUT if slack_m < tether.margin_m else SLACK
 
 
 def trail(points: list[Point3], colour: Color, thickness_px: float = 2.0) -> LinePrimitive:
-    """A line through points, as thick on the screen whatever the distance."""
+    """Return a line through points whose thickness on the screen does not depend on the distance."""
     return LinePrimitive(
         type=LinePrimitiveLineType.LineStrip, thickness=thickness_px, scale_invariant=True, points=points, color=colour
     )
 
 
 def point3(p: Vec3) -> Point3:
-    """The message of a point."""
+    """Return a point as a Foxglove message."""
     return Point3(x=p[0], y=p[1], z=p[2])
 
 
 def _airframe(radius_m: float, clearance_m: float | None) -> dict[str, Any]:
-    """Hub, booms, four rotor disks within the reach, and the feet."""
+    """Return hub, booms, four rotor disks within the reach, and feet."""
     rotor_m = radius_m / _ROTOR_PITCH
     out = (radius_m - rotor_m) * math.sqrt(0.5)
     corners = [(out, out), (-out, out), (-out, -out), (out, -out)]
@@ -210,7 +212,7 @@ def _segments(ends: list[Vec3], colour: Color, thickness_px: float) -> LinePrimi
 
 
 def _rod(length_m: float) -> CylinderPrimitive:
-    """From the frame's origin along its x."""
+    """Return a cylinder from the frame's origin along its x axis."""
     return CylinderPrimitive(
         pose=Pose(position=Vector3(x=length_m / 2, y=0.0, z=0.0), orientation=_ALONG_X),
         size=Vector3(x=0.025, y=0.025, z=length_m),

@@ -26,7 +26,7 @@ from companion.ground.protocol.messages import (
 )
 from companion.ground.telemetry import stream as snapshot
 from companion.ground.telemetry.health import NAMES
-from companion.ground.telemetry.stream import TEXT_MAX, StreamMaker, replay
+from companion.ground.telemetry.stream import TEXT_MAX, StreamBuilder, replay
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import (
     AttitudeSetpoint,
@@ -68,10 +68,10 @@ def changed(row: Row, **values: Any) -> Row:
 
 
 def stream_of(*rows: Row) -> Stream:
-    maker = StreamMaker(CONFIG, "s")
+    maker = StreamBuilder(CONFIG, "s")
     for row in rows:
-        maker.take(*row)
-    return maker.make(1.7e9)
+        maker.add_tick(*row)
+    return maker.build(1.7e9)
 
 
 def light_of(stream: Stream, name: str) -> tuple[Light, str]:
@@ -160,7 +160,7 @@ def test_with_nothing_known_everything_is_none_and_all_lights_of_devices_are_off
     lights = {health.name: health.light for health in stream.lights}
     assert {name for name, light in lights.items() if light is not Light.OFF} == {"loop", "recorder"}
     with pytest.raises(LookupError):
-        StreamMaker(CONFIG, "s").make(0.0)
+        StreamBuilder(CONFIG, "s").build(0.0)
 
 
 BAD_NUMBERS = [math.nan, math.inf, -math.inf, 1e308]
@@ -182,14 +182,14 @@ def test_numbers_that_are_none_make_a_message_that_every_parser_reads(bad: float
     event = Event(1.0, "e", Severity.INFO, SafetyAction.NOMINAL, "text")
     tether = TetherState(1.0, 1.0, 1.0, 0.1, 0.5, 0.0, 0.0, False, False, False)
     row = changed(IN_FLIGHT, outputs__events=(event,), outputs__tether=tether)
-    maker = StreamMaker(CONFIG, "s")
-    maker.take(*IN_FLIGHT)
-    maker.take(*(spoilt(record) for record in row))
+    maker = StreamBuilder(CONFIG, "s")
+    maker.add_tick(*IN_FLIGHT)
+    maker.add_tick(*(spoilt(record) for record in row))
 
     def no_constants(text: str) -> Any:
         raise AssertionError(text)
 
-    for topic, record in ((Topic.STREAM, maker.make(1.7e9)), (Topic.EVENTS, maker.events_record())):
+    for topic, record in ((Topic.STREAM, maker.build(1.7e9)), (Topic.EVENTS, maker.events_message())):
         data = json.loads(encode(record), parse_constant=no_constants)
         jsonschema.Draft202012Validator(schema_of(topic)).validate(data)
 
@@ -200,13 +200,13 @@ def test_timings_are_the_worst_since_the_message_before() -> None:
         assert row[0].arm is not None
         return changed(row, arm__asked_s=row[0].arm.stamp_s - (0.0009 if row[0].tick % 7 == 0 else 0.0004))
 
-    maker = StreamMaker(CONFIG, "s")
+    maker = StreamBuilder(CONFIG, "s")
     timings = []
     rows = [asked(row) for row in ROWS]
     for k, row in enumerate(rows):
-        maker.take(*row)
+        maker.add_tick(*row)
         if k % 10 == 9 or k == len(rows) - 1:
-            timings.append(maker.make(0.0).timing)
+            timings.append(maker.build(0.0).timing)
     whole = timing_of(rows)
     for name, values_s in (
         ("core_ms", whole.core_s),
@@ -223,23 +223,23 @@ def test_timings_are_the_worst_since_the_message_before() -> None:
 
 
 def test_late_ticks_and_lost_records_are_counted() -> None:
-    maker = StreamMaker(CONFIG, "s")
+    maker = StreamBuilder(CONFIG, "s")
     for k in range(100):
-        maker.take(*changed(ROWS[k], sent__lateness_s=0.0051 if k % 20 == 3 else 0.0049))
-    stream = maker.make(0.0, dropped=3)
+        maker.add_tick(*changed(ROWS[k], sent__lateness_s=0.0051 if k % 20 == 3 else 0.0049))
+    stream = maker.build(0.0, dropped=3)
     assert (stream.timing.missed, stream.timing.dropped) == (5, 3)
     assert light_of(stream, "recorder") == (Light.WARN, "3 records lost")
-    maker.take(*changed(ROWS[100], recorder_dropped=7))
-    assert maker.make(0.0, dropped=3).timing.dropped == 7
-    assert light_of(maker.make(0.0, recorder_error="the disk is full"), "recorder") == (Light.BAD, "the disk is full")
+    maker.add_tick(*changed(ROWS[100], recorder_dropped=7))
+    assert maker.build(0.0, dropped=3).timing.dropped == 7
+    assert light_of(maker.build(0.0, recorder_error="the disk is full"), "recorder") == (Light.BAD, "the disk is full")
 
 
 def test_the_newest_events_are_kept_and_all_are_counted() -> None:
-    maker = StreamMaker(CONFIG, "s")
+    maker = StreamBuilder(CONFIG, "s")
     for k in range(EVENTS_KEPT + 30):
         event = Event(0.1 * k, f"e{k}", Severity.WARNING, SafetyAction.HOLD, f"text {k}")
-        maker.take(*changed(ROWS[k], outputs__events=(event,), outputs__mission_t_s=0.05 * k))
-    record = maker.events_record()
+        maker.add_tick(*changed(ROWS[k], outputs__events=(event,), outputs__mission_t_s=0.05 * k))
+    record = maker.events_message()
     assert record.count == EVENTS_KEPT + 30
     assert [line.id for line in record.lines] == [f"e{k}" for k in range(30, EVENTS_KEPT + 30)]
     assert record.lines[0].mission_t_s == pytest.approx(1.5)
@@ -248,19 +248,19 @@ def test_the_newest_events_are_kept_and_all_are_counted() -> None:
 
 
 def test_what_repeats_for_ever_pushes_no_event_out() -> None:
-    maker = StreamMaker(CONFIG, "s")
-    maker.tell(1.0, "warning", "px4", "something once")
+    maker = StreamBuilder(CONFIG, "s")
+    maker.add_line(1.0, "warning", "px4", "something once")
     for k in range(5 * EVENTS_KEPT):
-        maker.tell(2.0 + k, "warning", "noise", f"the {k}th", instead=True)
+        maker.add_line(2.0 + k, "warning", "noise", f"the {k}th", instead=True)
     assert [line.text for line in maker.events] == ["something once", f"the {5 * EVENTS_KEPT - 1}th"]
     assert maker.count == 5 * EVENTS_KEPT + 1
 
 
 def test_the_longest_events_fit_into_a_message() -> None:
-    maker = StreamMaker(CONFIG, "s")
+    maker = StreamBuilder(CONFIG, "s")
     for _ in range(EVENTS_KEPT):
-        maker.tell(1e5 / 3, "critical", "x" * 40, "\N{PILE OF POO}\x00" * TEXT_MAX)
-    assert len(encode(maker.events_record())) <= MESSAGE_MAX_BYTES
+        maker.add_line(1e5 / 3, "critical", "x" * 40, "\N{PILE OF POO}\x00" * TEXT_MAX)
+    assert len(encode(maker.events_message())) <= MESSAGE_MAX_BYTES
 
 
 def tether(**values: Any) -> dict[str, Any]:
@@ -346,24 +346,24 @@ def test_a_light_turns_at_the_limit_of_the_vehicle_file(
 
 
 def test_the_rate_of_motion_capture_is_counted_and_judged() -> None:
-    maker = StreamMaker(CONFIG, "s")
+    maker = StreamBuilder(CONFIG, "s")
     rows = [changed(row, mocap__stamp_s=0.025 * (row[0].tick // 5)) for row in ROWS[:500]]  # 40 Hz
     for row in rows[:100]:
-        maker.take(*row)
-    assert "Hz" not in light_of(maker.make(0.0), "motion capture")[1]
+        maker.add_tick(*row)
+    assert "Hz" not in light_of(maker.build(0.0), "motion capture")[1]
     for row in rows[100:]:
-        maker.take(*row)
-    light, text = light_of(maker.make(0.0), "motion capture")
+        maker.add_tick(*row)
+    light, text = light_of(maker.build(0.0), "motion capture")
     assert light is Light.WARN and ("40 Hz" in text or "41 Hz" in text)
 
 
 def test_a_fault_of_one_tick_is_to_be_seen_for_a_second() -> None:
-    maker = StreamMaker(CONFIG, "s")
+    maker = StreamBuilder(CONFIG, "s")
     lights = []
     for k, row in enumerate(ROWS[:600]):
-        maker.take(*changed(row, sent__lateness_s=0.06 if k == 200 else 0.0))
+        maker.add_tick(*changed(row, sent__lateness_s=0.06 if k == 200 else 0.0))
         if k % 10 == 9:
-            lights.append((row[0].t_s, light_of(maker.make(0.0), "loop")[0]))
+            lights.append((row[0].t_s, light_of(maker.build(0.0), "loop")[0]))
     seen_s = [t_s for t_s, light in lights if light is Light.WARN]
     assert 0.9 < seen_s[-1] - seen_s[0] < 1.1
 

@@ -154,7 +154,7 @@ def test_nothing_is_opened_beside_a_flight_process_that_still_lives(
     ):
         rig.beat_until_ready()
         wait_until(lambda: "guardian_no_link" in rig.events, rig.log.read_text)
-        assert "the killed flight process still holds it" in rig.log.read_text()
+        assert "the killed flight process still holds the link" in rig.log.read_text()
         open_files = [os.readlink(one) for one in Path(f"/proc/{rig.guardian.pid}/fd").iterdir()]
         assert os.path.realpath(tmp_path / "autopilot") not in open_files
         rig.flight.kill()

@@ -135,7 +135,7 @@ class Flight:
             assert self._next < len(ROWS), why
             return condition()
 
-        wait_until(tick, lambda: f"{why}: {self.recorder.client.ground}")
+        wait_until(tick, lambda: f"{why}: {self.recorder.client.telemetry_status}")
 
     def begin(self, listener: Listener) -> None:
         """Tick until the ground sees it: from then on everything is told as it happens."""

@@ -165,7 +165,7 @@ def test_a_dead_recorder_does_not_touch_the_flight(recorder: RecorderProcess) ->
     report = recorder.finish(DEADLINE_S)
     assert (report.samples, report.dropped) == (10, 2)
     assert report.error is not None
-    assert "recorder process is gone" in report.error
+    assert "recorder process has ended" in report.error
 
 
 def test_a_killed_recorder_leaves_a_log_that_lacks_at_most_its_last_moment(recorder: RecorderProcess) -> None:
@@ -254,7 +254,7 @@ def test_sigterm_closes_the_log_and_ctrl_c_does_not(recorder: RecorderProcess) -
 def test_an_impossible_path_is_refused_in_one_line_before_the_flight(tmp_path: Path) -> None:
     taken = tmp_path / "taken.mcap"
     taken.touch()
-    for path, reason in ((tmp_path / "no" / "where.mcap", "No such file"), (taken, "exists already")):
+    for path, reason in ((tmp_path / "no" / "where.mcap", "No such file"), (taken, "already exists")):
         with pytest.raises(DeviceError) as refusal:
             RecorderProcess.start(path, config_json="{}", epoch_offset_ns=0, deadline_s=DEADLINE_S)
         assert str(path) in str(refusal.value)
@@ -345,7 +345,7 @@ def test_what_cannot_be_understood_is_nothing(channel: tuple[RecorderClient, soc
     recorder.send(message)
     say(recorder, ground="connected")
     client.record(*tick(0))
-    assert (client.take_commands(), client.error, client.ground) == ([], None, "connected")
+    assert (client.take_commands(), client.error, client.telemetry_status) == ([], None, "connected")
 
 
 def test_an_error_and_the_way_to_the_ground_are_known_the_newest_counts(
@@ -356,7 +356,7 @@ def test_an_error_and_the_way_to_the_ground_are_known_the_newest_counts(
     say(recorder, error="recorder: full")
     say(recorder, ground="not connected")
     client.record(*tick(0))
-    assert (client.ground, client.error, client.gone) == ("not connected", "recorder: full", False)
+    assert (client.telemetry_status, client.error, client.gone) == ("not connected", "recorder: full", False)
 
 
 def test_an_answer_is_a_packet_in_its_turn(channel: tuple[RecorderClient, socket.socket]) -> None:

@@ -135,7 +135,9 @@ def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_told_everythin
             flight.fly(700)
             listener.wait(Topic.EVENTS, Events, lambda events: events.count == 1)
             broker.kill()
-        flight.wait(lambda: "no broker" in (flight.recorder.client.ground or ""), "the flight is not told of the loss")
+        flight.wait(
+            lambda: "no broker" in (flight.recorder.client.telemetry_status or ""), "the flight is not told of the loss"
+        )
         flight.fly(3000)
         broker.start()
         with Listener(broker.port) as listener:
@@ -148,7 +150,7 @@ def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_told_everythin
             flight.fly(3600)
             listener.wait(Topic.STREAM, Stream, lambda stream: stream.t_s > 17.0)
             flight.wait(
-                lambda: (flight.recorder.client.ground or "").startswith("connected"),
+                lambda: (flight.recorder.client.telemetry_status or "").startswith("connected"),
                 "the flight is not told of the return",
             )
             flight.fly(len(ROWS))
@@ -178,8 +180,8 @@ def test_a_broker_that_takes_nothing_costs_no_sample_and_holds_nobody(tmp_path: 
 def test_no_broker_at_all_is_told_once_and_costs_no_sample(tmp_path: Path) -> None:
     url = f"mqtt://127.0.0.1:{free_port()}"
     with flight_with(tmp_path, url) as flight:
-        flight.wait(lambda: flight.recorder.client.ground is not None, "the flight is not told")
-        assert flight.recorder.client.ground == f"no broker at {url}, trying: Connection refused"
+        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")
+        assert flight.recorder.client.telemetry_status == f"no broker at {url}, trying: Connection refused"
         # Its thread yields to everything; 21 s of ticks in a moment could be over before it has written its line.
         flight.wait(lambda: any("no broker" in line for line in log_lines(flight.path)), "not in the log")
         flight.fly(len(ROWS))

@@ -191,7 +191,7 @@ def test_a_command_that_the_broker_kept_is_refused(tmp_path: Path, broker: Broke
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"commands": False}, "switched off in the vehicle file"),
+        ({"commands": False}, "disabled in the vehicle file"),
         ({"operators_file": "/nowhere/operators.yaml"}, "/nowhere/operators.yaml: no such file"),
     ],
 )
@@ -224,7 +224,7 @@ def test_no_command_is_heard_over_a_plain_way_to_another_computer(tmp_path: Path
     address = own_address()
     url = f"mqtt://{address}:{free_port()}"  # nobody listens there: what is refused is refused before any connection
     with flight_with(tmp_path, url) as flight:
-        flight.wait(lambda: flight.recorder.client.ground is not None, "the flight is not told")
+        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")
         flight.finish()
     assert any("commands are not heard over a plain connection" in line for line in log_lines(flight.path))
 
@@ -238,8 +238,8 @@ def test_a_login_that_cannot_be_used_is_told_in_one_line_and_the_log_is_written(
         login.write_text("username: x\npassword: y\n" if fault == "open to others" else "{[", encoding="utf-8")
         login.chmod(0o644 if fault == "open to others" else 0o600)
     with flight_with(tmp_path, broker.url, login_file=str(login)) as flight:
-        flight.wait(lambda: flight.recorder.client.ground is not None, "the flight is not told")
-        told = flight.recorder.client.ground or ""
+        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")
+        told = flight.recorder.client.telemetry_status or ""
         assert told.startswith("no telemetry: ") and str(login) in told and "\n" not in told
         assert ("chmod 600" in told) == (fault == "open to others")
         flight.fly(600)
@@ -264,9 +264,9 @@ def test_a_broker_that_does_not_let_the_vehicle_speak_is_told(tmp_path: Path) ->
     broker.start()
     try:
         with flight_with(tmp_path, broker.url) as flight:
-            text = "does not let this vehicle say its state: Not authorized"
+            text = "does not let this vehicle publish its state: Not authorized"
             flight.wait(lambda: any(text in line for line in log_lines(flight.path)), "the log is not told")
-            assert "does not let this vehicle say its" in (flight.recorder.client.ground or "")
+            assert "does not let this vehicle publish its" in (flight.recorder.client.telemetry_status or "")
     finally:
         broker.stop()
 
@@ -322,7 +322,7 @@ def test_over_tls_with_its_login_a_vehicle_is_seen_and_commanded(tmp_path: Path,
         ("no login", "Not authorized"),
         ("another authority", "certificate verify failed"),
         ("no certificate", "is no certificate in PEM form"),
-        ("a viewer's login", "does not let this vehicle say its state: Not authorized"),
+        ("a viewer's login", "does not let this vehicle publish its state: Not authorized"),
         ("plain to the TLS port", "no broker at"),
     ],
 )
@@ -346,8 +346,8 @@ def test_what_is_wrong_with_login_or_certificate_is_told_and_the_log_is_written(
         case _:
             url = f"mqtt://localhost:{site.tls_port}"
     with flight_with(tmp_path, url, **settings) as flight:
-        flight.wait(lambda: told in (flight.recorder.client.ground or ""), "the flight is not told")
-        assert "\n" not in (flight.recorder.client.ground or "")
+        flight.wait(lambda: told in (flight.recorder.client.telemetry_status or ""), "the flight is not told")
+        assert "\n" not in (flight.recorder.client.telemetry_status or "")
         flight.fly(1500)
         assert flight.finish().samples == 1500
 

@@ -21,7 +21,7 @@ from companion.model.codec import differences, plain
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
 from companion.model.types import Inputs, MocapPose, Outputs, Quat, Sent, TetherState, Vec3
-from companion.recorder.log_file import Disk
+from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
 from companion.recorder.viewer_scene import machine_of, path_of
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
@@ -32,8 +32,8 @@ NAN = math.nan
 
 def written(path: Path, rows: Iterable[Row], *, config: str | None = None, plan: str | None = None) -> Viewed:
     """Rows through the writer alone."""
-    disk = Disk(path)
-    writer = LogWriter(disk, EPOCH_NS, chunk_bytes=2**19)
+    log_file = LogFile(path)
+    writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
     writer.metadata("companion", {"log_format": "1"})
     writer.metadata("config", {"json": config_json() if config is None else config})
     if plan is not None:
@@ -41,7 +41,7 @@ def written(path: Path, rows: Iterable[Row], *, config: str | None = None, plan:
     for row in rows:
         writer.tick(*map(plain, row))
     writer.close()
-    disk.close()
+    log_file.close()
     return view(path)
 
 
@@ -160,8 +160,8 @@ def test_what_stands_is_drawn_once_for_good_in_its_own_frame(tmp_path: Path) -> 
 
 
 def test_a_plan_that_comes_later_is_drawn_with_everything_else_again(tmp_path: Path) -> None:
-    disk = Disk(tmp_path / "flight.mcap")
-    writer = LogWriter(disk, EPOCH_NS, chunk_bytes=2**19)
+    log_file = LogFile(tmp_path / "flight.mcap")
+    writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
     writer.metadata("config", {"json": config_json()})
     rows = still(40)
     for row in rows[:20]:
@@ -170,7 +170,7 @@ def test_a_plan_that_comes_later_is_drawn_with_everything_else_again(tmp_path: P
     for row in rows[20:]:
         writer.tick(*map(plain, row))
     writer.close()
-    disk.close()
+    log_file.close()
     first, second = view(tmp_path / "flight.mcap").by_topic["/scene_static"]
     names = [{one["id"] for one in message.data["entities"]} for message in (first, second)]
     assert names[1] - names[0] == {"planned path"}
@@ -315,18 +315,18 @@ def test_no_sick_tick_is_lost_or_stops_the_viewers(tmp_path: Path) -> None:
 
 
 def test_a_tick_that_cannot_be_drawn_is_recorded_and_told_once(tmp_path: Path) -> None:
-    disk = Disk(tmp_path / "flight.mcap")
-    writer = LogWriter(disk, EPOCH_NS, chunk_bytes=2**19)
+    log_file = LogFile(tmp_path / "flight.mcap")
+    writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
     rows = still(12)
     for inputs, outputs, sent in rows:
         torn: Any = (0.0, 1.0)
         writer.tick(plain(replace(inputs, mocap=mocap(inputs.t_s, position_world_m=torn))), plain(outputs), plain(sent))
     writer.close()
-    disk.close()
+    log_file.close()
     viewed = view(tmp_path / "flight.mcap")
     assert len(viewed.by_topic["/inputs"]) == len(viewed.by_topic["/sent"]) == len(rows)
     assert [message.data["name"] for message in viewed.by_topic["/log"]] == ["recorder"]
-    assert viewed.by_topic["/log"][0].data["message"].startswith("no viewer messages of tick 0: ValueError")
+    assert viewed.by_topic["/log"][0].data["message"].startswith("viewer messages left out: tick 0: ValueError")
 
 
 def floats(data: Any) -> Iterable[float]:

@@ -35,7 +35,7 @@ class Ages:
     force_s: float = UNKNOWN_S
     lateness_s: float = UNKNOWN_S
 
-    def take(self, i: Inputs, lateness_s: float) -> None:
+    def add_tick(self, i: Inputs, lateness_s: float) -> None:
         """One tick."""
         t_s, v = i.t_s, i.vehicle
         if v is not None:
@@ -82,7 +82,7 @@ class Lights:
         self._tether = vehicle.tether
         self._force_max_n = vehicle.devices.force.force_max_n
 
-    def judge(self, look: Look) -> tuple[Health, ...]:
+    def evaluate(self, look: Look) -> tuple[Health, ...]:
         """All lights, in the order of `NAMES`."""
         judged = (
             self._px4(look),

@@ -57,14 +57,14 @@ _LIGHTS_S = 1.0
 T = TypeVar("T", bound=tuple[float, ...])
 
 
-class StreamMaker:
+class StreamBuilder:
     """Takes every tick, makes a `Stream` of the newest now and then, and keeps the newest events."""
 
     def __init__(self, config: FlightConfig, session: str) -> None:
         self._session = session
-        self._lights = Lights(config.vehicle)
+        self._health = Lights(config.vehicle)
         self._newest: tuple[Inputs, Outputs, Sent] | None = None
-        self._now = Ages()
+        self._ages = Ages()
         self._worst = Worst()
         self._past: deque[tuple[float, Ages]] = deque()
         self._frames_s: deque[float] = deque()
@@ -86,11 +86,11 @@ class StreamMaker:
         """Of the newest tick."""
         return self._newest[1] if self._newest is not None else None
 
-    def take(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> None:
+    def add_tick(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> None:
         """The next tick."""
         before = self._newest
         self._newest = (inputs, outputs, sent)
-        self._now.take(inputs, sent.lateness_s)
+        self._ages.add_tick(inputs, sent.lateness_s)
         self._missed += sent.lateness_s > PERIOD_S
         mocap = inputs.mocap
         fresh = mocap is not None and (
@@ -100,9 +100,9 @@ class StreamMaker:
             if self._first_frame_s is None:
                 self._first_frame_s = mocap.stamp_s
             self._frames_s.append(mocap.stamp_s)
-        self._worst.take(before, inputs, sent, fresh)
+        self._worst.add_tick(before, inputs, sent, fresh)
         for event in outputs.events:
-            self._add(
+            self._append(
                 EventLine(
                     event.t_s,
                     outputs.mission_t_s,
@@ -113,7 +113,7 @@ class StreamMaker:
                 )
             )
 
-    def tell(self, t_s: float, severity: str, source: str, text: str, *, instead: bool = False) -> None:
+    def add_line(self, t_s: float, severity: str, source: str, text: str, *, instead: bool = False) -> None:
         """A line that is no event of the core: what PX4 or the guardian says, and what the ground was told.
 
         Args:
@@ -128,13 +128,13 @@ class StreamMaker:
             kept = [line for line in self.events if line.id != source]
             self.events.clear()
             self.events.extend(kept)
-        self._add(EventLine(t_s, mission_t_s, source, severity, SafetyAction.NOMINAL.value, shortened(text)))
+        self._append(EventLine(t_s, mission_t_s, source, severity, SafetyAction.NOMINAL.value, shortened(text)))
 
-    def events_record(self) -> Events:
+    def events_message(self) -> Events:
         """All of them that are kept."""
         return Events(VERSION, self._session, self.count, tuple(map(_finite_line, self.events)))
 
-    def make(self, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Stream:
+    def build(self, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Stream:
         """How it is now, with the worst timings since the message before.
 
         Args:
@@ -151,8 +151,8 @@ class StreamMaker:
         lost = max(dropped, i.recorder_dropped)
         ages = self._ages_of_the_last_second(i.t_s)
         look = Look(i, o, ages, self._mocap_rate_hz(i.t_s), self._missed, lost, recorder_error)
-        timing = self._worst.timing(self._missed, lost)
-        self._now, self._worst = Ages(), Worst()
+        timing = self._worst.message(self._missed, lost)
+        self._ages, self._worst = Ages(), Worst()
         self._seq += 1
         pose_from, position, attitude, age_s = _pose(i, o)
         reference, status = o.reference, i.status
@@ -188,18 +188,18 @@ class StreamMaker:
             tether=_tether(o.tether),
             control=_control(o.control),
             timing=timing,
-            lights=self._lights.judge(look),
+            lights=self._health.evaluate(look),
             bent_by=o.bent_by,
             waits_for_start=o.phase == WAITS_FOR_START,
         )
 
-    def _add(self, line: EventLine) -> None:
+    def _append(self, line: EventLine) -> None:
         self.events.append(line)
         self.count += 1
 
     def _ages_of_the_last_second(self, t_s: float) -> Ages:
         past = self._past
-        past.append((t_s, self._now))
+        past.append((t_s, self._ages))
         while past[0][0] < t_s - _LIGHTS_S:
             past.popleft()
         worst = Ages()
@@ -237,26 +237,26 @@ def replay(
     Returns:
         Records in order, the first tick's and the last tick's among them; and the events of the whole flight.
     """
-    maker = StreamMaker(config, session)
+    maker = StreamBuilder(config, session)
     maker.events = deque(maxlen=max_events)
     period_s = 1.0 / rate_hz
     records: list[Stream] = []
     due_s = -math.inf
     untold: float | None = None
     for inputs, outputs, sent in rows:
-        maker.take(inputs, outputs, sent)
+        maker.add_tick(inputs, outputs, sent)
         untold = inputs.t_s
         if not inputs.t_s < due_s - 1e-6:
             due_s = due_s + period_s if due_s + period_s > inputs.t_s else inputs.t_s + period_s
-            records.append(maker.make(epoch_offset_s + inputs.t_s))
+            records.append(maker.build(epoch_offset_s + inputs.t_s))
             untold = None
             if len(records) >= max_records:
                 records = _halved(records)
                 period_s *= 2.0
                 due_s = inputs.t_s + period_s
     if untold is not None:
-        records.append(maker.make(epoch_offset_s + untold))
-    return records, maker.events_record()
+        records.append(maker.build(epoch_offset_s + untold))
+    return records, maker.events_message()
 
 
 def _halved(records: list[Stream]) -> list[Stream]:

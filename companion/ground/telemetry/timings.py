@@ -17,7 +17,7 @@ class Worst:
         self._lateness_s = self._core_s = 0.0
         self._mocap_s = self._setpoint_s = self._joint_s = self._whole_s = self._read_s = UNKNOWN_S
 
-    def take(self, before: tuple[Inputs, Outputs, Sent] | None, i: Inputs, sent: Sent, fresh: bool) -> None:
+    def add_tick(self, before: tuple[Inputs, Outputs, Sent] | None, i: Inputs, sent: Sent, fresh: bool) -> None:
         """One tick; durations as in `companion.analysis.timing.Stopwatch`."""
         self._lateness_s = max(self._lateness_s, sent.lateness_s)
         self._core_s = max(self._core_s, sent.core_s - sent.joint_read_s)
@@ -36,7 +36,7 @@ class Worst:
         if now.written_s >= before[2].core_s and now.stamp_s > earlier.stamp_s:
             self._joint_s = max(self._joint_s, now.written_s - earlier.stamp_s)
 
-    def timing(self, missed: int, dropped: int) -> Timing:
+    def message(self, missed: int, dropped: int) -> Timing:
         """As a message says it."""
         return Timing(
             lateness_ms=_ms(self._lateness_s) or 0.0,

@@ -198,9 +198,9 @@ def test_a_long_press_ends_with_the_permission(stand: Stand, page: Page) -> None
 
 
 def test_a_vehicle_that_hears_no_commands_says_so(page: Page) -> None:
-    page.tell(told(state(commands=False, text="commands are switched off in the vehicle file")))
+    page.tell(told(state(commands=False, text="commands are disabled in the vehicle file")))
     assert page.enabled() == set()
-    assert page.text("#commands-why") == "commands are switched off in the vehicle file"
+    assert page.text("#commands-why") == "commands are disabled in the vehicle file"
 
 
 def _hold_down(page: Page, command: str, seconds: float, news: Callable[[], Message]) -> None:
