@@ -1,4 +1,4 @@
-"""`companion broker`: make a broker's users and certificates, and see what a broker lets a login do."""
+"""`companion broker`: create a broker's users and certificates, and show what a broker permits a login."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
 
 if TYPE_CHECKING:
-    from companion.ground.broker.check import Found
-    from companion.ground.broker.setup import Wanted
+    from companion.ground.broker.check import CheckResult
+    from companion.ground.broker.setup import BrokerUsers
 
 VEHICLE = "tarot650-2r"
 """Name of the supplied vehicle file's vehicle."""
@@ -25,33 +25,33 @@ VEHICLE = "tarot650-2r"
 
 def add_parser(commands: Any) -> None:
     """Add `broker` to the sub-parsers of `companion`."""
-    broker = commands.add_parser("broker", help="a broker for several computers: users, certificates, what it allows")
+    broker = commands.add_parser("broker", help="a broker for several computers: users, certificates, permissions")
     parts = broker.add_subparsers(dest="part", required=True, metavar="PART")
     init = parts.add_parser(
         "init",
-        help="make users, keys and certificates for a mosquitto",
-        description="Make a folder with everything that a mosquitto with logins and TLS needs, and a folder in it for each computer "
-        "that connects. Exit 0: made; 2: a name is wrong, or something is there already; 3: a tool or package is missing.",
+        help="create users, keys and certificates for a mosquitto broker",
+        description="Create a folder with all files that a mosquitto broker with logins and TLS needs, and in it a folder for each "
+        "computer that connects. Exit 0: created; 2: a name is invalid or the folder is not empty; 3: a tool or package is missing.",
     )
-    init.add_argument("folder", metavar="DIR", help="not there yet, or empty")
+    init.add_argument("folder", metavar="DIR", help="folder to create; must not exist, or be empty")
     several = {"action": "extend", "nargs": "+", "default": [], "metavar": "NAME"}
     init.add_argument(
-        "--host", **several, help="names and addresses of the broker's computer (default: this one's name)"
+        "--host", **several, help="names and addresses of the broker's computer (default: the name of this computer)"
     )
-    init.add_argument("--operator", **several, help="who may command (default: you)")
-    init.add_argument("--viewer", **several, help="who may look on (default: viewer)")
+    init.add_argument("--operator", **several, help="names of operators, who may command (default: you)")
+    init.add_argument("--viewer", **several, help="names of viewers, who may only watch (default: viewer)")
     init.add_argument("--vehicle", **several, help=f"names of vehicles in topics (default: {VEHICLE})")
     init.add_argument(
-        "--days", type=_days, default=730, help="how long the broker's certificate is valid (default: 730)"
+        "--days", type=_days, default=730, help="validity of the broker's certificate in days (default: 730)"
     )
     init.add_argument(
-        "--renew-certificates", action="store_true", help="only a new certificate for the broker of DIR; all else stays"
+        "--renew-certificates", action="store_true", help="only renew the certificate of the broker in DIR"
     )
     init.set_defaults(run=_init)
 
     check = parts.add_parser(
         "check",
-        help="what does a broker let a login do?",
+        help="show what a broker permits a login",
         description="Connect, subscribe and publish an empty message on every topic. Exit 0: connected; 2: wrong input; 3: no "
         "connection.",
     )
@@ -59,7 +59,7 @@ def add_parser(commands: Any) -> None:
     check.add_argument("--login", metavar="FILE", help="YAML file with username and password")
     check.add_argument("--ca", metavar="FILE", help="certificate of the authority that signed the broker's")
     check.add_argument(
-        "--vehicle", metavar="NAME", help="whose topics to write to, for a vehicle's own login (default: of no vehicle)"
+        "--vehicle", metavar="NAME", help="vehicle whose topics to write to, with its own login (default: none)"
     )
     check.set_defaults(run=_check)
 
@@ -81,21 +81,23 @@ def _init(arguments: argparse.Namespace) -> int:
         tell("companion broker init: certificates need cryptography: pip install 'companion[ground]'")
         return EXIT_REFUSED
     if not arguments.folder.strip():
-        tell("companion broker init: DIR: expected the name of a folder, got an empty one")
+        tell("companion broker init: DIR: expected the name of a folder, got an empty name")
         return EXIT_BAD_INPUT
     folder = Path(arguments.folder).absolute()
     now = datetime.datetime.now(datetime.UTC)
     if arguments.renew_certificates:
         if arguments.operator or arguments.viewer or arguments.vehicle:
             tell(
-                "companion broker init: --renew-certificates makes no users: expected no --operator, --viewer, --vehicle"
+                "companion broker init: --renew-certificates creates no users: remove --operator, --viewer and --vehicle"
             )
             return EXIT_BAD_INPUT
-        hosts = broker_setup.renew(folder, arguments.host, arguments.days, now)
-        print(f"{folder}/server.pem, server.key: for {', '.join(hosts)}, until {broker_setup.certificate_ends(folder)}")
-        print("The broker reads them when it starts: restart it. Nobody else needs a new file.")
+        hosts = broker_setup.renew_certificate(folder, arguments.host, arguments.days, now)
+        print(
+            f"{folder}/server.pem, server.key: for {', '.join(hosts)}, until {broker_setup.certificate_expiry(folder)}"
+        )
+        print("Restart the broker, which reads them when it starts. No other computer needs a new file.")
         return EXIT_OK
-    wanted = broker_setup.Wanted(
+    users = broker_setup.BrokerUsers(
         hosts=tuple(arguments.host) or broker_setup.this_host(),
         operators=tuple(arguments.operator) or (user_name(),),
         viewers=tuple(arguments.viewer) or ("viewer",),
@@ -103,20 +105,20 @@ def _init(arguments: argparse.Namespace) -> int:
         days=arguments.days,
     )
     try:
-        broker_setup.make(folder, wanted, now)
+        broker_setup.create(folder, users, now)
     except broker_setup.SetupError as error:
         tell(f"companion broker init: {error}")
         return EXIT_REFUSED
-    print("\n".join(_instructions(folder, wanted, str(broker_setup.certificate_ends(folder)))))
+    print("\n".join(_instructions(folder, users, str(broker_setup.certificate_expiry(folder)))))
     return EXIT_OK
 
 
-def _instructions(folder: Path, wanted: Wanted, ends: str) -> list[str]:
-    """What to copy where."""
-    host = (*wanted.hosts, "localhost")[0]
+def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
+    """Return the instructions: which files to copy where."""
+    host = (*users.hosts, "localhost")[0]
     url = f"mqtts://{f'[{host}]' if ':' in host else host}:8883"
     here = shlex.quote(str(folder))
-    lines = [f"made {folder}: broker's certificate until {ends}", ""]
+    lines = [f"created {folder}: the broker's certificate is valid until {ends}", ""]
     if os.geteuid() != 0:
         lines += ["Broker, by hand:", f"  mosquitto -c {here}/mosquitto.conf", ""]
     lines += [
@@ -126,9 +128,9 @@ def _instructions(folder: Path, wanted: Wanted, ends: str) -> list[str]:
         f"  sudo install -m 644 {here}/service.conf /etc/mosquitto/conf.d/companion.conf && sudo systemctl restart mosquitto",
         "",
     ]
-    for name in wanted.vehicles:
+    for name in users.vehicles:
         lines += [
-            f"Vehicle {name}: copy {folder}/vehicles/{name} to its computer, say to /etc/companion; its owner is the user that flies.",
+            f"Vehicle {name}: copy {folder}/vehicles/{name} to its computer, say to /etc/companion; owned by the user that flies.",
             "Vehicle file:",
             "  ground:",
             f"    topic: {name}",
@@ -139,13 +141,13 @@ def _instructions(folder: Path, wanted: Wanted, ends: str) -> list[str]:
             "      operators_file: /etc/companion/operators.yaml",
             "",
         ]
-    for name in wanted.operators:
+    for name in users.operators:
         lines += [
             f"Operator {name}: copy {folder}/operators/{name} to the computer of {name}. In it:",
             f"  companion monitor --broker {url} --login login.yaml --ca ca.pem --operator {name} --operators operators.yaml",
             "",
         ]
-    for name in wanted.viewers:
+    for name in users.viewers:
         lines += [
             f"Viewer {name}: copy {folder}/viewers/{name}. In it:",
             f"  companion monitor --broker {url} --login login.yaml --ca ca.pem --view-only",
@@ -153,7 +155,7 @@ def _instructions(folder: Path, wanted: Wanted, ends: str) -> list[str]:
         ]
     return [
         *lines,
-        "Whoever has a folder is who it names: copy each to its computer only (scp -rp), and keep ca.key here.",
+        "A folder gives access under its name: copy each only to its computer (scp -rp), and keep ca.key here.",
     ]
 
 
@@ -170,7 +172,7 @@ def _check(arguments: argparse.Namespace) -> int:
     except CheckError as error:
         tell(error)
         return EXIT_REFUSED
-    who = access.username or "anybody (no login)"
+    who = access.username or "anonymous (no login)"
     print(f"{access.address}: connected as {who}{', ' + found.tls if found.tls else ', not encrypted'}")
     if found.certificate_ends is not None:
         print(f"certificate valid until {found.certificate_ends}")
@@ -178,15 +180,15 @@ def _check(arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def table(found: Found) -> list[str]:
-    """What may be read and written, for people."""
+def table(found: CheckResult) -> list[str]:
+    """Return a table of the permissions."""
     words = {True: "yes", False: "no", None: "?"}
     lines = [f"{'':10} read  write"]
     lines += [f"{right.topic.value:10} {words[right.read]:5} {words[right.write]}" for right in found.rights]
     if any(right.read is None for right in found.rights):
-        lines.append("?: it may be subscribed to, but nothing was there that could have come")
+        lines.append("?: subscribing is permitted, but there was no message to receive")
     lines.append(f"vehicles heard: {', '.join(found.vehicles) or 'none'}")
     command = next(right for right in found.rights if right.topic is Topic.COMMAND)
     if command.write:
-        lines.append("commands pass this broker; the vehicle takes those that an operator has signed")
+        lines.append("commands pass this broker; the vehicle accepts those that an operator has signed")
     return lines

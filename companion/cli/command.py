@@ -1,4 +1,4 @@
-"""`companion command hold|land|abort|resume|start`: one signed command to one vehicle, and what came of it."""
+"""`companion command hold|land|abort|resume|start`: send one signed command to one vehicle and print its answer."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any
 from companion.cli.monitor import add_broker_options, vehicle_option
 from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
-from companion.ground.protocol.keys import SAFER
+from companion.ground.protocol.keys import SAFER_COMMANDS
 from companion.ground.protocol.messages import CommandName, Topic
-from companion.ground.station.command_sender import INSTEAD, Failed, Sent, signer_of, told
+from companion.ground.station.command_sender import FALLBACK_ADVICE, Failed, Sent, ack_text, signer_of
 from companion.ground.station.link import BrokerRefused
 from companion.ground.station.station import Station
 from companion.ground.station.tasks import until_first
@@ -22,13 +22,13 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_
 from companion.runtime.console import tell
 
 FOUND_S = 5.0
-"""For the broker, and for a first word of the vehicle."""
+"""Timeout for the broker and the first message of the vehicle."""
 _HELP = {
-    CommandName.HOLD: "come to rest and stay",
+    CommandName.HOLD: "stop and hold position",
     CommandName.LAND: "land",
-    CommandName.ABORT: "give the mission up and land at once",
-    CommandName.RESUME: "go on after a hold, if the supervisor agrees",
-    CommandName.START: "take off; for flights that wait for it",
+    CommandName.ABORT: "abort the mission and land at once",
+    CommandName.RESUME: "continue after a hold, if the supervisor allows it",
+    CommandName.START: "take off; for flights that wait for START",
 }
 
 
@@ -46,14 +46,14 @@ def add_parser(commands: Any) -> None:
         "--hold",
         type=int,
         metavar="N",
-        help="resume: number of the hold that is to end, as the telemetry has it; default: the one that stands now",
+        help="resume: number of the hold to end, as in the telemetry (default: the current hold)",
     )
     add_broker_options(command)
     command.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Command; returns the exit code."""
+    """Send the command; returns the exit code."""
     only = vehicle_option(arguments)
     access = broker_access(arguments.broker, arguments.login, arguments.ca)
     signer = signer_of(access, arguments.operators, arguments.operator)
@@ -62,22 +62,22 @@ def run(arguments: argparse.Namespace) -> int:
     name = CommandName(arguments.name)
     if arguments.hold is not None and (name is not CommandName.RESUME or arguments.hold < 1):
         raise ConfigError([f"--hold {arguments.hold}: expected the number of a hold, 1 or more, and only with resume"])
-    teller = _Commander(name, only, arguments.hold)
+    commander = _Commander(name, only, arguments.hold)
     station = Station(
         access,
         signer,
-        None,  # all: whoever misspelt a name sees the others
-        lambda heard: teller.changed.set(),
-        lambda connected, text: teller.changed.set(),
+        None,  # all vehicles, so that a misspelt name can be reported with the others
+        lambda heard: commander.changed.set(),
+        lambda connected, text: commander.changed.set(),
         topics=(Topic.STATE, Topic.ACK, Topic.STREAM),
         in_order=True,
     )
     try:
-        asyncio.run(until_first(station.run(), teller.command(station)))
+        asyncio.run(until_first(station.run(), commander.command(station)))
     except BrokerRefused as error:
         tell(f"companion command: {error}")
         return EXIT_REFUSED
-    return teller.code
+    return commander.code
 
 
 class _Commander:
@@ -90,51 +90,52 @@ class _Commander:
         self._sent = False
 
     async def command(self, station: Station) -> None:
-        """Find the vehicle, command it, tell what came of it."""
+        """Find the vehicle, send the command, print the result."""
         try:
             async with asyncio.timeout(FOUND_S):
                 vehicle = await self._found(station)
         except TimeoutError:
-            self._end(EXIT_LOST, f"{self._why_nobody(station)}; {INSTEAD}")
+            self._end(EXIT_LOST, f"{self._why_nobody(station)}; {FALLBACK_ADVICE}")
             return
         if vehicle is None:
             return
-        ack = await station.orders.give(vehicle, self._command, self._hear, self._hold)
+        ack = await station.commands.send(vehicle, self._command, self._hear, self._hold)
         if ack is None:
             self.code = EXIT_LOST if self._sent else EXIT_REFUSED
         elif ack.accepted:
             self.code = EXIT_OK
-            print(f"{vehicle}: {told(ack)}", flush=True)
+            print(f"{vehicle}: {ack_text(ack)}", flush=True)
         else:
-            self._end(EXIT_REFUSED, f"{vehicle}: {told(ack)}")
+            self._end(EXIT_REFUSED, f"{vehicle}: {ack_text(ack)}")
 
     async def _found(self, station: Station) -> str | None:
-        """The one vehicle that is meant; None: there are several, and that was told.
+        """Return the vehicle to command; None if several are possible, which has been reported.
 
-        What is retained comes before the link says that it is connected (`Station`, in_order): until then nobody is missing.
+        Retained messages arrive before the link reports that it is connected (`Station`, in_order): until then no vehicle counts as
+        missing.
         """
         connected_s: float | None = None
         while True:
             self.changed.clear()
-            known = station.watch.vehicles
+            known = station.tracker.vehicles
             if station.link.connected:
                 connected_s = connected_s or time.monotonic()
-                # What flies has proven so by then, whatever its state says.
+                # A flying vehicle has sent a proven message by then, whatever its state message says.
                 waited = time.monotonic() - connected_s > LIVE_S
-                names = [self._only] if self._only is not None else station.watch.there(time.monotonic())
-                if len(names) > 1 and self._command in SAFER:
+                names = [self._only] if self._only is not None else station.tracker.present(time.monotonic())
+                if len(names) > 1 and self._command in SAFER_COMMANDS:
                     if not waited:
-                        names = []  # a state proves nothing, and anybody may have left it behind
-                    elif len(proven := station.watch.proven(time.monotonic())) == 1:
+                        names = []  # a retained state is no proof of a flight
+                    elif len(proven := station.tracker.proven(time.monotonic())) == 1:
                         others = ", ".join(name for name in names if name not in proven)
                         tell(
-                            f"companion command: {proven[0]} is meant, nothing is proven by: {others}; "
+                            f"companion command: sent to {proven[0]}; no proven messages from: {others}; "
                             "to command another: --vehicle NAME"
                         )
                         return proven[0]
                 if len(names) > 1:
                     self._end(
-                        EXIT_BAD_INPUT, f"there are several vehicles ({', '.join(names)}); say which: --vehicle NAME"
+                        EXIT_BAD_INPUT, f"there are several vehicles ({', '.join(names)}); choose one: --vehicle NAME"
                     )
                     return None
                 if names and names[0] in known:
@@ -148,9 +149,9 @@ class _Commander:
     def _why_nobody(self, station: Station) -> str:
         if not station.link.connected:
             return station.link.text
-        there = [f"{name} ({_presence(vehicle)})" for name, vehicle in sorted(station.watch.vehicles.items())]
+        there = [f"{name} ({_presence(vehicle)})" for name, vehicle in sorted(station.tracker.vehicles.items())]
         whom = "a vehicle" if self._only is None else repr(self._only)
-        return f"nothing heard from {whom} at the broker within {FOUND_S:g} s" + (
+        return f"no message from {whom} at the broker within {FOUND_S:g} s" + (
             f"; known: {', '.join(there)}" if there else ""
         )
 

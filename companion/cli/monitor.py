@@ -1,4 +1,4 @@
-"""`companion monitor`: watch and command vehicles from the ground, in a browser or in a terminal; or look at logs of flights."""
+"""`companion monitor`: watch and command vehicles from the ground, in a browser or in a terminal; or view logs of flights."""
 
 from __future__ import annotations
 
@@ -37,15 +37,16 @@ def add_parser(commands: Any) -> None:
         help="watch and command from the ground: a page in the browser, or --text in the terminal",
         description="Serve a page that shows what vehicles send over MQTT and takes commands; with LOG, a page that plays logs.",
     )
-    monitor.add_argument(
-        "logs", nargs="*", type=Path, metavar="LOG", help="flight.mcap: look at it; no broker is needed"
-    )
+    monitor.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="flight.mcap to view; needs no broker")
     add_broker_options(monitor)
-    monitor.add_argument("--view-only", action="store_true", help="nobody commands from here")
-    monitor.add_argument("--text", action="store_true", help="in this terminal instead of a page")
-    monitor.add_argument("--port", type=int, default=PORT, help="of the page (default: %(default)s; 0: any)")
+    monitor.add_argument("--view-only", action="store_true", help="allow no commands from here")
+    monitor.add_argument("--text", action="store_true", help="show it in this terminal instead of a page")
+    monitor.add_argument("--port", type=int, default=PORT, help="port of the page (default: %(default)s; 0: any)")
     monitor.add_argument(
-        "--host", default="127.0.0.1", metavar="ADDRESS", help="where the page is served (default: %(default)s)"
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="address on which the page is served (default: %(default)s)",
     )
     monitor.add_argument("--cert", metavar="FILE", help="certificate (PEM) to serve the page with TLS")
     monitor.add_argument("--key", metavar="FILE", help="its private key (PEM)")
@@ -54,22 +55,22 @@ def add_parser(commands: Any) -> None:
 
 
 def add_broker_options(parser: argparse.ArgumentParser) -> None:
-    """What every command of the ground needs to know of broker and operator."""
+    """Add the options for broker and operator that all ground commands share."""
     parser.add_argument(
         "--broker", metavar="URL", default=Mqtt().url, help="mqtt[s]://HOST:PORT (default: %(default)s)"
     )
     parser.add_argument("--login", metavar="FILE", help="YAML file with username and password")
     parser.add_argument("--ca", metavar="FILE", help="certificates (PEM) of the authority that signed the broker's")
-    parser.add_argument("--operator", metavar="NAME", help="who commands (default: the only one in the file)")
-    parser.add_argument("--operators", metavar="FILE", help="keys of operators (default: this user's own)")
-    parser.add_argument("--vehicle", metavar="NAME", help="this one only")
+    parser.add_argument("--operator", metavar="NAME", help="operator who commands (default: the only one in the file)")
+    parser.add_argument("--operators", metavar="FILE", help="file of operator keys (default: this user's own)")
+    parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
 
 
 def vehicle_option(arguments: argparse.Namespace) -> str | None:
-    """The vehicle's name, looked at.
+    """Return the vehicle's name.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the name is invalid.
     """
     name: str | None = arguments.vehicle
     if name is not None and VEHICLE_NAME.fullmatch(name) is None:
@@ -80,7 +81,7 @@ def vehicle_option(arguments: argparse.Namespace) -> str | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Watch until Ctrl-C; returns the exit code."""
+    """Run until Ctrl-C; returns the exit code."""
     _check(arguments)
     try:
         if arguments.text:
@@ -96,11 +97,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Refusal(Exception):
-    """Something that is needed is not to be had; one line for the user."""
+    """A package, port or file that is needed is not available; one line for the user."""
 
 
 async def until_signal(work: Coroutine[Any, Any, Any]) -> None:
-    """Do the work until SIGINT, SIGTERM or SIGHUP, and end it in order."""
+    """Run a coroutine until SIGINT, SIGTERM or SIGHUP, then cancel it."""
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -109,17 +110,19 @@ async def until_signal(work: Coroutine[Any, Any, Any]) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Options against each other.
+    """Check the options against each other.
 
     Raises:
         ConfigError: one line.
     """
     if arguments.text and arguments.logs:
-        raise ConfigError(["companion monitor: --text shows a running flight; for logs, companion report, or the page"])
+        raise ConfigError(
+            ["companion monitor: --text shows a running flight only; for logs use the page or companion report"]
+        )
     if not 0 <= arguments.port <= 65535:
         raise ConfigError([f"companion monitor: --port {arguments.port}: expected 0 to 65535"])
     if (arguments.cert is None) != (arguments.key is None):
-        raise ConfigError(["companion monitor: --cert and --key go together"])
+        raise ConfigError(["companion monitor: --cert and --key must be given together"])
 
 
 def _station_settings(arguments: argparse.Namespace) -> tuple[BrokerAccess, Signer | str, str | None]:
@@ -135,12 +138,12 @@ def _serve(arguments: argparse.Namespace) -> None:
         if error.name != "aiohttp":
             raise
         raise _Refusal("the page needs aiohttp: pip install 'companion[ground]'; --text does not") from None
-    serving = web.Serving(arguments.host, arguments.port, _tls(arguments.cert, arguments.key))
+    serving = web.ServerSettings(arguments.host, arguments.port, _tls(arguments.cert, arguments.key))
 
     def listening(monitor: web.Monitor) -> None:
         print(f"companion monitor: {monitor.url}  (Ctrl-C ends)", flush=True)
-        if monitor.why_not is not None and not arguments.logs:
-            print(f"companion monitor: view only: {monitor.why_not}", flush=True)
+        if monitor.view_only_reason is not None and not arguments.logs:
+            print(f"companion monitor: view only: {monitor.view_only_reason}", flush=True)
         if arguments.open:
             threading.Thread(
                 target=_open, args=(monitor.url,), daemon=True
@@ -159,7 +162,7 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 
 def _read(paths: Sequence[Path]) -> list[ReplayLog]:
-    """Before anything is served: an hour's log takes a minute or two, and Ctrl-C ends it."""
+    """Read the logs before anything is served: a log of an hour takes one to two minutes, and Ctrl-C ends it."""
     from companion.ground.station.replay_log import read_for_page
 
     logs = []
@@ -172,7 +175,7 @@ def _read(paths: Sequence[Path]) -> list[ReplayLog]:
 
 def _open(url: str) -> None:
     if not webbrowser.open(url):
-        tell("companion monitor: --open: found no browser here; open the address above in one")
+        tell("companion monitor: --open: no browser found; open the address above")
 
 
 def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:

@@ -213,7 +213,11 @@ class Flight:
         """Report the state of the link to ground stations when it changes."""
         client = self._recorder.client
         gone = client.gone and client.telemetry_status is not None
-        ground = "the recorder process has ended: no telemetry, no commands; Ctrl-C lands" if gone else client.telemetry_status
+        ground = (
+            "the recorder process has ended: no telemetry, no commands; Ctrl-C lands"
+            if gone
+            else client.telemetry_status
+        )
         if ground != self._ground:
             self._ground = ground
             ipc.send(self._channel, {"type": "ground", "text": ground})

@@ -17,7 +17,7 @@ from companion.config.ground import Mqtt, topic_name
 from companion.config.loader import FlightConfig
 from companion.ground.protocol.access import KEYS, BrokerAccess, broker_access
 from companion.ground.protocol.commands import Verifier
-from companion.ground.protocol.connection import Connection, why
+from companion.ground.protocol.connection import Connection, error_text
 from companion.ground.protocol.keys import load_operators
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, RETAINED, STREAM_PERIOD_S, Command, Topic
 from companion.model.codec import pack_plain
@@ -197,11 +197,11 @@ class Uplink:
                 pause_s = PAUSE_MIN_S
                 await self._serve(client)
             except aiomqtt.MqttError as error:
-                reason = why(error)
+                reason = error_text(error)
             finally:
                 self._connected = False
                 complete = self._session.over and self._outbox.sent.is_set()
-                await client.drop(with_will=not complete)
+                await client.shut_down(with_will=not complete)
             self._report_change(WARNING, f"no broker at {self._access.address}, trying: {reason}")
             await asyncio.sleep(pause_s)
             pause_s = min(PAUSE_MAX_S, pause_s * 1.6)
@@ -215,7 +215,7 @@ class Uplink:
         self._counts.connections += 1
         self._report_change(INFO, f"connected to {self._access.address}")
         if self._session.accepts_commands:
-            refusal = await client.hear(self._command_topic, 1)
+            refusal = await client.subscribe_topic(self._command_topic, 1)
             text = f"the broker does not let this vehicle subscribe to commands: {refusal}"
             if refusal is not None:
                 self._session.notify(time.monotonic(), WARNING, text)
@@ -223,7 +223,8 @@ class Uplink:
         self._outbox.begin()
         self._connected = True
         parts = {
-            asyncio.create_task(part) for part in (client.broken(), self._send_stream(client), self._send_kept(client))
+            asyncio.create_task(part)
+            for part in (client.wait_broken(), self._send_stream(client), self._send_kept(client))
         }
         try:
             done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
@@ -245,7 +246,7 @@ class Uplink:
             payload, outbox.stream = outbox.stream, None
             outbox.stream_there.clear()
             if payload is not None:
-                await client.send(topic, payload, qos=0, retain=False)
+                await client.publish_message(topic, payload, qos=0, retain=False)
                 self._counts.stream_sent += 1
 
     async def _send_kept(self, client: Connection) -> None:
@@ -267,7 +268,9 @@ class Uplink:
             outbox.sent.set()
 
     async def _send(self, client: Connection, topic: Topic, payload: bytes) -> None:
-        refusal = await client.send(topic.of(self._session.vehicle), payload, qos=1, retain=topic in RETAINED)
+        refusal = await client.publish_message(
+            topic.of(self._session.vehicle), payload, qos=1, retain=topic in RETAINED
+        )
         if refusal is None:
             self._refused_topics.discard(topic)
         elif topic not in self._refused_topics:

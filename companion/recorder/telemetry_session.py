@@ -27,7 +27,7 @@ from companion.ground.protocol.messages import (
 )
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
-from companion.ground.telemetry.stream import StreamBuilder, shortened
+from companion.ground.telemetry.stream import StreamBuilder, truncated
 from companion.model.codec import restore, unpack_plain
 from companion.model.types import Inputs, Outcome, Outputs, Sent
 from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK
@@ -280,7 +280,7 @@ class TelemetrySession:
 
     def _proven(self, ack: Ack) -> Ack:
         """Return the ack with a proof for the operator who sent the command."""
-        key = self._verifier.operators.find(ack.operator) if self._verifier is not None else None
+        key = self._verifier.operators.find_key(ack.operator) if self._verifier is not None else None
         return ack if key is None else with_proof(ack, self.vehicle, key)
 
     def _metadata(self, name: str, values: dict[str, str]) -> None:
@@ -290,7 +290,7 @@ class TelemetrySession:
             self._changed.add(Topic.SCENE)
         elif name == "preflight":
             rows = [
-                PreflightRow(str(row["id"]), str(row["level"]), shortened(str(row["text"])))
+                PreflightRow(str(row["id"]), str(row["level"]), truncated(str(row["text"])))
                 for row in json.loads(values["json"])
             ]
             self._preflight = Preflight(VERSION, self.session, tuple(rows))
@@ -329,4 +329,4 @@ class TelemetrySession:
             refusals.count, refusals.reported_s = 0, now_s
             t_s = self.flight_s(now_s) or 0.0
             self._log.append((t_s, WARNING, text))
-            self._stream.add_line(t_s, WARNING, f"command_refused_{reason}", text, instead=True)
+            self._stream.add_line(t_s, WARNING, f"command_refused_{reason}", text, replace_last=True)

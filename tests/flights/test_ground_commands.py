@@ -87,7 +87,7 @@ class Station:
                 self.stream = decode(Stream, message.payload)
                 assert stream_proven(self.stream, self._vehicle, self._key)
                 self._session = self.stream.session
-                self._clock.heard(self.stream.t_s, time.monotonic())
+                self._clock.add(self.stream.t_s, time.monotonic())
             case Topic.ACK:
                 ack = decode(Ack, message.payload)
                 assert ack_proven(ack, self._vehicle, self._key)

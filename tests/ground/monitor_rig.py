@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import Operator, Operators
 from companion.ground.protocol.proof import Signer
-from companion.ground.station.web import Monitor, Serving, serve_live
+from companion.ground.station.web import Monitor, ServerSettings, serve_live
 from tests.support import DEADLINE_S
 
 ANNA = Operator("anna", b"a" * 32)
@@ -38,14 +38,14 @@ def play(scene: Coroutine[Any, Any, None]) -> None:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Look again and again, until `play`'s deadline."""
+    """Snapshot again and again, until `play`'s deadline."""
     while not condition():  # noqa: ASYNC110 - nobody tells
         await asyncio.sleep(0.01)
 
 
 @contextlib.asynccontextmanager
 async def monitor_at(
-    url: str, signer: Signer | str = SIGNER, *, serving: Serving | None = None, only: str | None = None
+    url: str, signer: Signer | str = SIGNER, *, serving: ServerSettings | None = None, only: str | None = None
 ) -> AsyncIterator[Monitor]:
     """The monitor of a broker, on a free port."""
     served: list[Monitor] = []
@@ -55,7 +55,7 @@ async def monitor_at(
         served.append(monitor)
         listening.set()
 
-    serving = serving or Serving("127.0.0.1", 0)
+    serving = serving or ServerSettings("127.0.0.1", 0)
     work = asyncio.ensure_future(serve_live(serving, broker_access(url, None, None), signer, only, on_listening))
     try:
         ready = asyncio.ensure_future(listening.wait())

@@ -37,7 +37,7 @@ from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_jsonable
 from companion.model.types import Sent
 from companion.sitl_config.loader import load_sitl
-from sitl.fast.loop import FastFlight
+from sitl.fast.loop import FastFlight, FastResult
 from tests.support import CATCH, DEADLINE_S
 
 SESSION = "5e55104e"
@@ -59,10 +59,15 @@ class Flown:
 
 
 @cache
-def flown() -> Flown:
+def catch_flight() -> FastResult:
     """The mission `catch`, flown in the fast loop."""
-    config = load_sitl(CATCH)
-    result = FastFlight(config).run()
+    return FastFlight(load_sitl(CATCH)).run()
+
+
+@cache
+def flown() -> Flown:
+    """The mission `catch` as telemetry."""
+    config, result = load_sitl(CATCH).flight, catch_flight()
     rows = [(i, o, sent_at(i.tick, i.t_s)) for i, o in zip(result.inputs, result.outputs, strict=True)]
     streams, events = replay(rows, config, SESSION, 1.7e9)
     path = [o.reference.position_world_m for o in result.outputs if o.reference is not None]

@@ -53,7 +53,7 @@ def _holding(page: Page, stand: Stand) -> None:
     stand.wait_heard("command", 1)
     page.tell(
         {"kind": "sent", "vehicle": page.shown, "command": "hold", "nonce": NONCE},
-        told(ack("hold", NONCE, "comes to rest on the planned way and stays")),
+        told(ack("hold", NONCE, "stops on the planned path and holds")),
     )
     page.tab.click("[data-preset='behind']")
     _fly(page, 8.5, action="hold")

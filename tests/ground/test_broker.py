@@ -35,7 +35,7 @@ pytestmark = pytest.mark.waits
 
 NOT_AUTHORISED = 135
 TOO_LARGE = 149
-WANTED = broker_setup.Wanted(
+WANTED = broker_setup.BrokerUsers(
     hosts=("gcs.lab", "192.0.2.7"), operators=("anna", "bert"), viewers=("wall",), vehicles=("tarot", "second"), days=30
 )
 COMMAND = Topic.COMMAND.of("tarot")
@@ -77,7 +77,7 @@ def running(folder: Path, logs: Path) -> Iterator[Site]:
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     folder = tmp_path_factory.mktemp("a site") / "broker"
-    broker_setup.make(folder, WANTED, datetime.datetime.now(datetime.UTC))
+    broker_setup.create(folder, WANTED, datetime.datetime.now(datetime.UTC))
     with running(folder, tmp_path_factory.mktemp("run")) as made:
         yield made
 
@@ -203,7 +203,7 @@ def test_every_login_gets_in_over_tls_and_over_loopback(site: Site) -> None:
 
 
 def test_tls_refuses_a_broker_of_another_authority(site: Site, tmp_path: Path) -> None:
-    broker_setup.make(tmp_path / "other", WANTED, datetime.datetime.now(datetime.UTC))
+    broker_setup.create(tmp_path / "other", WANTED, datetime.datetime.now(datetime.UTC))
     before = len(site.broker.log)
     assert "certificate verify failed" in tls_problem(site, trusting(tmp_path / "other/ca.pem"), "127.0.0.1")
     logged(site.broker, "SSL routines::.*alert", before)
@@ -463,7 +463,7 @@ def test_profile_is_a_drop_in_of_the_system_service(site: Site, tmp_path: Path) 
     finally:
         broker.stop()
     assert re.search(denied(wall, COMMAND), (tmp_path / "service.log").read_text())
-    assert not (tmp_path / "mosquitto.db").exists(), "nothing of yesterday comes back"
+    assert not (tmp_path / "mosquitto.db").exists(), "no messages are kept over a restart"
 
 
 def test_table_of_attacks_names_tests_that_exist() -> None:

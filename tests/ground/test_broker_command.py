@@ -15,7 +15,7 @@ import yaml
 from companion.cli.main import _parser, main
 from companion.config.ground import Ground
 from companion.ground.broker import setup as broker_setup
-from companion.ground.broker.certificates import hosts_of, make_authority, make_server
+from companion.ground.broker.certificates import certificate_hosts, make_authority, make_server
 from companion.ground.protocol.keys import load_login, load_operators
 from tests.broker import free_port, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
@@ -29,7 +29,7 @@ ROOMS = ["vehicles/tarot", "vehicles/second", "operators/anna", "operators/bert"
 def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     """Made once; no test changes it."""
     folder = tmp_path_factory.mktemp("made") / "site"
-    broker_setup.make(folder, WANTED, datetime.datetime.now(datetime.UTC))
+    broker_setup.create(folder, WANTED, datetime.datetime.now(datetime.UTC))
     return Site(folder, None, 0, 0)  # type: ignore[arg-type]
 
 
@@ -54,7 +54,7 @@ def test_init_says_what_to_copy_where(tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(monitors) == 2
     for monitor in monitors:
         assert _parser().parse_known_args(monitor)[1] == []
-    assert set(hosts_of((folder / "server.pem").read_bytes())) == {
+    assert set(certificate_hosts((folder / "server.pem").read_bytes())) == {
         "gcs.lab",
         "10.0.0.2",
         "localhost",
@@ -95,7 +95,7 @@ def test_no_password_is_on_a_command_line(tmp_path: Path, monkeypatch: pytest.Mo
     wrapper = tmp_path / "mosquitto_passwd"
     wrapper.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/words\nenv >> {tmp_path}/words\nexec {tool} "$@"\n')
     wrapper.chmod(0o700)
-    broker_setup.make(tmp_path / "site", WANTED, datetime.datetime.now(datetime.UTC))
+    broker_setup.create(tmp_path / "site", WANTED, datetime.datetime.now(datetime.UTC))
     words = (tmp_path / "words").read_text()
     assert words.startswith("-U ")
     for room in ROOMS:
@@ -111,7 +111,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (folder / "mine").mkdir(parents=True)
     assert main(["broker", "init", str(folder)]) == 2
     assert capsys.readouterr().err == (
-        f"{folder}: is there already, nothing was changed; choose another, or --renew-certificates\n"
+        f"{folder}: already exists, nothing was changed; choose another, or use --renew-certificates\n"
     )
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
 
@@ -121,13 +121,16 @@ BAD = {
     "parent folder": (["--viewer", ".."], "--viewer '..': expected 1 to 40 letters"),
     "wildcard": (["--vehicle", "+"], "--vehicle '+': expected 1 to 40 letters"),
     "line end": (["--operator", "anna\nuser eve"], "--operator 'anna\\nuser eve': expected 1 to 40 letters"),
-    "twice": (["--operator", "anna", "--viewer", "anna"], "anna: named twice; every vehicle and person needs a name"),
+    "twice": (
+        ["--operator", "anna", "--viewer", "anna"],
+        "anna: used twice; every vehicle and user needs a different name",
+    ),
     "host": (["--host", "no host"], "--host 'no host': expected a name or an address"),
     "days": (["--days", "0"], "argument --days: expected a number of days from 1 to 3000, got '0'"),
-    "users with renewal": (["--renew-certificates", "--viewer", "eve"], "--renew-certificates makes no users"),
+    "users with renewal": (["--renew-certificates", "--viewer", "eve"], "--renew-certificates creates no users"),
     "renewal of nothing": (
         ["--renew-certificates"],
-        "ca.pem: No such file or directory; expected a folder of broker init",
+        "ca.pem: No such file or directory; expected a folder that broker init created",
     ),
 }
 
@@ -152,7 +155,9 @@ def test_missing_mosquitto_passwd_is_one_line(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["broker", "init", str(tmp_path / "site")]) == 3
-    assert capsys.readouterr().err == ("companion broker init: mosquitto_passwd is not there: apt install mosquitto\n")
+    assert capsys.readouterr().err == (
+        "companion broker init: mosquitto_passwd is not installed: apt install mosquitto\n"
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -190,7 +195,7 @@ def test_renewed_certificate_is_trusted_by_the_same_people(
         words = ["--login", str(room / "login.yaml"), "--ca", str(room / "ca.pem")]
         assert main(["broker", "check", f"mqtts://127.0.0.1:{renewed.tls_port}", *words]) == 0
     assert main(["broker", "init", str(folder), "--renew-certificates", "--host", "other.lab"]) == 0
-    assert set(hosts_of((folder / "server.pem").read_bytes())) == {"other.lab", *broker_setup.LOCAL_HOSTS}
+    assert set(certificate_hosts((folder / "server.pem").read_bytes())) == {"other.lab", *broker_setup.LOCAL_HOSTS}
 
 
 def test_renewal_by_a_wrong_or_old_authority_is_refused(
@@ -201,12 +206,12 @@ def test_renewal_by_a_wrong_or_old_authority_is_refused(
     now = datetime.datetime.now(datetime.UTC)
     (folder / "ca.key").write_bytes(make_authority(now).key)
     assert main(["broker", "init", str(folder), "--renew-certificates"]) == 2
-    assert "the key is not that of the certificate" in capsys.readouterr().err
+    assert "the key does not belong to the certificate" in capsys.readouterr().err
     old = make_authority(now - datetime.timedelta(days=3640))
     (folder / "ca.key").write_bytes(old.key)
     (folder / "ca.pem").write_bytes(old.certificate)
     assert main(["broker", "init", str(folder), "--renew-certificates"]) == 2
-    assert "the authority ends on" in capsys.readouterr().err
+    assert "the authority expires on" in capsys.readouterr().err
     assert (folder / "server.pem").read_bytes() == (site.folder / "server.pem").read_bytes()
     assert make_server(old, ["a"], 5, now).certificate
 
@@ -221,7 +226,7 @@ def rights(out: str) -> dict[str, tuple[str, str]]:
     return {topic: (read, write) for topic, read, write in rows}
 
 
-VIEWED = ("state", "scene", "preflight", "events", "stream", "ack")
+PUBLISHED_TOPICS = ("state", "scene", "preflight", "events", "stream", "ack")
 EXPECTED = {
     "viewers/wall": ([], "?", "no", ("?", "no")),
     "operators/anna": ([], "?", "no", ("no", "yes")),
@@ -243,15 +248,15 @@ def test_check_finds_what_a_login_may_do(
         assert main(["broker", "check", url, *words]) == 0
     out = capsys.readouterr().out
     assert ("TLSv1.3" in out) == tls
-    assert rights(out) == {**dict.fromkeys(VIEWED, (read, write)), "command": command}
+    assert rights(out) == {**dict.fromkeys(PUBLISHED_TOPICS, (read, write)), "command": command}
 
 
 def test_check_of_the_loopback_profile_may_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with loopback_broker(tmp_path) as broker:
         assert main(["broker", "check", broker.url]) == 0
     out = capsys.readouterr().out
-    assert "connected as anybody (no login), not encrypted" in out
-    assert rights(out) == dict.fromkeys((*VIEWED, "command"), ("yes", "yes"))
+    assert "connected as anonymous (no login), not encrypted" in out
+    assert rights(out) == dict.fromkeys((*PUBLISHED_TOPICS, "command"), ("yes", "yes"))
 
 
 def test_check_says_why_it_does_not_get_in(site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -267,10 +272,10 @@ def test_check_says_why_it_does_not_get_in(site: Site, tmp_path: Path, capsys: p
 
     with running(site.folder, tmp_path) as made:
         plain, tls = f"mqtt://127.0.0.1:{made.plain_port}", f"mqtts://127.0.0.1:{made.tls_port}"
-        assert "refuses us without a login: Not authorized; see --login" in told(plain)
+        assert "refuses the connection without a login: Not authorized; see --login" in told(plain)
         assert "3 " in told(tls, "--login", login, "--ca", str(other))
         assert "the broker's certificate is not trusted" in told(tls, "--login", login, "--ca", str(other))
-        assert "no TLS there" in told(f"mqtts://127.0.0.1:{made.plain_port}", "--ca", str(site.folder / "ca.pem"))
+        assert "does not use TLS" in told(f"mqtts://127.0.0.1:{made.plain_port}", "--ca", str(site.folder / "ca.pem"))
         assert "the broker ended the connection" in told(f"mqtt://127.0.0.1:{made.tls_port}", "--login", login)
     assert "Connection refused; is the broker running there?" in told(f"mqtt://127.0.0.1:{free_port()}")
     assert told("http://here").startswith("2 ")

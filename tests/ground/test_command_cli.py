@@ -13,7 +13,7 @@ from companion.cli import command as command_command
 from companion.cli import main as cli
 from companion.ground.protocol.keys import Operator, Operators, load_operators, operators_text, write_private
 from companion.ground.protocol.messages import Presence, Topic
-from companion.ground.station.command_sender import TRIES
+from companion.ground.station.command_sender import ATTEMPTS
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from tests.broker import Broker, free_port, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, play
@@ -85,7 +85,7 @@ def test_a_stranger_is_told_that_the_vehicle_does_not_have_the_key(
         async with played_vehicle(broker.port, OPERATORS) as vehicle:
             ended = await command(capsys, "start", broker, str(keys))
             assert ended.code == EXIT_REFUSED
-            assert "start: no message of rig is proven for anna: it does not have this key" in ended.err
+            assert "start: no message from rig is proven for anna: it does not have this key" in ended.err
             assert not vehicle.commands_heard
 
     play(scene())
@@ -97,7 +97,7 @@ def test_no_answer(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
             vehicle.answers = False
             ended = await command(capsys, "land", broker, keys)
             assert ended.code == EXIT_LOST and ended.out == ""
-            assert len(ended.err_lines) == TRIES == len(vehicle.accepted)
+            assert len(ended.err_lines) == ATTEMPTS == len(vehicle.accepted)
             assert all("no answer from the vehicle within 1.5 s" in line for line in ended.err_lines)
 
     play(scene())
@@ -115,11 +115,11 @@ def test_nobody_there(
         assert ended.err.startswith(f"companion command: no broker at {nowhere}")
         ended = await command(capsys, "land", broker, keys)
         assert ended.code == EXIT_LOST
-        assert ended.err.startswith("companion command: nothing heard from a vehicle at the broker within")
+        assert ended.err.startswith("companion command: no message from a vehicle at the broker within")
         async with played_vehicle(broker.port, OPERATORS):
             ended = await command(capsys, "land", broker, keys, "--vehicle", "rug")
         assert ended.code == EXIT_LOST
-        assert "nothing heard from 'rug'" in ended.err and "known: rig (flying)" in ended.err
+        assert "no message from 'rug'" in ended.err and "known: rig (flying)" in ended.err
 
     play(scene())
 
@@ -133,7 +133,7 @@ def test_several_vehicles_have_to_be_told_apart(broker: Broker, keys: str, capsy
             ended = await command(capsys, "land", broker, keys)
             assert ended.code == EXIT_BAD_INPUT
             assert ended.err_lines == [
-                "companion command: there are several vehicles (one, two); say which: --vehicle NAME"
+                "companion command: there are several vehicles (one, two); choose one: --vehicle NAME"
             ]
             ended = await command(capsys, "land", broker, keys, "--vehicle", "two")
             assert (ended.code, ended.out) == (EXIT_OK, "two: land: land: done\n")
@@ -170,7 +170,7 @@ def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
             ended = await command(capsys, name, broker, keys)
             assert (ended.code, ended.out) == (EXIT_OK, f"rig: {name}: {name}: done\n")
             assert ended.err_lines == [
-                "companion command: rig is meant, nothing is proven by: quiet-49; to command another: --vehicle NAME"
+                "companion command: sent to rig; no proven messages from: quiet-49; to command another: --vehicle NAME"
             ]
             assert [heard.command.value for heard in vehicle.accepted] == [name]
 
@@ -195,7 +195,7 @@ async def leave_states(broker: Broker) -> None:
         (["hold", "--broker", "http://x"], "--broker: expected mqtt://"),
         (["hold", "--vehicle", "a/b"], "--vehicle 'a/b': expected the vehicle's name"),
         (["hold", "--operators", "nofile.yaml"], "nofile.yaml: no such file"),
-        (["hold", "--broker", "mqtt://192.0.2.1"], "is another computer and the way there is plain"),
+        (["hold", "--broker", "mqtt://192.0.2.1"], "is not encrypted"),
         (["hold", "--login", "nofile.yaml"], "nofile.yaml: no such file"),
     ],
 )

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.ground.protocol.commands import (
+    ACKS_PER_S,
     AHEAD_MAX_S,
-    ANSWERS_PER_S,
     LIMITS,
     REFUSED_MAX,
     Accepted,
@@ -26,12 +26,12 @@ from companion.ground.protocol.commands import (
     make_command,
     sign,
 )
-from companion.ground.protocol.keys import May, Operator, Operators, new_key
+from companion.ground.protocol.keys import Operator, Operators, Permission, new_key
 from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, CommandName, encode
 
 VEHICLE, SESSION, NOW_T_S = "tarot", "f3a9", 100.0
 ANNA, BERT, VIEWER = new_key(), new_key(), new_key()
-OPERATORS = Operators([Operator("anna", ANNA), Operator("bert", BERT, May.SAFER)], "operators.yaml")
+OPERATORS = Operators([Operator("anna", ANNA), Operator("bert", BERT, Permission.SAFER_COMMANDS)], "operators.yaml")
 SAFE = [CommandName.HOLD, CommandName.LAND, CommandName.ABORT]
 OTHERS = [CommandName.RESUME, CommandName.START]
 
@@ -328,10 +328,10 @@ def test_memory_is_bounded_and_forgets() -> None:
         if number == 20 + REFUSED_MAX:
             expected = Reason.TOO_MANY  # the first that finds no room: from now on their date is known
         assert judged(encode(made()), judge) is expected
-    assert max(heard.size for heard in judge._heard.values()) == 20 + REFUSED_MAX
+    assert max(heard.size for heard in judge._histories.values()) == 20 + REFUSED_MAX
     assert judged(encode(made(operator="bert", key=BERT)), judge) is None, "another operator is not touched"
     assert judged(encode(made(t_s=106.0)), judge, now_t_s=106.0) is None
-    assert sum(heard.size for heard in judge._heard.values()) == 1
+    assert sum(heard.size for heard in judge._histories.values()) == 1
 
 
 def test_well_signed_and_refused_is_answered_but_no_flood_of_it() -> None:
@@ -341,7 +341,7 @@ def test_well_signed_and_refused_is_answered_but_no_flood_of_it() -> None:
     assert {reason_of(answer) for answer in answers} == {Reason.STALE}
     assert [answer.command for answer in answers if isinstance(answer, Refused) and answer.command] == [
         stale
-    ] * ANSWERS_PER_S
+    ] * ACKS_PER_S
     again = judge.check(encode(stale), False, NOW_T_S + 1.0)
     assert isinstance(again, Refused)
     assert again.command == stale
@@ -401,11 +401,11 @@ def test_deep_json_is_refused_at_every_depth() -> None:
 def test_flight_clock_follows_the_fastest_message() -> None:
     clock = FlightClock()
     assert clock.now_ms(50.0) is None
-    clock.heard(10.0, 50.0)
+    clock.add(10.0, 50.0)
     assert clock.now_ms(50.0) == 10_000
-    clock.heard(10.0, 53.0)  # three seconds late: the clock is not set back
+    clock.add(10.0, 53.0)  # three seconds late: the clock is not set back
     assert clock.now_ms(53.0) == 13_000
-    clock.heard(13.5, 53.25)
+    clock.add(13.5, 53.25)
     assert clock.now_ms(53.25) == 13_500
     assert clock.now_ms(60.25) == 20_500, "it goes on when nothing is heard"
 
@@ -414,11 +414,11 @@ def test_flight_clock_forgets_what_was_long_ago() -> None:
     """A vehicle whose clock goes slower than ours is followed."""
     clock = FlightClock()
     for number in range(4000):
-        clock.heard(number * 0.999, float(number))
+        clock.add(number * 0.999, float(number))
     now_ms = clock.now_ms(3999.0)
     assert now_ms is not None
     assert 3999 * 999 <= now_ms <= 3999 * 999 + 11
-    assert len(clock._heard) <= FlightClock.LATELY_S + 1
+    assert len(clock._samples) <= FlightClock.WINDOW_S + 1
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 3.0)), min_size=1, max_size=100))
@@ -427,8 +427,8 @@ def test_flight_clock_is_never_early_and_no_later_than_the_fastest(steps: list[t
     for step_s, delay_s in steps:
         now_s += step_s
         sent.append((now_s, delay_s))
-        clock.heard(now_s - delay_s, now_s)
-    fastest_s = min(delay_s for at_s, delay_s in sent if at_s >= now_s - FlightClock.LATELY_S)
+        clock.add(now_s - delay_s, now_s)
+    fastest_s = min(delay_s for at_s, delay_s in sent if at_s >= now_s - FlightClock.WINDOW_S)
     now_ms = clock.now_ms(now_s)
     assert now_ms is not None
     assert abs(now_ms / 1000.0 - (now_s - fastest_s)) < 0.002

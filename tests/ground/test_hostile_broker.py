@@ -33,8 +33,8 @@ from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.station.hub import Hub, Outbox
 from companion.ground.station.station import Station
 from companion.ground.station.tasks import until_first
-from companion.ground.station.text_view import Around, frame, line
-from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, Watch
+from companion.ground.station.text_view import StationStatus, render, status_line
+from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, VehicleTracker
 from companion.ground.telemetry.scene import scene_of
 from companion.model.codec import to_jsonable
 from tests.broker import Broker, loopback_broker
@@ -44,7 +44,7 @@ from tests.ground.vehicle import flight, played_vehicle, state_of
 pytestmark = pytest.mark.waits
 
 STREAM = "companion/rig/stream"
-AROUND = Around("connected", True, "anna", None)
+AROUND = StationStatus("connected", True, "anna", None)
 
 
 def stream_of(t_s: float = 1.0, session: str = "s1", **values: Any) -> Stream:
@@ -55,17 +55,17 @@ def proven(stream: Stream, vehicle: str = "rig") -> bytes:
     return encode(with_proofs(stream, vehicle, [b"b" * 32, ANNA.key]))
 
 
-def flying(t_s: float = 100.0) -> Watch:
+def flying(t_s: float = 100.0) -> VehicleTracker:
     """A ground station of anna that has heard one proven message, at 50 s of its own clock."""
-    watch = Watch(signer=SIGNER)
-    assert watch.take(STREAM, proven(stream_of(t_s)), False, 50.0) is not None
+    watch = VehicleTracker(signer=SIGNER)
+    assert watch.receive(STREAM, proven(stream_of(t_s)), False, 50.0) is not None
     return watch
 
 
 # -- the clock that commands are dated by ------------------------------------------------------------------------------
 
 
-def forged(watch: Watch) -> dict[str, bytes]:
+def forged(watch: VehicleTracker) -> dict[str, bytes]:
     genuine = with_proofs(stream_of(100.05), "rig", [ANNA.key])
     return {
         "no proof": encode(stream_of(160.0)),
@@ -79,11 +79,11 @@ def forged(watch: Watch) -> dict[str, bytes]:
     }
 
 
-@pytest.mark.parametrize("name", forged(Watch()))
+@pytest.mark.parametrize("name", forged(VehicleTracker()))
 def test_a_forged_stream_makes_nobody_sign_for_a_time_that_has_not_come(name: str) -> None:
     """Signed 60 s ahead it would be refused now and good for whoever kept a copy of it 60 s later."""
     watch = flying()
-    assert watch.take(STREAM, forged(watch)[name], False, 50.1) is None
+    assert watch.receive(STREAM, forged(watch)[name], False, 50.1) is None
     known = watch.vehicles["rig"].proven
     assert known is not None
     assert (known.session, known.now_ms(50.1), known.hold) == ("s1", 100_100, 0)
@@ -92,10 +92,10 @@ def test_a_forged_stream_makes_nobody_sign_for_a_time_that_has_not_come(name: st
 
 
 def test_a_copy_of_an_earlier_message_is_not_shown_as_new() -> None:
-    watch, copy = Watch(signer=SIGNER), proven(stream_of(99.0))
-    assert watch.take(STREAM, copy, False, 49.0) is not None
-    assert watch.take(STREAM, proven(stream_of(100.0)), False, 50.0) is not None
-    assert watch.take(STREAM, copy, False, 50.1) is None
+    watch, copy = VehicleTracker(signer=SIGNER), proven(stream_of(99.0))
+    assert watch.receive(STREAM, copy, False, 49.0) is not None
+    assert watch.receive(STREAM, proven(stream_of(100.0)), False, 50.0) is not None
+    assert watch.receive(STREAM, copy, False, 50.1) is None
 
 
 def test_a_copy_of_the_newest_message_keeps_no_dead_link_alive() -> None:
@@ -103,7 +103,7 @@ def test_a_copy_of_the_newest_message_keeps_no_dead_link_alive() -> None:
     watch, copy = flying(), proven(stream_of(100.0))
     for k in range(1, 401):
         now_s = 50.0 + k / 20
-        assert watch.take(STREAM, copy, False, now_s) is None
+        assert watch.receive(STREAM, copy, False, now_s) is None
     known = watch.vehicles["rig"].proven
     assert known is not None and not known.live(70.0)
     assert known.now_ms(70.0) == 120_000
@@ -113,49 +113,49 @@ def test_a_copy_of_the_newest_message_keeps_no_dead_link_alive() -> None:
 
 def test_a_recording_of_an_earlier_flight_takes_the_place_of_none_that_is_under_way() -> None:
     now, before = stream_of(100.0, "now", wall_s=2000.0), stream_of(500.0, "before", wall_s=1000.0)
-    watch = Watch(signer=SIGNER)
+    watch = VehicleTracker(signer=SIGNER)
     for k in range(40):  # the recording plays already when the flight begins, and goes on
-        watch.take(STREAM, proven(replace(before, t_s=500.0 + k / 20)), False, 50.0 + k / 20)
+        watch.receive(STREAM, proven(replace(before, t_s=500.0 + k / 20)), False, 50.0 + k / 20)
     known = watch.vehicles["rig"]
     assert known.proven is not None and known.proven.session == "before"
     for k in range(40):
-        assert watch.take(STREAM, proven(replace(now, t_s=100.0 + k / 20)), False, 52.0 + k / 20) is not None
-        assert watch.take(STREAM, proven(replace(before, t_s=502.0 + k / 20)), False, 52.01 + k / 20) is None
+        assert watch.receive(STREAM, proven(replace(now, t_s=100.0 + k / 20)), False, 52.0 + k / 20) is not None
+        assert watch.receive(STREAM, proven(replace(before, t_s=502.0 + k / 20)), False, 52.01 + k / 20) is None
     assert (known.session, known.proven.session) == ("now", "now")
 
 
 def test_the_next_flight_is_taken_though_the_clock_on_the_wall_was_set_back() -> None:
     watch = flying()
     later = proven(stream_of(1.0, "s2", wall_s=5.0))
-    assert watch.take(STREAM, later, False, 50.5) is None
-    assert watch.take(STREAM, later, False, 50.0 + LIVE_S) is not None
+    assert watch.receive(STREAM, later, False, 50.5) is None
+    assert watch.receive(STREAM, later, False, 50.0 + LIVE_S) is not None
     known = watch.vehicles["rig"].proven
     assert known is not None and (known.session, known.now_ms(51.0)) == ("s2", 1000)
 
 
 def test_without_a_key_everything_is_shown() -> None:
-    watch = Watch()
+    watch = VehicleTracker()
     for t_s in (100.0, 160.0):
-        assert watch.take(STREAM, encode(stream_of(t_s)), False, 50.0) is not None
+        assert watch.receive(STREAM, encode(stream_of(t_s)), False, 50.0) is not None
     assert watch.vehicles["rig"].proven is None
 
 
 def test_an_answer_that_the_vehicle_did_not_prove_is_none() -> None:
     """Else whoever reads the nonce on the way says "landing" and ends the tries."""
     ack = Ack(VERSION, "s1", "0" * 32, "anna", CommandName.LAND, True, "landing", 1.0, "catch", "land")
-    watch, topic = Watch(signer=SIGNER), "companion/rig/ack"
-    assert watch.take(topic, encode(ack), False, 50.0) is None
-    assert watch.take(topic, encode(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
-    assert watch.take(topic, encode(with_proof(ack, "other", ANNA.key)), False, 50.0) is None
-    assert watch.take(topic, encode(with_proof(ack, "rig", ANNA.key)), False, 50.0) is not None
-    assert watch.take(topic, encode(replace(ack, operator="bert")), False, 50.0) is not None
+    watch, topic = VehicleTracker(signer=SIGNER), "companion/rig/ack"
+    assert watch.receive(topic, encode(ack), False, 50.0) is None
+    assert watch.receive(topic, encode(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
+    assert watch.receive(topic, encode(with_proof(ack, "other", ANNA.key)), False, 50.0) is None
+    assert watch.receive(topic, encode(with_proof(ack, "rig", ANNA.key)), False, 50.0) is not None
+    assert watch.receive(topic, encode(replace(ack, operator="bert")), False, 50.0) is not None
 
 
 def test_a_flood_of_vehicles_does_not_push_out_the_one_that_is_proven() -> None:
     watch = flying()
     for number in range(3 * VEHICLES_MAX):
         name = f"forged-{number}"
-        watch.take(f"companion/{name}/state", encode(state_of(name, "s")), False, 50.01)
+        watch.receive(f"companion/{name}/state", encode(state_of(name, "s")), False, 50.01)
     assert len(watch.vehicles) == VEHICLES_MAX
     assert "rig" in watch.vehicles
 
@@ -223,28 +223,28 @@ def everything_hostile() -> Iterator[tuple[Topic, bytes]]:
             yield topic, other
 
 
-@pytest.mark.parametrize("signed", [True, False])
-def test_no_message_raises_anywhere_in_a_ground_station(signed: bool) -> None:
-    """Every value at every place of every message, through the watch, the page's hub and what the terminal shows."""
-    watch = Watch(signer=SIGNER if signed else None)
+def test_no_message_raises_anywhere_in_a_ground_station() -> None:
+    """Every value at every place of every message, through the tracker, the page's hub and what the terminal shows."""
+    watch, signed = VehicleTracker(), VehicleTracker(signer=SIGNER)
     hub, outbox = Hub(watch, ""), Outbox()
-    hub.join(outbox, 0.0)
+    hub.add(outbox, 0.0)
     console = Console(file=io.TextIOWrapper(io.BytesIO(), encoding="utf-8"), width=100)
     now_s, taken = 50.0, 0
     for topic, payload in everything_hostile():
         now_s += 0.001
-        heard = watch.take(topic.of("rig"), payload, False, now_s)
-        if heard is None:
+        signed.receive(topic.of("rig"), payload, False, now_s)
+        received = watch.receive(topic.of("rig"), payload, False, now_s)
+        if received is None:
             continue
         taken += 1
-        hub.relay(heard)
+        hub.publish(received)
         known = watch.vehicles["rig"]
-        console.print(frame(known, now_s, AROUND))
-        line(known, now_s).encode()
-        watch.there(now_s)
-        Hub(watch, "").join(Outbox(), now_s)
+        console.print(render(known, now_s, AROUND))
+        status_line(known, now_s).encode()
+        watch.present(now_s)
+        Hub(watch, "").add(Outbox(), now_s)
     assert taken > 100, "what is merely odd is shown"
-    assert watch.rubbish > 4000
+    assert watch.rejected > 4000 and signed.rejected > 4000
 
 
 @given(
@@ -252,9 +252,9 @@ def test_no_message_raises_anywhere_in_a_ground_station(signed: bool) -> None:
     st.sampled_from([topic.of("rig") for topic in Topic] + ["companion/rig", "x", "", "a/\0/b"]),
 )
 def test_random_bytes_are_counted(payload: bytes, topic: str) -> None:
-    watch = Watch(signer=SIGNER)
-    assert watch.take(topic, payload, False, 50.0) is None
-    assert watch.rubbish == 1
+    watch = VehicleTracker(signer=SIGNER)
+    assert watch.receive(topic, payload, False, 50.0) is None
+    assert watch.rejected == 1
 
 
 @pytest.fixture
@@ -276,7 +276,7 @@ def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker: Broke
                 played_vehicle(broker.port, OPERATORS, session="s1") as vehicle,
                 aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as hostile,
             ):
-                watch = station.watch
+                watch = station.tracker
                 await until(lambda: "rig" in watch.vehicles and watch.vehicles["rig"].proven is not None)
                 for number, (topic, payload) in enumerate(everything_hostile()):
                     await hostile.publish(topic.of("rig"), payload, qos=number % 200 == 0)
@@ -287,10 +287,10 @@ def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker: Broke
                 ):
                     await hostile.publish(Topic.STATE.of("rig"), encode(lie), qos=1, retain=True)
                     await until(lambda lie=lie: watch.vehicles["rig"].state == lie)  # type: ignore[misc]
-                    ack = await station.orders.give("rig", CommandName.LAND, lambda note: None)
+                    ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
                     assert ack is not None and ack.accepted
                 assert [command.command for command in vehicle.accepted] == [CommandName.LAND] * 3
-                assert watch.rubbish > 4000
+                assert watch.rejected > 4000
             assert [text for text in changes if not text.startswith("connected")] == []
 
         await until_first(station.run(), fight())
@@ -312,10 +312,10 @@ def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> None:
 
         async def fight() -> None:
             async with played_vehicle(broker.port, OPERATORS):
-                await until(lambda: station.watch.rubbish > 10)
-                ack = await station.orders.give("rig", CommandName.LAND, lambda note: None)
+                await until(lambda: station.tracker.rejected > 10)
+                ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
                 assert ack is not None and ack.accepted
-            assert "ZeroDivisionError: 'of our own'" in (station.watch.rubbish_text or "")
+            assert "ZeroDivisionError: 'of our own'" in (station.tracker.rejected_text or "")
             assert len(changes) == 1
 
         await until_first(station.run(), fight())
@@ -326,8 +326,8 @@ def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> None:
 def test_proofs_are_of_the_whole_message() -> None:
     stream = with_proofs(stream_of(), "rig", [ANNA.key])
     data = to_jsonable(stream)
-    watch = Watch(signer=SIGNER)
+    watch = VehicleTracker(signer=SIGNER)
     for name in data.keys() - {"v", "session", "proofs"}:
         less = {key: value for key, value in data.items() if key != name}
-        watch.take(STREAM, json.dumps(less).encode(), False, 50.0)
+        watch.receive(STREAM, json.dumps(less).encode(), False, 50.0)
     assert not watch.vehicles or watch.vehicles["rig"].proven is None

@@ -13,8 +13,8 @@ from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.messages import VERSION, Ack, CommandName, Events, Presence, Topic, encode
 from companion.ground.station.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Outbox
-from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, Heard, Watch
-from companion.ground.station.web_guard import MESSAGES_BURST, Bucket, host_allowed, origin_allowed, same_token
+from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, ReceivedRecord, VehicleTracker
+from companion.ground.station.web_guard import MESSAGES_BURST, RateLimiter, host_allowed, origin_allowed, same_token
 from tests.ground.vehicle import flight, state_of
 
 pytestmark = pytest.mark.waits
@@ -49,7 +49,7 @@ RUBBISH: dict[str, tuple[str, bytes]] = {
     "another record": ("companion/rig/state", stream_of()),
     "another vehicle": ("companion/rig/state", encode(state_of("other", SESSION))),
     "oversized": ("companion/rig/events", b" " * 200_001),
-    "no vehicle's name": ("companion/<b>/stream", stream_of()),
+    "not a vehicle name": ("companion/<b>/stream", stream_of()),
     "a command": ("companion/rig/command", stream_of()),
     "no topic of ours": ("companion/rig/stream/deeper", stream_of()),
     "empty": ("companion/rig/stream", b""),
@@ -58,38 +58,38 @@ RUBBISH: dict[str, tuple[str, bytes]] = {
 
 @pytest.mark.parametrize(("topic", "payload"), RUBBISH.values(), ids=RUBBISH.keys())
 def test_rubbish_is_counted_and_remembered_by_nobody(topic: str, payload: bytes) -> None:
-    watch = Watch()
-    assert watch.take(topic, payload, False, 0.0) is None
-    assert watch.rubbish == 1
-    assert watch.rubbish_text is not None and watch.rubbish_text.isprintable()
+    watch = VehicleTracker()
+    assert watch.receive(topic, payload, False, 0.0) is None
+    assert watch.rejected == 1
+    assert watch.rejected_text is not None and watch.rejected_text.isprintable()
     assert not watch.vehicles
 
 
 def test_a_retained_record_that_is_deleted_is_no_rubbish() -> None:
-    watch = Watch()
-    assert watch.take("companion/rig/state", b"", True, 0.0) is None
-    assert watch.rubbish == 0
+    watch = VehicleTracker()
+    assert watch.receive("companion/rig/state", b"", True, 0.0) is None
+    assert watch.rejected == 0
 
 
 def test_a_retained_stream_does_not_look_alive() -> None:
-    watch = Watch()
-    assert watch.take("companion/rig/stream", stream_of(), True, 0.0) is None
+    watch = VehicleTracker()
+    assert watch.receive("companion/rig/stream", stream_of(), True, 0.0) is None
     assert not watch.vehicles["rig"].live(0.0)
 
 
 def test_a_late_message_says_how_late_it_is() -> None:
-    watch = Watch()
-    first = watch.take("companion/rig/stream", stream_of(t_s=1.0), False, 100.0)
-    late = watch.take("companion/rig/stream", stream_of(t_s=1.05), False, 103.0)
+    watch = VehicleTracker()
+    first = watch.receive("companion/rig/stream", stream_of(t_s=1.0), False, 100.0)
+    late = watch.receive("companion/rig/stream", stream_of(t_s=1.05), False, 103.0)
     assert first is not None and first.age_s == pytest.approx(0.0, abs=2e-3)
     assert late is not None and late.age_s == pytest.approx(2.95, abs=2e-3)
 
 
 def test_a_new_flight_has_a_clock_of_its_own_and_an_old_retained_state_does_not_bring_the_old_one_back() -> None:
-    watch = Watch()
-    watch.take("companion/rig/stream", stream_of(t_s=500.0), False, 100.0)
-    watch.take("companion/rig/stream", stream_of("s2", t_s=1.0), False, 101.0)
-    watch.take("companion/rig/state", encode(state_of("rig", SESSION, presence=Presence.ENDED)), True, 101.0)
+    watch = VehicleTracker()
+    watch.receive("companion/rig/stream", stream_of(t_s=500.0), False, 100.0)
+    watch.receive("companion/rig/stream", stream_of("s2", t_s=1.0), False, 101.0)
+    watch.receive("companion/rig/state", encode(state_of("rig", SESSION, presence=Presence.ENDED)), True, 101.0)
     known = watch.vehicles["rig"]
     assert known.session == "s2"
     assert known.clock.now_ms(102.0) == pytest.approx(2000, abs=1)
@@ -97,28 +97,28 @@ def test_a_new_flight_has_a_clock_of_its_own_and_an_old_retained_state_does_not_
 
 
 def test_a_flood_of_vehicles_does_not_push_out_the_one_that_flies() -> None:
-    watch = Watch()
+    watch = VehicleTracker()
     for number in range(3 * VEHICLES_MAX):
-        watch.take("companion/rig/stream", stream_of(), False, number + 0.5)
-        watch.take(f"companion/fake-{number}/state", encode(state_of(f"fake-{number}", "s")), True, float(number))
+        watch.receive("companion/rig/stream", stream_of(), False, number + 0.5)
+        watch.receive(f"companion/fake-{number}/state", encode(state_of(f"fake-{number}", "s")), True, float(number))
     assert len(watch.vehicles) == VEHICLES_MAX
     assert watch.vehicles["rig"].stream is not None
 
 
 def test_who_is_there() -> None:
-    watch = Watch()
+    watch = VehicleTracker()
     for name, presence in (("flies", Presence.FLYING), ("over", Presence.ENDED), ("gone", Presence.LOST)):
-        watch.take(f"companion/{name}/state", encode(state_of(name, SESSION, presence=presence)), True, 0.0)
-    watch.take("companion/heard/stream", stream_of(), False, 0.0)
-    assert watch.there(0.0) == ["flies", "heard"]
-    assert watch.there(2 * LIVE_S) == ["flies"]
+        watch.receive(f"companion/{name}/state", encode(state_of(name, SESSION, presence=presence)), True, 0.0)
+    watch.receive("companion/heard/stream", stream_of(), False, 0.0)
+    assert watch.present(0.0) == ["flies", "heard"]
+    assert watch.present(2 * LIVE_S) == ["flies"]
 
 
 def test_only_one_vehicle_is_watched_if_one_is_named() -> None:
-    watch = Watch("rig")
-    watch.take("companion/other/stream", stream_of(), False, 0.0)
-    watch.take("companion/rig/stream", stream_of(), False, 0.0)
-    assert list(watch.vehicles) == ["rig"] and watch.rubbish == 0
+    watch = VehicleTracker("rig")
+    watch.receive("companion/other/stream", stream_of(), False, 0.0)
+    watch.receive("companion/rig/stream", stream_of(), False, 0.0)
+    assert list(watch.vehicles) == ["rig"] and watch.rejected == 0
 
 
 def test_the_newest_stream_wins_and_nothing_else_is_lost() -> None:
@@ -136,9 +136,9 @@ def test_a_viewer_that_would_lose_an_event_is_sent_away_and_streams_never_do_tha
         outbox.put_stream("rig", "{}")
     for _ in range(OUTBOX_MAX):
         outbox.put("{}")
-    assert outbox.parting is None
+    assert outbox.close_reason is None
     outbox.put("{}")
-    assert outbox.parting is TOO_SLOW
+    assert outbox.close_reason is TOO_SLOW
 
 
 def test_an_idle_viewer_costs_bounded_memory_however_many_vehicles_are_made_up() -> None:
@@ -152,30 +152,30 @@ def test_a_few_huge_messages_are_too_many_too() -> None:
     outbox = Outbox()
     for _ in range(30):
         outbox.put("x" * 200_000)
-    assert outbox.parting is TOO_SLOW
+    assert outbox.close_reason is TOO_SLOW
 
 
 def test_who_comes_late_is_told_what_is_known_but_no_old_stream() -> None:
-    watch = Watch()
+    watch = VehicleTracker()
     hub = Hub(watch, "no broker yet")
-    watch.take("companion/rig/state", encode(state_of("rig", SESSION)), True, 0.0)
-    watch.take("companion/rig/events", encode(Events(VERSION, SESSION, 0, ())), True, 0.0)
-    watch.take("companion/rig/stream", stream_of(), False, 10.0)
+    watch.receive("companion/rig/state", encode(state_of("rig", SESSION)), True, 0.0)
+    watch.receive("companion/rig/events", encode(Events(VERSION, SESSION, 0, ())), True, 0.0)
+    watch.receive("companion/rig/stream", stream_of(), False, 10.0)
     soon, late = Outbox(), Outbox()
-    hub.join(soon, 10.0 + 0.9 * FRESH_S)
-    hub.join(late, 10.0 + 1.1 * FRESH_S)
+    hub.add(soon, 10.0 + 0.9 * FRESH_S)
+    hub.add(late, 10.0 + 1.1 * FRESH_S)
     assert [message["kind"] for message in took(soon)] == ["broker", "state", "events", "stream"]
     assert [message["kind"] for message in took(late)] == ["broker", "state", "events"]
 
 
 def test_everybody_gets_the_same_text_and_who_left_gets_nothing() -> None:
-    hub = Hub(Watch(), "no broker yet")
+    hub = Hub(VehicleTracker(), "no broker yet")
     outboxes = [Outbox() for _ in range(3)]
     for outbox in outboxes:
-        hub.join(outbox, 0.0)
+        hub.add(outbox, 0.0)
         took(outbox)
-    hub.leave(outboxes[0])
-    hub.relay(Heard("rig", Topic.ACK, ack_of("00")))
+    hub.remove(outboxes[0])
+    hub.publish(ReceivedRecord("rig", Topic.ACK, ack_of("00")))
     outboxes[0].put("{}")
     assert took(outboxes[0]) == [{}]
     first, second = (took(outbox) for outbox in outboxes[1:])
@@ -185,16 +185,16 @@ def test_everybody_gets_the_same_text_and_who_left_gets_nothing() -> None:
 @pytest.mark.parametrize("number", [b"NaN", b"Infinity", b"-Infinity", b'"nan"', b'"inf"', b"1e999", b"9" * 400])
 def test_what_browsers_cannot_read_is_not_taken(number: bytes) -> None:
     """NaN is JSON to Python and to no browser."""
-    watch = Watch()
+    watch = VehicleTracker()
     payload = stream_of(progress=0.25).replace(b'"progress":0.25', b'"progress":' + number)
-    assert watch.take("companion/rig/stream", payload, False, 0.0) is None
-    assert watch.rubbish == 1
+    assert watch.receive("companion/rig/stream", payload, False, 0.0) is None
+    assert watch.rejected == 1
 
 
 HOSTS: dict[str, tuple[str | None, str, bool]] = {
     "address": ("127.0.0.1:8642", "127.0.0.1", True),
     "name": ("localhost:8642", "127.0.0.1", True),
-    "through ssh -L": ("LOCALHOST:9000", "127.0.0.1", True),
+    "ssh -L": ("LOCALHOST:9000", "127.0.0.1", True),
     "IPv6": ("[::1]:8642", "::1", True),
     "rebinding": ("evil.example:8642", "127.0.0.1", False),
     "rebinding, looks like loopback": ("127.0.0.1.evil.example", "127.0.0.1", False),
@@ -237,7 +237,7 @@ def test_tokens() -> None:
 
 
 def test_a_burst_is_allowed_a_flood_is_not_and_it_is_forgotten() -> None:
-    bucket = Bucket(0.0)
+    bucket = RateLimiter(0.0)
     allowed = sum(bucket.take(0.0) for _ in range(1000))
     assert allowed == MESSAGES_BURST
     assert not bucket.take(0.05)
@@ -250,8 +250,8 @@ def test_a_burst_is_allowed_a_flood_is_not_and_it_is_forgotten() -> None:
         ("http://127.0.0.1", None, "--broker: expected mqtt://HOST:PORT"),
         ("mqtt://127.0.0.1:99999", None, "--broker: expected a port"),
         ("mqtts://127.0.0.1", "nofile.pem", "--ca nofile.pem: no such file"),
-        ("mqtts://127.0.0.1", "README.md", "--ca README.md: is no certificate"),
-        ("mqtt://127.0.0.1", "README.md", "--ca README.md: means nothing without TLS"),
+        ("mqtts://127.0.0.1", "README.md", "--ca README.md: is not a certificate"),
+        ("mqtt://127.0.0.1", "README.md", "--ca README.md: has no effect without TLS"),
     ],
 )
 def test_unusable_brokers(url: str, ca: str | None, why: str) -> None:

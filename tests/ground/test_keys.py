@@ -13,13 +13,13 @@ import pytest
 
 from companion.config.document import ConfigError
 from companion.ground.protocol.keys import (
-    May,
     Operator,
+    Permission,
+    default_operators_file,
     load_login,
     load_operators,
     new_key,
     operators_text,
-    own_file,
     write_private,
 )
 from companion.ground.protocol.messages import CommandName
@@ -47,29 +47,33 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_written_file_reads_back(tmp_path: Path) -> None:
-    made = [Operator("anna", new_key()), Operator("1e3", new_key(), May.SAFER), Operator("null", new_key())]
+    made = [
+        Operator("anna", new_key()),
+        Operator("1e3", new_key(), Permission.SAFER_COMMANDS),
+        Operator("null", new_key()),
+    ]
     write_private(tmp_path / "operators.yaml", operators_text(made).encode())
     operators = load_operators(tmp_path / "operators.yaml")
     assert operators.names == ("anna", "1e3", "null")
     assert [operators.key(one.name) for one in made] == [one.key for one in made]
-    assert operators.may("anna", CommandName.START)
-    assert operators.may("1e3", CommandName.ABORT)
-    assert not operators.may("1e3", CommandName.RESUME)
-    assert not operators.may("nobody", CommandName.HOLD)
-    assert operators.find("nobody") is None
-    with pytest.raises(ConfigError, match="no operator 'nobody'; there are: anna, 1e3, null"):
+    assert operators.is_allowed("anna", CommandName.START)
+    assert operators.is_allowed("1e3", CommandName.ABORT)
+    assert not operators.is_allowed("1e3", CommandName.RESUME)
+    assert not operators.is_allowed("nobody", CommandName.HOLD)
+    assert operators.find_key("nobody") is None
+    with pytest.raises(ConfigError, match="no operator 'nobody'; expected one of anna, 1e3, null"):
         operators.key("nobody")
 
 
 def test_users_own_file_is_made_once_and_private(home: Path) -> None:
     first = load_operators()
-    assert own_file() == home / "config/companion/operators.yaml"
-    assert stat.S_IMODE(own_file().stat().st_mode) == 0o600
-    assert stat.S_IMODE(own_file().parent.stat().st_mode) == 0o700
+    assert default_operators_file() == home / "config/companion/operators.yaml"
+    assert stat.S_IMODE(default_operators_file().stat().st_mode) == 0o600
+    assert stat.S_IMODE(default_operators_file().parent.stat().st_mode) == 0o700
     assert len(first.names) == 1
     assert len(first.key(first.names[0])) == 32
     assert load_operators().key(first.names[0]) == first.key(first.names[0])
-    assert [path.name for path in own_file().parent.iterdir()] == ["operators.yaml"]
+    assert [path.name for path in default_operators_file().parent.iterdir()] == ["operators.yaml"]
 
 
 def test_umask_opens_no_file(home: Path) -> None:
@@ -78,8 +82,8 @@ def test_umask_opens_no_file(home: Path) -> None:
         load_operators()
     finally:
         os.umask(before)
-    assert stat.S_IMODE(own_file().stat().st_mode) == 0o600
-    assert stat.S_IMODE(own_file().parent.stat().st_mode) == 0o700
+    assert stat.S_IMODE(default_operators_file().stat().st_mode) == 0o600
+    assert stat.S_IMODE(default_operators_file().parent.stat().st_mode) == 0o700
 
 
 def test_processes_that_start_at_once_share_one_key(home: Path) -> None:
@@ -109,18 +113,18 @@ def test_processes_that_start_at_once_share_one_key(home: Path) -> None:
     keys = {process.communicate(timeout=DEADLINE_S)[0] for process in started}
     assert [process.returncode for process in started] == [0] * 6
     assert len(keys) == 1
-    assert [path.name for path in own_file().parent.iterdir()] == ["operators.yaml"]
+    assert [path.name for path in default_operators_file().parent.iterdir()] == ["operators.yaml"]
 
 
 def test_relative_xdg_folder_is_ignored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", "here")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert own_file() == tmp_path / ".config/companion/operators.yaml"
+    assert default_operators_file() == tmp_path / ".config/companion/operators.yaml"
 
 
 def test_own_file_that_cannot_be_made_is_one_line(home: Path) -> None:
     (home / "config").write_text("a file where a folder should be")
-    with pytest.raises(ConfigError, match=r"operators.yaml: .*; name another file") as refused:
+    with pytest.raises(ConfigError, match=r"operators.yaml: .*; give another file") as refused:
         load_operators()
     assert len(refused.value.lines) == 1
 
@@ -129,7 +133,7 @@ def test_own_file_that_cannot_be_made_is_one_line(home: Path) -> None:
 def test_file_open_to_others_is_refused_with_the_fix(tmp_path: Path, mode: int) -> None:
     path = private(tmp_path / "operators.yaml", one_operator(), mode)
     for load in (load_operators, load_login):
-        with pytest.raises(ConfigError, match=f"open to others .mode {mode:04o}.; chmod 600 {path}") as refused:
+        with pytest.raises(ConfigError, match=f"open to others .mode {mode:04o}.; run: chmod 600 {path}") as refused:
             load(path)
         assert len(refused.value.lines) == 1
 

@@ -111,7 +111,7 @@ def test_a_port_that_is_taken(sandbox: Sandbox) -> None:
         assert running.end().code == EXIT_OK
     assert ended.code == EXIT_REFUSED
     assert ended.err_lines == [
-        f"companion monitor: port {port} of 127.0.0.1 is in use, by another monitor perhaps; choose another one: --port N"
+        f"companion monitor: port {port} of 127.0.0.1 is in use, perhaps by another monitor; choose another: --port N"
     ]
 
 
@@ -131,7 +131,7 @@ def test_mistakes(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str])
         ([str(log), str(foreign)], f"{foreign}: is no MCAP file"),
         ([str(log), "--text"], "--text shows a running flight"),
         (["--port", "70000"], "--port 70000: expected 0 to 65535"),
-        (["--cert", str(cert)], "--cert and --key go together"),
+        (["--cert", str(cert)], "--cert and --key must be given together"),
         (["--cert", str(cert), "--key", "nofile.pem"], "--key nofile.pem: cannot be read"),
         (["--cert", str(key), "--key", str(cert)], "expected a certificate and its private key"),
         (["--broker", "localhost"], "--broker: expected mqtt://"),
@@ -178,7 +178,7 @@ def test_logs_are_served_without_a_broker(log: Path, tmp_path: Path, sandbox: Sa
                     await ws.send_json({"kind": "token", "token": ""})
                     hello = await ws.receive_json()
                     assert hello["replay"] is True and hello["logs"] == [str(log), str(log)]
-                    assert hello["can_command"] is False and "replayed" in hello["why_not"]
+                    assert hello["can_command"] is False and "replay" in hello["why_not"]
                 for number, status in ((0, 200), (1, 200), (2, 404)):
                     async with session.get(f"{address}replay/{number}.json") as answer:
                         assert answer.status == status

@@ -18,14 +18,14 @@ from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     MESSAGE_MAX_BYTES,
     Events,
-    Light,
+    HealthLevel,
     Stream,
     Topic,
     decode,
     encode,
 )
 from companion.ground.telemetry import stream as snapshot
-from companion.ground.telemetry.health import NAMES
+from companion.ground.telemetry.health import DEVICE_NAMES
 from companion.ground.telemetry.stream import TEXT_MAX, StreamBuilder, replay
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import (
@@ -74,7 +74,7 @@ def stream_of(*rows: Row) -> Stream:
     return maker.build(1.7e9)
 
 
-def light_of(stream: Stream, name: str) -> tuple[Light, str]:
+def light_of(stream: Stream, name: str) -> tuple[HealthLevel, str]:
     found = {health.name: health for health in stream.lights}
     return found[name].light, found[name].text
 
@@ -155,10 +155,10 @@ def test_with_nothing_known_everything_is_none_and_all_lights_of_devices_are_off
         ROWS[0], vehicle=None, status=None, mocap=None, arm=None, force=None, outputs__reference=None, outputs__attitude=None
     )  # fmt: skip
     stream = stream_of(row)
-    assert [health.name for health in stream.lights] == list(NAMES)
+    assert [health.name for health in stream.lights] == list(DEVICE_NAMES)
     assert (stream.pose_from, stream.position_world_m, stream.e_p_m, stream.e_q_deg) == (None, None, None, None)
     lights = {health.name: health.light for health in stream.lights}
-    assert {name for name, light in lights.items() if light is not Light.OFF} == {"loop", "recorder"}
+    assert {name for name, light in lights.items() if light is not HealthLevel.OFF} == {"loop", "recorder"}
     with pytest.raises(LookupError):
         StreamBuilder(CONFIG, "s").build(0.0)
 
@@ -228,10 +228,13 @@ def test_late_ticks_and_lost_records_are_counted() -> None:
         maker.add_tick(*changed(ROWS[k], sent__lateness_s=0.0051 if k % 20 == 3 else 0.0049))
     stream = maker.build(0.0, dropped=3)
     assert (stream.timing.missed, stream.timing.dropped) == (5, 3)
-    assert light_of(stream, "recorder") == (Light.WARN, "3 records lost")
+    assert light_of(stream, "recorder") == (HealthLevel.WARN, "3 records lost")
     maker.add_tick(*changed(ROWS[100], recorder_dropped=7))
     assert maker.build(0.0, dropped=3).timing.dropped == 7
-    assert light_of(maker.build(0.0, recorder_error="the disk is full"), "recorder") == (Light.BAD, "the disk is full")
+    assert light_of(maker.build(0.0, recorder_error="the disk is full"), "recorder") == (
+        HealthLevel.BAD,
+        "the disk is full",
+    )
 
 
 def test_the_newest_events_are_kept_and_all_are_counted() -> None:
@@ -251,7 +254,7 @@ def test_what_repeats_for_ever_pushes_no_event_out() -> None:
     maker = StreamBuilder(CONFIG, "s")
     maker.add_line(1.0, "warning", "px4", "something once")
     for k in range(5 * EVENTS_KEPT):
-        maker.add_line(2.0 + k, "warning", "noise", f"the {k}th", instead=True)
+        maker.add_line(2.0 + k, "warning", "noise", f"the {k}th", replace_last=True)
     assert [line.text for line in maker.events] == ["something once", f"the {5 * EVENTS_KEPT - 1}th"]
     assert maker.count == 5 * EVENTS_KEPT + 1
 
@@ -288,58 +291,63 @@ AGES = [
 
 @pytest.mark.parametrize(("name", "aged"), AGES)
 def test_a_light_turns_with_the_age_of_its_device(name: str, aged: Callable[[float], dict[str, Any]]) -> None:
-    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.1))), name)[0] is Light.OK
-    assert light_of(stream_of(changed(IN_FLIGHT, **aged(1.1))), name)[0] is Light.BAD
+    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.1))), name)[0] is HealthLevel.OK
+    assert light_of(stream_of(changed(IN_FLIGHT, **aged(1.1))), name)[0] is HealthLevel.BAD
 
 
 @pytest.mark.parametrize("name_aged", [AGES[0], *AGES[2:]])
 def test_a_light_warns_from_half_its_limit_on(name_aged: tuple[str, Callable[[float], dict[str, Any]]]) -> None:
     name, aged = name_aged
-    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.7))), name)[0] is Light.WARN
+    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.7))), name)[0] is HealthLevel.WARN
 
 
 @pytest.mark.parametrize(
     ("name", "values", "light", "text"),
     [
-        ("PX4", {}, Light.OK, "4 ms old, OFFBOARD, armed"),
-        ("PX4", {"status": None}, Light.BAD, "no heartbeat"),
-        ("estimate", {"vehicle__position_world_m": (9.0, 0.0, 1.0)}, Light.BAD, "cm"),
-        ("estimate", {"vehicle__attitude_wxyz": quat_from_euler_zyx(0.0, 0.0, 0.3)}, Light.BAD, "17."),
-        ("estimate", {"mocap__tracking_valid": False}, Light.OFF, "nothing to compare with"),
-        ("motion capture", {"mocap__tracking_valid": False}, Light.BAD, "not seen"),
-        ("motion capture", {"outputs__mocap_trusted": False}, Light.BAD, "not believed"),
-        ("motion capture", {"mocap__latency_s": 0.06}, Light.WARN, "60 ms late"),
-        ("motion capture", {"mocap__latency_s": 0.2}, Light.BAD, "200 ms late"),
-        ("arm", {}, Light.OK, "31 / 30 degC"),
-        ("arm", {"arm__temperature_c": (30.0, SAFETY.servo_warn_c)}, Light.WARN, "/ 65 degC"),
-        ("arm", {"arm__temperature_c": (SAFETY.servo_max_c, 30.0)}, Light.BAD, "75 / 30 degC"),
-        ("arm", {"arm__hardware_error": (0, 32)}, Light.BAD, "servo 2: overload"),
-        ("arm", {"arm__hardware_error": (128, 0)}, Light.WARN, "watchdog"),
-        ("arm", {"arm__read_failures": SAFETY.arm_read_failures_max}, Light.WARN, "without an answer"),
-        ("force sensor", {"force__overload": True}, Light.WARN, "overloaded"),
-        ("loop", {"sent__lateness_s": 0.06}, Light.WARN, "60.0 ms late at worst, 1 ticks missed"),
-        ("loop", {"sent__lateness_s": 0.4}, Light.BAD, "400.0 ms"),
-        ("guardian", {}, Light.OFF, "none"),
-        ("guardian", {"guardian_ready": True}, Light.OK, "stands by"),
-        ("guardian", {"guardian_ready": False}, Light.BAD, "dead"),
-        ("battery", {}, Light.OK, "15.8 V, 90 %"),
-        ("battery", {"status__battery_remaining": 0.25}, Light.WARN, "25 %"),
-        ("battery", {"status__battery_remaining": 0.15}, Light.BAD, "15 %"),
-        ("battery", {"status__battery_voltage_v": 13.0}, Light.BAD, "13.0 V"),
-        ("battery", {"status__battery_voltage_v": None, "status__battery_remaining": None}, Light.OFF, "not say"),
-        ("tether", {}, Light.OFF, "not measured"),
-        ("tether", tether(), Light.OK, "1.00 m left"),
-        ("tether", tether(stop_slack_m=0.2), Light.WARN, "m left"),
-        ("tether", tether(stop_slack_m=0.05), Light.BAD, "0.05 m where it could stop"),
-        ("tether", tether(clearance_m=0.0), Light.WARN, "cm from rotors"),
-        ("tether", tether(turns=-1.6), Light.BAD, "-1.6 turns"),
-        ("tether", tether(taut=True, pull_n=12.0), Light.BAD, "taut: pulls with 12 N"),
-        ("tether", tether(snagged=True), Light.BAD, "snagged"),
-        ("tether", tether(separated=True), Light.BAD, "holds the machine no more"),
+        ("PX4", {}, HealthLevel.OK, "4 ms old, OFFBOARD, armed"),
+        ("PX4", {"status": None}, HealthLevel.BAD, "no heartbeat"),
+        ("estimate", {"vehicle__position_world_m": (9.0, 0.0, 1.0)}, HealthLevel.BAD, "cm"),
+        ("estimate", {"vehicle__attitude_wxyz": quat_from_euler_zyx(0.0, 0.0, 0.3)}, HealthLevel.BAD, "17."),
+        ("estimate", {"mocap__tracking_valid": False}, HealthLevel.OFF, "no fresh pose to compare with"),
+        ("motion capture", {"mocap__tracking_valid": False}, HealthLevel.BAD, "not tracked"),
+        ("motion capture", {"outputs__mocap_trusted": False}, HealthLevel.BAD, "rejected"),
+        ("motion capture", {"mocap__latency_s": 0.06}, HealthLevel.WARN, "60 ms late"),
+        ("motion capture", {"mocap__latency_s": 0.2}, HealthLevel.BAD, "200 ms late"),
+        ("arm", {}, HealthLevel.OK, "31 / 30 degC"),
+        ("arm", {"arm__temperature_c": (30.0, SAFETY.servo_warn_c)}, HealthLevel.WARN, "/ 65 degC"),
+        ("arm", {"arm__temperature_c": (SAFETY.servo_max_c, 30.0)}, HealthLevel.BAD, "75 / 30 degC"),
+        ("arm", {"arm__hardware_error": (0, 32)}, HealthLevel.BAD, "servo 2: overload"),
+        ("arm", {"arm__hardware_error": (128, 0)}, HealthLevel.WARN, "watchdog"),
+        ("arm", {"arm__read_failures": SAFETY.arm_read_failures_max}, HealthLevel.WARN, "without an answer"),
+        ("force sensor", {"force__overload": True}, HealthLevel.WARN, "overloaded"),
+        ("loop", {"sent__lateness_s": 0.06}, HealthLevel.WARN, "60.0 ms late at worst, 1 ticks missed"),
+        ("loop", {"sent__lateness_s": 0.4}, HealthLevel.BAD, "400.0 ms"),
+        ("guardian", {}, HealthLevel.OFF, "no guardian"),
+        ("guardian", {"guardian_ready": True}, HealthLevel.OK, "standby"),
+        ("guardian", {"guardian_ready": False}, HealthLevel.BAD, "dead"),
+        ("battery", {}, HealthLevel.OK, "15.8 V, 90 %"),
+        ("battery", {"status__battery_remaining": 0.25}, HealthLevel.WARN, "25 %"),
+        ("battery", {"status__battery_remaining": 0.15}, HealthLevel.BAD, "15 %"),
+        ("battery", {"status__battery_voltage_v": 13.0}, HealthLevel.BAD, "13.0 V"),
+        (
+            "battery",
+            {"status__battery_voltage_v": None, "status__battery_remaining": None},
+            HealthLevel.OFF,
+            "not reported",
+        ),
+        ("tether", {}, HealthLevel.OFF, "not measured"),
+        ("tether", tether(), HealthLevel.OK, "1.00 m left"),
+        ("tether", tether(stop_slack_m=0.2), HealthLevel.WARN, "m left"),
+        ("tether", tether(stop_slack_m=0.05), HealthLevel.BAD, "0.05 m where it could stop"),
+        ("tether", tether(clearance_m=0.0), HealthLevel.WARN, "cm from rotors"),
+        ("tether", tether(turns=-1.6), HealthLevel.BAD, "-1.6 turns"),
+        ("tether", tether(taut=True, pull_n=12.0), HealthLevel.BAD, "taut: pulls with 12 N"),
+        ("tether", tether(snagged=True), HealthLevel.BAD, "snagged"),
+        ("tether", tether(separated=True), HealthLevel.BAD, "no longer holds the vehicle"),
     ],
 )
 def test_a_light_turns_at_the_limit_of_the_vehicle_file(
-    name: str, values: dict[str, Any], light: Light, text: str
+    name: str, values: dict[str, Any], light: HealthLevel, text: str
 ) -> None:
     found = light_of(stream_of(changed(IN_FLIGHT, **values)), name)
     assert found[0] is light and text in found[1], found
@@ -354,7 +362,7 @@ def test_the_rate_of_motion_capture_is_counted_and_judged() -> None:
     for row in rows[100:]:
         maker.add_tick(*row)
     light, text = light_of(maker.build(0.0), "motion capture")
-    assert light is Light.WARN and ("40 Hz" in text or "41 Hz" in text)
+    assert light is HealthLevel.WARN and ("40 Hz" in text or "41 Hz" in text)
 
 
 def test_a_fault_of_one_tick_is_to_be_seen_for_a_second() -> None:
@@ -364,7 +372,7 @@ def test_a_fault_of_one_tick_is_to_be_seen_for_a_second() -> None:
         maker.add_tick(*changed(row, sent__lateness_s=0.06 if k == 200 else 0.0))
         if k % 10 == 9:
             lights.append((row[0].t_s, light_of(maker.build(0.0), "loop")[0]))
-    seen_s = [t_s for t_s, light in lights if light is Light.WARN]
+    seen_s = [t_s for t_s, light in lights if light is HealthLevel.WARN]
     assert 0.9 < seen_s[-1] - seen_s[0] < 1.1
 
 

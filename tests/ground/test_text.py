@@ -26,8 +26,8 @@ from companion.ground.protocol.messages import CommandName, Presence, encode
 from companion.ground.protocol.proof import with_proofs
 from companion.ground.station.station import Station
 from companion.ground.station.text_monitor import _Screen
-from companion.ground.station.text_view import STALE_S, Around, Note, frame, line, stale, word
-from companion.ground.station.vehicles import Vehicle, Watch
+from companion.ground.station.text_view import STALE_S, Notice, StationStatus, render, stale, status_line, status_word
+from companion.ground.station.vehicles import Vehicle, VehicleTracker
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play
 from tests.ground.vehicle import flight, played_vehicle, state_of
@@ -35,7 +35,7 @@ from tests.support import ROOT
 
 pytestmark = pytest.mark.waits
 
-AROUND = Around("connected to mqtt://127.0.0.1:1883", True, "anna", None)
+AROUND = StationStatus("connected to mqtt://127.0.0.1:1883", True, "anna", None)
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 def known(presence: Presence = Presence.FLYING, heard_s: float = 0.0, event: str = "caught", **values: Any) -> Vehicle:
     """What is known of a vehicle that said this."""
-    watch = Watch()
+    watch = VehicleTracker()
     events = flight()[2]
     lines = (replace(events.lines[0], text=event),)
     state = state_of("rig", "s", presence=presence, outcome="completed" if presence is Presence.ENDED else None)
@@ -55,14 +55,14 @@ def known(presence: Presence = Presence.FLYING, heard_s: float = 0.0, event: str
         ("events", replace(events, session="s", lines=lines)),
         ("stream", replace(flight()[1][-1], session="s", **values)),
     ):
-        assert watch.take(f"companion/rig/{topic}", encode(record), False, heard_s) is not None
+        assert watch.receive(f"companion/rig/{topic}", encode(record), False, heard_s) is not None
     return watch.vehicles["rig"]
 
 
-def drawn(vehicle: Vehicle | None, now_s: float = 0.0, around: Around = AROUND) -> str:
+def drawn(vehicle: Vehicle | None, now_s: float = 0.0, around: StationStatus = AROUND) -> str:
     console = Console(width=140, record=True, file=open(os.devnull, "w"), color_system="standard", force_terminal=True)  # noqa: SIM115
     with contextlib.closing(console.file):
-        console.print(frame(vehicle, now_s, around))
+        console.print(render(vehicle, now_s, around))
         return console.export_text(styles=True)
 
 
@@ -75,7 +75,7 @@ def plain(text: str) -> str:
     [
         (known(), 0.0, "FLYING", False),
         (known(kind="ground"), 0.0, "ON THE GROUND", False),
-        (known(waits_for_start=True), 0.0, "WAITS FOR START", False),
+        (known(waits_for_start=True), 0.0, "WAITING FOR START", False),
         (known(action="hold"), 0.0, "HOLD", False),
         (known(action="autopilot_land"), 0.0, "AUTOPILOT LAND", False),
         (known(), STALE_S + 0.1, "NO DATA FOR 0.4 s", True),
@@ -85,7 +85,7 @@ def plain(text: str) -> str:
     ],
 )
 def test_the_word(vehicle: Vehicle, now_s: float, expected: str, alarm: bool) -> None:
-    text, style = word(vehicle, now_s)
+    text, style = status_word(vehicle, now_s)
     assert text == expected
     assert ("on red" in style) is alarm
 
@@ -113,14 +113,18 @@ def test_a_taut_tether_is_loud() -> None:
 
 
 def test_who_may_not_command_is_told_why_and_shown_no_keys() -> None:
-    text = plain(drawn(known(), 0.0, replace(AROUND, operator=None, why_not="nobody shall", notes=(Note("a note"),))))
+    text = plain(
+        drawn(
+            known(), 0.0, replace(AROUND, operator=None, view_only_reason="nobody shall", notices=(Notice("a note"),))
+        )
+    )
     assert "view only: nobody shall" in text and "ABORT" not in text and "a note" in text
 
 
 def test_text_from_the_network_does_not_steer_the_terminal() -> None:
     hostile = "\x1b[2J\x1b]0;title\x07[red]markup[/red]\r\n\x9b31m"
     vehicle = known(event=hostile, phase=hostile, action=hostile, mode=hostile)
-    shown = drawn(vehicle) + line(vehicle, 0.0)
+    shown = drawn(vehicle) + status_line(vehicle, 0.0)
     assert "\x1b[2J" not in shown and "\x07" not in shown and "\x9b" not in shown and "\x1b]" not in shown
     assert "[red]markup[/red]" in plain(shown)
 
@@ -201,7 +205,7 @@ def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
             flight()[1][-1], session=session, hold=hold, action="hold", wall_s=2e9 if session == "s2" else 1e9
         )
         payload = encode(with_proofs(replace(stream, t_s=stream.t_s + hold), vehicle, [ANNA.key]))
-        assert station.watch.take(f"companion/{vehicle}/stream", payload, False, time.monotonic()) is not None
+        assert station.tracker.receive(f"companion/{vehicle}/stream", payload, False, time.monotonic()) is not None
         screen._chosen = vehicle
 
     shown()

@@ -17,7 +17,7 @@ from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.messages import Topic
 from companion.ground.station.hub import Hub
 from companion.ground.station.station import Station
-from companion.ground.station.web import Monitor, Serving, WebError
+from companion.ground.station.web import Monitor, ServerSettings, WebError
 from companion.ground.station.web_guard import HEADERS, MESSAGE_MAX_BYTES
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import (
@@ -261,12 +261,12 @@ def idle_viewer(monitor: Monitor) -> Iterator[None]:
                                                        ("192.0.2.7", False, False), ("0.0.0.0", False, False),
                                                        ("192.0.2.7", True, True)])  # fmt: skip
 def test_other_computers_command_over_tls_only(host: str, tls: bool, commands: bool) -> None:
-    serving = Serving(host, 8642, ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER) if tls else None)
+    serving = ServerSettings(host, 8642, ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER) if tls else None)
     station = Station(
         broker_access("mqtt://127.0.0.1", None, None), SIGNER, None, lambda heard: None, lambda c, t: None
     )
-    monitor = Monitor(serving, Hub(station.watch, ""), station.orders)
-    assert (monitor.why_not is None) is commands
+    monitor = Monitor(serving, Hub(station.tracker, ""), station.commands)
+    assert (monitor.view_only_reason is None) is commands
     assert ("#token=" in monitor.url) is commands
 
 
@@ -279,7 +279,7 @@ def test_the_page_over_tls(broker: Broker, tmp_path: Path) -> None:
     async def scene() -> None:
         async with (
             played_vehicle(broker.port, OPERATORS),
-            monitor_at(broker.url, serving=Serving("127.0.0.1", 0, server)) as monitor,
+            monitor_at(broker.url, serving=ServerSettings("127.0.0.1", 0, server)) as monitor,
             viewer_of(monitor, ssl=trusting) as viewer,
         ):
             assert monitor.url.startswith("https://127.0.0.1:")
@@ -294,10 +294,10 @@ def test_a_port_that_is_taken_is_said(broker: Broker) -> None:
     async def scene() -> None:
         async with monitor_at(broker.url) as monitor:
             with pytest.raises(WebError, match=f"port {monitor.port} of 127.0.0.1 is in use"):
-                async with monitor_at(broker.url, serving=Serving("127.0.0.1", monitor.port)):
+                async with monitor_at(broker.url, serving=ServerSettings("127.0.0.1", monitor.port)):
                     pass
         with pytest.raises(WebError, match=r"--host 192\.0\.2\.7: cannot listen there"):
-            async with monitor_at(broker.url, serving=Serving("192.0.2.7", 0)):
+            async with monitor_at(broker.url, serving=ServerSettings("192.0.2.7", 0)):
                 pass
 
     play(scene())

@@ -14,7 +14,7 @@ from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import Operator, operators_text, write_private
 from companion.ground.protocol.messages import CommandName, Presence
 from companion.ground.protocol.proof import Signer
-from companion.ground.station.command_sender import NO_ANSWER, TRIES, signer_of
+from companion.ground.station.command_sender import ATTEMPTS, NO_ANSWER, signer_of
 from companion.ground.station.vehicles import LIVE_S
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, play, token_of, viewer_of
@@ -71,7 +71,7 @@ def test_a_refusal_of_the_vehicle_reaches_the_page(broker: Broker) -> None:
 
 @pytest.mark.parametrize("command", ["hold", "start"])
 def test_no_answer_is_said_and_only_what_makes_things_safer_is_sent_again(broker: Broker, command: str) -> None:
-    tries = TRIES if command == "hold" else 1
+    tries = ATTEMPTS if command == "hold" else 1
 
     async def scene() -> None:
         async with (
@@ -152,7 +152,7 @@ def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broke
                 return str((await viewer.until("refused"))["text"])
 
             await viewer.until("broker", lambda message: message["connected"])
-            assert "nothing is known of a vehicle 'other'" in await why_not("other")
+            assert "no vehicle 'other' is known" in await why_not("other")
             assert "no command can be dated" in await why_not("rig")
             await vehicle.say_stream()
             await viewer.until("stream")
@@ -161,7 +161,7 @@ def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broke
             )  # as long as proven messages come in, a state that nobody has proven is not believed
             await vehicle.say_state(commands=False, text="the broker is another computer")
             await viewer.until("state", lambda message: not message["data"]["commands"])
-            assert "hears no commands: the broker is another computer" in await why_not("rig")
+            assert "accepts no commands: the broker is another computer" in await why_not("rig")
             await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
             await viewer.until("state", lambda message: message["data"]["presence"] == "ended")
             assert "has ended" in await why_not("rig")
@@ -223,9 +223,9 @@ def test_who_may_command_from_a_monitor(broker: Broker, tmp_path: Path) -> None:
     remote = broker_access("mqtt://192.0.2.1", None, None)
     file = tmp_path / "operators.yaml"
     write_private(file, operators_text([ANNA, Operator("bob", b"b" * 32)]).encode())
-    assert "is another computer and the way there is plain" in str(signer_of(remote, str(file), "anna"))
+    assert "is not encrypted" in str(signer_of(remote, str(file), "anna"))
     assert "--view-only" in str(signer_of(here, str(file), "anna", view_only=True))
-    assert "several operators (anna, bob); say who you are" in str(signer_of(here, str(file), None))
+    assert "several operators (anna, bob); choose one" in str(signer_of(here, str(file), None))
     assert signer_of(here, str(file), "anna") == SIGNER
     with pytest.raises(ConfigError, match="no operator 'eve'"):
         signer_of(here, str(file), "eve")
@@ -235,7 +235,7 @@ def test_a_key_is_made_for_this_computer_alone(tmp_path: Path, monkeypatch: pyte
     """No vehicle elsewhere would know it."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     why_not = signer_of(broker_access("mqtts://192.0.2.1", None, None), None, None)
-    assert "name a file: --operators" in str(why_not)
+    assert "give a file: --operators" in str(why_not)
     assert not list(tmp_path.iterdir())
     signer = signer_of(broker_access("mqtt://127.0.0.1", None, None), None, None)
     assert isinstance(signer, Signer) and list(tmp_path.rglob("operators.yaml"))

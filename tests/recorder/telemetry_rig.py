@@ -70,7 +70,7 @@ class Listener:
         with self._changed:
             self._heard.append((found[1], bytes(message.payload), message.retain))
             if found[1] is Topic.STREAM:
-                self.clock.heard(decode(Stream, bytes(message.payload)).t_s, time.monotonic())
+                self.clock.add(decode(Stream, bytes(message.payload)).t_s, time.monotonic())
             self._changed.notify_all()
 
     def of(self, topic: Topic) -> list[bytes]:

@@ -121,7 +121,7 @@ def test_a_flight_process_that_dies_is_silent_first_and_lost_with_its_channel(tm
         os.close(os.dup(flight.recorder.client.fileno()))
         flight.recorder.client._socket.close()  # as the kernel does for a process that is gone
         lost = listener.wait(Topic.STATE, State, lambda state: state.presence is Presence.LOST)
-        assert lost.wall_s > 0.0 and lost.text is not None and "without a word" in lost.text
+        assert lost.wall_s > 0.0 and lost.text is not None and "without notice" in lost.text
         flight.recorder.process.wait(DEADLINE_S)
     assert len(FlightLog.read(flight.path).inputs) == 400
 

@@ -226,7 +226,7 @@ def test_no_command_is_heard_over_a_plain_way_to_another_computer(tmp_path: Path
     with flight_with(tmp_path, url) as flight:
         flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")
         flight.finish()
-    assert any("commands are not heard over a plain connection" in line for line in log_lines(flight.path))
+    assert any("commands are not accepted over an unencrypted connection" in line for line in log_lines(flight.path))
 
 
 @pytest.mark.parametrize("fault", ["open to others", "absent", "no yaml"])
@@ -275,7 +275,7 @@ def test_a_broker_that_does_not_let_the_vehicle_speak_is_told(tmp_path: Path) ->
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     """A broker with TLS, logins and ACLs, as `companion broker init` makes it."""
     folder = tmp_path_factory.mktemp("site") / "broker"
-    broker_setup.make(folder, WANTED, datetime.datetime.now(datetime.UTC))
+    broker_setup.create(folder, WANTED, datetime.datetime.now(datetime.UTC))
     with running(folder, tmp_path_factory.mktemp("run")) as made:
         yield made
 
@@ -321,7 +321,7 @@ def test_over_tls_with_its_login_a_vehicle_is_seen_and_commanded(tmp_path: Path,
         ("wrong password", "Not authorized"),
         ("no login", "Not authorized"),
         ("another authority", "certificate verify failed"),
-        ("no certificate", "is no certificate in PEM form"),
+        ("no certificate", "is not a certificate in PEM form"),
         ("a viewer's login", "does not let this vehicle publish its state: Not authorized"),
         ("plain to the TLS port", "no broker at"),
     ],

@@ -108,7 +108,7 @@ def test_the_frames_are_where_the_arm_s_kinematics_have_them(tmp_path: Path) -> 
 
 
 def test_each_channel_keeps_its_rate(tmp_path: Path) -> None:
-    rows = [row for row in tethered(end_s=9.0) if row[0].t_s >= 1.0]
+    rows = [row for row in tethered(end_s=5.0) if row[0].t_s >= 1.0]
     viewed = written(tmp_path / "flight.mcap", rows, plan="[[0, 0, 1], [1, 0, 1]]")
     seconds = rows[-1][0].t_s - rows[0][0].t_s
     for topic, rate_hz in (
@@ -123,7 +123,7 @@ def test_each_channel_keeps_its_rate(tmp_path: Path) -> None:
     ):
         assert len(viewed.by_topic[topic]) / seconds == pytest.approx(rate_hz, rel=0.02), topic
     assert len(viewed.by_topic["/scene_static"]) == 1
-    assert 4 <= len(viewed.by_topic["/scene_path"]) <= 5
+    assert 2 <= len(viewed.by_topic["/scene_path"]) <= 3
 
 
 def only(seen: list[Seen], entity: str) -> dict[str, Any]:
@@ -233,8 +233,8 @@ def test_the_flown_path_stays_short_however_long_the_flight(tmp_path: Path) -> N
     seen = mocap(0.0)
 
     def circling() -> Iterable[Row]:
-        for k in range(2000):
-            t_s = k * 0.05
+        for k in range(600):
+            t_s = k * 0.1
             pose = replace(seen, stamp_s=t_s, position_world_m=(math.cos(t_s), math.sin(t_s), 1.0))
             yield replace(inputs, tick=k, t_s=t_s, mocap=pose), replace(outputs, tick=k, t_s=t_s), replace(sent, tick=k)
 

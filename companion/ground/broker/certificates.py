@@ -1,4 +1,4 @@
-"""An authority of one's own and the broker's certificate, so that a ground station knows the broker from somebody in between."""
+"""A private certificate authority and the broker's certificate, by which a ground station identifies the broker."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS = 3650
 _EARLY = datetime.timedelta(days=1)
-"""Valid from a day ago: computers without a clock of their own are late."""
+"""Certificates are valid from a day ago, because computers without a real-time clock may be late."""
 
 
 class CertificateError(Exception):
-    """A certificate or key that cannot be used; says why in one line."""
+    """A certificate or key cannot be used; one line."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -30,7 +30,7 @@ class Pair:
 
 
 def make_authority(now: datetime.datetime) -> Pair:
-    """A new authority, ECDSA P-256, for `AUTHORITY_DAYS`.
+    """Return a new authority, ECDSA P-256, valid for `AUTHORITY_DAYS`.
 
     Args:
         now: with time zone.
@@ -46,23 +46,23 @@ def make_authority(now: datetime.datetime) -> Pair:
 
 
 def make_server(authority: Pair, hosts: Sequence[str], days: int, now: datetime.datetime) -> Pair:
-    """The broker's certificate with a new key, signed by the authority.
+    """Return a certificate for the broker, with a new key, signed by the authority.
 
     Args:
-        authority: who signs.
-        hosts: names and addresses by which the broker is reached.
-        days: how long it is valid, at most as long as the authority is.
+        authority: the signing authority.
+        hosts: names and addresses of the broker.
+        days: validity, at most that of the authority.
         now: with time zone.
 
     Raises:
-        CertificateError: the authority cannot be read, its key is another one's, or it ends too early.
+        CertificateError: the authority is invalid, its key does not match, or it expires earlier.
     """
     issuer, signer = _opened(authority)
     until = now + datetime.timedelta(days=days)
     if until > issuer.not_valid_after_utc:
         ends = f"{issuer.not_valid_after_utc:%Y-%m-%d}"
         raise CertificateError(
-            f"the authority ends on {ends}, before {days} days are over; make a new folder, or fewer days"
+            f"the authority expires on {ends}, in less than {days} days; create a new folder, or use fewer days"
         )
     key = ec.generate_private_key(ec.SECP256R1())
     builder = (
@@ -79,23 +79,23 @@ def make_server(authority: Pair, hosts: Sequence[str], days: int, now: datetime.
     return _pair(builder.sign(signer, hashes.SHA256()), key)
 
 
-def hosts_of(certificate: bytes) -> list[str]:
-    """Names and addresses that a certificate (PEM) stands for.
+def certificate_hosts(certificate: bytes) -> list[str]:
+    """Return the names and addresses in a certificate (PEM).
 
     Raises:
-        CertificateError: it is none.
+        CertificateError: it is not a certificate with host names.
     """
     try:
         parsed = x509.load_pem_x509_certificate(certificate)
         names = parsed.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except (ValueError, x509.ExtensionNotFound):
-        raise CertificateError("no certificate (PEM) with names of hosts") from None
+        raise CertificateError("expected a certificate (PEM) with host names") from None
     addresses = [str(address) for address in names.get_values_for_type(x509.IPAddress)]
     return [*names.get_values_for_type(x509.DNSName), *addresses]
 
 
-def ends(certificate: bytes) -> datetime.date:
-    """Last day of a certificate (PEM)."""
+def expiry_date(certificate: bytes) -> datetime.date:
+    """Return the last valid day of a certificate (PEM)."""
     return x509.load_pem_x509_certificate(certificate).not_valid_after_utc.date()
 
 
@@ -104,9 +104,9 @@ def _opened(authority: Pair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateK
         issuer = x509.load_pem_x509_certificate(authority.certificate)
         signer = serialization.load_pem_private_key(authority.key, password=None)
     except (ValueError, TypeError):
-        raise CertificateError("no certificate and key in PEM form") from None
+        raise CertificateError("expected a certificate and a key in PEM form") from None
     if not isinstance(signer, ec.EllipticCurvePrivateKey) or signer.public_key() != issuer.public_key():
-        raise CertificateError("the key is not that of the certificate")
+        raise CertificateError("the key does not belong to the certificate")
     return issuer, signer
 
 

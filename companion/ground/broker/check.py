@@ -1,4 +1,4 @@
-"""What a broker lets a login do, found by trying: connect, subscribe, publish rubbish, and see what comes back."""
+"""Permissions of a login at a broker, found by trying: connect, subscribe, publish an empty message, and see what arrives."""
 
 from __future__ import annotations
 
@@ -19,67 +19,69 @@ from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.messages import Topic, vehicle_of
 
 ANSWER_S = 5.0
-"""For each answer of the broker."""
+"""Timeout for each answer of the broker."""
 _PROBE = b""
-"""No message at all: every reader throws it away."""
+"""An empty message, which every receiver rejects."""
 
 
 class CheckError(Exception):
-    """The broker cannot be reached, or does not want us; one line."""
+    """The broker is unreachable or refuses the connection; one line."""
 
 
 @dataclass(frozen=True, slots=True)
-class Right:
-    """What may be done with one topic."""
+class TopicRights:
+    """Permissions on one topic."""
 
     topic: Topic
     read: bool | None
-    """None: it lets us subscribe, but nothing was there to be read."""
+    """None if subscribing is allowed but no message was there to be read."""
     write: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What a broker lets a login do."""
+class CheckResult:
+    """Permissions of a login at a broker."""
 
     tls: str | None
-    """Version of TLS."""
+    """TLS version, or None."""
     certificate_ends: str | None
-    rights: tuple[Right, ...]
+    rights: tuple[TopicRights, ...]
     vehicles: tuple[str, ...]
-    """Those that something retained was heard of."""
+    """Vehicles with a retained message."""
 
 
-def check(access: BrokerAccess, vehicle: str | None = None) -> Found:
+def check(access: BrokerAccess, vehicle: str | None = None) -> CheckResult:
     """Connect and try every topic.
 
     Args:
-        access: the broker, login, certificates.
-        vehicle: whose topics to write to; its readers, and on ``command`` itself, count one message of rubbish each. None: of a name
-            that no vehicle has.
+        access: broker, login, certificates.
+        vehicle: vehicle whose topics are written to; its readers, and the vehicle itself on ``command``, count one rejected message
+            each. None for a name that no vehicle has.
 
     Raises:
-        CheckError: no connection, or an answer that does not come.
+        CheckError: no connection, or no answer.
     """
     name = vehicle or f"check-{secrets.token_hex(4)}"
-    # Before paho, which leaves the socket open when TLS fails.
+    # First, because paho leaves the socket open if TLS fails.
     tls, ends = _certificate(access)
-    talk = _Talk(access)
+    client = _Client(access)
     try:
-        talk.connect()
-        granted = {topic: not talk.subscribe(topic.of("+")).is_failure for topic in Topic}
-        written = {topic: not talk.publish(topic.of(name)).is_failure for topic in Topic}
-        # The broker handles what we ask in order: whatever it sends us of the above, it sends before this answer.
-        talk.unsubscribe([topic.of("+") for topic in Topic])
+        client.connect()
+        granted = {topic: not client.subscribe(topic.of("+")).is_failure for topic in Topic}
+        written = {topic: not client.publish(topic.of(name)).is_failure for topic in Topic}
+        # The broker answers in order: all messages of these subscriptions arrive before this answer.
+        client.unsubscribe([topic.of("+") for topic in Topic])
     finally:
-        talk.close()
-    heard = {topic for found in map(vehicle_of, talk.heard) if found for topic in [found[1]]}
+        client.close()
+    received = {topic for found in map(vehicle_of, client.received_topics) if found for topic in [found[1]]}
     rights = tuple(
-        Right(topic, granted[topic] and (topic in heard or (False if written[topic] else None)), written[topic])
+        TopicRights(
+            topic, granted[topic] and (topic in received or (False if written[topic] else None)), written[topic]
+        )
         for topic in Topic
     )
-    vehicles = {found[0] for found in map(vehicle_of, talk.heard) if found} - {name}
-    return Found(tls, ends, rights, tuple(sorted(vehicles)))
+    vehicles = {found[0] for found in map(vehicle_of, client.received_topics) if found} - {name}
+    return CheckResult(tls, ends, rights, tuple(sorted(vehicles)))
 
 
 def _unreachable(access: BrokerAccess, error: OSError) -> str:
@@ -90,14 +92,16 @@ def _unreachable(access: BrokerAccess, error: OSError) -> str:
             "signed by the authority of --ca"
         )
     if isinstance(error, ssl.SSLError) or (address.tls and isinstance(error, ConnectionResetError)):
-        return f"{address}: no TLS there ({getattr(error, 'reason', None) or error.strerror}); is the port right?"
+        return (
+            f"{address}: the port does not use TLS ({getattr(error, 'reason', None) or error.strerror}); check the port"
+        )
     if isinstance(error, TimeoutError):
         return f"{address}: no answer within {ANSWER_S:g} s"
-    return f"{address}: {error.strerror or error}; is the broker running there?"
+    return f"{address}: {error.strerror or error}; check that the broker is running"
 
 
 def _certificate(access: BrokerAccess) -> tuple[str | None, str | None]:
-    """(version of TLS, end of the broker's certificate), both None without TLS; over a connection of its own."""
+    """Return the TLS version and the expiry of the broker's certificate, both None without TLS; uses a connection of its own."""
     if access.tls is None:
         return None, None
     try:
@@ -111,14 +115,14 @@ def _certificate(access: BrokerAccess) -> tuple[str | None, str | None]:
         raise CheckError(_unreachable(access, error)) from None
 
 
-class _Talk:
-    """One connection, question by question; paho's thread hands its answers over."""
+class _Client:
+    """One connection with blocking calls; paho's thread queues the answers."""
 
     def __init__(self, access: BrokerAccess) -> None:
         self._access = access
         self._answers: queue.SimpleQueue[tuple[str, int, Any]] = queue.SimpleQueue()
-        self.heard: list[str] = []
-        """Topics of messages."""
+        self.received_topics: list[str] = []
+        """Topics of received messages."""
         client = mqtt.Client(
             CallbackAPIVersion.VERSION2, client_id=f"companion-check-{secrets.token_hex(6)}", protocol=mqtt.MQTTv5
         )
@@ -132,14 +136,14 @@ class _Talk:
         client.on_unsubscribe = lambda c, u, mid, codes, properties: self._answers.put(("unsubscribe", mid, None))
         client.on_publish = lambda c, u, mid, code, properties: self._answers.put(("publish", mid, code))
         client.on_disconnect = lambda c, u, flags, code, properties: self._answers.put(("disconnect", 0, code))
-        client.on_message = lambda c, u, message: self.heard.append(message.topic)
+        client.on_message = lambda c, u, message: self.received_topics.append(message.topic)
         self._client = client
 
     def connect(self) -> None:
-        """Ask for a connection and wait for the broker's word.
+        """Connect and wait for the broker's answer.
 
         Raises:
-            CheckError: none, or a refusal.
+            CheckError: no answer, or a refusal.
         """
         address = self._access.address
         try:
@@ -153,25 +157,25 @@ class _Talk:
         code = self._answer("connect", 0)
         if code.is_failure:
             login = "without a login" if self._access.username is None else f"as {self._access.username}"
-            raise CheckError(f"{address}: the broker refuses us {login}: {code}; see --login")
+            raise CheckError(f"{address}: the broker refuses the connection {login}: {code}; see --login")
 
     def subscribe(self, topic: str) -> ReasonCode:
-        """The broker's word."""
+        """Subscribe; return the broker's reason code."""
         code, mid = self._client.subscribe(topic, qos=1)
         return cast(ReasonCode, self._answer("subscribe", mid or 0, code))
 
     def publish(self, topic: str) -> ReasonCode:
-        """The broker's word; nothing is retained."""
+        """Publish without retaining; return the broker's reason code."""
         info = self._client.publish(topic, _PROBE, qos=1)
         return cast(ReasonCode, self._answer("publish", info.mid, info.rc))
 
     def unsubscribe(self, topics: Sequence[str]) -> None:
-        """Wait until it is done."""
+        """Unsubscribe and wait for the answer."""
         code, mid = self._client.unsubscribe(list(topics))
         self._answer("unsubscribe", mid or 0, code)
 
     def close(self) -> None:
-        """End the connection and the thread, whatever state they are in."""
+        """End the connection and the thread in whatever state they are."""
         self._client.disconnect()
         self._client.loop_stop()
 

@@ -8,20 +8,20 @@ from pathlib import Path
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Topic
 
 INSTALLED = Path("/etc/mosquitto/companion")
-"""Where the system service finds the files."""
+"""Folder of the system service's files."""
 PLAIN_PORT = 1883
 TLS_PORT = 8883
-VIEWED = tuple(topic for topic in Topic if topic is not Topic.COMMAND)
-"""Topics that the vehicle writes and people read."""
+PUBLISHED_TOPICS = tuple(topic for topic in Topic if topic is not Topic.COMMAND)
+"""Topics that the vehicle publishes and ground stations read."""
 _PACKET_ROOM_BYTES = 62_144
-"""Topic, properties, and room to grow; the packet's limit counts them too."""
+"""Topic, properties and a margin, which the packet limit includes."""
 
 
 def profile_text(folder: Path) -> str:
-    """mosquitto.conf(5) of a broker that people on other computers use; its other files are in `folder`."""
+    """Return mosquitto.conf(5) of a broker for several computers; its other files are in `folder`."""
     return f"""\
-# For several computers: TLS and a login from everywhere, no TLS but a login all the same from this computer. Made by
-# companion broker init; docs/broker.md says what each line is for.
+# For several computers: TLS and a login from everywhere, a login without TLS from this computer. Written by
+# companion broker init; docs/broker.md explains each line.
 listener {TLS_PORT}
 certfile {folder}/server.pem
 keyfile {folder}/server.key
@@ -31,12 +31,12 @@ max_connections 100
 listener {PLAIN_PORT} 127.0.0.1
 max_connections 100
 
-# For both: who is who, and who may do what. What is refused comes back to an MQTT 5 client as reason code 135.
+# For both: users and their permissions. An MQTT 5 client gets reason code 135 for what is refused.
 allow_anonymous false
 password_file {folder}/passwords
 acl_file {folder}/acl
 
-# Nothing that a client does lets the broker grow without end, and nothing of yesterday comes back.
+# Limits on memory, whatever clients do; no messages are kept over a restart.
 max_packet_size {MESSAGE_MAX_BYTES + _PACKET_ROOM_BYTES}
 max_queued_messages 1000
 max_queued_bytes 8000000
@@ -47,24 +47,24 @@ log_type error
 log_type warning
 log_type notice
 log_type information
-# mosquitto 2.0 tells a denied message in this type alone. It tells every other one too: some 150 bytes for each that goes in or out.
+# mosquitto 2.0 logs denied messages only with this type. It also logs every other message, about 150 bytes each.
 log_type debug
 """
 
 
 def acl_text(vehicles: Sequence[str], operators: Sequence[str], viewers: Sequence[str]) -> str:
-    """The access list, mosquitto.conf(5) `acl_file`: what is not named is denied.
+    """Return the access list, mosquitto.conf(5) `acl_file`: what is not listed is denied.
 
     Args:
-        vehicles: names in topics, which are their logins too.
+        vehicles: names in topics, which are also the vehicles' logins.
         operators: logins that may command every vehicle.
-        viewers: logins that may look on.
+        viewers: logins that may only read.
     """
-    blocks = ["# Who may read and write what; what is not named is denied, and nobody reads $SYS."]
+    blocks = ["# Permissions by user; what is not listed is denied, including $SYS."]
     for vehicle in vehicles:
-        written = [f"topic write {topic.of(vehicle)}" for topic in VIEWED]
+        written = [f"topic write {topic.of(vehicle)}" for topic in PUBLISHED_TOPICS]
         blocks.append("\n".join([f"user {vehicle}", *written, f"topic read {Topic.COMMAND.of(vehicle)}"]))
-    read = [f"topic read {topic.of('+')}" for topic in VIEWED]
+    read = [f"topic read {topic.of('+')}" for topic in PUBLISHED_TOPICS]
     for operator in operators:
         blocks.append("\n".join([f"user {operator}", *read, f"topic write {Topic.COMMAND.of('+')}"]))
     for viewer in viewers:

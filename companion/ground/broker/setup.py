@@ -1,11 +1,11 @@
-"""Everything that a broker with logins and TLS needs, made in one folder: for the broker itself, and a folder for each computer.
+"""Files of a broker with logins and TLS: one folder for the broker, with a folder for each computer that connects.
 
 mosquitto.conf passwords acl ca.pem server.pem server.key   the broker
 service.conf                                                the same profile for the system service
-ca.key                                                      renews server.pem, nothing else
-vehicles/NAME/{login.yaml,ca.pem,operators.yaml}            the vehicle: all operators' keys
-operators/NAME/{login.yaml,ca.pem,operators.yaml}           an operator's computer: his own key
-viewers/NAME/{login.yaml,ca.pem}                            who looks on
+ca.key                                                      signs a new server.pem, nothing else
+vehicles/NAME/{login.yaml,ca.pem,operators.yaml}            a vehicle: keys of all operators
+operators/NAME/{login.yaml,ca.pem,operators.yaml}           an operator's computer: the operator's own key
+viewers/NAME/{login.yaml,ca.pem}                            a viewer's computer
 """
 
 from __future__ import annotations
@@ -25,7 +25,14 @@ from pathlib import Path
 
 from companion.config.document import ConfigError
 from companion.config.ground import VEHICLE_NAME
-from companion.ground.broker.certificates import CertificateError, Pair, ends, hosts_of, make_authority, make_server
+from companion.ground.broker.certificates import (
+    CertificateError,
+    Pair,
+    certificate_hosts,
+    expiry_date,
+    make_authority,
+    make_server,
+)
 from companion.ground.broker.mosquitto_config import INSTALLED, acl_text, profile_text
 from companion.ground.protocol.keys import OPERATOR_NAME, Operator, new_key, operators_text, write_private
 from companion.runtime.files import write_whole
@@ -37,104 +44,106 @@ _HASH_DEADLINE_S = 60.0
 
 
 class SetupError(Exception):
-    """A tool that is missing, or does not do what it should; one line."""
+    """A tool is missing or fails; one line."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """Who and what a broker is made for."""
+class BrokerUsers:
+    """Hosts and users of a broker."""
 
     hosts: tuple[str, ...]
-    """Names and addresses beside those of loopback."""
+    """Names and addresses of the broker, in addition to loopback."""
     operators: tuple[str, ...]
     viewers: tuple[str, ...]
     vehicles: tuple[str, ...]
     days: int
-    """Of the broker's certificate."""
+    """Validity of the broker's certificate."""
 
 
-def make(folder: Path, wanted: Wanted, now: datetime.datetime) -> None:
-    """Make the folder, whole or not at all.
+def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
+    """Create the folder, whole or not at all.
 
     Args:
-        folder: absolute; not there yet, or empty.
-        wanted: for whom.
+        folder: absolute path; must not exist, or be empty.
+        users: hosts and users.
         now: with time zone.
 
     Raises:
-        ConfigError: a name cannot be used, or something is in the folder already.
+        ConfigError: a name is invalid, or the folder is not empty.
         SetupError: mosquitto_passwd is missing or fails.
     """
-    _refuse_names(wanted)
+    _check_names(users)
     if not str(folder).isprintable():
-        raise ConfigError([f"{folder}: a folder's name with control characters; choose another"])
+        raise ConfigError([f"{folder}: the folder's name has control characters; choose another"])
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError([f"{folder}: is there already, nothing was changed; choose another, or --renew-certificates"])
+        raise ConfigError(
+            [f"{folder}: already exists, nothing was changed; choose another, or use --renew-certificates"]
+        )
     beside = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside.mkdir(mode=0o700)
         try:
-            _fill(beside, folder, wanted, now)
+            _fill(beside, folder, users, now)
             beside.rename(folder)
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     except OSError as error:
-        raise ConfigError([f"{folder}: cannot be made: {error.strerror or error}"]) from None
+        raise ConfigError([f"{folder}: cannot be created: {error.strerror or error}"]) from None
 
 
-def renew(folder: Path, hosts: Sequence[str], days: int, now: datetime.datetime) -> tuple[str, ...]:
-    """A new key and certificate for the broker of a folder, by the same authority: nobody else needs a new file.
+def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: datetime.datetime) -> tuple[str, ...]:
+    """Create a new key and certificate of the broker, signed by the same authority: no other computer needs a new file.
 
     Args:
-        folder: as `make` left it.
-        hosts: instead of those of the old certificate; empty: the same.
-        days: of the new certificate.
+        folder: as `create` made it.
+        hosts: names and addresses of the broker; empty for those of the old certificate.
+        days: validity of the new certificate.
         now: with time zone.
 
     Returns:
         The hosts.
 
     Raises:
-        ConfigError: files are missing or unusable; nothing was changed.
+        ConfigError: files are missing or invalid; nothing was changed.
     """
-    _refuse_hosts(hosts)
+    _check_hosts(hosts)
     named = folder / "ca.key"
     try:
         authority = Pair((folder / "ca.pem").read_bytes(), named.read_bytes())
         named = folder / "server.pem"
-        known = tuple(_all_hosts(hosts) if hosts else hosts_of(named.read_bytes()))
+        known = tuple(_all_hosts(hosts) if hosts else certificate_hosts(named.read_bytes()))
         server = make_server(authority, known, days, now)
         for name, data in (("server.key", server.key), ("server.pem", server.certificate)):
             named = folder / name
             write_whole(named, data, mode=0o600, durable=True)
     except OSError as error:
         raise ConfigError(
-            [f"{error.filename or named}: {error.strerror or error}; expected a folder of broker init"]
+            [f"{error.filename or named}: {error.strerror or error}; expected a folder that broker init created"]
         ) from None
     except CertificateError as error:
         raise ConfigError([f"{named}: {error}"]) from None
     return known
 
 
-def certificate_ends(folder: Path) -> datetime.date:
-    """Last day of the broker's certificate."""
-    return ends((folder / "server.pem").read_bytes())
+def certificate_expiry(folder: Path) -> datetime.date:
+    """Return the last valid day of the broker's certificate."""
+    return expiry_date((folder / "server.pem").read_bytes())
 
 
-def _fill(folder: Path, later: Path, wanted: Wanted, now: datetime.datetime) -> None:
-    """Write everything into `folder`, which will be `later`."""
+def _fill(folder: Path, later: Path, users: BrokerUsers, now: datetime.datetime) -> None:
+    """Write all files into `folder`, which will be renamed to `later`."""
     authority = make_authority(now)
     try:
-        server = make_server(authority, _all_hosts(wanted.hosts), wanted.days, now)
+        server = make_server(authority, _all_hosts(users.hosts), users.days, now)
     except CertificateError as error:
-        raise ConfigError([f"--days {wanted.days}: {error}"]) from None
-    logins = {name: secrets.token_urlsafe(24) for name in (*wanted.vehicles, *wanted.operators, *wanted.viewers)}
-    operators = [Operator(name, new_key()) for name in wanted.operators]
+        raise ConfigError([f"--days {users.days}: {error}"]) from None
+    logins = {name: secrets.token_urlsafe(24) for name in (*users.vehicles, *users.operators, *users.viewers)}
+    operators = [Operator(name, new_key()) for name in users.operators]
     files = {
         "mosquitto.conf": profile_text(later).encode(),
         "service.conf": profile_text(INSTALLED).encode(),
-        "acl": acl_text(wanted.vehicles, wanted.operators, wanted.viewers).encode(),
+        "acl": acl_text(users.vehicles, users.operators, users.viewers).encode(),
         "ca.pem": authority.certificate,
         "ca.key": authority.key,
         "server.pem": server.certificate,
@@ -143,9 +152,9 @@ def _fill(folder: Path, later: Path, wanted: Wanted, now: datetime.datetime) -> 
     }
     everybody = operators_text(operators).encode() if operators else None
     own = {operator.name: operators_text([operator]).encode() for operator in operators}
-    rooms = [(f"vehicles/{name}", name, everybody) for name in wanted.vehicles]
-    rooms += [(f"operators/{name}", name, own[name]) for name in wanted.operators]
-    rooms += [(f"viewers/{name}", name, None) for name in wanted.viewers]
+    rooms = [(f"vehicles/{name}", name, everybody) for name in users.vehicles]
+    rooms += [(f"operators/{name}", name, own[name]) for name in users.operators]
+    rooms += [(f"viewers/{name}", name, None) for name in users.viewers]
     for room, name, keys in rooms:
         (folder / room).mkdir(mode=0o700, parents=True)
         files[f"{room}/login.yaml"] = f'username: "{name}"\npassword: "{logins[name]}"\n'.encode()
@@ -158,10 +167,10 @@ def _fill(folder: Path, later: Path, wanted: Wanted, now: datetime.datetime) -> 
 
 
 def _hash_passwords(path: Path) -> None:
-    """``name:password`` lines become ``name:hash`` lines in place; no password is on any command line."""
+    """Replace ``name:password`` lines by ``name:hash`` lines in place; no password appears on a command line."""
     tool = shutil.which("mosquitto_passwd")
     if tool is None:
-        raise SetupError("mosquitto_passwd is not there: apt install mosquitto")
+        raise SetupError("mosquitto_passwd is not installed: apt install mosquitto")
     try:
         done = subprocess.run(
             [tool, "-U", str(path)],
@@ -182,31 +191,31 @@ def _hash_passwords(path: Path) -> None:
     os.chmod(path, 0o600)
 
 
-def _refuse_names(wanted: Wanted) -> None:
+def _check_names(users: BrokerUsers) -> None:
     lines = [
         f"{option} {name!r:.60}: expected 1 to 40 letters, digits, '_', '-' or '.'"
         for option, pattern, names in (
-            ("--vehicle", VEHICLE_NAME, wanted.vehicles),
-            ("--operator", OPERATOR_NAME, wanted.operators),
-            ("--viewer", OPERATOR_NAME, wanted.viewers),
+            ("--vehicle", VEHICLE_NAME, users.vehicles),
+            ("--operator", OPERATOR_NAME, users.operators),
+            ("--viewer", OPERATOR_NAME, users.viewers),
         )
         for name in names
         if pattern.fullmatch(name) is None or name in (".", "..")
     ]
-    everybody = [*wanted.vehicles, *wanted.operators, *wanted.viewers]
+    everybody = [*users.vehicles, *users.operators, *users.viewers]
     lines += [
-        f"{name}: named twice; every vehicle and person needs a name of its own"
+        f"{name}: used twice; every vehicle and user needs a different name"
         for name in sorted(set(everybody))
         if everybody.count(name) > 1
     ]
-    if not wanted.vehicles:
+    if not users.vehicles:
         lines.append("--vehicle: expected the name of at least one")
     if lines:
         raise ConfigError(lines)
-    _refuse_hosts(wanted.hosts)
+    _check_hosts(users.hosts)
 
 
-def _refuse_hosts(hosts: Sequence[str]) -> None:
+def _check_hosts(hosts: Sequence[str]) -> None:
     lines = [f"--host {host!r:.60}: expected a name or an address" for host in hosts if not _is_host(host)]
     if lines:
         raise ConfigError(lines)
@@ -225,7 +234,7 @@ def _all_hosts(hosts: Sequence[str]) -> list[str]:
 
 
 def this_host() -> tuple[str, ...]:
-    """This computer's name, if it can stand in a certificate."""
+    """Return this computer's name if a certificate can hold it."""
     with contextlib.suppress(OSError):
         name = socket.gethostname()
         if _is_host(name):

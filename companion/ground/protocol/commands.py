@@ -1,11 +1,11 @@
-"""Signed commands: how the ground makes one, and how the vehicle decides whether to believe it.
+"""Signed commands: how the ground station makes one, and how the vehicle verifies it.
 
-A command is signed with its operator's key, end to end: what stands between ground and vehicle (broker, logins, TLS) may fail or be
-open, and nobody without a key commands the vehicle. The signature is HMAC-SHA256 (RFC 2104) over `canonical`.
+A command is signed with its operator's key, end to end: even if everything between ground and vehicle (broker, logins, TLS) fails or
+is open, nobody commands the vehicle without a key. The signature is HMAC-SHA256 (RFC 2104) over `canonical`.
 
-What a key cannot prove is checked beside it: the command is of this flight (session), made now (the vehicle's own flight clock, which
-the ground takes from `Stream` messages that the vehicle has proven), for the first time (nonce), and not one of very many (rate). None
-of it is touched by a message that is not well signed, so nobody without a key can have a genuine command refused.
+A signature does not prove that a command is meant now. So the vehicle also checks that the command names this flight (session), is
+recent by the vehicle's own flight clock (which the ground takes from proven `Stream` messages), is new (nonce) and within a rate
+limit. A message without a valid signature changes none of this state, so nobody without a key can have a genuine command refused.
 
 A command that was refused once is never accepted later, whatever the reason was.
 """
@@ -22,21 +22,23 @@ from enum import StrEnum
 from typing import NamedTuple, TypeAlias
 
 from companion.config.ground import VEHICLE_NAME
-from companion.ground.protocol.keys import OPERATOR_NAME, SAFER, Operators
+from companion.ground.protocol.keys import OPERATOR_NAME, SAFER_COMMANDS, Operators
 from companion.ground.protocol.messages import COMMAND_MAX_BYTES, VERSION, Command, CommandName
-from companion.ground.protocol.strict_json import WireError, parse
+from companion.ground.protocol.strict_json import StrictJsonError, parse
 from companion.model.codec import RecordError, from_jsonable
 
 DOMAIN = "companion command 2"
-"""First line of every signed text: a signature made for anything else is none of a command."""
+"""First line of every signed text; a signature made for another purpose is not valid for a command."""
 AHEAD_MAX_S = 0.5
-"""A command may be so much ahead of the vehicle's clock."""
+"""Largest lead of a command's time over the vehicle's clock."""
 REFUSED_MAX = 512
-"""Nonces of refused commands that are kept for each operator and command. Beyond that a time is kept: see `_Heard.refuse`."""
-ANSWERS_PER_S = 20
-"""Refused commands that are answered: replaying old ones makes no flood of answers."""
+"""Nonces of refused commands that are kept per operator and command name; beyond that a range of times is kept
+(`_History.add_refused`).
+"""
+ACKS_PER_S = 20
+"""Limit of acks for refused commands, so that replayed commands cause no flood of acks."""
 _NOTHING = (float("inf"), float("-inf"))
-"""A range of dates that holds none."""
+"""An empty range of times."""
 _T_MS_MAX = 2**53
 _TEXT_MAX = 160
 _SESSION = re.compile(r"[\x21-\x7e]{1,64}")
@@ -46,11 +48,11 @@ _MAC = re.compile(r"[0-9a-f]{64}")
 
 
 class Limits(NamedTuple):
-    """How fresh and how frequent a command has to be."""
+    """Age and rate limits of a command."""
 
     age_max_s: float
     per_s: int
-    """Accepted per operator and second."""
+    """Accepted commands per operator and second."""
 
 
 LIMITS = {
@@ -60,11 +62,11 @@ LIMITS = {
     CommandName.RESUME: Limits(2.0, 1),
     CommandName.START: Limits(2.0, 1),
 }
-"""Each command has a rate of its own: however many HOLDs there are, LAND gets through."""
+"""Each command name has its own rate limit: LAND gets through however many HOLDs there are."""
 
 
 class Reason(StrEnum):
-    """Why a command was refused."""
+    """Reason for refusing a command."""
 
     OVERSIZED = "oversized"
     MALFORMED = "malformed"
@@ -85,33 +87,34 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """Genuine, fresh, of this flight, for the first time, by somebody who may."""
+    """The command is genuine, recent, new, of this flight, and its operator may give it."""
 
     command: Command
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """Not to be followed."""
+    """The command must not be carried out."""
 
     reason: Reason
     text: str
-    """One line for people, printable; may quote what was sent."""
+    """One printable line for the operator; may quote the payload."""
     command: Command | None = None
-    """Set if it was well signed and its sender is to be told by an `Ack`. None: anybody may have sent it, or it is a copy of one
-    that was answered, or `ANSWERS_PER_S` are used up."""
+    """The command if it was well signed and an `Ack` is sent to its operator. None if the sender is unknown, the command is a copy of
+    one that was answered, or the limit `ACKS_PER_S` is reached.
+    """
 
 
 Verdict: TypeAlias = Accepted | Refused
 
 
 def canonical(command: Command) -> bytes:
-    """What is signed: `DOMAIN`, then every field but ``mac`` in the record's order, one per line, the last with its line end too.
+    """Return the signed text: `DOMAIN`, then every field except ``mac`` in the record's order, one per line, each with a line end.
 
     Raises:
-        ValueError: a field could be read in two ways, or is none that a command may have.
+        ValueError: a field is out of range or ambiguous.
     """
-    problem = _unspeakable(command)
+    problem = _field_problem(command)
     if problem is not None:
         raise ValueError(problem)
     return (
@@ -121,10 +124,10 @@ def canonical(command: Command) -> bytes:
 
 
 def sign(command: Command, key: bytes) -> Command:
-    """The command with its signature, whatever stood there before.
+    """Return the command with its signature; an existing signature is replaced.
 
     Raises:
-        ValueError: it has a field that no command may have.
+        ValueError: a field is out of range.
     """
     return replace(command, mac=_mac(command, key))
 
@@ -132,19 +135,19 @@ def sign(command: Command, key: bytes) -> Command:
 def make_command(
     name: CommandName, vehicle: str, session: str, operator: str, key: bytes, t_ms: int, hold: int = 0
 ) -> Command:
-    """A signed command with a nonce of its own; `companion.ground.protocol.messages.encode` makes the payload.
+    """Return a signed command with a new nonce; `companion.ground.protocol.messages.encode` makes the payload.
 
     Args:
-        name: what is asked for.
+        name: the command.
         vehicle: the vehicle's name in topics.
-        session: `State.session` or `Stream.session` of the flight that is meant.
-        operator: who asks.
-        key: the operator's, `Operators.key`.
+        session: `State.session` or `Stream.session` of the flight.
+        operator: the operator's name.
+        key: the operator's key, `Operators.key`.
         t_ms: the vehicle's flight clock now, `FlightClock.now_ms`.
-        hold: number of the hold that a RESUME is to end, `Stream.hold`; 0: none.
+        hold: number of the hold that a RESUME ends, `Stream.hold`; 0 for other commands.
 
     Raises:
-        ValueError: a field that no command may have; says which.
+        ValueError: a field is out of range; the message names it.
     """
     unsigned = Command(VERSION, vehicle, session, operator, name, t_ms, hold, secrets.token_hex(16), "")
     return sign(unsigned, key)
@@ -154,14 +157,14 @@ def _mac(command: Command, key: bytes) -> str:
     return hmac.digest(key, canonical(command), hashlib.sha256).hex()
 
 
-def _unspeakable(command: Command) -> str | None:
-    """None, or what is wrong with a field of the signed text."""
+def _field_problem(command: Command) -> str | None:
+    """Return what is wrong with a field of the signed text, or None."""
     if VEHICLE_NAME.fullmatch(command.vehicle) is None:
-        return f"vehicle: {command.vehicle!r:.60} is no vehicle's name"
+        return f"vehicle: {command.vehicle!r:.60} is not a vehicle name"
     if _SESSION.fullmatch(command.session) is None:
-        return f"session: {command.session!r:.60} is no session"
+        return f"session: {command.session!r:.60} is not a session id"
     if OPERATOR_NAME.fullmatch(command.operator) is None:
-        return f"operator: {command.operator!r:.60} is no operator's name"
+        return f"operator: {command.operator!r:.60} is not an operator name"
     if not -_T_MS_MAX < command.t_ms < _T_MS_MAX:
         return "t_ms: out of range"
     if not 0 <= command.hold < _HOLD_MAX:
@@ -171,61 +174,65 @@ def _unspeakable(command: Command) -> str | None:
     return None
 
 
-class _Heard:
-    """What is remembered of one operator's commands of one name. Bounded, however many come."""
+class _History:
+    """Bounded history of one operator's commands of one name."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.accepted_t_s: deque[float] = deque(maxlen=limits.per_s)
-        """Flight clock at which the newest were accepted."""
-        self._followed: dict[str, float] = {}
-        """Nonce, and the flight clock at which the command is stale in any case. The rate bounds how many there are."""
+        """Flight clock of the newest accepted commands."""
+        self._accepted: dict[str, float] = {}
+        """Nonces of accepted commands, with the flight clock at which each becomes stale. Bounded by the rate limit."""
         self._refused: dict[str, float] = {}
-        """The same of those that were refused, at most `REFUSED_MAX`."""
-        self._closed_t_s = {False: _NOTHING, True: _NOTHING}
-        """Oldest and newest date of refused commands whose nonces found no room: nothing between is accepted any more. Those from
-        the future (True) are kept apart, lest they close what is dated between now and then."""
+        """The same for refused commands, at most `REFUSED_MAX`."""
+        self._closed_range_t_s = {False: _NOTHING, True: _NOTHING}
+        """Oldest and newest time of refused commands whose nonces were not kept: no command from this range is accepted. Commands from
+        the future (True) have a range of their own, so that they do not block the time between now and then.
+        """
 
     @property
     def size(self) -> int:
-        """Nonces that are kept."""
-        return len(self._followed) + len(self._refused)
+        """Number of nonces that are kept."""
+        return len(self._accepted) + len(self._refused)
 
-    def knows(self, command: Command) -> bool:
-        """Whether it was accepted or refused before, or may have been."""
+    def contains(self, command: Command) -> bool:
+        """Whether the command was accepted or refused before, or may have been."""
         nonce, t_s = command.nonce, command.t_ms / 1000.0
-        closed = any(from_t_s <= t_s <= until_t_s for from_t_s, until_t_s in self._closed_t_s.values())
-        return closed or nonce in self._followed or nonce in self._refused
+        closed = any(from_t_s <= t_s <= until_t_s for from_t_s, until_t_s in self._closed_range_t_s.values())
+        return closed or nonce in self._accepted or nonce in self._refused
 
-    def follow(self, command: Command, now_t_s: float) -> None:
+    def add_accepted(self, command: Command, now_t_s: float) -> None:
         self.accepted_t_s.append(now_t_s)
-        self._followed[command.nonce] = command.t_ms / 1000.0 + self.limits.age_max_s
+        self._accepted[command.nonce] = command.t_ms / 1000.0 + self.limits.age_max_s
 
-    def refuse(self, command: Command, now_t_s: float) -> None:
+    def add_refused(self, command: Command, now_t_s: float) -> None:
         if len(self._refused) < REFUSED_MAX:
             self._refused[command.nonce] = command.t_ms / 1000.0 + self.limits.age_max_s
         else:
             t_s = command.t_ms / 1000.0
             future = t_s - now_t_s > AHEAD_MAX_S
-            from_t_s, until_t_s = self._closed_t_s[future]
-            self._closed_t_s[future] = min(from_t_s, t_s), max(until_t_s, t_s)
+            from_t_s, until_t_s = self._closed_range_t_s[future]
+            self._closed_range_t_s[future] = min(from_t_s, t_s), max(until_t_s, t_s)
 
-    def sweep(self, now_t_s: float) -> None:
-        """Forget what is stale: the clock never goes back, so it stays stale."""
-        stale_t_s = now_t_s - self.limits.age_max_s - 1.0  # well beyond what rounding can bring back
-        for future, (from_t_s, until_t_s) in self._closed_t_s.items():
-            self._closed_t_s[future] = _NOTHING if until_t_s < stale_t_s else (max(from_t_s, stale_t_s), until_t_s)
-        self._followed = {nonce: until for nonce, until in self._followed.items() if until >= now_t_s}
+    def forget_stale(self, now_t_s: float) -> None:
+        """Forget stale commands: the clock never goes back, so they stay stale."""
+        stale_t_s = now_t_s - self.limits.age_max_s - 1.0  # a margin well beyond rounding errors
+        for future, (from_t_s, until_t_s) in self._closed_range_t_s.items():
+            self._closed_range_t_s[future] = (
+                _NOTHING if until_t_s < stale_t_s else (max(from_t_s, stale_t_s), until_t_s)
+            )
+        self._accepted = {nonce: until for nonce, until in self._accepted.items() if until >= now_t_s}
         self._refused = {nonce: until for nonce, until in self._refused.items() if until >= now_t_s}
 
 
 class Verifier:
-    """The vehicle's judge of what comes in on its ``command`` topic. No I/O and no clock; it remembers what it has judged.
+    """Verifies messages of the vehicle's ``command`` topic. No I/O and no clock; it keeps a history of the commands that it has
+    verified.
 
     Args:
-        operators: who may command.
-        vehicle: own name in topics.
-        session: of this flight.
+        operators: operators who may command.
+        vehicle: the vehicle's name in topics.
+        session: session id of this flight.
     """
 
     def __init__(self, operators: Operators, vehicle: str, session: str) -> None:
@@ -235,100 +242,103 @@ class Verifier:
         self._now_t_s = float("-inf")
         self._swept_t_s = float("-inf")
         self._stopped_t_s = float("-inf")
-        """Newest date of an accepted HOLD, LAND or ABORT, whoever gave it."""
-        self._heard = {
-            (name, command): _Heard(limits) for name in operators.names for command, limits in LIMITS.items()
+        """Newest time of an accepted HOLD, LAND or ABORT of any operator."""
+        self._histories = {
+            (name, command): _History(limits) for name in operators.names for command, limits in LIMITS.items()
         }
-        """Each command of each operator has its own room: no flood of one takes that of another."""
-        self._answered: deque[float] = deque(maxlen=ANSWERS_PER_S)
+        """One history per operator and command, so that a flood of one does not affect another."""
+        self._answered_t_s: deque[float] = deque(maxlen=ACKS_PER_S)
 
     def check(self, payload: bytes, retained: bool, now_t_s: float | None) -> Verdict:
-        """Judge one message; never raises, whatever the payload.
+        """Verify one message; never raises, whatever the payload.
 
         Args:
-            payload: as it came.
-            retained: the broker had kept it: it may be of any age, and whoever comes next would hear it again.
-            now_t_s: flight clock, s; None: it has not begun. It never goes back here: of two calls the later time counts.
+            payload: as received.
+            retained: the broker had kept the message: its age is unknown, and later subscribers would receive it again.
+            now_t_s: flight clock, s; None before it starts. The time never goes back: of two calls the later time counts.
         """
         if len(payload) > COMMAND_MAX_BYTES:
             return Refused(Reason.OVERSIZED, f"{len(payload)} bytes, at most {COMMAND_MAX_BYTES} expected")
         try:
             command = _parsed(payload)
-        except RecursionError:  # nested nearly as deep as the parser goes: too deep to be shown
-            return Refused(Reason.MALFORMED, "nested too deep")
+        except RecursionError:  # nested nearly as deep as the parser allows
+            return Refused(Reason.MALFORMED, "nested too deeply")
         if isinstance(command, Refused):
             return command
         if command.vehicle != self._vehicle:
             return Refused(Reason.WRONG_VEHICLE, f"for {command.vehicle}, this is {self._vehicle}")
-        key = self.operators.find(command.operator)
+        key = self.operators.find_key(command.operator)
         if key is None:
-            return Refused(Reason.UNKNOWN_OPERATOR, f"{command.operator} is none of this vehicle's operators")
+            return Refused(Reason.UNKNOWN_OPERATOR, f"{command.operator} is not an operator of this vehicle")
         if not hmac.compare_digest(_mac(command, key), command.mac):
             return Refused(Reason.BAD_SIGNATURE, f"not signed with the key of {command.operator}")
         if now_t_s is not None:
             self._now_t_s = max(self._now_t_s, now_t_s)
         if self._now_t_s - self._swept_t_s >= 1.0:
             self._swept_t_s = self._now_t_s
-            for heard in self._heard.values():
-                heard.sweep(self._now_t_s)
-        return self._judge(command, retained)
+            for history in self._histories.values():
+                history.forget_stale(self._now_t_s)
+        return self._verify_signed(command, retained)
 
-    def _judge(self, command: Command, retained: bool) -> Verdict:
-        """Of a command that its operator has made, whenever that was. One that could come again is remembered, accepted or not."""
-        heard = self._heard[command.operator, command.command]
+    def _verify_signed(self, command: Command, retained: bool) -> Verdict:
+        """Verify a well-signed command of any age. A command that could be sent again is remembered, whether accepted or not."""
+        history = self._histories[command.operator, command.command]
         now_t_s, t_s = self._now_t_s, command.t_ms / 1000.0
         who = f"{command.command.value} of {command.operator}"
         if command.session != self._session:
-            return self._answer(Reason.WRONG_SESSION, f"{who} is for another flight", command)
-        if now_t_s - t_s > heard.limits.age_max_s:
-            text = f"{who} is {now_t_s - t_s:.1f} s old, at most {heard.limits.age_max_s:.1f} s expected"
-            return self._answer(Reason.STALE, text, command)
-        if heard.knows(command):
-            return Refused(Reason.REPLAYED, f"{who} was heard before")
+            return self._refuse(Reason.WRONG_SESSION, f"{who} is for another flight", command)
+        if now_t_s - t_s > history.limits.age_max_s:
+            text = f"{who} is {now_t_s - t_s:.1f} s old, at most {history.limits.age_max_s:.1f} s expected"
+            return self._refuse(Reason.STALE, text, command)
+        if history.contains(command):
+            return Refused(Reason.REPLAYED, f"{who} was received before")
         if retained:
-            heard.refuse(command, now_t_s)
-            return Refused(Reason.RETAINED, "a command that the broker kept; commands are sent, never retained")
-        problem = self._problem(command, heard, who)
+            history.add_refused(command, now_t_s)
+            return Refused(Reason.RETAINED, "the broker had retained the command; commands are never retained")
+        problem = self._problem(command, history, who)
         if problem is not None:
-            heard.refuse(command, now_t_s)
-            return self._answer(*problem, command)
-        heard.follow(command, now_t_s)
-        if command.command in SAFER:
+            history.add_refused(command, now_t_s)
+            return self._refuse(*problem, command)
+        history.add_accepted(command, now_t_s)
+        if command.command in SAFER_COMMANDS:
             self._stopped_t_s = max(self._stopped_t_s, t_s)
         return Accepted(command)
 
-    def _problem(self, command: Command, heard: _Heard, who: str) -> tuple[Reason, str] | None:
-        """Why a command that was never heard before is refused; None: it is not."""
+    def _problem(self, command: Command, history: _History, who: str) -> tuple[Reason, str] | None:
+        """Return why a new command is refused, or None."""
         now_t_s, t_s = self._now_t_s, command.t_ms / 1000.0
         if now_t_s == float("-inf"):
-            return Reason.EARLY, "the flight has not begun"
+            return Reason.EARLY, "the flight has not started"
         if t_s - now_t_s > AHEAD_MAX_S:
             text = f"{who} is {t_s - now_t_s:.1f} s ahead of the flight's clock, at most {AHEAD_MAX_S:.1f} s expected"
             return Reason.FROM_THE_FUTURE, text
-        if not self.operators.may(command.operator, command.command):
-            return Reason.NOT_ALLOWED, f"{command.operator} may make things safer only, not {command.command.value}"
-        if command.command not in SAFER and t_s < self._stopped_t_s:
-            return Reason.OVERTAKEN, f"{who} was given before a hold, land or abort that was accepted"
-        accepted_t_s = heard.accepted_t_s
-        if len(accepted_t_s) == heard.limits.per_s and now_t_s - accepted_t_s[0] < 1.0:
-            return Reason.TOO_MANY, f"{who}: more than {heard.limits.per_s} a second"
+        if not self.operators.is_allowed(command.operator, command.command):
+            return (
+                Reason.NOT_ALLOWED,
+                f"{command.operator} may only give hold, land and abort, not {command.command.value}",
+            )
+        if command.command not in SAFER_COMMANDS and t_s < self._stopped_t_s:
+            return Reason.OVERTAKEN, f"{who} is older than an accepted hold, land or abort"
+        accepted_t_s = history.accepted_t_s
+        if len(accepted_t_s) == history.limits.per_s and now_t_s - accepted_t_s[0] < 1.0:
+            return Reason.TOO_MANY, f"{who}: more than {history.limits.per_s} a second"
         return None
 
-    def _answer(self, reason: Reason, text: str, command: Command) -> Refused:
-        if len(self._answered) == ANSWERS_PER_S and self._now_t_s - self._answered[0] < 1.0:
+    def _refuse(self, reason: Reason, text: str, command: Command) -> Refused:
+        if len(self._answered_t_s) == ACKS_PER_S and self._now_t_s - self._answered_t_s[0] < 1.0:
             return Refused(reason, text)
-        self._answered.append(self._now_t_s)
+        self._answered_t_s.append(self._now_t_s)
         return Refused(reason, text, command)
 
 
 def _parsed(payload: bytes) -> Command | Refused:
-    """The command as it claims to be, every field in range; or why it is none."""
+    """Return the command of a payload with every field in range, or the refusal."""
     try:
         data = parse(payload)
-    except WireError as error:
+    except StrictJsonError as error:
         return Refused(Reason.MALFORMED, str(error))
     if not isinstance(data, dict):
-        return Refused(Reason.MALFORMED, "no JSON object")
+        return Refused(Reason.MALFORMED, "not a JSON object")
     version = data.get("v")
     if type(version) is int and version != VERSION:
         return Refused(Reason.WRONG_VERSION, f"version {version}, expected {VERSION}")
@@ -336,7 +346,7 @@ def _parsed(payload: bytes) -> Command | Refused:
         command = from_jsonable(Command, data)
     except RecordError as error:
         return Refused(Reason.MALFORMED, _shown(str(error)))
-    problem = _unspeakable(command)
+    problem = _field_problem(command)
     if problem is not None:
         return Refused(Reason.MALFORMED, _shown(problem))
     if _MAC.fullmatch(command.mac) is None:
@@ -345,38 +355,38 @@ def _parsed(payload: bytes) -> Command | Refused:
 
 
 def _shown(text: str) -> str:
-    """Printable and short, whatever is quoted in it."""
+    """Return printable, short text, whatever is quoted in it."""
     return text.encode("ascii", "backslashreplace").decode("ascii")[:_TEXT_MAX]
 
 
 class FlightClock:
-    """What a ground station knows of the flight clock of one session. A new session wants a new one.
+    """Estimate of one session's flight clock on a ground station. A new session needs a new instance.
 
-    A message says what the clock was when it was sent, so it shows the clock late, never early: of all that were heard lately the one
-    with the largest difference to the local clock was the fastest, and the others do not set the clock back.
+    A message carries the clock at which it was sent, so the estimate is late, never early. Of the recent messages the one with the
+    largest difference to the local clock had the least delay; the others do not set the estimate back.
     """
 
-    LATELY_S = 10.0
+    WINDOW_S = 10.0
 
     def __init__(self) -> None:
-        self._heard: deque[tuple[float, float]] = deque()
-        """(local time, flight clock - local clock): later in time, smaller in difference."""
+        self._samples: deque[tuple[float, float]] = deque()
+        """(local time, flight clock - local clock): increasing in time, decreasing in difference."""
 
-    def heard(self, t_s: float, monotonic_s: float) -> None:
-        """Take the time of one message.
+    def add(self, t_s: float, monotonic_s: float) -> None:
+        """Add the time of one message.
 
         Args:
             t_s: `Stream.t_s`.
-            monotonic_s: local monotonic clock when it was received, s.
+            monotonic_s: local monotonic clock at receipt, s.
         """
         difference_s = t_s - monotonic_s
-        heard = self._heard
-        while heard and heard[-1][1] <= difference_s:
-            heard.pop()
-        heard.append((monotonic_s, difference_s))
-        while heard[0][0] < monotonic_s - self.LATELY_S:
-            heard.popleft()
+        samples = self._samples
+        while samples and samples[-1][1] <= difference_s:
+            samples.pop()
+        samples.append((monotonic_s, difference_s))
+        while samples[0][0] < monotonic_s - self.WINDOW_S:
+            samples.popleft()
 
     def now_ms(self, monotonic_s: float) -> int | None:
-        """The flight clock now, ms; None as long as nothing was heard. Goes on when the vehicle has fallen silent."""
-        return None if not self._heard else int((monotonic_s + self._heard[0][1]) * 1000.0)
+        """Return the flight clock now, ms; None before the first message. The clock goes on while the vehicle is silent."""
+        return None if not self._samples else int((monotonic_s + self._samples[0][1]) * 1000.0)

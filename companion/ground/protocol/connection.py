@@ -1,8 +1,8 @@
-"""One connection to a broker, on aiomqtt: answers with their reasons, messages without a queue, an end that leaves nothing behind.
+"""One MQTT connection on aiomqtt, with reason codes, unqueued messages and a complete shutdown.
 
-Differs from `aiomqtt.Client` in what that does not offer: the reason code of a publish (an ACL that does not let us write says so in
-PUBACK only), messages that are handed on at once instead of being queued (a flood of them makes no task for each), and an end that
-leaves no socket behind whatever state the connection is in.
+It adds what `aiomqtt.Client` does not offer: the reason code of a publish (an ACL that forbids writing shows it only in PUBACK),
+messages passed on at once instead of queued (a flood creates no tasks), and a shutdown that closes the socket in every state of the
+connection.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from paho.mqtt.reasoncodes import ReasonCode
 from companion.ground.protocol.access import BrokerAccess
 
 KEEPALIVE_S = 5
-"""After 1.5 times this without a word the broker sends the last will (MQTT 5, 3.1.2.10)."""
+"""After 1.5 times this without a message the broker publishes the last will (MQTT 5, 3.1.2.10)."""
 OnMessage = Callable[[str, bytes, bool], None]
-"""Topic, payload, retained. Called in the event loop; must not raise."""
+"""Called in the event loop with topic, payload and retained flag; must not raise."""
 _SSL_SOURCE = re.compile(r" \(_ssl\.c:\d+\)$")
 
 
 class Connection(aiomqtt.Client):
-    """One connection; a new one for each attempt.
+    """One connection; each attempt needs a new instance.
 
     Args:
-        access: how to get there.
-        identifier: a new connection with the same one ends the one before it at the broker.
-        on_message: for every message.
-        packet_max_bytes: the broker keeps larger ones to itself (Maximum Packet Size).
-        answer_s: for each answer of the broker.
-        will: what the broker publishes when the connection breaks.
-        send_buffer_bytes: of the system; what a slow broker has not taken lies in there and gets old.
+        access: settings of the broker.
+        identifier: client id; a new connection with the same id ends the previous one at the broker.
+        on_message: called for every message.
+        packet_max_bytes: Maximum Packet Size; the broker drops larger messages.
+        answer_s: timeout for each answer of the broker.
+        will: message that the broker publishes if the connection breaks.
+        send_buffer_bytes: size of the socket's send buffer; its content becomes stale if the broker is slow.
     """
 
     def __init__(
@@ -77,13 +77,13 @@ class Connection(aiomqtt.Client):
         self._client.connect_timeout = answer_s
         self._answer_s = answer_s
         self._take = on_message
-        self._under_way: dict[int, asyncio.Future[ReasonCode]] = {}
+        self._pending: dict[int, asyncio.Future[ReasonCode]] = {}
 
     async def open(self) -> None:
-        """Connect. The blocking part runs in a thread that cannot be cancelled: whoever cancels waits until it is over.
+        """Connect. The blocking part runs in a thread that cannot be cancelled: a cancelled caller waits for its end.
 
         Raises:
-            aiomqtt.MqttError: no broker, no answer, or it refuses us.
+            aiomqtt.MqttError: the broker is unreachable, does not answer, or refuses the connection.
         """
         opening = asyncio.ensure_future(self.__aenter__())
         try:
@@ -95,8 +95,8 @@ class Connection(aiomqtt.Client):
                 await opening
             raise
 
-    async def hear(self, topic: str, qos: int) -> str | None:
-        """Subscribe; None, or why the broker does not let us.
+    async def subscribe_topic(self, topic: str, qos: int) -> str | None:
+        """Subscribe; return None, or why the broker refuses.
 
         Raises:
             aiomqtt.MqttError: no answer.
@@ -104,58 +104,59 @@ class Connection(aiomqtt.Client):
         codes = await self.subscribe(topic, qos)
         task = asyncio.current_task()
         if task is not None and task.cancelling():
-            # Python 3.11's `asyncio.wait_for`, which aiomqtt waits with, forgets a cancellation that comes together with the result.
+            # aiomqtt uses `asyncio.wait_for`, which in Python 3.11 loses a cancellation that coincides with the result.
             raise asyncio.CancelledError
         refused = [code for code in codes if isinstance(code, ReasonCode) and code.is_failure]
         return str(refused[0]) if refused else None
 
-    async def send(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> str | None:
-        """Publish, and wait until the broker has it (QoS 1) or the system has taken it (QoS 0); None, or why the broker refuses it.
+    async def publish_message(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> str | None:
+        """Publish and wait until the broker has the message (QoS 1) or the socket has taken it (QoS 0); return None, or why the broker
+        refuses.
 
         Raises:
-            aiomqtt.MqttError: the connection is gone, or nothing happened within `answer_s`.
+            aiomqtt.MqttError: the connection is lost, or there was no answer within `answer_s`.
         """
         info = self._client.publish(topic, payload, qos=qos, retain=retain)
         if info.rc != 0:
             raise aiomqtt.MqttCodeError(info.rc, "could not publish")
         done: asyncio.Future[ReasonCode] = asyncio.get_running_loop().create_future()
-        self._under_way[info.mid] = done
+        self._pending[info.mid] = done
         try:
             async with asyncio.timeout(self._answer_s):
                 code = await done
         except TimeoutError:
             raise aiomqtt.MqttError(f"no answer from the broker within {self._answer_s:g} s") from None
         finally:
-            self._under_way.pop(info.mid, None)
+            self._pending.pop(info.mid, None)
         return str(code) if code.is_failure else None
 
-    async def broken(self) -> None:
+    async def wait_broken(self) -> None:
         """Wait until the connection is lost.
 
         Raises:
-            aiomqtt.MqttError: it is; says why.
+            aiomqtt.MqttError: always, with the reason.
         """
         async for _ in self.messages:
-            pass  # none comes this way: see _on_message
+            pass  # messages do not arrive here: see _on_message
         raise aiomqtt.MqttError("the connection ended")
 
-    async def drop(self, *, with_will: bool = False) -> None:
-        """Close, whatever state it is in.
+    async def shut_down(self, *, with_will: bool = False) -> None:
+        """Close the connection in whatever state it is.
 
         Args:
-            with_will: without a word, so that the broker says the last will.
+            with_will: close without DISCONNECT, so that the broker publishes the last will.
         """
         if not with_will:
             with contextlib.suppress(OSError, ValueError):
                 self._client.disconnect()
-        await asyncio.sleep(0)  # a writer that was asked for is registered by now, and goes with the socket
+        await asyncio.sleep(0)  # lets a requested writer register, so that it is removed with the socket
         if not with_will:
             with contextlib.suppress(OSError, ValueError):
                 self._client.loop_write()
-        self._client._sock_close()  # paho leaves the socket open where it gave up before CONNACK
+        self._client._sock_close()  # paho leaves the socket open if it fails before CONNACK
         for future in (self._connected, self._disconnected):
             if future.done() and not future.cancelled():
-                future.exception()  # told already; asyncio would complain that nobody looked
+                future.exception()  # retrieved, because asyncio warns of exceptions that are not
         if self._misc_task is not None:
             self._misc_task.cancel()
             await asyncio.wait((self._misc_task,))
@@ -165,21 +166,21 @@ class Connection(aiomqtt.Client):
             self._take(message.topic, bytes(message.payload), message.retain)
 
     def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:
-        done = self._under_way.get(mid)
+        done = self._pending.get(mid)
         if done is not None and not done.done():
             done.set_result(reason_code)
 
 
-def code_of(error: aiomqtt.MqttError) -> ReasonCode | None:
-    """The broker's reason code in an error, if there is one."""
+def reason_code(error: aiomqtt.MqttError) -> ReasonCode | None:
+    """Return the broker's reason code of an error, or None."""
     cause = error.__cause__ if isinstance(error.__cause__, aiomqtt.MqttError) else error
     code = getattr(cause, "rc", None)
     return code if isinstance(code, ReasonCode) else None
 
 
-def why(error: aiomqtt.MqttError) -> str:
-    """One line of an error, without the library's own framing."""
-    code = code_of(error)
+def error_text(error: aiomqtt.MqttError) -> str:
+    """Return one line for an error, without the library's prefixes."""
+    code = reason_code(error)
     if code is not None:
         return str(code)
     cause = error.__cause__ if isinstance(error.__cause__, aiomqtt.MqttError) else error
@@ -187,7 +188,7 @@ def why(error: aiomqtt.MqttError) -> str:
 
 
 def _logger() -> logging.Logger:
-    """What the library says of a connection is said by us, in our words."""
+    """Return a logger that discards the library's messages: the companion reports connection changes itself."""
     logger = logging.getLogger("companion.mqtt")
     logger.propagate = False
     if not logger.handlers:

@@ -1,4 +1,4 @@
-"""Files that hold secrets of the ground stations: operators with their keys, and a login at a broker. Readable by their owner alone.
+"""Files with secrets of the ground stations: operators with their keys, and a login at a broker. Readable by their owner alone.
 
     version: 1
     operators:
@@ -6,8 +6,8 @@
         key: base64 of 32 random bytes
         may: all        # or safer: hold, land and abort only
 
-The vehicle's file has everybody who may command it; a ground computer's has those who sit at it. A user who has neither gets a file
-of his own at the first use, which vehicle and ground station of one computer share.
+The vehicle's file lists all operators who may command it; the file of a ground computer lists its own operators. If a user has no
+file, one is created at the first use; vehicle and ground station on one computer share it.
 """
 
 from __future__ import annotations
@@ -38,33 +38,33 @@ from companion.runtime.files import write_whole
 OPERATOR_NAME = re.compile(r"[A-Za-z0-9_.-]{1,40}")
 KEY_BYTES = 32
 OPERATORS_MAX = 100
-SAFER = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
+SAFER_COMMANDS = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
 
 M = TypeVar("M", bound=Model)
 
 
-class May(StrEnum):
-    """What an operator may ask for."""
+class Permission(StrEnum):
+    """Commands that an operator may give."""
 
-    SAFER = "safer"
+    SAFER_COMMANDS = "safer"
     """Hold, land, abort."""
     ALL = "all"
 
 
-def _a_name(name: str) -> str:
+def _checked_name(name: str) -> str:
     if OPERATOR_NAME.fullmatch(name) is None:
         raise ValueError("expected 1 to 40 letters, digits, '_', '-' or '.'")
     return name
 
 
-# What is wrong with a secret is said without showing it.
-def _a_text(value: object) -> object:
+# Messages about a secret must not show it.
+def _checked_text(value: object) -> object:
     if not isinstance(value, str):
         raise ValueError("expected text; put it in quotes")
     return value
 
 
-def _a_key(text: str) -> str:
+def _checked_key(text: str) -> str:
     try:
         size = len(base64.b64decode(text, validate=True))
     except (binascii.Error, ValueError):
@@ -75,32 +75,32 @@ def _a_key(text: str) -> str:
 
 
 class OperatorEntry(Model):
-    """One operator of the file."""
+    """One operator in the file."""
 
-    name: Annotated[str, AfterValidator(_a_name)]
-    key: Annotated[str, AfterValidator(_a_key), BeforeValidator(_a_text), Field(repr=False)]
+    name: Annotated[str, AfterValidator(_checked_name)]
+    key: Annotated[str, AfterValidator(_checked_key), BeforeValidator(_checked_text), Field(repr=False)]
     """base64 of 32 random bytes"""
     may: Literal["safer", "all"] = "all"
     """safer: hold, land and abort; all: resume and start too"""
 
 
 class OperatorsFile(Model):
-    """The file as it is written."""
+    """Content of an operators file."""
 
     version: Literal[1]
     operators: tuple[OperatorEntry, ...]
 
     @model_validator(mode="after")
-    def _everybody_once(self) -> Self:
+    def _check_unique(self) -> Self:
         problems: list[tuple[tuple[str | int, ...], str]] = []
         if not 0 < len(self.operators) <= OPERATORS_MAX:
-            problems.append((("operators",), f"expected 1 to {OPERATORS_MAX} of them, found {len(self.operators)}"))
+            problems.append((("operators",), f"expected 1 to {OPERATORS_MAX} operators, found {len(self.operators)}"))
         for index, entry in enumerate(self.operators):
             before = self.operators[:index]
             if any(other.name == entry.name for other in before):
                 problems.append((("operators", index, "name"), f"{entry.name} is in the file twice; remove one"))
             elif any(_decoded(other.key) == _decoded(entry.key) for other in before):
-                text = "another operator has the same key: nobody could tell who commanded; give each a key of its own"
+                text = "another operator has the same key, so their commands cannot be told apart; give each operator a different key"
                 problems.append((("operators", index, "key"), text))
         refuse("operators", problems)
         return self
@@ -110,79 +110,79 @@ class Login(Model):
     """A login at a broker."""
 
     username: Annotated[str, Field(min_length=1, max_length=100)]
-    password: Annotated[str, BeforeValidator(_a_text), Field(repr=False)]
+    password: Annotated[str, BeforeValidator(_checked_text), Field(repr=False)]
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Operator:
-    """Who may command."""
+    """An operator with key and permission."""
 
     name: str
     key: bytes
-    may: May = May.ALL
+    permission: Permission = Permission.ALL
 
     def __repr__(self) -> str:
-        return f"Operator({self.name}, {self.may})"
+        return f"Operator({self.name}, {self.permission})"
 
 
 class Operators:
-    """The operators of one file; immutable, and shows no key."""
+    """The operators of one file; immutable, and its repr shows no key."""
 
     def __init__(self, operators: Sequence[Operator], source: str) -> None:
         self._by_name = {operator.name: operator for operator in operators}
         self.source = source
-        """File, as the user wrote it."""
+        """Path of the file as the user wrote it."""
 
     def __repr__(self) -> str:
         return f"Operators({', '.join(self.names)})"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """In the order of the file."""
+        """Names in the order of the file."""
         return tuple(self._by_name)
 
     @property
     def keys(self) -> tuple[bytes, ...]:
-        """In the order of the file."""
+        """Keys in the order of the file."""
         return tuple(operator.key for operator in self._by_name.values())
 
     def key(self, name: str) -> bytes:
-        """The 32 bytes of an operator.
+        """Return the 32 bytes of an operator's key.
 
         Raises:
-            ConfigError: no such operator; names those that there are.
+            ConfigError: the operator does not exist; the message lists those that do.
         """
         operator = self._by_name.get(name)
         if operator is None:
-            raise ConfigError([f"{self.source}: no operator {name!r:.60}; there are: {', '.join(self.names)}"])
+            raise ConfigError([f"{self.source}: no operator {name!r:.60}; expected one of {', '.join(self.names)}"])
         return operator.key
 
-    def find(self, name: str) -> bytes | None:
-        """The key, or None if there is no such operator."""
+    def find_key(self, name: str) -> bytes | None:
+        """Return the key, or None if the operator does not exist."""
         operator = self._by_name.get(name)
         return None if operator is None else operator.key
 
-    def may(self, name: str, command: CommandName) -> bool:
-        """Whether an operator may ask for this."""
+    def is_allowed(self, name: str, command: CommandName) -> bool:
+        """Whether an operator may give a command."""
         operator = self._by_name.get(name)
-        return operator is not None and (operator.may is May.ALL or command in SAFER)
+        return operator is not None and (operator.permission is Permission.ALL or command in SAFER_COMMANDS)
 
 
 def load_operators(path: str | Path | None = None) -> Operators:
     """Read an operators file.
 
     Args:
-        path: the file, ``~`` for the home folder; None: the user's own, made with one operator if it is not there.
+        path: the file, with ``~`` for the home folder; None for the user's own, created with one operator if it does not exist.
 
     Raises:
-        ConfigError: one line per problem: not there, others can read it, not as it should be, cannot be made.
+        ConfigError: one line per problem: the file is missing, readable by others, invalid, or cannot be created.
     """
     if path is None:
-        path = own_file()
+        path = default_operators_file()
         if not path.exists():
-            _make_own(path)
+            _create_default(path)
     parsed = _read(OperatorsFile, path)
-    operators = [Operator(entry.name, _decoded(entry.key), May(entry.may)) for entry in parsed.operators]
+    operators = [Operator(entry.name, _decoded(entry.key), Permission(entry.may)) for entry in parsed.operators]
     return Operators(operators, str(path))
 
 
@@ -190,13 +190,13 @@ def load_login(path: str | Path) -> Login:
     """Read a login file.
 
     Raises:
-        ConfigError: one line per problem: not there, others can read it, not as it should be.
+        ConfigError: one line per problem: the file is missing, readable by others, or invalid.
     """
     return _read(Login, path)
 
 
-def own_file() -> Path:
-    """Where this user's operators are: ``$XDG_CONFIG_HOME/companion/operators.yaml``, by default below ``~/.config``.
+def default_operators_file() -> Path:
+    """Return this user's operators file: ``$XDG_CONFIG_HOME/companion/operators.yaml``, by default below ``~/.config``.
 
     Raises:
         ConfigError: the user has no home folder.
@@ -208,26 +208,26 @@ def own_file() -> Path:
         return Path.home() / ".config/companion/operators.yaml"
     except RuntimeError:
         raise ConfigError(
-            ["operators: this user has no home folder; name a file (operators_file, --operators)"]
+            ["operators: this user has no home folder; give a file (operators_file, --operators)"]
         ) from None
 
 
 def new_key() -> bytes:
-    """A key for an operator."""
+    """Return a new operator key."""
     return secrets.token_bytes(KEY_BYTES)
 
 
 def operators_text(operators: Sequence[Operator]) -> str:
-    """The file's text."""
+    """Return the text of an operators file."""
     lines = [
-        "# Keys of operators: whoever has one commands the vehicle. Keep it to yourself: chmod 600.",
+        "# Keys of operators: anyone who has a key can command the vehicle. Keep this file private: chmod 600.",
         "version: 1",
         "operators:",
     ]
     for operator in operators:
         key = base64.b64encode(operator.key).decode("ascii")
-        # In quotes: a name may look like a number.
-        lines += [f'  - name: "{operator.name}"', f'    key: "{key}"', f"    may: {operator.may.value}"]
+        # Quoted, because a name may look like a number.
+        lines += [f'  - name: "{operator.name}"', f'    key: "{key}"', f"    may: {operator.permission.value}"]
     return "\n".join(lines) + "\n"
 
 
@@ -241,8 +241,8 @@ def write_private(path: Path, data: bytes) -> None:
     write_whole(path, data, mode=0o600, replace=False, durable=True)
 
 
-def _make_own(path: Path) -> None:
-    """One operator, of the user's own name. Of several processes that try at once, the first one's file is everybody's."""
+def _create_default(path: Path) -> None:
+    """Create a file with one operator, named after the user. If several processes try at once, all use the file of the first."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
@@ -250,12 +250,12 @@ def _make_own(path: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise ConfigError(
-            [f"{path}: cannot be made: {reason}; name another file (operators_file, --operators)"]
+            [f"{path}: cannot be created: {reason}; give another file (operators_file, --operators)"]
         ) from None
 
 
 def user_name() -> str:
-    """This user's name, as an operator's; what an operator's name cannot have becomes '-'."""
+    """Return this user's name as an operator name; characters that are not allowed become '-'."""
     try:
         name = getpass.getuser()
     except (KeyError, OSError):  # a user id without a name
@@ -264,7 +264,7 @@ def user_name() -> str:
 
 
 def _read(model: type[M], path: str | Path) -> M:
-    """A file that its owner alone may read, as a model."""
+    """Read a file that its owner alone may read, as a model."""
     shown = str(path)
     try:
         expanded = Path(path).expanduser()
@@ -272,16 +272,16 @@ def _read(model: type[M], path: str | Path) -> M:
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError([f"{shown}: no such file"]) from None
     except RuntimeError:
-        raise ConfigError([f"{shown}: '~' is not known: this user has no home folder"]) from None
+        raise ConfigError([f"{shown}: '~' cannot be expanded: this user has no home folder"]) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise ConfigError([f"{shown}: not readable: {reason}"]) from None
     if mode & 0o077 and not expanded.is_dir():
-        raise ConfigError([f"{shown}: holds secrets and is open to others (mode {mode:04o}); chmod 600 {shown}"])
+        raise ConfigError([f"{shown}: holds secrets and is open to others (mode {mode:04o}); run: chmod 600 {shown}"])
     document = read_document(expanded, shown)
     built = validate(model, document)
     if built is None:
-        # What was found instead is not quoted: it may be the secret.
+        # The value found is not quoted: it may be the secret.
         raise ConfigError([line.split(", got ")[0] for line in problem_lines(document.problems)])
     return built
 

@@ -1,21 +1,21 @@
 """Messages between a vehicle and its ground stations over MQTT, version 2: one frozen record per topic, JSON on the wire.
 
-All topics of a vehicle lie below ``companion/VEHICLE/``:
+All topics of a vehicle are below ``companion/VEHICLE/``:
 
-=============  =========  ========  ============================================================================
-topic          record     QoS       what
-=============  =========  ========  ============================================================================
-``state``      `State`    1, ret.   who is there, and how it ended; the broker says ``lost`` when the vehicle falls silent
-``scene``      `Scene`    1, ret.   what does not change in a flight: geometry, limits, planned path
-``preflight``  `Preflight`  1, ret. the rows of the last preflight
-``events``     `Events`   1, ret.   the newest events, all of them again each time: whoever comes late knows them too
-``stream``     `Stream`   0         20 Hz: where it is, what it does, how it is
-``command``    `Command`  1         ground to vehicle: signed, fresh, once
-``ack``        `Ack`      1         what came of a command
-=============  =========  ========  ============================================================================
+=============  ===========  ========  ==========================================================================
+topic          record       QoS       content
+=============  ===========  ========  ==========================================================================
+``state``      `State`      1, ret.   presence and outcome; the broker publishes ``lost`` when the vehicle falls silent
+``scene``      `Scene`      1, ret.   constants of the flight: geometry, limits, planned path
+``preflight``  `Preflight`  1, ret.   rows of the last preflight
+``events``     `Events`     1, ret.   the newest events, all of them in each message, for late subscribers
+``stream``     `Stream`     0         20 Hz: pose, phase, health
+``command``    `Command`    1         ground to vehicle: signed, recent, once
+``ack``        `Ack`        1         result of a command
+=============  ===========  ========  ==========================================================================
 
 World ENU, body FLU, SI units, quaternions (w, x, y, z), as in `companion.model.types`. A field that is None is left out of the JSON.
-``t_s`` is the flight clock of the session; ``wall_s`` seconds since 1970 by the vehicle's wall clock, for people only.
+``t_s`` is the flight clock of the session; ``wall_s`` is seconds since 1970 by the vehicle's wall clock, for display only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeVar
 
-from companion.ground.protocol.strict_json import WireError, check_finite, parse
+from companion.ground.protocol.strict_json import StrictJsonError, check_finite, parse
 from companion.model.codec import RecordError, from_jsonable, json_text, to_jsonable
 from companion.model.frozen import quick
 from companion.model.types import Quat, Vec2, Vec3, Vec4
@@ -33,14 +33,14 @@ VERSION = 2
 ROOT = "companion"
 STREAM_PERIOD_S = 0.05
 MESSAGE_MAX_BYTES = 200_000
-"""Nothing larger is ever sent on any of the topics; a receiver throws larger ones away unread."""
+"""Largest message on any topic; a receiver drops larger ones unread."""
 COMMAND_MAX_BYTES = 1024
 
 M = TypeVar("M")
 
 
 class MessageError(ValueError):
-    """A payload that is none of ours; says why in one line."""
+    """The payload is not a valid message; one line."""
 
 
 class Topic(Enum):
@@ -55,26 +55,26 @@ class Topic(Enum):
     ACK = "ack"
 
     def of(self, vehicle: str) -> str:
-        """Full name of this topic of a vehicle; ``+`` for those of every vehicle."""
+        """Return the full name of a vehicle's topic; ``+`` stands for every vehicle."""
         return f"{ROOT}/{vehicle}/{self.value}"
 
 
 class Presence(Enum):
-    """What is known of a vehicle's process."""
+    """State of a vehicle's processes."""
 
-    FLYING = "flying"  # it ticks, on the ground or in the air: `Stream.kind` says which
-    SILENT = "silent"  # its recorder lives, but the flight process says nothing: the guardian may be landing it
-    ENDED = "ended"  # over, in order; `outcome` says how
-    LOST = "lost"  # the connection broke without a word: nothing is known
+    FLYING = "flying"  # the control loop runs, on the ground or in the air (`Stream.kind`)
+    SILENT = "silent"  # the recorder runs but the flight process sends nothing: the guardian may be landing the vehicle
+    ENDED = "ended"  # the flight has ended normally, see `outcome`
+    LOST = "lost"  # the connection was lost without notice
 
 
-class Light(Enum):
-    """Health of one device at a glance."""
+class HealthLevel(Enum):
+    """Health of one device."""
 
     OK = "ok"
     WARN = "warn"
     BAD = "bad"
-    OFF = "off"  # not there, or not known yet
+    OFF = "off"  # not present, or not known yet
 
 
 @quick
@@ -85,26 +85,26 @@ class State:
     v: int
     vehicle: str
     session: str
-    """Drawn at random at the start of each flight; commands name it."""
+    """Random id of the flight, which commands name."""
     presence: Presence
     simulated: bool
     mission: str
     law: str
     preset: str
     wall_s: float
-    """When it was said; 0.0 in the last will."""
+    """Time of the message; 0.0 in the last will."""
     commands: bool
-    """Commands are heard."""
+    """The vehicle accepts commands."""
     outcome: str | None = None
     """`companion.model.types.Outcome`, once known."""
     text: str | None = None
-    """For people: why it is silent, why commands are not heard, ..."""
+    """For display: why the vehicle is silent, why it accepts no commands, ..."""
 
 
 @quick
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """``scene``, retained: what a picture of the machine in its room is drawn from."""
+    """``scene``, retained: geometry and limits for drawing the machine in its room."""
 
     v: int
     session: str
@@ -115,7 +115,7 @@ class Scene:
     tether_margin_m: float
     attachment_body_m: Vec3
     radius_m: float
-    """Horizontal reach, rotor disks included."""
+    """Horizontal reach including the rotor disks."""
     ground_clearance_m: float
     shoulder_body_m: Vec3
     link_lengths_m: Vec2
@@ -126,9 +126,9 @@ class Scene:
     tracking_warn_m: float
     tracking_abort_m: float
     mission_s: float
-    """Planned duration from take-off to touch-down."""
+    """Planned duration from take-off to touchdown."""
     path_world_m: tuple[Vec3, ...]
-    """Planned path, evenly in time, at most 300 points; empty until it is planned."""
+    """Planned path at even time steps, at most 300 points; empty until it is planned."""
     phases: tuple[str, ...]
 
 
@@ -156,7 +156,7 @@ class Preflight:
 @quick
 @dataclass(frozen=True, slots=True)
 class EventLine:
-    """One event as people read it."""
+    """One event for display."""
 
     t_s: float
     mission_t_s: float
@@ -179,25 +179,25 @@ class Events:
     v: int
     session: str
     count: int
-    """Of the whole session, those included that are kept no more."""
+    """Number of events of the session, including those no longer kept."""
     lines: tuple[EventLine, ...]
 
 
 @quick
 @dataclass(frozen=True, slots=True)
-class Health:
-    """One light."""
+class DeviceHealth:
+    """Health of one device."""
 
     name: str
-    light: Light
+    light: HealthLevel
     text: str
-    """What was measured: ``3 ms old``, ``15.9 V, 82 %``."""
+    """Measured values, such as ``3 ms old`` or ``15.9 V, 82 %``."""
 
 
 @quick
 @dataclass(frozen=True, slots=True)
 class TetherView:
-    """The tether as far as people need it; see `companion.model.types.TetherState`."""
+    """State of the tether for display; see `companion.model.types.TetherState`."""
 
     slack_m: float
     stop_slack_m: float
@@ -210,7 +210,7 @@ class TetherView:
 @quick
 @dataclass(frozen=True, slots=True)
 class ControlView:
-    """Inside of the controller; see `companion.model.types.ControlLog`."""
+    """Internal values of the controller; see `companion.model.types.ControlLog`."""
 
     rho: float
     h_hat: Vec4
@@ -226,20 +226,20 @@ class ControlView:
 @quick
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """The loop and the wires, worst of the ticks since the message before."""
+    """Durations of the loop and the links: the worst of the ticks since the previous message."""
 
     lateness_ms: float
     mocap_age_ms: float | None
     mocap_to_setpoint_ms: float | None
     joint_read_to_write_ms: float | None
     core_ms: float
-    """Inputs taken to decision made, `Sent.core_s - Sent.joint_read_s`."""
+    """From inputs read to decision made, `Sent.core_s - Sent.joint_read_s`."""
     missed: int
-    """Ticks of this session that began a whole period late."""
+    """Ticks of this session that began at least one period late."""
     dropped: int
     """Records of this session that the recorder lost."""
     whole_ms: float | None = None
-    """Tick begun to everything sent, the later of `Sent.setpoint_sent_s` and `Sent.current_sent_s`."""
+    """From the start of the tick to the last output, the later of `Sent.setpoint_sent_s` and `Sent.current_sent_s`."""
     bus_read_ms: float | None = None
     """One read of all servos, by the bus thread."""
 
@@ -247,7 +247,7 @@ class Timing:
 @quick
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """``stream``, 20 Hz. Position and attitude are motion capture's, PX4's where that is lost."""
+    """``stream``, 20 Hz. Position and attitude are motion capture's, or PX4's while that is lost."""
 
     v: int
     session: str
@@ -262,7 +262,7 @@ class Stream:
     action: str
     """`companion.model.types.SafetyAction`."""
     hold: int | None
-    """Number of the hold that stands, `companion.model.types.Sent.hold`: `resume` names it. None: it does not hold."""
+    """Number of the current hold, `companion.model.types.Sent.hold`, which `resume` names; None if the vehicle does not hold."""
     armed: bool | None
     mode: str | None
     landed: str | None
@@ -279,28 +279,28 @@ class Stream:
     e_q_deg: float | None
     """Angle between attitude and setpoint."""
     thrust: float | None
-    """Normalised, as sent."""
+    """Normalised thrust as sent."""
     battery_v: float | None
     battery_remaining: float | None
     tether: TetherView | None
     control: ControlView | None
     timing: Timing
-    lights: tuple[Health, ...]
+    lights: tuple[DeviceHealth, ...]
     bent_by: tuple[str, ...]
     waits_for_start: bool
-    """All is well and it waits on the ground for `start`."""
+    """The vehicle is ready on the ground and waits for `start`."""
     proofs: tuple[str, ...] = ()
-    """One for each operator whose key the vehicle holds (`companion.ground.protocol.proof`); empty if it hears no commands."""
+    """One proof per operator whose key the vehicle holds (`companion.ground.protocol.proof`); empty if it accepts no commands."""
 
 
 class CommandName(Enum):
-    """What people may ask for."""
+    """Commands of an operator."""
 
     HOLD = "hold"
     LAND = "land"
     ABORT = "abort"
-    RESUME = "resume"  # go on after a hold
-    START = "start"  # take off; for flights that wait for it
+    RESUME = "resume"  # continue after a hold
+    START = "start"  # take off; for flights that wait for START
 
 
 @quick
@@ -314,10 +314,11 @@ class Command:
     operator: str
     command: CommandName
     t_ms: int
-    """The vehicle's flight clock as the sender knows it: `Stream.t_s` of the last proven message and the time since, in ms. No two
-    wall clocks need to agree."""
+    """The sender's estimate of the vehicle's flight clock, ms: `Stream.t_s` of the last proven message plus the time since. Wall clocks
+    need not agree.
+    """
     hold: int
-    """`Stream.hold` that a `resume` is to end; 0: none, and in every other command."""
+    """`Stream.hold` that a `resume` ends; 0 in every other command."""
     nonce: str
     """32 hexadecimal digits, never used twice."""
     mac: str
@@ -327,7 +328,7 @@ class Command:
 @quick
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """``ack``: one for every command that was well signed, and for none of the others."""
+    """``ack``: one for every well-signed command, and for no other."""
 
     v: int
     session: str
@@ -335,14 +336,14 @@ class Ack:
     operator: str
     command: CommandName
     accepted: bool
-    """It did something, or what it asks for is done already."""
+    """The command took effect, or its effect was already there."""
     text: str
     """What was done, or why nothing was."""
     t_s: float
     phase: str
     action: str
     proof: str = ""
-    """For the operator who commanded (`companion.ground.protocol.proof`)."""
+    """Proof for the operator who sent the command (`companion.ground.protocol.proof`)."""
 
 
 RECORDS: dict[Topic, type] = {
@@ -358,16 +359,16 @@ RETAINED = frozenset({Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS})
 
 
 def encode(message: object) -> bytes:
-    """A record as it goes over the wire."""
+    """Return a record as a payload."""
     return json_text(to_jsonable(message)).encode()
 
 
 def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) -> M:
-    """A record from the wire.
+    """Return the record of a payload.
 
     Raises:
-        MessageError: the payload is too large, is not strict JSON (`companion.ground.protocol.strict_json`), has another version, does
-            not fit the record, or holds a number that is not finite.
+        MessageError: the payload is too large, is not strict JSON (`companion.ground.protocol.strict_json`), has another version,
+            does not fit the record, or holds a number that is not finite.
     """
     if len(payload) > max_bytes:
         raise MessageError(f"{len(payload)} bytes, at most {max_bytes} expected")
@@ -378,15 +379,15 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
             raise MessageError(f"version {version!r:.20}, expected {VERSION}")
         record = from_jsonable(cls, data)
         check_finite(record)
-    except (RecordError, WireError) as error:
+    except (RecordError, StrictJsonError) as error:
         raise MessageError(str(error)) from None
-    except RecursionError:  # nested so deeply that the refusal cannot even quote it
+    except RecursionError:  # nested too deeply to be quoted
         raise MessageError("nested too deeply") from None
     return record
 
 
 def vehicle_of(topic: str) -> tuple[str, Topic] | None:
-    """(vehicle, topic) of a full name; None if it is none of ours."""
+    """Return (vehicle, topic) of a full topic name, or None if it is not one of a vehicle."""
     parts = topic.split("/")
     if len(parts) != 3 or parts[0] != ROOT or not parts[1]:
         return None

@@ -1,7 +1,7 @@
-"""Proofs that a vehicle puts on what it publishes, for each operator whose key it holds: HMAC-SHA256 (RFC 2104), cut to 128 bits.
+"""Proofs that a vehicle adds to its messages for each operator whose key it holds: HMAC-SHA256 (RFC 2104), cut to 128 bits.
 
-The stream carries one proof per operator, an answer that of the operator who commanded. A ground station with a key dates its commands
-by proven messages only: whoever else writes to the broker cannot make it sign a command for a time that has not come.
+The stream carries one proof per operator, an ack that of the operator who sent the command. A ground station with a key dates its
+commands by proven messages only, so another sender at the broker cannot make it sign a command for a future time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from companion.model.codec import json_text, to_jsonable
 
 _STREAM_DOMAIN = "companion stream 2"
 _ACK_DOMAIN = "companion ack 2"
-"""First line of every proven text: no proof is good for anything else, and none is a command's signature."""
+"""First line of every proven text, so that a proof is valid for nothing else, and is not a command's signature."""
 _PROOF_BYTES = 16
 
 
@@ -29,13 +29,13 @@ class Signer:
 
 
 def with_proofs(stream: Stream, vehicle: str, keys: Iterable[bytes]) -> Stream:
-    """The stream message with one proof for each key, in their order."""
+    """Return the stream message with one proof for each key, in their order."""
     text = _text(_STREAM_DOMAIN, vehicle, replace(stream, proofs=()))
     return replace(stream, proofs=tuple(_proof(text, key) for key in keys))
 
 
 def stream_proven(stream: Stream, vehicle: str, key: bytes) -> bool:
-    """Whether one of the proofs was made with this key, for this vehicle and this very message."""
+    """Whether one of the proofs was made with this key for this vehicle and exactly this message."""
     if not stream.proofs:
         return False
     wanted = _proof(_text(_STREAM_DOMAIN, vehicle, replace(stream, proofs=())), key)
@@ -43,12 +43,12 @@ def stream_proven(stream: Stream, vehicle: str, key: bytes) -> bool:
 
 
 def with_proof(ack: Ack, vehicle: str, key: bytes) -> Ack:
-    """The answer with the proof for the operator whose key this is."""
+    """Return the ack with the proof for the operator who holds this key."""
     return replace(ack, proof=_proof(_text(_ACK_DOMAIN, vehicle, replace(ack, proof="")), key))
 
 
 def ack_proven(ack: Ack, vehicle: str, key: bytes) -> bool:
-    """Whether the answer was made by a vehicle that holds this key."""
+    """Whether the ack was made by a vehicle that holds this key."""
     return with_proof(ack, vehicle, key).proof == ack.proof
 
 

@@ -1,4 +1,4 @@
-"""Commands from the ground: signed, sent, and followed until the vehicle has answered."""
+"""Commands from the ground: signed, published, and repeated until the vehicle answers."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ from dataclasses import dataclass
 
 from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.commands import make_command
-from companion.ground.protocol.keys import load_operators, own_file
+from companion.ground.protocol.keys import default_operators_file, load_operators
 from companion.ground.protocol.messages import Ack, CommandName, Topic, encode
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.link import Link, LinkError
-from companion.ground.station.vehicles import Vehicle, Watch
+from companion.ground.station.vehicles import Vehicle, VehicleTracker
 
 ANSWER_S = 1.5
-"""For the vehicle's `Ack`."""
-TRIES = 3
-"""Of a command that makes things safer, each with a nonce of its own. Others are sent once: who asks for a start that was lost asks
-again himself."""
+"""Timeout for the vehicle's `Ack`."""
+ATTEMPTS = 3
+"""Attempts for a command that makes the flight safer, each with its own nonce. Others are sent once: an operator repeats a lost START
+himself.
+"""
 REPEATED = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
-INSTEAD = "use Ctrl-C or the pilot's switch"
-NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {INSTEAD}"
+FALLBACK_ADVICE = "use Ctrl-C or the pilot's switch"
+NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {FALLBACK_ADVICE}"
 
 
 def signer_of(
     access: BrokerAccess, operators_file: str | None, operator: str | None, *, view_only: bool = False
 ) -> Signer | str:
-    """Who commands from here, or why nobody does.
+    """Return the operator who commands from here, or why nobody can.
 
     Args:
-        access: a plain connection to a broker elsewhere carries no commands: the vehicle would hear none that came that way.
-        operators_file: file of operators and their keys; None: this user's own.
-        operator: name in the file; None: the only one in it.
-        view_only: nobody shall.
+        access: the broker; over an unencrypted connection to another computer the vehicle accepts no commands.
+        operators_file: file of operators and their keys; None for this user's own.
+        operator: name in the file; None for the only one.
+        view_only: allow no commands.
 
     Raises:
         ConfigError: the file or the name is wrong.
@@ -42,20 +43,22 @@ def signer_of(
     if view_only:
         return "this monitor was started with --view-only"
     if not access.trusted:
-        return f"{access.address} is another computer and the way there is plain; commands need mqtts:// or a broker on this computer"
-    if operators_file is None and not access.address.loopback and not own_file().exists():
-        return "no key of an operator is here, and one that is made here is known to no vehicle; name a file: --operators FILE"
+        return (
+            f"the connection to {access.address} is not encrypted; commands need mqtts:// or a broker on this computer"
+        )
+    if operators_file is None and not access.address.loopback and not default_operators_file().exists():
+        return "this computer has no operator key that the vehicle knows; give a file: --operators FILE"
     operators = load_operators(operators_file)
     if operator is None:
         if len(operators.names) != 1:
-            return f"{operators.source} holds several operators ({', '.join(operators.names)}); say who you are: --operator NAME"
+            return f"{operators.source} holds several operators ({', '.join(operators.names)}); choose one: --operator NAME"
         operator = operators.names[0]
     return Signer(operator, operators.key(operator))
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A command went out."""
+    """A command was published."""
 
     vehicle: str
     command: CommandName
@@ -64,87 +67,87 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """A command, or one try of it, came to nothing."""
+    """A command, or one attempt of it, has failed."""
 
     vehicle: str
     command: CommandName
     text: str
 
 
-Tell = Callable[["Sent | Failed"], None]
+Notify = Callable[["Sent | Failed"], None]
 
 
-def told(ack: Ack) -> str:
-    """An answer as people read it: ``hold: holding``, ``resume refused: too little tether left``."""
+def ack_text(ack: Ack) -> str:
+    """Return an ack for display: ``hold: holding``, ``resume refused: too little tether left``."""
     name = ack.command.value
     if ack.accepted:
         return f"{name}: {ack.text}"
     return ack.text if ack.text.startswith(f"{name} refused") else f"{name} refused: {ack.text}"
 
 
-class Orders:
-    """Gives commands of one operator to any vehicle that is watched.
+class CommandSender:
+    """Sends commands of one operator to any known vehicle.
 
     Args:
-        link: to the broker.
-        watch: knows session and clock of each vehicle.
+        link: connection to the broker.
+        tracker: session and clock of each vehicle.
         signer: the operator, or why there is none.
     """
 
-    def __init__(self, link: Link, watch: Watch, signer: Signer | str) -> None:
+    def __init__(self, link: Link, watch: VehicleTracker, signer: Signer | str) -> None:
         self._link = link
-        self._watch = watch
+        self._tracker = watch
         self._signer = signer
         self._waiting: dict[str, asyncio.Future[Ack]] = {}
         self._newest: dict[str, object] = {}
 
     @property
     def operator(self) -> str | None:
-        """Who commands from here."""
+        """Name of the operator who commands from here, or None."""
         return self._signer.operator if isinstance(self._signer, Signer) else None
 
     @property
-    def why_not(self) -> str | None:
-        """Why nobody commands from here; None: somebody does."""
+    def view_only_reason(self) -> str | None:
+        """Why no commands can be sent from here, or None if they can."""
         return self._signer if isinstance(self._signer, str) else None
 
-    def heard(self, ack: Ack) -> None:
-        """Take every `Ack` that comes in; those to this operator are proven (`Watch`)."""
+    def on_ack(self, ack: Ack) -> None:
+        """Process an `Ack`; those to this operator have been proven by `VehicleTracker`."""
         answer = self._waiting.get(ack.nonce)
         if answer is not None and not answer.done():
             answer.set_result(ack)
 
-    async def give(self, vehicle: str, command: CommandName, tell: Tell, hold: int | None = None) -> Ack | None:
-        """Give a command; over when the vehicle has answered, or all tries are used up.
+    async def send(self, vehicle: str, command: CommandName, notify: Notify, hold: int | None = None) -> Ack | None:
+        """Send a command; returns when the vehicle has answered or all attempts have failed.
 
-        A newer command for the same vehicle, or a new flight, ends the tries of an older one.
+        A newer command for the same vehicle, or a new flight, ends the attempts of an older command.
 
         Args:
             vehicle: its name.
-            command: what is asked for.
-            tell: hears of every try as it goes out, and of every one that failed.
-            hold: number of the hold that a RESUME is to end, as the operator saw it; None: the one that stands by the newest message.
+            command: the command.
+            notify: called with every attempt that is sent and every one that fails.
+            hold: number of the hold that a RESUME ends, as the operator saw it; None for the hold of the newest message.
 
         Returns:
-            The vehicle's answer; None: there was none, `tell` knows why.
+            The vehicle's answer, or None if there was none; `notify` has received the reason.
         """
-        problem = self._impossible(vehicle)
+        problem = self._problem(vehicle)
         if problem is not None or not isinstance(self._signer, Signer):
-            tell(Failed(vehicle, command, problem or str(self._signer)))
+            notify(Failed(vehicle, command, problem or str(self._signer)))
             return None
-        session = _session(self._watch.vehicles.get(vehicle))
+        session = _session(self._tracker.vehicles.get(vehicle))
         order = self._newest[vehicle] = object()
         answer: asyncio.Future[Ack] = asyncio.get_running_loop().create_future()
         nonces: list[str] = []
-        tries = TRIES if command in REPEATED else 1
+        tries = ATTEMPTS if command in REPEATED else 1
         try:
             for number in range(1, tries + 1):
-                problem = await self._try(self._signer, vehicle, command, hold, session, answer, nonces, tell)
+                problem = await self._attempt(self._signer, vehicle, command, hold, session, answer, nonces, notify)
                 if problem is None:
                     return answer.result()
-                current = _session(self._watch.vehicles.get(vehicle))
+                current = _session(self._tracker.vehicles.get(vehicle))
                 on = number < tries and self._newest[vehicle] is order and current == session
-                tell(Failed(vehicle, command, problem + (f" (sent again, {number + 1} of {tries})" if on else "")))
+                notify(Failed(vehicle, command, problem + (f" (sent again, {number + 1} of {tries})" if on else "")))
                 if not on:
                     return None
         finally:
@@ -154,7 +157,7 @@ class Orders:
                 del self._newest[vehicle]
         return None
 
-    async def _try(
+    async def _attempt(
         self,
         signer: Signer,
         vehicle: str,
@@ -163,55 +166,55 @@ class Orders:
         session: str | None,
         answer: asyncio.Future[Ack],
         nonces: list[str],
-        tell: Tell,
+        notify: Notify,
     ) -> str | None:
-        """One try, `ANSWER_S` long at most; None: the answer is there, otherwise what went wrong."""
-        known = self._watch.vehicles.get(vehicle)
+        """Make one attempt of at most `ANSWER_S`; return None if the answer has arrived, else what went wrong."""
+        known = self._tracker.vehicles.get(vehicle)
         proven = None if known is None else known.proven
-        if proven is None or proven.session != session:  # was there a moment ago
-            return f"a new flight of {vehicle} has begun"
+        if proven is None or proven.session != session:  # it was known when the command was given
+            return f"a new flight of {vehicle} has started"
         t_ms, ends = proven.now_ms(time.monotonic()), 0
         if command is CommandName.RESUME:
             ends = proven.hold if hold is None else hold
         try:
             signed = make_command(command, vehicle, session, signer.operator, signer.key, t_ms, ends)
         except ValueError as error:
-            return f"no command can be made for what calls itself {vehicle}: {error}"
+            return f"no command can be made for {vehicle}: {error}"
         nonces.append(signed.nonce)
         self._waiting[signed.nonce] = answer
-        tell(Sent(vehicle, command, signed.nonce))
+        notify(Sent(vehicle, command, signed.nonce))
         problem = NO_ANSWER
         try:
             async with asyncio.timeout(ANSWER_S):
                 try:
                     await self._link.publish(Topic.COMMAND.of(vehicle), encode(signed))
                 except LinkError as error:
-                    problem = f"{error}; {INSTEAD}"
+                    problem = f"{error}; {FALLBACK_ADVICE}"
                 await asyncio.shield(answer)  # an earlier try may still be answered
         except TimeoutError:
             return problem
         return None
 
-    def _impossible(self, vehicle: str) -> str | None:
-        """Why no command can be made, or would be heard; None: it is sent.
+    def _problem(self, vehicle: str) -> str | None:
+        """Return why a command cannot be made or would not be accepted, or None.
 
-        What nobody has proven never speaks against a command as long as proven messages come in.
+        Unproven messages never block a command while proven ones arrive.
         """
-        known = self._watch.vehicles.get(vehicle)
+        known = self._tracker.vehicles.get(vehicle)
         if known is None or (known.session is None and known.proven is None):
-            return f"nothing is known of a vehicle {vehicle!r:.60}"
+            return f"no vehicle {vehicle!r:.60} is known"
         if known.proven is not None and known.proven.live(time.monotonic()):
             return None
         if known.ended:
             return f"the flight of {vehicle} has ended"
         if known.state is not None and known.state.session == known.session and not known.state.commands:
-            return f"{vehicle} hears no commands: {known.state.text or 'switched off'}; {INSTEAD}"
+            return f"{vehicle} accepts no commands: {known.state.text or 'disabled'}; {FALLBACK_ADVICE}"
         if known.proven is not None:
             return None
         if known.stream is None:
-            return f"nothing was heard from {vehicle} yet, so no command can be dated; {INSTEAD}"
-        text = "it does not have this key, or another program speaks for it"
-        return f"no message of {vehicle} is proven for {self.operator}: {text}; {INSTEAD}"
+            return f"no message from {vehicle} has arrived yet, so no command can be dated; {FALLBACK_ADVICE}"
+        text = "it does not have this key, or another program sends under its name"
+        return f"no message from {vehicle} is proven for {self.operator}: {text}; {FALLBACK_ADVICE}"
 
 
 def _session(known: Vehicle | None) -> str | None:

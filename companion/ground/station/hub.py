@@ -1,7 +1,7 @@
-"""Fans what vehicles send out to viewers. The JSON text of a message is made once, however many watch; no I/O here.
+"""Distributes messages of the vehicles to viewers. The JSON text of a message is built once for all viewers; no I/O here.
 
-A viewer has a bounded outbox. Of the stream the newest message of each vehicle counts; everything else is kept in order until it is
-taken, and a viewer that lets too much of it pile up is told to go: whoever lost events must not believe that there were none.
+Each viewer has a bounded outbox. Of the stream only the newest message of each vehicle is kept; all other messages are kept in
+order. A viewer that does not read them in time is disconnected: a viewer that lost events must not believe that there were none.
 """
 
 from __future__ import annotations
@@ -13,72 +13,72 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.ground.protocol.messages import Topic
-from companion.ground.station.vehicles import VEHICLES_MAX, Heard, Watch
+from companion.ground.station.vehicles import VEHICLES_MAX, ReceivedRecord, VehicleTracker
 from companion.model.codec import json_text, to_jsonable
 
 OUTBOX_MAX = 1000
-"""Messages beside the stream that a viewer may leave lying."""
+"""Limit of waiting messages per viewer, not counting the stream."""
 OUTBOX_MAX_CHARACTERS = 4_000_000
 VIEWERS_MAX = 100
 FRESH_S = 0.5
-"""An older stream message is not shown to a viewer who comes late: it would look alive."""
+"""An older stream message is not sent to a new viewer, because it would look live."""
 
 
 @dataclass(frozen=True, slots=True)
-class Parting:
-    """Why a viewer is sent away."""
+class CloseReason:
+    """Why a viewer is disconnected."""
 
     code: int
-    """Of the WebSocket's close frame, RFC 6455 section 7.4."""
+    """Code of the WebSocket's close frame, RFC 6455 section 7.4."""
     reason: str
 
 
-TOO_SLOW = Parting(1013, "too slow: messages were lost, connect again")
-GOING_AWAY = Parting(1001, "the monitor was ended")
+TOO_SLOW = CloseReason(1013, "too slow: messages were lost, connect again")
+GOING_AWAY = CloseReason(1001, "the monitor has ended")
 
 
 class Outbox:
-    """What waits to be sent to one viewer."""
+    """Messages that wait to be sent to one viewer."""
 
     def __init__(self) -> None:
         self._kept: deque[str] = deque()
         self._characters = 0
         self._streams: dict[str, str] = {}
         self._something = asyncio.Event()
-        self._parted = asyncio.Event()
-        self.parting: Parting | None = None
+        self._closed = asyncio.Event()
+        self.close_reason: CloseReason | None = None
 
     def put(self, text: str) -> None:
-        """A message that must not be lost."""
+        """Add a message that must not be lost."""
         if len(self._kept) >= OUTBOX_MAX or self._characters + len(text) > OUTBOX_MAX_CHARACTERS:
-            self.part(TOO_SLOW)
+            self.close(TOO_SLOW)
             return
         self._kept.append(text)
         self._characters += len(text)
         self._something.set()
 
     def put_stream(self, vehicle: str, text: str) -> None:
-        """A message that the next one of the same vehicle replaces."""
+        """Add a message that the next one of the same vehicle replaces."""
         if vehicle not in self._streams and len(self._streams) >= VEHICLES_MAX:
             del self._streams[next(iter(self._streams))]
         self._streams[vehicle] = text
         self._something.set()
 
-    def part(self, parting: Parting) -> None:
-        """Send the viewer away; what lies there is dropped."""
-        if self.parting is None:
-            self.parting = parting
+    def close(self, parting: CloseReason) -> None:
+        """Disconnect the viewer and drop the waiting messages."""
+        if self.close_reason is None:
+            self.close_reason = parting
             self._kept.clear()
             self._streams.clear()
         self._something.set()
-        self._parted.set()
+        self._closed.set()
 
-    async def parted(self) -> None:
-        """Wait until the viewer is sent away."""
-        await self._parted.wait()
+    async def wait_closed(self) -> None:
+        """Wait until the viewer is to be disconnected."""
+        await self._closed.wait()
 
     async def take(self) -> list[str]:
-        """Wait until there is something, and take all of it, in order; empty: see `parting`."""
+        """Wait for messages and return all of them in order; empty if the outbox was closed (`close_reason`)."""
         await self._something.wait()
         self._something.clear()
         texts = [*self._kept, *self._streams.values()]
@@ -92,21 +92,21 @@ class Hub:
     """All viewers of one monitor.
 
     Args:
-        watch: what is known of the vehicles, for those who come late.
-        broker_text: what is said of the broker before anything else is known.
+        tracker: state of the vehicles, for new viewers.
+        broker_text: state of the broker before it is known.
     """
 
-    def __init__(self, watch: Watch, broker_text: str) -> None:
-        self._watch = watch
+    def __init__(self, watch: VehicleTracker, broker_text: str) -> None:
+        self._tracker = watch
         self._viewers: set[Outbox] = set()
         self._broker: dict[str, Any] = {"kind": "broker", "connected": False, "text": broker_text}
-        self._rubbish_told = 0
+        self._rejected_sent = 0
 
-    def join(self, outbox: Outbox, now_s: float) -> None:
-        """A new viewer; is told what is known."""
+    def add(self, outbox: Outbox, now_s: float) -> None:
+        """Add a viewer and send it the known state."""
         self._viewers.add(outbox)
         outbox.put(json.dumps(self._broker))
-        for known in self._watch.vehicles.values():
+        for known in self._tracker.vehicles.values():
             for topic, record in (
                 (Topic.STATE, known.state),
                 (Topic.SCENE, known.scene),
@@ -114,48 +114,48 @@ class Hub:
                 (Topic.EVENTS, known.events),
             ):
                 if record is not None:
-                    outbox.put(envelope(Heard(known.name, topic, record)))
+                    outbox.put(envelope(ReceivedRecord(known.name, topic, record)))
             age_s = known.stream_age_s(now_s)
             if known.stream is not None and age_s is not None and age_s < FRESH_S:
-                outbox.put_stream(known.name, envelope(Heard(known.name, Topic.STREAM, known.stream, age_s)))
+                outbox.put_stream(known.name, envelope(ReceivedRecord(known.name, Topic.STREAM, known.stream, age_s)))
 
-    def leave(self, outbox: Outbox) -> None:
-        """A viewer is gone."""
+    def remove(self, outbox: Outbox) -> None:
+        """Remove a viewer."""
         self._viewers.discard(outbox)
 
-    def relay(self, heard: Heard) -> None:
-        """A record, to everybody."""
+    def publish(self, received: ReceivedRecord) -> None:
+        """Send a record to all viewers."""
         if not self._viewers:
             return
-        text = envelope(heard)
+        text = envelope(received)
         for outbox in self._viewers:
-            if heard.topic is Topic.STREAM:
-                outbox.put_stream(heard.vehicle, text)
+            if received.topic is Topic.STREAM:
+                outbox.put_stream(received.vehicle, text)
             else:
                 outbox.put(text)
 
-    def broker(self, connected: bool, text: str) -> None:
-        """The connection to the broker has changed."""
+    def set_broker(self, connected: bool, text: str) -> None:
+        """Publish a change of the broker connection."""
         self._broker = {**self._broker, "connected": connected, "text": text}
-        self._tell_broker()
+        self._publish_broker()
 
-    def tell_rubbish(self) -> None:
-        """Say how much was thrown away, if it has become more; for once a second."""
-        if self._watch.rubbish != self._rubbish_told:
-            self._rubbish_told = self._watch.rubbish
-            self._broker |= {"rubbish": self._watch.rubbish, "rubbish_text": self._watch.rubbish_text}
-            self._tell_broker()
+    def publish_rejected(self) -> None:
+        """Publish the number of rejected messages if it has changed; call once a second."""
+        if self._tracker.rejected != self._rejected_sent:
+            self._rejected_sent = self._tracker.rejected
+            self._broker |= {"rubbish": self._tracker.rejected, "rubbish_text": self._tracker.rejected_text}
+            self._publish_broker()
 
-    def _tell_broker(self) -> None:
+    def _publish_broker(self) -> None:
         text = json.dumps(self._broker)
         for outbox in self._viewers:
             outbox.put(text)
 
 
-def envelope(heard: Heard) -> str:
-    """A record as viewers get it. Made of the record, not of the payload: what the record does not say is not passed on."""
-    data: dict[str, Any] = {"kind": heard.topic.value, "vehicle": heard.vehicle}
-    if heard.age_s is not None:
-        data["age_s"] = round(heard.age_s, 3)
-    data["data"] = to_jsonable(heard.record)
+def envelope(received: ReceivedRecord) -> str:
+    """Return a record as JSON for viewers. It is built from the record, not from the payload, so that nothing unknown is passed on."""
+    data: dict[str, Any] = {"kind": received.topic.value, "vehicle": received.vehicle}
+    if received.age_s is not None:
+        data["age_s"] = round(received.age_s, 3)
+    data["data"] = to_jsonable(received.record)
     return json_text(data)

@@ -1,4 +1,4 @@
-"""The ground station's connection to its broker: it comes back by itself for ever, and says how it is."""
+"""The ground station's connection to its broker; it reconnects by itself and reports changes."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from typing import NoReturn
 import aiomqtt
 
 from companion.ground.protocol.access import BrokerAccess
-from companion.ground.protocol.connection import Connection, OnMessage, code_of, why
+from companion.ground.protocol.connection import Connection, OnMessage, error_text, reason_code
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES
 
 ANSWER_S = 2.0
-"""For each answer of the broker."""
+"""Timeout for each answer of the broker."""
 _PAUSE_MIN_S, _PAUSE_MAX_S = 0.2, 2.0
 _TOPIC_ROOM_BYTES = 1024
-_REFUSALS = frozenset({128, 132, 133, 134, 135, 138, 140, 144, 149, 156, 157})
-"""CONNACK reason codes (MQTT 5, 3.2.2.2) that time does not mend: bad login, not authorised, banned, ..."""
+_PERMANENT_REASON_CODES = frozenset({128, 132, 133, 134, 135, 138, 140, 144, 149, 156, 157})
+"""CONNACK reason codes (MQTT 5, 3.2.2.2) that do not change with time: bad login, not authorised, banned, ..."""
 
 
 class LinkError(Exception):
-    """A message could not be handed to the broker; says why in one line."""
+    """A message could not be published; one line."""
 
 
 class BrokerRefused(Exception):
-    """The broker is there and does not want us; nothing that time mends. One line for the user."""
+    """The broker refuses the connection for a reason that does not change with time; one line for the user."""
 
 
 class Link:
-    """Receives from one broker and publishes to it, across as many connections as it takes.
+    """Receives from one broker and publishes to it, reconnecting as often as needed.
 
     Args:
-        access: how to get there.
-        topics: filters and the quality of service asked for, in the order of subscription.
+        access: settings of the broker.
+        topics: topic filters and their QoS, in the order of subscription.
         on_message: called in the event loop for every message.
-        on_change: called in the event loop with (connected, one line for people) whenever that changes.
+        on_change: called in the event loop with (connected, one line for display) after each change.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Link:
         self._on_message = on_message
         self._on_change = on_change
         self._client: Connection | None = None
-        self._ever = False
+        self._was_connected = False
         self.connected = False
         self.text = f"no broker at {access.address} yet, trying"
 
@@ -59,41 +59,41 @@ class Link:
         """Stay connected.
 
         Raises:
-            BrokerRefused: the very first contact was refused for a reason that time does not mend. Later ones are tried on.
+            BrokerRefused: the first connection was refused for a permanent reason. Later refusals are retried.
         """
         pause_s = _PAUSE_MIN_S
         while True:
             client = self._new_connection()
             try:
                 await client.open()
-                for topic, qos in self._topics:  # one after another: what is retained comes in that order
-                    refusal = await client.hear(topic, qos)
+                for topic, qos in self._topics:  # one after another, so that retained messages arrive in this order
+                    refusal = await client.subscribe_topic(topic, qos)
                     if refusal is not None:
                         raise aiomqtt.MqttError(f"it does not let us read {topic}: {refusal}")
-                self._client, pause_s, self._ever = client, _PAUSE_MIN_S, True
+                self._client, pause_s, self._was_connected = client, _PAUSE_MIN_S, True
                 self._changed(True, f"connected to {self._access.address}")
-                await client.broken()
+                await client.wait_broken()
             except aiomqtt.MqttError as error:
                 reason = self._why(error)
             finally:
                 self._client = None
-                await client.drop()
+                await client.shut_down()
             self._changed(False, f"no broker at {self._access.address}, trying: {reason}")
             await asyncio.sleep(pause_s)
             pause_s = min(_PAUSE_MAX_S, pause_s * 1.6)
 
     async def publish(self, topic: str, payload: bytes) -> None:
-        """Hand a message to the broker, at least once (QoS 1).
+        """Publish a message at least once (QoS 1).
 
         Raises:
-            LinkError: no broker, no answer within `ANSWER_S`, or the broker does not let us.
+            LinkError: no broker is connected, it did not answer within `ANSWER_S`, or it refused the message.
         """
         if self._client is None:
             raise LinkError(self.text)
         try:
-            refusal = await self._client.send(topic, payload, qos=1)
+            refusal = await self._client.publish_message(topic, payload, qos=1)
         except aiomqtt.MqttError as error:
-            raise LinkError(f"the broker could not be told: {why(error)}") from None
+            raise LinkError(f"the broker did not take the command: {error_text(error)}") from None
         if refusal is not None:
             raise LinkError(f"the broker refused it: {refusal}")
 
@@ -107,14 +107,14 @@ class Link:
         )
 
     def _why(self, error: aiomqtt.MqttError) -> str:
-        code = code_of(error)
-        if code is not None and not self._ever and code.value in _REFUSALS:
+        code = reason_code(error)
+        if code is not None and not self._was_connected and code.value in _PERMANENT_REASON_CODES:
             login = f"the login {self._access.username!r}" if self._access.username else "a connection without login"
             raise BrokerRefused(f"{self._access.address}: the broker refuses {login}: {code}; see --login") from None
-        if "CERTIFICATE_VERIFY_FAILED" in str(error) and not self._ever:
-            text = f"the broker is not believed ({why(error)}); name the authority of its certificate: --ca FILE"
+        if "CERTIFICATE_VERIFY_FAILED" in str(error) and not self._was_connected:
+            text = f"the broker's certificate is not trusted ({error_text(error)}); give its authority: --ca FILE"
             raise BrokerRefused(f"{self._access.address}: {text}") from None
-        return why(error)
+        return error_text(error)
 
     def _changed(self, connected: bool, text: str) -> None:
         if (connected, text) != (self.connected, self.text):

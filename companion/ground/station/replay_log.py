@@ -1,4 +1,4 @@
-"""A flight's log as the page plays it: the same records that the vehicle would have sent, 20 a second."""
+"""A flight's log as the page plays it: the messages that the vehicle would have published, 20 a second."""
 
 from __future__ import annotations
 
@@ -35,22 +35,20 @@ class ReplayLog:
 
 
 def read_for_page(path: Path, number: int) -> ReplayLog:
-    """Read a log and make of it what the page plays.
+    """Read a log and convert it for the page.
 
     Args:
         path: the log.
-        number: of this log among those of the page.
+        number: index of this log on the page.
 
     Raises:
-        LogError: one line: not there, damaged, no flight's, of another version.
+        LogError: one line: the log is missing, damaged, not of a flight, or of another version.
     """
     log = FlightLog.read(path, ticks_max=TICKS_MAX)
     if not log.inputs:
         raise LogError(f"{path}: holds no ticks")
     if log.config_json is None:
-        raise LogError(
-            f"{path}: holds no configuration (metadata record 'config'); there is no room to draw the flight in"
-        )
+        raise LogError(f"{path}: holds no configuration (metadata record 'config'), which the page needs")
     try:
         config = logged_flight(log.config_json)
     except ValidationError as error:
@@ -77,17 +75,17 @@ def _epoch_offset_s(log: FlightLog) -> float:
     try:
         return int(log.metadata["companion"]["epoch_offset_ns"]) / 1e9
     except (KeyError, ValueError):
-        return 0.0  # wall time is for people only, and nothing else hangs on it
+        return 0.0  # wall time is for display only
 
 
 def _reference_path(log: FlightLog) -> list[Vec3]:
-    """Where the vehicle was to be, evenly in time; what a scene takes at most of it."""
+    """Return the reference path at even time steps, with about as many points as a scene holds."""
     path = [outputs.reference.position_world_m for outputs in log.outputs if outputs.reference is not None]
     return path[:: max(1, len(path) // PATH_POINTS_MAX)]
 
 
 def _preflight(log: FlightLog) -> tuple[PreflightRow, ...]:
-    """Empty for logs without one."""
+    """Return the preflight rows; empty for a log without them."""
     try:
         rows = json.loads(log.metadata.get("preflight", {}).get("json", "[]"))
         return tuple(PreflightRow(str(row["id"]), str(row["level"]), str(row["text"])) for row in rows)

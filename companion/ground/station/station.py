@@ -1,4 +1,4 @@
-"""A ground station without a face: connection, knowledge of the vehicles, commands. Page, terminal and `companion command` share it."""
+"""A ground station without a user interface: connection, vehicle state, commands. Shared by page, terminal and `companion command`."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import NoReturn
 from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.messages import Topic
 from companion.ground.protocol.proof import Signer
-from companion.ground.station.command_sender import Orders
+from companion.ground.station.command_sender import CommandSender
 from companion.ground.station.link import Link
-from companion.ground.station.vehicles import HEARD_TOPICS, Heard, Watch
+from companion.ground.station.vehicles import VEHICLE_TOPICS, ReceivedRecord, VehicleTracker
 
-OnHeard = Callable[[Heard], None]
+OnRecord = Callable[[ReceivedRecord], None]
 OnChange = Callable[[bool, str], None]
 
 
 class Station:
-    """Watches all vehicles of a broker, or one of them.
+    """Tracks all vehicles of a broker, or one of them.
 
     Args:
-        access: how the broker is reached.
-        signer: the operator who commands from here, or why nobody does.
-        only: name of the one vehicle that is watched; None: all.
-        on_heard: hears of every record.
-        on_change: hears when the connection comes or goes, with one line for people.
-        topics: that are subscribed, in this order.
-        in_order: everything at QoS 0: on one connection nothing overtakes anything, retained records come first. Else what is
-            retained and acks come at least once.
+        access: settings of the broker.
+        signer: the operator who commands from here, or why nobody can.
+        only: name of the one vehicle to track; None for all.
+        on_record: called with every record.
+        on_change: called when the connection changes, with one line for display.
+        topics: topics to subscribe to, in this order.
+        in_order: subscribe to everything with QoS 0: no message overtakes another, and retained messages arrive first. Otherwise
+            retained messages and acks arrive at least once.
     """
 
     def __init__(
@@ -36,30 +36,30 @@ class Station:
         access: BrokerAccess,
         signer: Signer | str,
         only: str | None,
-        on_heard: OnHeard,
+        on_heard: OnRecord,
         on_change: OnChange,
         *,
-        topics: Sequence[Topic] = HEARD_TOPICS,
+        topics: Sequence[Topic] = VEHICLE_TOPICS,
         in_order: bool = False,
     ) -> None:
-        self.watch = Watch(only, signer if isinstance(signer, Signer) else None)
-        self._on_heard = on_heard
+        self.tracker = VehicleTracker(only, signer if isinstance(signer, Signer) else None)
+        self._on_record = on_heard
         subscriptions = [(topic.of(only or "+"), 0 if in_order or topic is Topic.STREAM else 1) for topic in topics]
-        self.link = Link(access, subscriptions, self._take, on_change)
-        self.orders = Orders(self.link, self.watch, signer)
+        self.link = Link(access, subscriptions, self._on_message, on_change)
+        self.commands = CommandSender(self.link, self.tracker, signer)
 
     async def run(self) -> NoReturn:
         """Stay connected; see `Link.run`."""
         await self.link.run()
 
-    def _take(self, topic: str, payload: bytes, retained: bool) -> None:
-        """Take one message. None ends the connection, whatever it holds: commands have to leave by it."""
+    def _on_message(self, topic: str, payload: bytes, retained: bool) -> None:
+        """Process one message. No message, however malformed, ends the connection: commands need it."""
         try:
-            heard = self.watch.take(topic, payload, retained, time.monotonic())
-            if heard is None:
+            received = self.tracker.receive(topic, payload, retained, time.monotonic())
+            if received is None:
                 return
-            if heard.topic is Topic.ACK:
-                self.orders.heard(heard.record)
-            self._on_heard(heard)
+            if received.topic is Topic.ACK:
+                self.commands.on_ack(received.record)
+            self._on_record(received)
         except Exception as error:
-            self.watch.reject(topic, error)
+            self.tracker.count_rejected(topic, error)

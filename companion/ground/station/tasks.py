@@ -1,4 +1,4 @@
-"""Several coroutines at once, as one."""
+"""Concurrent coroutines that end together."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 async def until_first(*coroutines: Coroutine[Any, Any, Any]) -> None:
-    """Run all until the first one ends; the others are cancelled and waited for.
+    """Run all coroutines until the first one ends, then cancel the others and wait for them.
 
     Raises:
         Whatever the first one to fail raised.

@@ -1,4 +1,4 @@
-"""What `companion monitor --text` shows: one vehicle at a glance, as rich draws it, or as a single line. Pure."""
+"""Display of `companion monitor --text`: one vehicle as rich renderables, or as a single line. Pure."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from companion.ground.protocol.messages import EventLine, Light, Presence, Stream
+from companion.ground.protocol.messages import EventLine, HealthLevel, Presence, Stream
 from companion.ground.station.vehicles import Vehicle
 from companion.model.types import LandedState, PhaseKind, SafetyAction
 
 STALE_S = 0.3
-"""The stream comes 20 times a second; what is older is shown as old."""
+"""The stream arrives 20 times a second; older data is shown as stale."""
 EVENTS_SHOWN = 8
-NOTES_SHOWN = 3
+NOTICES_SHOWN = 3
 _KIND_WORD = {
     PhaseKind.GROUND.value: "ON THE GROUND",
     PhaseKind.TAKEOFF.value: "TAKING OFF",
@@ -27,13 +27,18 @@ _KIND_WORD = {
 }
 _ACTION_STYLE = {SafetyAction.NOMINAL.value: "green", SafetyAction.WARN.value: "yellow"}
 _SEVERITY_STYLE = {"info": "cyan", "warning": "yellow", "critical": "bold red"}
-_LIGHT_STYLE = {Light.OK: "green", Light.WARN: "yellow", Light.BAD: "bold red", Light.OFF: "dim"}
+_LIGHT_STYLE = {
+    HealthLevel.OK: "green",
+    HealthLevel.WARN: "yellow",
+    HealthLevel.BAD: "bold red",
+    HealthLevel.OFF: "dim",
+}
 _ALARM = "bold white on red"
 _MODE_LANDED = {state.value: state.value.replace("_", " ") for state in LandedState}
 
 
 @dataclass(frozen=True, slots=True)
-class Note:
+class Notice:
     """One line about commands."""
 
     text: str
@@ -41,26 +46,26 @@ class Note:
 
 
 @dataclass(frozen=True, slots=True)
-class Around:
-    """What is shown beside the vehicle."""
+class StationStatus:
+    """Status of the ground station, shown below the vehicle."""
 
     broker: str
     connected: bool
     operator: str | None
-    why_not: str | None
+    view_only_reason: str | None
     others: tuple[str, ...] = ()
-    """Other vehicles that are known."""
-    rubbish: int = 0
-    notes: tuple[Note, ...] = ()
+    """Names of all vehicles if there are several."""
+    rejected: int = 0
+    notices: tuple[Notice, ...] = ()
 
 
 def printable(text: str) -> str:
-    """Nothing that came over the network may steer the terminal."""
+    """Return text without control characters, so that nothing from the network can control the terminal."""
     return text if text.isprintable() else "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
-def word(vehicle: Vehicle, now_s: float) -> tuple[str, str]:
-    """How it is in one word, and the style of it; ended and lost come before everything that was heard earlier."""
+def status_word(vehicle: Vehicle, now_s: float) -> tuple[str, str]:
+    """Return the vehicle's status in a few words, and its style; ended and lost have precedence over older data."""
     state, stream, age_s = vehicle.state, vehicle.stream, vehicle.stream_age_s(now_s)
     if state is not None and state.session == vehicle.session:
         match state.presence:
@@ -75,21 +80,21 @@ def word(vehicle: Vehicle, now_s: float) -> tuple[str, str]:
     if age_s > STALE_S:
         return f"NO DATA FOR {age_s:.1f} s", _ALARM
     if stream.waits_for_start:
-        return "WAITS FOR START", "bold cyan"
+        return "WAITING FOR START", "bold cyan"
     if stream.action not in _ACTION_STYLE:
         return printable(stream.action).upper().replace("_", " "), "bold red"
     return _KIND_WORD.get(stream.kind, printable(stream.kind)), "bold green"
 
 
 def stale(vehicle: Vehicle, now_s: float) -> bool:
-    """Its figures are not those of now."""
+    """Whether the displayed values are stale."""
     age_s = vehicle.stream_age_s(now_s)
     return age_s is None or age_s > STALE_S
 
 
-def line(vehicle: Vehicle, now_s: float) -> str:
-    """One vehicle in one line, for pipes and logs."""
-    parts = [printable(vehicle.name), word(vehicle, now_s)[0]]
+def status_line(vehicle: Vehicle, now_s: float) -> str:
+    """Return one vehicle in one line, for pipes and logs."""
+    parts = [printable(vehicle.name), status_word(vehicle, now_s)[0]]
     stream = vehicle.stream
     if stream is not None and not vehicle.ended:
         parts += [f"{printable(stream.phase)} {100 * stream.progress:.0f} %", f"t {stream.mission_t_s:.1f} s"]
@@ -100,25 +105,25 @@ def line(vehicle: Vehicle, now_s: float) -> str:
     return " | ".join(parts)
 
 
-def frame(vehicle: Vehicle | None, now_s: float, around: Around) -> RenderableType:
-    """The whole picture."""
+def render(vehicle: Vehicle | None, now_s: float, station: StationStatus) -> RenderableType:
+    """Return the whole display."""
     parts: list[RenderableType] = []
     if vehicle is None:
         parts.append(Text("no vehicle yet", style="dim"))
     else:
         parts += [_head(vehicle, now_s), *_body(vehicle, stale(vehicle, now_s) or vehicle.ended), *_events(vehicle)]
-    parts += [Text(), _keys(around)]
-    parts += [Text(f"  {printable(note.text)}", style=note.style) for note in around.notes[-NOTES_SHOWN:]]
-    parts.append(Text(printable(around.broker), style="dim" if around.connected else _ALARM))
-    if around.rubbish:
-        parts.append(Text(f"{around.rubbish} messages at the broker were none of ours", style="yellow"))
-    if around.others:
-        parts.append(Text(f"n: next of {', '.join(map(printable, around.others))}", style="dim"))
+    parts += [Text(), _keys(station)]
+    parts += [Text(f"  {printable(notice.text)}", style=notice.style) for notice in station.notices[-NOTICES_SHOWN:]]
+    parts.append(Text(printable(station.broker), style="dim" if station.connected else _ALARM))
+    if station.rejected:
+        parts.append(Text(f"{station.rejected} messages at the broker were rejected", style="yellow"))
+    if station.others:
+        parts.append(Text(f"n: next of {', '.join(map(printable, station.others))}", style="dim"))
     return Group(*parts)
 
 
 def _head(vehicle: Vehicle, now_s: float) -> RenderableType:
-    text, style = word(vehicle, now_s)
+    text, style = status_word(vehicle, now_s)
     head = Table.grid(padding=(0, 2))
     cells = [Text(printable(vehicle.name), style="bold"), Text(f" {text} ", style=style)]
     state = vehicle.state
@@ -158,10 +163,10 @@ def _body(vehicle: Vehicle, old: bool) -> list[RenderableType]:
     return [course, figures, Text(_timing(stream), style=style), Text(), lights]
 
 
-def _light(name: str, light: Light, text: str, old: bool) -> Text:
-    """Old lights are out, whatever they were."""
+def _light(name: str, light: HealthLevel, text: str, old: bool) -> Text:
+    """Return one device's health; it is dimmed if the data is stale."""
     cell = Text()
-    cell.append("● " if light is not Light.BAD else "■ ", style="dim" if old else _LIGHT_STYLE[light])
+    cell.append("● " if light is not HealthLevel.BAD else "■ ", style="dim" if old else _LIGHT_STYLE[light])
     cell.append(f"{printable(name):<15}", style="dim" if old else "")
     return cell.append(printable(text), style="dim")
 
@@ -177,18 +182,18 @@ def _events(vehicle: Vehicle) -> list[RenderableType]:
     return shown
 
 
-def _keys(around: Around) -> Text:
-    if around.why_not is not None:
-        return Text(f"q quit    view only: {printable(around.why_not)}", style="dim")
+def _keys(station: StationStatus) -> Text:
+    if station.view_only_reason is not None:
+        return Text(f"q quit    view only: {printable(station.view_only_reason)}", style="dim")
     text = Text()
     for key, name, style in (("h", "HOLD", "bold yellow"), ("l", "LAND", "bold yellow"), ("a", "ABORT", "bold red")):
         text.append(f"{key} ", style="bold").append(f"{name}   ", style=style)
-    return text.append(f"r resume   s start   q quit    you are {around.operator}", style="dim")
+    return text.append(f"r resume   s start   q quit    you are {station.operator}", style="dim")
 
 
 def _autopilot(stream: Stream) -> str:
     if stream.armed is None:
-        return "PX4 not heard"
+        return "no PX4"
     landed = _MODE_LANDED.get(stream.landed or "", "")
     return ", ".join(
         part
@@ -215,7 +220,7 @@ def _figures(stream: Stream) -> list[str]:
 
 
 def _timing(stream: Stream) -> str:
-    """What is behind what, and below it how long the parts of a tick took."""
+    """Return delays in the first line, durations of a tick's parts in the second."""
     timing = stream.timing
     behind = {
         "late": timing.lateness_ms,

@@ -27,53 +27,53 @@ from companion.ground.protocol.messages import (
 )
 from companion.ground.protocol.proof import Signer, ack_proven, stream_proven
 
-HEARD_TOPICS = (Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS, Topic.STREAM, Topic.ACK)
+VEHICLE_TOPICS = (Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS, Topic.STREAM, Topic.ACK)
 VEHICLES_MAX = 64
-"""More are not remembered: whoever was silent longest is forgotten, those with proven messages last."""
+"""Limit of tracked vehicles; the one that was silent longest is forgotten first, those with proven messages last."""
 LIVE_S = 1.0
-"""A vehicle whose stream is younger is there."""
+"""A vehicle whose stream is younger is present."""
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
-    """One record that a vehicle sent."""
+class ReceivedRecord:
+    """One record from a vehicle."""
 
     vehicle: str
     topic: Topic
     record: Any
     age_s: float | None = None
-    """Of a `Stream`: by how much it took longer than the quickest of the last ones. Else None."""
+    """Of a `Stream`: its delay beyond that of the fastest recent message; None for other records."""
 
 
 @dataclass(slots=True)
-class Proven:
-    """What a command is made of: the session, the flight clock and the hold of proven stream messages. Mutable; for `Watch` alone."""
+class ProvenState:
+    """Session, flight clock and hold of proven stream messages, from which commands are made. Only `VehicleTracker` changes it."""
 
     session: str
     wall_s: float
-    """`Stream.wall_s` of the newest one."""
+    """`Stream.wall_s` of the newest proven message."""
     t_s: float
-    """`Stream.t_s` of the newest one."""
+    """`Stream.t_s` of the newest proven message."""
     hold: int
-    """`Stream.hold` of the newest one; 0: it does not hold."""
-    heard_s: float
-    """Monotonic clock of this computer, when the last one came."""
+    """`Stream.hold` of the newest proven message; 0 if the vehicle does not hold."""
+    received_s: float
+    """Local monotonic clock at which the newest proven message arrived."""
     clock: FlightClock = field(default_factory=FlightClock)
 
     def live(self, now_s: float) -> bool:
-        """Proven messages come in."""
-        return now_s - self.heard_s < LIVE_S
+        """Whether proven messages arrive."""
+        return now_s - self.received_s < LIVE_S
 
     def now_ms(self, now_s: float) -> int:
-        """The flight clock now; never ahead of the vehicle's own."""
+        """Return the flight clock now; never ahead of the vehicle's own."""
         now_ms = self.clock.now_ms(now_s)
-        assert now_ms is not None  # it has heard one at least
+        assert now_ms is not None  # at least one message has arrived
         return now_ms
 
 
 @dataclass(slots=True)
 class Vehicle:
-    """What is known of one vehicle. Mutable; `Watch` alone changes it."""
+    """Known state of one vehicle. Only `VehicleTracker` changes it."""
 
     name: str
     session: str | None = None
@@ -82,84 +82,84 @@ class Vehicle:
     preflight: Preflight | None = None
     events: Events | None = None
     stream: Stream | None = None
-    stream_heard_s: float | None = None
-    """Monotonic clock of this computer."""
-    heard_s: float = 0.0
+    stream_received_s: float | None = None
+    """Local monotonic clock."""
+    received_s: float = 0.0
     clock: FlightClock = field(default_factory=FlightClock)
-    """For the age of what is shown."""
-    proven: Proven | None = None
-    """None: no stream message was proven for the operator of this ground station."""
+    """For the age of the displayed data."""
+    proven: ProvenState | None = None
+    """None if no stream message was proven for this ground station's operator."""
 
     def stream_age_s(self, now_s: float) -> float | None:
-        """Since the newest stream message came; None: none has come in this session."""
-        return None if self.stream_heard_s is None else now_s - self.stream_heard_s
+        """Return the time since the newest stream message, or None if none has arrived in this session."""
+        return None if self.stream_received_s is None else now_s - self.stream_received_s
 
     def live(self, now_s: float) -> bool:
-        """Its stream comes in."""
+        """Whether its stream arrives."""
         age_s = self.stream_age_s(now_s)
         return age_s is not None and age_s < LIVE_S
 
     @property
     def ended(self) -> bool:
-        """Its flight is over, and said so."""
+        """Whether the vehicle has reported the end of its flight."""
         return self.state is not None and self.state.presence is Presence.ENDED and self.state.session == self.session
 
 
-class Watch:
-    """Takes every message of a broker; keeps what is one, counts what is none.
+class VehicleTracker:
+    """Processes every message of a broker: stores valid records, counts rejected messages.
 
     Args:
-        only: name of the one vehicle that is watched; None: all.
-        signer: the operator who commands from here; None: nobody does, and nothing can be proven.
+        only: name of the one vehicle to track; None for all.
+        signer: the operator who commands from here; None if nobody does, and then nothing can be proven.
     """
 
     def __init__(self, only: str | None = None, signer: Signer | None = None) -> None:
         self._only = only
         self._signer = signer
         self.vehicles: dict[str, Vehicle] = {}
-        self.rubbish = 0
-        """Messages that were thrown away."""
-        self.rubbish_text: str | None = None
-        """Topic and fault of the last one."""
+        self.rejected = 0
+        """Number of rejected messages."""
+        self.rejected_text: str | None = None
+        """Topic and error of the last rejected message."""
 
-    def take(self, topic: str, payload: bytes, retained: bool, now_s: float) -> Heard | None:
-        """The record that a message holds, remembered; None if it is none of ours.
+    def receive(self, topic: str, payload: bytes, retained: bool, now_s: float) -> ReceivedRecord | None:
+        """Store and return the record of a message; None if the message is not a valid record.
 
         Args:
             topic: full name.
-            payload: as it came.
-            retained: the broker kept it: it may be of any age.
-            now_s: monotonic clock of this computer.
+            payload: as received.
+            retained: the broker had kept the message: its age is unknown.
+            now_s: local monotonic clock.
         """
         try:
             named = vehicle_of(topic)
-            if named is None or named[1] not in HEARD_TOPICS or VEHICLE_NAME.fullmatch(named[0]) is None:
+            if named is None or named[1] not in VEHICLE_TOPICS or VEHICLE_NAME.fullmatch(named[0]) is None:
                 raise MessageError("not a topic of a vehicle")
             name, kind = named
             if self._only is not None and name != self._only:
                 return None
             if not payload and retained:
-                return None  # MQTT's way to say that nothing is retained any more
+                return None  # an empty retained message deletes the retained one
             record: Any = decode(RECORDS[kind], payload)
             if isinstance(record, State) and record.vehicle != name:
                 raise MessageError(f"is of vehicle {record.vehicle!r:.60}")
-            if isinstance(record, Ack) and not self._believed(record, name):
+            if isinstance(record, Ack) and not self._is_genuine(record, name):
                 raise MessageError("is not proven by the vehicle")
-            if isinstance(record, Stream) and not retained and not self._prove(name, record, now_s):
-                raise MessageError("is not proven by the vehicle, as those before it were")
+            if isinstance(record, Stream) and not retained and not self._accept_stream(name, record, now_s):
+                raise MessageError("is not proven by the vehicle, unlike earlier ones")
         except MessageError as error:
-            self.rubbish += 1
-            self.rubbish_text = f"{topic!r:.80}: {error}"
+            self.rejected += 1
+            self.rejected_text = f"{topic!r:.80}: {error}"
             return None
-        return self._remember(self._vehicle(name, now_s), kind, record, retained, now_s)
+        return self._store(self._vehicle(name, now_s), kind, record, retained, now_s)
 
-    def reject(self, topic: str, error: Exception) -> None:
-        """Count a message that could not be handled for a reason that nobody thought of."""
-        self.rubbish += 1
-        self.rubbish_text = f"{topic!r:.80}: {type(error).__name__}: {str(error)!r:.80}"
+    def count_rejected(self, topic: str, error: Exception) -> None:
+        """Count a message that failed with an unexpected exception."""
+        self.rejected += 1
+        self.rejected_text = f"{topic!r:.80}: {type(error).__name__}: {str(error)!r:.80}"
 
-    def there(self, now_s: float) -> list[str]:
-        """Names of the vehicles that are there: in flight by their word, or heard a moment ago."""
+    def present(self, now_s: float) -> list[str]:
+        """Return the names of vehicles that report a flight or whose stream arrives."""
         return sorted(
             name
             for name, known in self.vehicles.items()
@@ -168,21 +168,21 @@ class Watch:
         )
 
     def proven(self, now_s: float) -> list[str]:
-        """Names of the vehicles whose proven messages come in."""
+        """Return the names of vehicles whose proven messages arrive."""
         return sorted(
             name for name, known in self.vehicles.items() if known.proven is not None and known.proven.live(now_s)
         )
 
-    def _believed(self, ack: Ack, name: str) -> bool:
-        """Answers to this operator are proven; those to others cannot be judged here."""
+    def _is_genuine(self, ack: Ack, name: str) -> bool:
+        """Whether an ack is proven if it is for this operator; acks for others cannot be checked here."""
         signer = self._signer
         return signer is None or ack.operator != signer.operator or ack_proven(ack, name, signer.key)
 
-    def _prove(self, name: str, stream: Stream, now_s: float) -> bool:
-        """Take what a proven stream message proves; False: it is not to be shown either.
+    def _accept_stream(self, name: str, stream: Stream, now_s: float) -> bool:
+        """Store the state that a proven stream message carries; return False if the message must not be displayed.
 
-        One of another flight counts if that flight is the later one by the vehicle's wall clock, or if the flight that was proven
-        before has fallen silent. So a recording of an earlier flight takes the place of none that is under way.
+        A message of another flight is accepted if that flight is the later one by the vehicle's wall clock, or if the flight proven
+        before has fallen silent. So a recording of an earlier flight cannot replace a running one.
         """
         known = self.vehicles.get(name)
         proven = known.proven if known is not None else None
@@ -193,28 +193,28 @@ class Watch:
                 return False
             proven = None
         if proven is None:
-            proven = Proven(stream.session, stream.wall_s, stream.t_s, stream.hold or 0, now_s)
+            proven = ProvenState(stream.session, stream.wall_s, stream.t_s, stream.hold or 0, now_s)
             self._vehicle(name, now_s).proven = proven
         elif stream.t_s <= proven.t_s:
-            return False  # a copy of what was heard before: the vehicle sends none without a new tick
-        proven.wall_s, proven.t_s, proven.hold, proven.heard_s = stream.wall_s, stream.t_s, stream.hold or 0, now_s
-        proven.clock.heard(stream.t_s, now_s)
+            return False  # a replayed message: the vehicle sends none without a new tick
+        proven.wall_s, proven.t_s, proven.hold, proven.received_s = stream.wall_s, stream.t_s, stream.hold or 0, now_s
+        proven.clock.add(stream.t_s, now_s)
         return True
 
     def _vehicle(self, name: str, now_s: float) -> Vehicle:
         known = self.vehicles.get(name)
         if known is None:
             if len(self.vehicles) >= VEHICLES_MAX:
-                del self.vehicles[min(self.vehicles.values(), key=lambda v: (v.proven is not None, v.heard_s)).name]
+                del self.vehicles[min(self.vehicles.values(), key=lambda v: (v.proven is not None, v.received_s)).name]
             known = self.vehicles[name] = Vehicle(name)
-        known.heard_s = now_s
+        known.received_s = now_s
         return known
 
-    def _remember(self, known: Vehicle, kind: Topic, record: Any, retained: bool, now_s: float) -> Heard | None:
+    def _store(self, known: Vehicle, kind: Topic, record: Any, retained: bool, now_s: float) -> ReceivedRecord | None:
         if isinstance(record, (State, Stream)) and record.session != known.session:
             if known.session is None or not retained:
                 known.session = record.session
-                known.stream = known.stream_heard_s = None
+                known.stream = known.stream_received_s = None
                 known.clock = FlightClock()
         age_s = None
         match record:
@@ -228,9 +228,9 @@ class Watch:
                 known.events = record
             case Stream():
                 if retained:
-                    return None  # nobody keeps a stream: of unknown age, it would look alive
-                known.stream, known.stream_heard_s = record, now_s
-                known.clock.heard(record.t_s, now_s)
+                    return None  # the age of a retained stream message is unknown; it would look live
+                known.stream, known.stream_received_s = record, now_s
+                known.clock.add(record.t_s, now_s)
                 flight_ms = known.clock.now_ms(now_s)
                 age_s = None if flight_ms is None else max(0.0, flight_ms / 1e3 - record.t_s)
-        return Heard(known.name, kind, record, age_s)
+        return ReceivedRecord(known.name, kind, record, age_s)

@@ -2,15 +2,15 @@
 
 WebSocket at ``/ws``, JSON text. Server to page:
 
-    {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first of all; again when the token came late
-    {"kind": "broker", "connected", "text", "rubbish"?, "rubbish_text"?}             how it stands with the broker
+    {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first message; again when the token came late
+    {"kind": "broker", "connected", "text", "rubbish"?, "rubbish_text"?}             connection to the broker; rejected messages
     {"kind": "state" | "scene" | "preflight" | "events" | "ack", "vehicle", "data"}  records of `companion.ground.protocol.messages`
-    {"kind": "stream", "vehicle", "age_s", "data"}                                   age_s: how late it came to the server
-    {"kind": "sent", "vehicle", "command", "nonce"}                                  to who commanded; its `ack` has the nonce
-    {"kind": "refused", "vehicle", "command", "text"}                                to the viewer who commanded
+    {"kind": "stream", "vehicle", "age_s", "data"}                                   age_s: delay until it reached the server
+    {"kind": "sent", "vehicle", "command", "nonce"}                                  to the commanding viewer; its `ack` has the nonce
+    {"kind": "refused", "vehicle", "command", "text"}                                to the commanding viewer
 
 Page to server: ``{"kind": "token", "token"}`` first (empty without one: view only), then ``{"kind": "command", "vehicle", "command",
-"hold"?}``: with "resume" the number of the hold that the stream showed when the operator pressed; without it, the one that stands.
+"hold"?}``. With "resume", `hold` is the number of the hold that was displayed; without it, the current hold.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from companion import __version__
 from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.messages import CommandName
 from companion.ground.protocol.proof import Signer
-from companion.ground.station.command_sender import Failed, Orders, Sent
-from companion.ground.station.hub import GOING_AWAY, TOO_SLOW, VIEWERS_MAX, Hub, Outbox, Parting
+from companion.ground.station.command_sender import CommandSender, Failed, Sent
+from companion.ground.station.hub import GOING_AWAY, TOO_SLOW, VIEWERS_MAX, CloseReason, Hub, Outbox
 from companion.ground.station.replay_log import ReplayLog
 from companion.ground.station.station import Station
 from companion.ground.station.tasks import until_first
@@ -42,7 +42,7 @@ from companion.ground.station.web_guard import (
     HEADERS,
     MESSAGE_MAX_BYTES,
     MESSAGES_PER_S,
-    Bucket,
+    RateLimiter,
     host_allowed,
     is_loopback,
     new_token,
@@ -52,16 +52,16 @@ from companion.ground.station.web_guard import (
 
 PAGE = Path(__file__).parent / "page"
 TOKEN_WAIT_S = 1.0
-"""A page says its token at once; until then it is not greeted, so that it is greeted once."""
+"""Time for the page to send its token, so that one hello is enough."""
 HEARTBEAT_S = 6.0
 SEND_S = 10.0
-"""A viewer that takes nothing for so long is gone."""
+"""A viewer that reads nothing for this long is disconnected."""
 CLOSE_S = 1.0
 _SEND_BUFFER_BYTES = 65536
-"""Of the kernel, for each viewer: what lies there is old when it arrives."""
-NO_TOKEN = "view only: open the address that companion monitor printed, with all that follows the #"
+"""Kernel send buffer per viewer; a larger one would delay the data."""
+NO_TOKEN = "view only: open the address that companion monitor printed, including the part after #"
 
-_VIEW_ONLY_TEXT = "commands from other computers need TLS: --cert and --key, or come through ssh -L"
+_VIEW_ONLY_TEXT = "commands from other computers need TLS (--cert and --key) or an ssh -L tunnel"
 
 
 class WebError(Exception):
@@ -69,8 +69,8 @@ class WebError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Serving:
-    """Where and how the server listens."""
+class ServerSettings:
+    """Address and TLS settings of the server."""
 
     host: str
     port: int
@@ -81,58 +81,62 @@ class Monitor:
     """One web server.
 
     Args:
-        serving: where.
-        hub: what viewers are told; None in a replay.
-        orders: commands; None in a replay.
+        serving: address and TLS settings.
+        hub: distributes messages to viewers; None for a replay.
+        commands: sends commands; None for a replay.
         replay_logs: the logs of a replay.
     """
 
     def __init__(
-        self, serving: Serving, hub: Hub | None, orders: Orders | None, replay_logs: Sequence[ReplayLog] = ()
+        self,
+        serving: ServerSettings,
+        hub: Hub | None,
+        orders: CommandSender | None,
+        replay_logs: Sequence[ReplayLog] = (),
     ) -> None:
         self._serving = serving
         self._hub = hub
-        self._orders = orders
+        self._commands = orders
         self._replay_logs = tuple(replay_logs)
         self._token = new_token()
-        self._errands: asyncio.TaskGroup | None = None
+        self._tasks: asyncio.TaskGroup | None = None
         self._outboxes: set[Outbox] = set()
         self.port = serving.port
 
     @property
     def viewers(self) -> int:
-        """How many watch."""
+        """Number of connected viewers."""
         return len(self._outboxes)
 
     @property
-    def why_not(self) -> str | None:
-        """Why nobody commands through this server, whatever he knows; None: who has the token does."""
-        if self._orders is None:
-            return "a log is replayed: there is nothing to command"
-        if self._orders.why_not is not None:
-            return self._orders.why_not
+    def view_only_reason(self) -> str | None:
+        """Why no viewer can command through this server, or None if those with the token can."""
+        if self._commands is None:
+            return "this is the replay of a log"
+        if self._commands.view_only_reason is not None:
+            return self._commands.view_only_reason
         if self._serving.tls is None and not is_loopback(self._serving.host):
             return _VIEW_ONLY_TEXT
         return None
 
     @property
     def url(self) -> str:
-        """The page's address, with the token if it is worth anything."""
+        """Address of the page, with the token if commands are possible."""
         host = "127.0.0.1" if self._serving.host in ("0.0.0.0", "") else self._serving.host
         host = f"[{host}]" if ":" in host else host
         scheme = "http" if self._serving.tls is None else "https"
-        return f"{scheme}://{host}:{self.port}/" + (f"#token={self._token}" if self.why_not is None else "")
+        return f"{scheme}://{host}:{self.port}/" + (f"#token={self._token}" if self.view_only_reason is None else "")
 
     async def serve(self, listening: Callable[[], None]) -> NoReturn:
-        """Serve until cancelled, then say goodbye to all viewers.
+        """Serve until cancelled, then disconnect all viewers.
 
         Args:
             listening: called once, when `url` can be opened.
 
         Raises:
-            WebError: the port is taken, or the address is none of this computer.
+            WebError: the port is in use, or the address is not one of this computer.
         """
-        app = web.Application(middlewares=[self._guard], client_max_size=MESSAGE_MAX_BYTES)
+        app = web.Application(middlewares=[self._check_host], client_max_size=MESSAGE_MAX_BYTES)
         app.on_response_prepare.append(_add_headers)
         app.router.add_get("/ws", self._viewer)
         app.router.add_get(r"/replay/{number:\d{1,3}}.json", self._log)
@@ -148,24 +152,22 @@ class Monitor:
                 raise WebError(_why_not_listening(self._serving, error)) from None
             self.port = runner.addresses[0][1]
             listening()
-            async with asyncio.TaskGroup() as self._errands:
+            async with asyncio.TaskGroup() as self._tasks:
                 while True:
                     await asyncio.sleep(1.0)
                     if self._hub is not None:
-                        self._hub.tell_rubbish()
+                        self._hub.publish_rejected()
         finally:
             for outbox in self._outboxes:
-                outbox.part(GOING_AWAY)
+                outbox.close(GOING_AWAY)
             await runner.cleanup()
 
     @web.middleware
-    async def _guard(
+    async def _check_host(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         if not host_allowed(request.headers.get("Host"), self._serving.host):
-            raise web.HTTPForbidden(
-                text="this server is not called so; use the address that companion monitor printed\n"
-            )
+            raise web.HTTPForbidden(text="unknown host name; use the address that companion monitor printed\n")
         return await handler(request)
 
     async def _log(self, request: web.Request) -> web.Response:
@@ -183,29 +185,29 @@ class Monitor:
         if not origin_allowed(
             request.headers.get("Origin"), request.headers.get("Host"), tls=self._serving.tls is not None
         ):
-            raise web.HTTPForbidden(text="a WebSocket for pages of this server only (Origin)\n")
+            raise web.HTTPForbidden(text="this WebSocket is only for pages of this server (Origin)\n")
         ws = web.WebSocketResponse(
             heartbeat=HEARTBEAT_S, timeout=CLOSE_S, max_msg_size=MESSAGE_MAX_BYTES, compress=False, writer_limit=1
         )
         await ws.prepare(request)
-        _keep_short(request)
+        _limit_send_buffer(request)
         parting = await _Session(ws, self).run()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_S):
                 await ws.close(code=parting.code, message=parting.reason.encode())
         if request.transport is not None:
-            request.transport.abort()  # whoever does not answer the close frame is not waited for
+            request.transport.abort()  # do not wait for a viewer that does not answer the close frame
         return ws
 
     def hello(self, given: object) -> str:
-        """The greeting for a viewer with this token."""
-        why_not = self.why_not or (None if same_token(given, self._token) else NO_TOKEN)
+        """Return the hello message for a viewer with this token."""
+        why_not = self.view_only_reason or (None if same_token(given, self._token) else NO_TOKEN)
         return json.dumps(
             {
                 "kind": "hello",
                 "version": __version__,
                 "can_command": why_not is None,
-                "operator": None if self._orders is None else self._orders.operator,
+                "operator": None if self._commands is None else self._commands.operator,
                 "why_not": why_not,
                 "replay": self._hub is None,
                 "logs": [log.name for log in self._replay_logs],
@@ -213,30 +215,30 @@ class Monitor:
         )
 
     def may_command(self, given: object) -> bool:
-        """Whether a viewer with this token commands."""
-        return self.why_not is None and same_token(given, self._token)
+        """Whether a viewer with this token may command."""
+        return self.view_only_reason is None and same_token(given, self._token)
 
-    def join(self, token: object) -> Outbox | None:
-        """A new viewer; None: there are too many."""
+    def add_viewer(self, token: object) -> Outbox | None:
+        """Add a viewer; return None if there are too many."""
         if len(self._outboxes) >= VIEWERS_MAX:
             return None
         outbox = Outbox()
         outbox.put(self.hello(token))
         self._outboxes.add(outbox)
         if self._hub is not None:
-            self._hub.join(outbox, time.monotonic())
+            self._hub.add(outbox, time.monotonic())
         return outbox
 
-    def leave(self, outbox: Outbox) -> None:
-        """A viewer is gone."""
+    def remove_viewer(self, outbox: Outbox) -> None:
+        """Remove a viewer."""
         self._outboxes.discard(outbox)
         if self._hub is not None:
-            self._hub.leave(outbox)
+            self._hub.remove(outbox)
 
-    def order(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
-        """Give a command; it is followed to its end even if the viewer goes away."""
-        assert self._orders is not None and self._errands is not None
-        self._errands.create_task(self._orders.give(vehicle, command, lambda note: outbox.put(_note(note)), hold))
+    def send_command(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
+        """Send a command; it is completed even if the viewer disconnects."""
+        assert self._commands is not None and self._tasks is not None
+        self._tasks.create_task(self._commands.send(vehicle, command, lambda note: outbox.put(_note(note)), hold))
 
 
 Listening = Callable[[Monitor], None]
@@ -244,28 +246,32 @@ Listening = Callable[[Monitor], None]
 
 
 async def serve_live(
-    serving: Serving, access: BrokerAccess, signer: Signer | str, only: str | None, listening: Listening
+    serving: ServerSettings, access: BrokerAccess, signer: Signer | str, only: str | None, listening: Listening
 ) -> None:
-    """Serve what vehicles send, until cancelled.
+    """Serve what the vehicles publish, until cancelled.
 
     Raises:
-        WebError: cannot listen.
-        BrokerRefused: the broker does not want us.
+        WebError: the server cannot listen.
+        BrokerRefused: the broker refuses the connection.
     """
     hub: Hub
     station = Station(
-        access, signer, only, lambda heard: hub.relay(heard), lambda connected, text: hub.broker(connected, text)
+        access,
+        signer,
+        only,
+        lambda received: hub.publish(received),
+        lambda connected, text: hub.set_broker(connected, text),
     )
-    hub = Hub(station.watch, station.link.text)
-    monitor = Monitor(serving, hub, station.orders)
+    hub = Hub(station.tracker, station.link.text)
+    monitor = Monitor(serving, hub, station.commands)
     await until_first(monitor.serve(lambda: listening(monitor)), station.run())
 
 
-async def serve_logs(serving: Serving, logs: Sequence[ReplayLog], listening: Listening) -> None:
+async def serve_logs(serving: ServerSettings, logs: Sequence[ReplayLog], listening: Listening) -> None:
     """Serve logs, until cancelled.
 
     Raises:
-        WebError: cannot listen.
+        WebError: the server cannot listen.
     """
     monitor = Monitor(serving, None, None, logs)
     await monitor.serve(lambda: listening(monitor))
@@ -278,10 +284,10 @@ class _Session:
         self._ws = ws
         self._monitor = monitor
         self._token: object = None
-        self._bucket = Bucket(time.monotonic())
+        self._bucket = RateLimiter(time.monotonic())
 
-    async def run(self) -> Parting:
-        """Until either side goes; says what the viewer is told in farewell."""
+    async def run(self) -> CloseReason:
+        """Run until either side ends the connection; return the reason for the close frame."""
         first = None
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TOKEN_WAIT_S):
@@ -291,33 +297,33 @@ class _Session:
                 return GOING_AWAY
             message = _parsed(first.data)
             if message is None or message.get("kind") != "token":
-                return Parting(1008, "the first message is the token")
+                return CloseReason(1008, "expected the token as first message")
             self._token = message.get("token")
-        outbox = self._monitor.join(self._token)
+        outbox = self._monitor.add_viewer(self._token)
         if outbox is None:
-            return Parting(1013, f"{VIEWERS_MAX} watch already")
+            return CloseReason(1013, f"there are {VIEWERS_MAX} viewers already")
         try:
-            await until_first(self._listen(outbox), self._send(outbox), outbox.parted())
+            await until_first(self._listen(outbox), self._send(outbox), outbox.wait_closed())
         finally:
-            self._monitor.leave(outbox)
-        return outbox.parting or GOING_AWAY
+            self._monitor.remove_viewer(outbox)
+        return outbox.close_reason or GOING_AWAY
 
     async def _send(self, outbox: Outbox) -> None:
         try:
-            while outbox.parting is None:
+            while outbox.close_reason is None:
                 for text in await outbox.take():
                     async with asyncio.timeout(SEND_S):
                         await self._ws.send_str(text)
         except TimeoutError:
-            outbox.part(TOO_SLOW)
+            outbox.close(TOO_SLOW)
         except (ConnectionError, RuntimeError):
-            pass  # it is gone, or goes; aiohttp says so with either
+            pass  # the viewer has disconnected; aiohttp raises either
 
     async def _listen(self, outbox: Outbox) -> None:
         async for received in self._ws:
             message = _parsed(received.data) if received.type is WSMsgType.TEXT else None
             if not self._bucket.take(time.monotonic()):
-                outbox.part(Parting(1008, f"more than {MESSAGES_PER_S:g} messages a second"))
+                outbox.close(CloseReason(1008, f"more than {MESSAGES_PER_S:g} messages a second"))
                 return
             match message:
                 case {"kind": "token", "token": token}:
@@ -327,14 +333,14 @@ class _Session:
                     hold = more.get("hold")
                     self._command(vehicle, COMMANDS[name], hold if type(hold) is int else None, outbox)
                 case _:
-                    outbox.part(Parting(1008, "expected a token or a command"))
+                    outbox.close(CloseReason(1008, "expected a token or a command"))
                     return
 
     def _command(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
         if self._monitor.may_command(self._token):
-            self._monitor.order(vehicle, command, hold, outbox)
+            self._monitor.send_command(vehicle, command, hold, outbox)
         else:
-            outbox.put(_note(Failed(vehicle, command, self._monitor.why_not or NO_TOKEN)))
+            outbox.put(_note(Failed(vehicle, command, self._monitor.view_only_reason or NO_TOKEN)))
 
 
 COMMANDS = {command.value: command for command in CommandName}
@@ -355,8 +361,8 @@ def _note(note: Sent | Failed) -> str:
     return json.dumps({"kind": "refused", **common, "text": note.text})
 
 
-def _keep_short(request: web.Request) -> None:
-    """Little room for what is on its way to a viewer: it would be old when it arrives."""
+def _limit_send_buffer(request: web.Request) -> None:
+    """Limit the buffered data for a viewer, which would be stale when it arrives."""
     transport = request.transport
     if isinstance(transport, asyncio.Transport):
         transport.set_write_buffer_limits(high=_SEND_BUFFER_BYTES // 2)
@@ -371,13 +377,11 @@ async def _index(request: web.Request) -> web.FileResponse:
     return web.FileResponse(PAGE / "index.html")
 
 
-def _why_not_listening(serving: Serving, error: OSError) -> str:
+def _why_not_listening(serving: ServerSettings, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
-        return (
-            f"port {serving.port} of {serving.host} is in use, by another monitor perhaps; choose another one: --port N"
-        )
+        return f"port {serving.port} of {serving.host} is in use, perhaps by another monitor; choose another: --port N"
     if error.errno in (errno.EACCES, errno.EPERM):
-        return f"port {serving.port} is not for this user; choose one above 1023: --port N"
+        return f"port {serving.port} is not allowed for this user; choose one above 1023: --port N"
     return (
         f"--host {serving.host}: cannot listen there: {error.strerror or error}; expected an address of this computer"
     )

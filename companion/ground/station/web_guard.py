@@ -1,8 +1,8 @@
-"""Who may talk to the monitor's web server. Pure; what browsers send is not believed.
+"""Access control of the monitor's web server. Pure; nothing that a browser sends is trusted.
 
-Loopback alone keeps nobody out: any web page that a person has open may talk to http://127.0.0.1, by its own name (DNS rebinding) or
-across origins (a WebSocket asks nobody). So the Host header must name this computer, the Origin of a WebSocket must be this server,
-and commands need a token that only the person who started the monitor was shown.
+Listening on loopback alone is no protection: any web page in the user's browser can reach http://127.0.0.1, through a host name of
+its own (DNS rebinding) or across origins (WebSockets have no same-origin policy). So the Host header must name this computer, the
+Origin of a WebSocket must be this server, and commands need a token that only the user who started the monitor has seen.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Of every answer."""
+"""Headers of every response."""
 MESSAGE_MAX_BYTES = 1024
-"""From a page to the server."""
+"""Largest message from a page."""
 MESSAGES_PER_S, MESSAGES_BURST = 10.0, 20.0
 _HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 
 
 def new_token() -> str:
-    """128 random bits."""
+    """Return 128 random bits as text."""
     return secrets.token_urlsafe(16)
 
 
 def same_token(given: object, token: str) -> bool:
-    """In a time that tells nothing."""
+    """Compare in constant time."""
     return isinstance(given, str) and hmac.compare_digest(given.encode("utf-8", "replace"), token.encode())
 
 
 def is_loopback(host: str) -> bool:
-    """A name or address that only this computer reaches."""
+    """Whether only this computer reaches the name or address."""
     if host.lower() == "localhost":
         return True
     address = _address(host)
@@ -54,9 +54,9 @@ def host_allowed(host_header: str | None, listens_on: str) -> bool:
     """Whether a Host header names this server.
 
     Args:
-        host_header: as it came.
-        listens_on: the --host given. Where it stands for every address (0.0.0.0, ::), any address and this computer's own name will
-            do: an attacker's page can only come by a name.
+        host_header: as received.
+        listens_on: value of --host. If it stands for every address (0.0.0.0, ::), any address and this computer's own name are
+            allowed: an attacker's page can only use a host name.
     """
     match = None if host_header is None else _HOST.fullmatch(host_header)
     if match is None:
@@ -71,7 +71,7 @@ def host_allowed(host_header: str | None, listens_on: str) -> bool:
 
 
 def origin_allowed(origin: str | None, host_header: str | None, *, tls: bool) -> bool:
-    """Whether a WebSocket is asked for by a page of this server itself. Programs that are no browsers must say so, too."""
+    """Whether a WebSocket request comes from a page of this server. Other programs must send the same header."""
     if origin is None or host_header is None:
         return False
     try:
@@ -81,14 +81,14 @@ def origin_allowed(origin: str | None, host_header: str | None, *, tls: bool) ->
     return (parts.scheme, parts.netloc.lower()) == ("https" if tls else "http", host_header.lower())
 
 
-class Bucket:
+class RateLimiter:
     """Allows `MESSAGES_PER_S` on average and `MESSAGES_BURST` at once."""
 
     def __init__(self, now_s: float) -> None:
         self._full_s = now_s
 
     def take(self, now_s: float) -> bool:
-        """One message; False: too many."""
+        """Count one message; return False if there are too many."""
         full_s = max(self._full_s, now_s) + 1.0 / MESSAGES_PER_S
         if full_s - now_s > MESSAGES_BURST / MESSAGES_PER_S + 1e-6:
             return False

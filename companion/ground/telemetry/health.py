@@ -1,7 +1,7 @@
-"""One light for each device: is it well, by the limits of the vehicle file? With the figure that says so. Pure.
+"""Health of each device by the limits of the vehicle file, with the value measured. Pure.
 
-Limits are those of the monitors (`companion.safety.events`): what lands the vehicle or takes a device away is BAD, what is told is
-WARN. The lights decide nothing: the monitors do.
+The limits are those of the safety monitors (`companion.safety.events`): a value that lands the vehicle or disables a device is BAD,
+one that causes a warning is WARN. The health is for display only; the monitors act on their own.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
-from companion.ground.protocol.messages import Health, Light
+from companion.ground.protocol.messages import DeviceHealth, HealthLevel
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.types import Inputs, Outputs, PhaseKind
 from companion.safety.arm import WATCHDOG_RESTARTED, error_text
 
-NAMES = (
+DEVICE_NAMES = (
     "PX4", "estimate", "motion capture", "arm", "force sensor", "loop", "recorder", "guardian", "battery", "tether",
 )  # fmt: skip
-"""In the order in which they are shown."""
+"""Devices in display order."""
 UNKNOWN_S = -math.inf
 
 
 @dataclass(slots=True)
-class Ages:
-    """The worst of some ticks; `UNKNOWN_S` where there was nothing to measure. Seconds."""
+class WorstAges:
+    """The largest ages of some ticks, s; `UNKNOWN_S` where there was nothing to measure."""
 
     vehicle_s: float = UNKNOWN_S
     """Oldest of position, attitude and IMU from PX4."""
@@ -36,7 +36,7 @@ class Ages:
     lateness_s: float = UNKNOWN_S
 
     def add_tick(self, i: Inputs, lateness_s: float) -> None:
-        """One tick."""
+        """Include one tick."""
         t_s, v = i.t_s, i.vehicle
         if v is not None:
             oldest_s = min(v.position_stamp_s, v.attitude_stamp_s, v.imu_stamp_s)
@@ -51,188 +51,194 @@ class Ages:
             self.force_s = max(self.force_s, t_s - i.force.stamp_s)
         self.lateness_s = max(self.lateness_s, lateness_s)
 
-    def merge(self, other: Ages) -> None:
-        """The worst of both."""
+    def merge(self, other: WorstAges) -> None:
+        """Include the ticks of another instance."""
         for name in self.__slots__:
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What the lights are judged by."""
+class Snapshot:
+    """Values that the health is evaluated from."""
 
     inputs: Inputs
-    """Of the newest tick."""
+    """Inputs of the newest tick."""
     outputs: Outputs
-    ages: Ages
-    """Worst of the last second."""
+    ages: WorstAges
+    """Largest ages of the last second."""
     mocap_rate_hz: float | None
-    """Frames seen in the last second; None: not yet known."""
+    """Frames in the last second; None if it is not known yet."""
     missed: int
     dropped: int
-    """Records that were lost, of the whole session."""
+    """Lost records of the whole session."""
     recorder_error: str | None = None
 
 
-class Lights:
-    """Judges by one vehicle file."""
+class HealthEvaluator:
+    """Evaluates the health of all devices by one vehicle file."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._s = vehicle.safety
         self._tether = vehicle.tether
         self._force_max_n = vehicle.devices.force.force_max_n
 
-    def evaluate(self, look: Look) -> tuple[Health, ...]:
-        """All lights, in the order of `NAMES`."""
+    def evaluate(self, snapshot: Snapshot) -> tuple[DeviceHealth, ...]:
+        """Return the health of all devices, in the order of `DEVICE_NAMES`."""
         judged = (
-            self._px4(look),
-            self._estimate(look),
-            self._mocap(look),
-            self._arm(look),
-            self._force(look),
-            self._loop(look),
-            _recorder(look),
-            _guardian(look),
-            self._battery(look),
-            self._tether_light(look),
+            self._px4(snapshot),
+            self._estimate(snapshot),
+            self._mocap(snapshot),
+            self._arm(snapshot),
+            self._force(snapshot),
+            self._loop(snapshot),
+            _recorder(snapshot),
+            _guardian(snapshot),
+            self._battery(snapshot),
+            self._tether_health(snapshot),
         )
-        return tuple(Health(name, light, text) for name, (light, text) in zip(NAMES, judged, strict=True))
+        return tuple(DeviceHealth(name, light, text) for name, (light, text) in zip(DEVICE_NAMES, judged, strict=True))
 
-    def _px4(self, look: Look) -> tuple[Light, str]:
-        status, ages, s = look.inputs.status, look.ages, self._s
-        if status is None and look.inputs.vehicle is None:
-            return Light.OFF, "nothing heard yet"
+    def _px4(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        status, ages, s = snapshot.inputs.status, snapshot.ages, self._s
+        if status is None and snapshot.inputs.vehicle is None:
+            return HealthLevel.OFF, "nothing received yet"
         mode = f"{status.mode.value.upper()}, {'armed' if status.armed else 'disarmed'}" if status else "no heartbeat"
         if status is None or ages.heartbeat_s > s.heartbeat_timeout_s:
-            return Light.BAD, f"no heartbeat for {ages.heartbeat_s:.1f} s" if status else mode
-        if look.inputs.vehicle is None:
-            return Light.WARN, f"no state yet, {mode}"
-        return _by_age(ages.vehicle_s, s.vehicle_timeout_s), f"{_old(ages.vehicle_s)}, {mode}"
+            return HealthLevel.BAD, f"no heartbeat for {ages.heartbeat_s:.1f} s" if status else mode
+        if snapshot.inputs.vehicle is None:
+            return HealthLevel.WARN, f"no state yet, {mode}"
+        return _level_by_age(ages.vehicle_s, s.vehicle_timeout_s), f"{_age_text(ages.vehicle_s)}, {mode}"
 
-    def _estimate(self, look: Look) -> tuple[Light, str]:
-        i, s, ages = look.inputs, self._s, look.ages
+    def _estimate(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        i, s, ages = snapshot.inputs, self._s, snapshot.ages
         if i.vehicle is None or i.mocap is None or not i.mocap.tracking_valid or not ages.mocap_s <= s.mocap_timeout_s:
-            return Light.OFF, "nothing to compare with"
+            return HealthLevel.OFF, "no fresh pose to compare with"
         apart_m = math.dist(i.vehicle.position_world_m, i.mocap.position_world_m)
         turned_deg = math.degrees(
             abs(wrap_rad(yaw_from_quat(i.vehicle.attitude_wxyz) - yaw_from_quat(i.mocap.attitude_wxyz)))
         )
-        share = max(apart_m / s.estimate_disagreement_m, turned_deg / s.yaw_disagreement_deg)
-        return _by_share(share), f"{apart_m * 100:.1f} cm, {turned_deg:.1f} deg from motion capture"
+        ratio = max(apart_m / s.estimate_disagreement_m, turned_deg / s.yaw_disagreement_deg)
+        return _level_by_ratio(ratio), f"{apart_m * 100:.1f} cm, {turned_deg:.1f} deg from motion capture"
 
-    def _mocap(self, look: Look) -> tuple[Light, str]:
-        mocap, s, rate_hz = look.inputs.mocap, self._s, look.mocap_rate_hz
+    def _mocap(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        mocap, s, rate_hz = snapshot.inputs.mocap, self._s, snapshot.mocap_rate_hz
         if mocap is None:
-            return Light.OFF, "no pose yet"
-        age_s, late_s = look.ages.mocap_s, mocap.latency_s or 0.0
+            return HealthLevel.OFF, "no pose yet"
+        age_s, late_s = snapshot.ages.mocap_s, mocap.latency_s or 0.0
         rate = f", {rate_hz:.0f} Hz" if rate_hz is not None else ""
-        text = f"{_old(age_s)}{rate}"
+        text = f"{_age_text(age_s)}{rate}"
         if not mocap.tracking_valid:
-            return Light.BAD, "the body is not seen"
-        if not look.outputs.mocap_trusted:
-            return Light.BAD, "not believed: it jumps or stands still"
+            return HealthLevel.BAD, "rigid body not tracked"
+        if not snapshot.outputs.mocap_trusted:
+            return HealthLevel.BAD, "rejected: poses jump or are frozen"
         if not late_s <= s.mocap_timeout_s:
-            return Light.BAD, f"{late_s * 1e3:.0f} ms late by Motive's clock"
-        light = _by_age(age_s, s.mocap_timeout_s)
-        if light is Light.OK and late_s > s.mocap_latency_warn_s:
-            return Light.WARN, f"{late_s * 1e3:.0f} ms late by Motive's clock"
-        if light is Light.OK and rate_hz is not None and rate_hz < s.mocap_rate_min_hz:
-            return Light.WARN, text
+            return HealthLevel.BAD, f"{late_s * 1e3:.0f} ms late by Motive's clock"
+        light = _level_by_age(age_s, s.mocap_timeout_s)
+        if light is HealthLevel.OK and late_s > s.mocap_latency_warn_s:
+            return HealthLevel.WARN, f"{late_s * 1e3:.0f} ms late by Motive's clock"
+        if light is HealthLevel.OK and rate_hz is not None and rate_hz < s.mocap_rate_min_hz:
+            return HealthLevel.WARN, text
         return light, text
 
-    def _arm(self, look: Look) -> tuple[Light, str]:
-        arm, s, age_s = look.inputs.arm, self._s, look.ages.arm_s
+    def _arm(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        arm, s, age_s = snapshot.inputs.arm, self._s, snapshot.ages.arm_s
         if arm is None:
-            return Light.OFF, "no joint state yet"
+            return HealthLevel.OFF, "no joint state yet"
         hottest_c = max(arm.temperature_c)
-        text = f"{_old(age_s)}, {arm.temperature_c[0]:.0f} / {arm.temperature_c[1]:.0f} degC"
+        text = f"{_age_text(age_s)}, {arm.temperature_c[0]:.0f} / {arm.temperature_c[1]:.0f} degC"
         if any(error & ~WATCHDOG_RESTARTED for error in arm.hardware_error):
-            return Light.BAD, error_text(arm.hardware_error)
+            return HealthLevel.BAD, error_text(arm.hardware_error)
         if hottest_c >= s.servo_max_c:
-            return Light.BAD, text
-        light = _by_age(age_s, s.arm_timeout_s)
-        if light is Light.OK and any(arm.hardware_error):
-            return Light.WARN, "the bus watchdog had let go; torque is back"
-        if light is Light.OK and arm.read_failures >= s.arm_read_failures_max:
-            return Light.WARN, f"{arm.read_failures} bus cycles without an answer"
-        return Light.WARN if light is Light.OK and hottest_c >= s.servo_warn_c else light, text
+            return HealthLevel.BAD, text
+        light = _level_by_age(age_s, s.arm_timeout_s)
+        if light is HealthLevel.OK and any(arm.hardware_error):
+            return HealthLevel.WARN, "the bus watchdog had released torque; it is on again"
+        if light is HealthLevel.OK and arm.read_failures >= s.arm_read_failures_max:
+            return HealthLevel.WARN, f"{arm.read_failures} bus cycles without an answer"
+        return HealthLevel.WARN if light is HealthLevel.OK and hottest_c >= s.servo_warn_c else light, text
 
-    def _force(self, look: Look) -> tuple[Light, str]:
-        force, age_s = look.inputs.force, look.ages.force_s
+    def _force(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        force, age_s = snapshot.inputs.force, snapshot.ages.force_s
         if force is None:
-            return Light.OFF, "no sample yet"
+            return HealthLevel.OFF, "no sample yet"
         size_n = math.hypot(*force.force_sensor_n)
-        light = _by_age(age_s, self._s.force_timeout_s)
-        if light is Light.OK and (force.overload or not size_n <= self._force_max_n):
-            return Light.WARN, f"overloaded: {size_n:.0f} N"
-        return light, f"{_old(age_s)}, {size_n:.1f} N"
+        light = _level_by_age(age_s, self._s.force_timeout_s)
+        if light is HealthLevel.OK and (force.overload or not size_n <= self._force_max_n):
+            return HealthLevel.WARN, f"overloaded: {size_n:.0f} N"
+        return light, f"{_age_text(age_s)}, {size_n:.1f} N"
 
-    def _loop(self, look: Look) -> tuple[Light, str]:
-        late_s, s = look.ages.lateness_s, self._s
-        light = Light.BAD if late_s > s.loop_stalled_s else Light.WARN if late_s > s.loop_late_s else Light.OK
-        missed = f"{look.missed} ticks missed" if look.missed else "no tick missed"
+    def _loop(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        late_s, s = snapshot.ages.lateness_s, self._s
+        light = (
+            HealthLevel.BAD
+            if late_s > s.loop_stalled_s
+            else HealthLevel.WARN
+            if late_s > s.loop_late_s
+            else HealthLevel.OK
+        )
+        missed = f"{snapshot.missed} ticks missed" if snapshot.missed else "no tick missed"
         return light, f"{late_s * 1e3:.1f} ms late at worst, {missed}"
 
-    def _battery(self, look: Look) -> tuple[Light, str]:
-        status, s = look.inputs.status, self._s
+    def _battery(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        status, s = snapshot.inputs.status, self._s
         voltage_v = status.battery_voltage_v if status is not None else None
         remaining = status.battery_remaining if status is not None else None
         parts = [f"{voltage_v:.1f} V"] if voltage_v is not None else []
         parts += [f"{remaining * 100:.0f} %"] if remaining is not None else []
         if not parts:
-            return Light.OFF, "PX4 does not say"
+            return HealthLevel.OFF, "not reported by PX4"
         empty = remaining is not None and not remaining >= s.battery_min
         if voltage_v is not None and s.battery_voltage_min_v is not None:
             empty = empty or not voltage_v >= s.battery_voltage_min_v
         warn = remaining is not None and remaining < s.battery_warn
-        return Light.BAD if empty else Light.WARN if warn else Light.OK, ", ".join(parts)
+        return HealthLevel.BAD if empty else HealthLevel.WARN if warn else HealthLevel.OK, ", ".join(parts)
 
-    def _tether_light(self, look: Look) -> tuple[Light, str]:
-        state, tether = look.outputs.tether, self._tether
+    def _tether_health(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        state, tether = snapshot.outputs.tether, self._tether
         if state is None:
-            return Light.OFF, "not measured"
+            return HealthLevel.OFF, "not measured"
         left = f"{state.slack_m:.2f} m left"
         if state.separated:
-            return Light.BAD, "holds the machine no more"
+            return HealthLevel.BAD, "no longer holds the vehicle"
         if state.snagged:
-            return Light.BAD, f"snagged: pulls with {state.pull_n:.0f} N, {left}"
+            return HealthLevel.BAD, f"snagged: pulls with {state.pull_n:.0f} N, {left}"
         if state.taut:
-            return Light.BAD, f"taut: pulls with {state.pull_n:.0f} N, {left}"
-        if look.outputs.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE):
-            return Light.OK, left
+            return HealthLevel.BAD, f"taut: pulls with {state.pull_n:.0f} N, {left}"
+        if snapshot.outputs.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE):
+            return HealthLevel.OK, left
         if not state.stop_slack_m >= self._s.tether_stop_slack_min_m:
-            return Light.BAD, f"{left}, {state.stop_slack_m:.2f} m where it could stop"
+            return HealthLevel.BAD, f"{left}, {state.stop_slack_m:.2f} m where it could stop"
         if abs(state.turns) > tether.turns_max:
-            return Light.BAD, f"wound: {state.turns:+.1f} turns, {left}"
+            return HealthLevel.BAD, f"wound: {state.turns:+.1f} turns, {left}"
         if state.clearance_m < tether.clearance_min_m:
-            return Light.WARN, f"{state.clearance_m * 100:.0f} cm from rotors or arm, {left}"
-        return Light.WARN if state.stop_slack_m < tether.margin_m else Light.OK, left
+            return HealthLevel.WARN, f"{state.clearance_m * 100:.0f} cm from rotors or arm, {left}"
+        return HealthLevel.WARN if state.stop_slack_m < tether.margin_m else HealthLevel.OK, left
 
 
-def _recorder(look: Look) -> tuple[Light, str]:
-    if look.recorder_error is not None:
-        return Light.BAD, look.recorder_error
-    if look.dropped:
-        return Light.WARN, f"{look.dropped} records lost"
-    return Light.OK, "nothing lost"
+def _recorder(snapshot: Snapshot) -> tuple[HealthLevel, str]:
+    if snapshot.recorder_error is not None:
+        return HealthLevel.BAD, snapshot.recorder_error
+    if snapshot.dropped:
+        return HealthLevel.WARN, f"{snapshot.dropped} records lost"
+    return HealthLevel.OK, "nothing lost"
 
 
-def _guardian(look: Look) -> tuple[Light, str]:
-    ready = look.inputs.guardian_ready
+def _guardian(snapshot: Snapshot) -> tuple[HealthLevel, str]:
+    ready = snapshot.inputs.guardian_ready
     if ready is None:
-        return Light.OFF, "none stands by"
-    return (Light.OK, "stands by") if ready else (Light.BAD, "dead, or could not take over")
+        return HealthLevel.OFF, "no guardian"
+    return (HealthLevel.OK, "standby") if ready else (HealthLevel.BAD, "dead or not ready")
 
 
-def _by_age(age_s: float, limit_s: float) -> Light:
-    return _by_share(age_s / limit_s)
+def _level_by_age(age_s: float, limit_s: float) -> HealthLevel:
+    return _level_by_ratio(age_s / limit_s)
 
 
-def _by_share(share: float) -> Light:
-    """Of a limit: beyond it BAD, from the half on WARN; what is no number is BAD."""
-    return Light.OK if share <= 0.5 else Light.WARN if share <= 1.0 else Light.BAD
+def _level_by_ratio(ratio: float) -> HealthLevel:
+    """Return the level for a ratio of value to limit: BAD beyond 1 or not finite, WARN beyond 0.5."""
+    return HealthLevel.OK if ratio <= 0.5 else HealthLevel.WARN if ratio <= 1.0 else HealthLevel.BAD
 
 
-def _old(age_s: float) -> str:
-    age_s = max(0.0, age_s)  # joints are read within their tick
+def _age_text(age_s: float) -> str:
+    age_s = max(0.0, age_s)  # joints are read during the tick
     return f"{age_s * 1e3:.0f} ms old" if age_s < 1.0 else f"{age_s:.1f} s old"

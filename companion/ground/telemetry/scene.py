@@ -1,4 +1,4 @@
-"""What a picture of the machine in its room is drawn from, of a flight's configuration. Pure."""
+"""The scene message of a flight, from its configuration. Pure."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ PATH_POINTS_MAX = 300
 
 
 def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = (), *, mission_s: float = 0.0) -> Scene:
-    """The scene of a flight.
+    """Return the scene of a flight.
 
     Args:
         config: effective configuration.
-        session: of the flight.
-        path_world_m: planned path, evenly in time; of more than `PATH_POINTS_MAX` points so many are taken, evenly.
-        mission_s: planned duration; 0: not planned yet.
+        session: session id of the flight.
+        path_world_m: planned path at even time steps; reduced evenly to `PATH_POINTS_MAX` points if it has more.
+        mission_s: planned duration; 0 before it is planned.
     """
     vehicle = config.vehicle
     room, tether, safety, airframe, arm = vehicle.room, vehicle.tether, vehicle.safety, vehicle.airframe, vehicle.arm
@@ -51,7 +51,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
 
 
 def thinned(path_world_m: Sequence[Vec3]) -> tuple[Vec3, ...]:
-    """At most `PATH_POINTS_MAX` points, evenly, the first and the last among them."""
+    """Return at most `PATH_POINTS_MAX` points at even steps, including the first and the last."""
     count = len(path_world_m)
     if count <= PATH_POINTS_MAX:
         return tuple(path_world_m)

@@ -1,6 +1,6 @@
-"""Ticks of a flight as the messages that people see: 20 times a second how it is, and what happened. Pure: time is an argument.
+"""Stream and event messages built from the ticks of a flight. Pure: time is an argument.
 
-``e_p`` is as in `companion.analysis.metrics`: the pose against the reference of the moment at which it was taken.
+``e_p`` is defined as in `companion.analysis.metrics`: the pose against the reference of the time at which the pose was measured.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from companion.ground.protocol.messages import (
     Timing,
 )
 from companion.ground.protocol.strict_json import NUMBER_MAX
-from companion.ground.telemetry.health import Ages, Lights, Look
-from companion.ground.telemetry.timings import Worst, worst_of
+from companion.ground.telemetry.health import HealthEvaluator, Snapshot, WorstAges
+from companion.ground.telemetry.timings import WorstTimings, merge_timings
 from companion.model.flight_stage import Stage
 from companion.model.types import (
     ControlLog,
@@ -40,54 +40,54 @@ from companion.model.types import (
 )
 
 _TOUCHDOWN = Stage.TOUCHDOWN.value
-"""On the floor the reference lies below it: no error of the flight."""
+"""On the ground the reference lies below the floor, which is no tracking error."""
 WAITS_FOR_START = Stage.READY.value
-"""`Outputs.phase` of a flight that is ready and waits for the command."""
+"""`Outputs.phase` of a flight that is ready and waits for START."""
 PERIOD_S = 0.005
-"""Of the control loop: a tick that begins later than this is missed (`companion.core.flight_core.NOMINAL_DT_S`)."""
+"""Period of the control loop: a tick that begins later than this is missed (`companion.core.flight_core.NOMINAL_DT_S`)."""
 MOCAP_FRESH_S = 0.1
-"""An older pose is not graded (`companion.analysis.log.MOCAP_FRESH_S`)."""
+"""An older pose is stale and not graded (`companion.analysis.log.MOCAP_FRESH_S`)."""
 TEXT_MAX = 300
-"""Characters of an event's text: `EVENTS_KEPT` of them fit into one message, whatever they are."""
+"""Characters of an event's text, so that `EVENTS_KEPT` of them always fit into one message."""
 _TEXT_MAX_BYTES = 1600
-"""The same in JSON, where a character may take twelve bytes."""
-_LIGHTS_S = 1.0
-"""The lights show the worst of so long: what lasts a tick is to be seen."""
+"""The same limit in JSON, where a character may take twelve bytes."""
+_HEALTH_WINDOW_S = 1.0
+"""The health shows the worst values of this window, so that a problem of a single tick is visible."""
 
 T = TypeVar("T", bound=tuple[float, ...])
 
 
 class StreamBuilder:
-    """Takes every tick, makes a `Stream` of the newest now and then, and keeps the newest events."""
+    """Takes every tick, builds `Stream` messages on request, and keeps the newest events."""
 
     def __init__(self, config: FlightConfig, session: str) -> None:
         self._session = session
-        self._health = Lights(config.vehicle)
+        self._health = HealthEvaluator(config.vehicle)
         self._newest: tuple[Inputs, Outputs, Sent] | None = None
-        self._ages = Ages()
-        self._worst = Worst()
-        self._past: deque[tuple[float, Ages]] = deque()
+        self._ages = WorstAges()
+        self._worst = WorstTimings()
+        self._past: deque[tuple[float, WorstAges]] = deque()
         self._frames_s: deque[float] = deque()
         self._first_frame_s: float | None = None
         self._missed = 0
         self._seq = 0
         self.events: deque[EventLine] = deque(maxlen=EVENTS_KEPT)
-        """The newest, oldest first."""
+        """The newest events, oldest first."""
         self.count = 0
-        """Of all events."""
+        """Number of all events."""
 
     @property
     def ticks_seen(self) -> bool:
-        """There is something to make a `Stream` of."""
+        """Whether there was a tick to build a `Stream` from."""
         return self._newest is not None
 
     @property
     def newest_outputs(self) -> Outputs | None:
-        """Of the newest tick."""
+        """Outputs of the newest tick."""
         return self._newest[1] if self._newest is not None else None
 
     def add_tick(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> None:
-        """The next tick."""
+        """Add the next tick."""
         before = self._newest
         self._newest = (inputs, outputs, sent)
         self._ages.add_tick(inputs, sent.lateness_s)
@@ -109,50 +109,50 @@ class StreamBuilder:
                     event.id,
                     event.severity.value,
                     event.action.value,
-                    shortened(event.text),
+                    truncated(event.text),
                 )
             )
 
-    def add_line(self, t_s: float, severity: str, source: str, text: str, *, instead: bool = False) -> None:
-        """A line that is no event of the core: what PX4 or the guardian says, and what the ground was told.
+    def add_line(self, t_s: float, severity: str, source: str, text: str, *, replace_last: bool = False) -> None:
+        """Add a line that is no event of the core: a text of PX4 or the guardian, or a notice of the telemetry.
 
         Args:
             t_s: flight clock.
-            severity: a value of `companion.model.types.Severity`.
-            source: who says it; the line's id.
+            severity: value of `companion.model.types.Severity`.
+            source: sender, used as the line's id.
             text: cut to `TEXT_MAX` characters.
-            instead: of the last line of the same source, if it is still kept: what repeats for ever is to push out nothing else.
+            replace_last: replace the last line of the same source, so that a repeated line displaces no other.
         """
         mission_t_s = self._newest[1].mission_t_s if self._newest is not None else 0.0
-        if instead:
+        if replace_last:
             kept = [line for line in self.events if line.id != source]
             self.events.clear()
             self.events.extend(kept)
-        self._append(EventLine(t_s, mission_t_s, source, severity, SafetyAction.NOMINAL.value, shortened(text)))
+        self._append(EventLine(t_s, mission_t_s, source, severity, SafetyAction.NOMINAL.value, truncated(text)))
 
     def events_message(self) -> Events:
-        """All of them that are kept."""
+        """Return the events that are kept."""
         return Events(VERSION, self._session, self.count, tuple(map(_finite_line, self.events)))
 
     def build(self, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Stream:
-        """How it is now, with the worst timings since the message before.
+        """Return the current stream message, with the worst timings since the previous one.
 
         Args:
             wall_s: seconds since 1970.
-            dropped: records that the recorder itself knows to be lost.
-            recorder_error: why it records no more.
+            dropped: records that the recorder lost.
+            recorder_error: why recording stopped, or None.
 
         Raises:
-            LookupError: no tick was taken yet.
+            LookupError: there was no tick yet.
         """
         if self._newest is None:
             raise LookupError("no tick yet")
         i, o, sent = self._newest
         lost = max(dropped, i.recorder_dropped)
         ages = self._ages_of_the_last_second(i.t_s)
-        look = Look(i, o, ages, self._mocap_rate_hz(i.t_s), self._missed, lost, recorder_error)
+        snapshot = Snapshot(i, o, ages, self._mocap_rate_hz(i.t_s), self._missed, lost, recorder_error)
         timing = self._worst.message(self._missed, lost)
-        self._ages, self._worst = Ages(), Worst()
+        self._ages, self._worst = WorstAges(), WorstTimings()
         self._seq += 1
         pose_from, position, attitude, age_s = _pose(i, o)
         reference, status = o.reference, i.status
@@ -188,7 +188,7 @@ class StreamBuilder:
             tether=_tether(o.tether),
             control=_control(o.control),
             timing=timing,
-            lights=self._health.evaluate(look),
+            lights=self._health.evaluate(snapshot),
             bent_by=o.bent_by,
             waits_for_start=o.phase == WAITS_FOR_START,
         )
@@ -197,12 +197,12 @@ class StreamBuilder:
         self.events.append(line)
         self.count += 1
 
-    def _ages_of_the_last_second(self, t_s: float) -> Ages:
+    def _ages_of_the_last_second(self, t_s: float) -> WorstAges:
         past = self._past
         past.append((t_s, self._ages))
-        while past[0][0] < t_s - _LIGHTS_S:
+        while past[0][0] < t_s - _HEALTH_WINDOW_S:
             past.popleft()
-        worst = Ages()
+        worst = WorstAges()
         for _, ages in past:
             worst.merge(ages)
         return worst
@@ -223,57 +223,57 @@ def replay(
     max_records: int = 12000,
     max_events: int = 2000,
 ) -> tuple[list[Stream], Events]:
-    """A logged flight as the messages that people would have seen.
+    """Return a logged flight as the messages that the vehicle would have published.
 
     Args:
-        rows: ticks in order, such as `companion.analysis.log.FlightLog.rows()` gives.
-        config: of the flight.
-        session: any name for it.
+        rows: ticks in order, such as `companion.analysis.log.FlightLog.rows()` returns.
+        config: configuration of the flight.
+        session: any session id.
         epoch_offset_s: wall clock at zero of the flight clock.
-        rate_hz: of the records; half, a quarter, ... of it where a long flight would give more than `max_records`.
+        rate_hz: of the messages; halved as often as a long flight would exceed `max_records`.
         max_records: at least 2.
-        max_events: the newest so many are kept.
+        max_events: number of newest events to keep.
 
     Returns:
-        Records in order, the first tick's and the last tick's among them; and the events of the whole flight.
+        Messages in order, including the first and the last tick; and the events of the flight.
     """
     maker = StreamBuilder(config, session)
     maker.events = deque(maxlen=max_events)
     period_s = 1.0 / rate_hz
     records: list[Stream] = []
     due_s = -math.inf
-    untold: float | None = None
+    pending_s: float | None = None
     for inputs, outputs, sent in rows:
         maker.add_tick(inputs, outputs, sent)
-        untold = inputs.t_s
+        pending_s = inputs.t_s
         if not inputs.t_s < due_s - 1e-6:
             due_s = due_s + period_s if due_s + period_s > inputs.t_s else inputs.t_s + period_s
             records.append(maker.build(epoch_offset_s + inputs.t_s))
-            untold = None
+            pending_s = None
             if len(records) >= max_records:
-                records = _halved(records)
+                records = _every_second(records)
                 period_s *= 2.0
                 due_s = inputs.t_s + period_s
-    if untold is not None:
-        records.append(maker.build(epoch_offset_s + untold))
+    if pending_s is not None:
+        records.append(maker.build(epoch_offset_s + pending_s))
     return records, maker.events_message()
 
 
-def _halved(records: list[Stream]) -> list[Stream]:
-    """Every second one, the first and the last among them, with the worst timings of those between."""
+def _every_second(records: list[Stream]) -> list[Stream]:
+    """Return every second message, including the first and the last, with the worst timings of those left out."""
     kept = [records[0]]
     between: list[Timing] = []
     for index, record in enumerate(records[1:], 1):
         if index % 2 and index != len(records) - 1:
             between.append(record.timing)
             continue
-        kept.append(dataclasses.replace(record, timing=worst_of([*between, record.timing])))
+        kept.append(dataclasses.replace(record, timing=merge_timings([*between, record.timing])))
         between = []
     return kept
 
 
 def _pose(i: Inputs, o: Outputs) -> tuple[str | None, Vec3 | None, Quat | None, float]:
-    """Source, position, attitude, and how long ago the vehicle was there, s."""
+    """Return the source, position, attitude and age (s) of the vehicle's pose."""
     mocap = i.mocap
     if mocap is not None and mocap.tracking_valid and o.mocap_trusted and i.t_s - mocap.stamp_s <= MOCAP_FRESH_S:
         age_s = i.t_s - mocap.stamp_s + (mocap.latency_s or 0.0)
@@ -325,8 +325,8 @@ def _control(control: ControlLog | None) -> ControlView | None:
     )
 
 
-def shortened(text: str) -> str:
-    """Cut to what a message has room for."""
+def truncated(text: str) -> str:
+    """Return text cut to the size that a message allows."""
     text = text[:TEXT_MAX]
     return text if len(json.dumps(text)) <= _TEXT_MAX_BYTES else text[: _TEXT_MAX_BYTES // 12]
 
@@ -338,12 +338,12 @@ def _finite_line(line: EventLine) -> EventLine:
 
 
 def _fits(value: float) -> bool:
-    """Whether a message may hold it: False for NaN, too."""
+    """Whether a message may hold the number; False for NaN."""
     return abs(value) <= NUMBER_MAX
 
 
 def _number(value: float | None, digits: int) -> float | None:
-    """What is no number is not known."""
+    """Return the rounded number, or None if it is not finite."""
     return round(value, digits) if value is not None and _fits(value) else None
 
 

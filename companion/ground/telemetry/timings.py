@@ -1,4 +1,4 @@
-"""The worst durations since the message before, as the ground is told of them. Pure."""
+"""Worst durations of the loop and the links since the previous stream message. Pure."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from companion.ground.telemetry.health import UNKNOWN_S
 from companion.model.types import Inputs, Outputs, Sent
 
 
-class Worst:
-    """The worst durations of some ticks, s."""
+class WorstTimings:
+    """The longest durations of some ticks, s."""
 
     def __init__(self) -> None:
         self._lateness_s = self._core_s = 0.0
         self._mocap_s = self._setpoint_s = self._joint_s = self._whole_s = self._read_s = UNKNOWN_S
 
     def add_tick(self, before: tuple[Inputs, Outputs, Sent] | None, i: Inputs, sent: Sent, fresh: bool) -> None:
-        """One tick; durations as in `companion.analysis.timing.Stopwatch`."""
+        """Include one tick; durations as in `companion.analysis.timing.Stopwatch`."""
         self._lateness_s = max(self._lateness_s, sent.lateness_s)
         self._core_s = max(self._core_s, sent.core_s - sent.joint_read_s)
         if i.mocap is not None:
@@ -37,7 +37,7 @@ class Worst:
             self._joint_s = max(self._joint_s, now.written_s - earlier.stamp_s)
 
     def message(self, missed: int, dropped: int) -> Timing:
-        """As a message says it."""
+        """Return the durations as a message."""
         return Timing(
             lateness_ms=_ms(self._lateness_s) or 0.0,
             mocap_age_ms=_ms(self._mocap_s),
@@ -51,8 +51,8 @@ class Worst:
         )
 
 
-def worst_of(timings: Sequence[Timing]) -> Timing:
-    """Of messages in order as of one."""
+def merge_timings(timings: Sequence[Timing]) -> Timing:
+    """Return the worst timings of consecutive messages."""
 
     def worst(name: str) -> float | None:
         return max((v for t in timings if (v := getattr(t, name)) is not None), default=None)

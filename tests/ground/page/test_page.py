@@ -242,10 +242,10 @@ def test_events_can_be_filtered(page: Page) -> None:
 
 def test_a_filter_that_leaves_nothing_says_so(page: Page) -> None:
     page.tab.click("[data-filter='critical']")
-    assert page.text("#event-none") == "Nothing has happened yet."
+    assert page.text("#event-none") == "No events yet."
     page.tell(told(flown().events))
     assert page.tab.locator("#event-list li:visible").count() == 0
-    assert page.text("#event-none") == "Nothing so grave has happened."
+    assert page.text("#event-none") == "No events of this severity."
 
 
 def test_a_new_session_begins_with_nothing_of_the_old_one(page: Page) -> None:

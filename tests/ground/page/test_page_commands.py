@@ -136,7 +136,7 @@ def test_keys_command_too(stand: Stand, page: Page) -> None:
 
 
 def test_start_needs_a_vehicle_that_waits_and_a_long_press(stand: Stand, page: Page) -> None:
-    assert "start" not in page.enabled() and "only when it waits" in page.text("[data-command='start']")
+    assert "start" not in page.enabled() and "only while waiting" in page.text("[data-command='start']")
     news = playing(flown().streams[0], waits_for_start=True)
     page.tell(news())
     assert "start" in page.enabled() and "resume" not in page.enabled()

@@ -1,4 +1,4 @@
-// A camera that turns about a point, moved by mouse, fingers and keys.
+// A camera that orbits a point, controlled by mouse, touch and keys.
 
 import { dot, heading, mix, sub } from "./geometry.js";
 
@@ -7,7 +7,7 @@ const NEAR_M = 0.05;
 const PITCH_MAX = Math.PI / 2 - 0.001;
 const rad = (degrees) => (degrees * Math.PI) / 180;
 
-/** Direction of view; `fit` shows the whole room, `follow` looks at the vehicle from where it came. */
+/** View directions; `fit` shows the whole room, `follow` keeps the vehicle in the centre. */
 const PRESETS = {
   room: { yaw: rad(62), pitch: rad(22), fit: true },
   behind: { yaw: 0, pitch: rad(16), follow: true, distance: 2.1 },
@@ -35,7 +35,7 @@ export class Camera {
     this.distance = preset.distance ?? 6;
   }
 
-  /** Make ready for a picture: room as {min, max}, pose of the vehicle or null. */
+  /** Set the camera for one frame: room as {min, max}, pose of the vehicle or null. */
   aim(width, height, room, position, attitude) {
     this.width = width;
     this.height = height;
@@ -62,7 +62,7 @@ export class Camera {
     this.focal = Math.min(this.height, this.width * 0.8) / (2 * Math.tan(FIELD / 2));
   }
 
-  /** Go as near as shows all corners of the room, and put them into the middle of the picture. */
+  /** Move as close as possible with all corners of the room visible, and centre them. */
   _fit(room) {
     const corners = [];
     for (let k = 0; k < 8; k += 1) corners.push([0, 1, 2].map((axis) => ((k >> axis) & 1 ? room.max : room.min)[axis]));
@@ -80,14 +80,14 @@ export class Camera {
     this.distance *= this.zoom;
   }
 
-  /** Whoever comes nearer looks at the vehicle. */
+  /** Shift the view to the vehicle as the user zooms in. */
   _approach(position) {
     const k = Math.max(0, Math.min(1, (0.85 - this.zoom) / 0.35));
     this.target = mix(this.target, position, k);
     this.centre = [this.centre[0] * (1 - k) + (this.width / 2) * k, this.centre[1] * (1 - k) + (this.height / 2) * k];
   }
 
-  /** Size and middle of what points cover on the screen; null if some are behind the eye. */
+  /** Bounding box of points on the screen; null if a point is behind the eye. */
   _box(points) {
     this._axes();
     const places = points.map((point) => this.project(point));
@@ -97,25 +97,25 @@ export class Camera {
     return { wide: right - left, high: bottom - top, x: (left + right) / 2, y: (top + bottom) / 2 };
   }
 
-  /** A point as (right, up, depth) from the eye. */
+  /** Camera coordinates of a point: (right, up, depth). */
   seen(point) {
     const away = sub(point, this.eye);
     return [dot(away, this.right), dot(away, this.up), dot(away, this.forward)];
   }
 
-  /** Place on the screen of what `seen` gave, and pixels per metre there. */
+  /** Screen position of camera coordinates, and pixels per metre there. */
   place([right, up, depth]) {
     const k = this.focal / depth;
     return [this.centre[0] + right * k, this.centre[1] - up * k, k];
   }
 
-  /** Place on the screen of a point, or null if it is behind the eye. */
+  /** Screen position of a point, or null if it is behind the eye. */
   project(point) {
     const seen = this.seen(point);
     return seen[2] < NEAR_M ? null : this.place(seen);
   }
 
-  /** A line of points on the screen, in the pieces that are in front of the eye. */
+  /** A polyline on the screen, split into the pieces in front of the eye. */
   trace(points) {
     const pieces = [];
     let piece = [];
@@ -151,7 +151,7 @@ export class Camera {
   }
 }
 
-/** Let people move the camera; `changed` is called after each move. */
+/** Attach the controls of the camera; `changed` is called after each move. */
 export function steer(camera, canvas, changed) {
   const fingers = new Map();
   let spread = 0;

@@ -6,14 +6,14 @@ import { fixed } from "./format.js";
 import { after } from "./vehicle.js";
 
 const LEFT = 42;
-const RIGHT = 38; // the same in every plot: times stand below each other
+const RIGHT = 38; // the same in every plot, so that the time axes align
 const TOP = 5;
 const BOTTOM = 5;
 const BOTTOM_LABELLED = 16;
 const LABEL_PX = 12;
 const GAP_S = 0.5; // records farther apart are not joined by a line
 
-/** A step of 1, 2 or 5 times a power of ten, for about so many steps in a span. */
+/** Step of 1, 2 or 5 times a power of ten that divides a span into about `count` parts. */
 export function niceStep(span, count) {
   const raw = span / count;
   const power = 10 ** Math.floor(Math.log10(raw));
@@ -30,7 +30,7 @@ function stroke(context, colour, width, dash, x0, y0, x1, y1) {
   context.stroke();
 }
 
-/** A label that can be read over lines. */
+/** Draw a label on a plate, so that it is readable over lines. */
 function write(context, { text, colour, x, y }) {
   context.textAlign = "left";
   context.textBaseline = "top";
@@ -43,7 +43,7 @@ function write(context, { text, colour, x, y }) {
 export class StripChart {
   /**
    * @param spec {title, digits, floor, span, spanRight, series: [{label, unit, colour, dashed, right, value(record)}], limits(scene): [{value, label, level}]}
-   *   `floor`: the axes begin there; `span`, `spanRight`: axes are never narrower.
+   *   `floor`: lower end of the axes; `span`, `spanRight`: smallest range of the axes.
    */
   constructor(spec) {
     this.spec = spec;
@@ -59,14 +59,14 @@ export class StripChart {
     this.canvas.setAttribute("aria-label", `${spec.title}, last 30 s`);
   }
 
-  /** Time at a place on the canvas, s. */
+  /** Time at a horizontal position on the canvas, s. */
   timeAt(x, from, to) {
     const wide = this.canvas.clientWidth - LEFT - RIGHT;
     return from + ((x - LEFT) / wide) * (to - from);
   }
 
   /**
-   * @param shown {records, from, to, now, cursor, scene, events, origin}: window of time, all in s of the flight clock; `origin` is
+   * @param shown {records, from, to, now, cursor, scene, events, origin}: time window in s of the flight clock; `origin` is
    *   the clock at take-off, `cursor` the time under the pointer or null
    */
   draw(shown, { named, labelled }) {
@@ -155,10 +155,10 @@ export class StripChart {
     return box.bottom - ((value - axis.low) / (axis.high - axis.low)) * (box.bottom - box.top);
   }
 
-  /** Lines of the events; gives their labels. */
+  /** Draw the event lines; return their labels. */
   _marks(context, box, x, { events, from, to }, named) {
     const labels = [];
-    const ends = []; // how far to the right each row of labels is taken
+    const ends = []; // right end of each row of labels
     for (const event of events) {
       if (event.t_s < from || event.t_s > to) continue;
       const colour = event.severity === "critical" ? colours.bad : event.severity === "warning" ? colours.warn : colours.soft;
@@ -175,7 +175,7 @@ export class StripChart {
     return labels;
   }
 
-  /** Lines of the limits, and where those are that lie outside; gives their labels, none over another. */
+  /** Draw the limit lines; return labels for them and for limits outside the axis, without overlap. */
   _limits(context, box, axis, scene) {
     const labels = [];
     const label = (text, colour, y) => {

@@ -1,4 +1,4 @@
-// The page's own clock: monotonic, but it also counts the time that the computer slept through.
+// The page's clock: monotonic, and it includes the time that the computer was suspended.
 
 let sleptMs = 0;
 let lastMonotonicMs = performance.now();
@@ -9,7 +9,7 @@ export function nowMs() {
   const monotonicMs = performance.now();
   const wallMs = Date.now();
   const missedMs = wallMs - lastWallMs - (monotonicMs - lastMonotonicMs);
-  // A wall clock that is set forward looks the same; the worst of it is one warning too many.
+  // Setting the wall clock forward looks the same; it causes at most a needless warning.
   if (missedMs > 1000) sleptMs += missedMs;
   lastMonotonicMs = monotonicMs;
   lastWallMs = wallMs;

@@ -1,4 +1,4 @@
-// The colours of the style sheet, for canvases. They change with the scheme of the system.
+// Colours of the style sheet, for canvases. They follow the colour scheme of the system.
 
 const NAMES = [
   "page", "card", "line", "ink", "soft", "ok", "warn", "bad", "calm", "accent", "series-1", "series-2", "series-3", "series-4",
@@ -16,12 +16,12 @@ function read() {
   for (const name of NAMES) colours[name] = style.getPropertyValue(`--${name}`).trim();
 }
 
-/** Colour of a level: ok, warn, bad; calm for everything else. */
+/** Colour of a level: ok, warn or bad; calm for all others. */
 export function levelColour(level) {
   return colours[level === "ok" || level === "warn" || level === "bad" ? level : "calm"];
 }
 
-/** Call back after each change of the scheme. */
+/** Register a listener for changes of the colour scheme. */
 export function onColours(listener) {
   listeners.push(listener);
 }

@@ -1,43 +1,43 @@
-// The command buttons: what may be pressed, and what came of it.
+// The command buttons: which are enabled, and the result of each command.
 
 import { byId, make, setData, setHidden, setText } from "./dom.js";
 
 const DOUBLE_MS = 300;
 const PRESS_MS = 800;
 const NO_ANSWER_MS = 2500; // the monitor itself gives up after 1.5 s and says so
-const FRESH_MS = 8000; // so long a button shows what came of it
-const LIVE_S = 1; // as the monitor has it
+const FRESH_MS = 8000; // a button shows its result for this long
+const LIVE_S = 1; // same limit as in the monitor
 const SAFE = new Set(["hold", "land", "abort"]);
 const KEYS = { H: "hold", L: "land", A: "abort" };
 const HELP = "use Ctrl-C in the flight's terminal, or the pilot's switch";
 
 /**
- * Why a command cannot be given now; null: it can. Commands that make it safer do not depend on how fresh the data is.
+ * Reason why a command cannot be given now, or null. Commands that make the flight safer do not need fresh data.
  *
  * @param name of the command
- * @param about {canCommand, whyNot, vehicle, verdict}
+ * @param context {canCommand, whyNot, vehicle, verdict}: state of page and vehicle
  */
 export function refusal(name, { canCommand, whyNot, vehicle, verdict }) {
   if (!canCommand) return whyNot || "view only";
   if (vehicle === null) return "no vehicle";
-  // The vehicle proves its stream and not its state: while the stream comes in, no state keeps anybody from making it safer.
+  // The stream is proven, the state is not: while the stream arrives, no state message can block a command that makes the flight safer.
   if (SAFE.has(name) && verdict.ageS !== null && verdict.ageS <= LIVE_S && vehicle.stream?.proofs?.length > 0) return null;
   if (verdict.ended) return "the flight is over";
-  if (vehicle.state && !vehicle.state.commands && vehicle.state.presence !== "lost") return vehicle.state.text || "this vehicle hears no commands";
+  if (vehicle.state && !vehicle.state.commands && vehicle.state.presence !== "lost") return vehicle.state.text || "this vehicle accepts no commands";
   if (SAFE.has(name)) return null;
-  if (verdict.stale) return "not while the data is old";
+  if (verdict.stale) return "not while the data is stale";
   const { stream } = vehicle;
-  if (name === "start") return stream?.waits_for_start ? null : "only when it waits for it";
-  return stream?.action === "hold" ? null : "only while it holds";
+  if (name === "start") return stream?.waits_for_start ? null : "only while waiting for START";
+  return stream?.action === "hold" ? null : "only during a hold";
 }
 
 export class Commands {
-  /** @param send sends a message to the monitor; false: it did not leave */
+  /** @param send sends a message to the monitor; returns false if there is no connection */
   constructor(send, now) {
     this._send = send;
     this._now = now;
-    this._about = { canCommand: false, whyNot: "not connected yet", vehicle: null, verdict: { ended: false, stale: true } };
-    this._told = new Map(); // "vehicle command" -> {state, text, atMs, nonces, sent}
+    this._context = { canCommand: false, whyNot: "not connected yet", vehicle: null, verdict: { ended: false, stale: true } };
+    this._results = new Map(); // "vehicle command" -> {state, text, atMs, nonces, sent}
     this._pressedMs = new Map();
     this._buttons = new Map();
     for (const button of byId("commands").querySelectorAll("[data-command]")) this._wire(button);
@@ -49,13 +49,13 @@ export class Commands {
     const hint = make("small", { className: "hint" });
     button.replaceChildren(make("span", { className: "label", text: button.textContent }), hint);
     this._buttons.set(name, { button, hint, output: byId("answers").querySelector(`[data-for="${name}"]`) });
-    if (button.dataset.press === "long") new LongPress(button, this._now, () => this._meant(), () => this.press(name));
+    if (button.dataset.press === "long") new LongPress(button, this._now, () => this._target(), () => this.press(name));
     else button.addEventListener("click", () => this.press(name));
   }
 
-  /** Whom a long press is for: vehicle, flight and hold that are shown. */
-  _meant() {
-    const { vehicle } = this._about;
+  /** Target of a long press: the vehicle, flight and hold that are displayed. */
+  _target() {
+    const { vehicle } = this._context;
     return JSON.stringify([vehicle?.name, vehicle?.stream?.session, vehicle?.stream?.hold]);
   }
 
@@ -67,79 +67,79 @@ export class Commands {
     this.press(name);
   }
 
-  /** A person wants this command. */
+  /** Give a command. */
   press(name) {
     const now = this._now();
-    if (refusal(name, this._about) !== null || now - (this._pressedMs.get(name) ?? -Infinity) < DOUBLE_MS) return;
+    if (refusal(name, this._context) !== null || now - (this._pressedMs.get(name) ?? -Infinity) < DOUBLE_MS) return;
     this._pressedMs.set(name, now);
-    const vehicle = this._about.vehicle.name;
+    const vehicle = this._context.vehicle.name;
     const message = { kind: "command", vehicle, command: name };
-    if (name === "resume") message.hold = this._about.vehicle.stream?.hold ?? 0;
+    if (name === "resume") message.hold = this._context.vehicle.stream?.hold ?? 0;
     const left = this._send(message);
-    const told = left ? { state: "wait", text: "sending …" } : { state: "no", text: `NOT SENT, no connection to the monitor: ${HELP}` };
-    this._told.set(`${vehicle} ${name}`, { ...told, open: left, atMs: now, nonces: new Set(), sent: 0 });
-    this.draw(this._about);
+    const result = left ? { state: "wait", text: "sending …" } : { state: "no", text: `NOT SENT, no connection to the monitor: ${HELP}` };
+    this._results.set(`${vehicle} ${name}`, { ...result, open: left, atMs: now, nonces: new Set(), sent: 0 });
+    this.draw(this._context);
   }
 
   /** A message of the monitor about commands: sent, refused or ack. */
-  hear(message) {
+  onMessage(message) {
     const name = message.kind === "ack" ? message.data?.command : message.command;
     if (!this._buttons.has(name)) return;
     const key = `${message.vehicle} ${name}`;
     if (message.kind === "sent") this._sent(key, message.nonce);
-    else if (message.kind === "refused") this._tell(key, "no", String(message.text ?? "refused"));
+    else if (message.kind === "refused") this._setResult(key, "no", String(message.text ?? "refused"));
     else this._acknowledged(key, message.data);
-    this.draw(this._about);
+    this.draw(this._context);
   }
 
   _sent(key, nonce) {
-    const told = this._told.get(key);
-    if (!told) return;
-    told.nonces.add(nonce);
-    told.sent += 1;
-    if (told.state === "wait") told.text = "sent, waiting for the vehicle …";
-    else if (told.open) told.text = `no answer yet, sent again (${told.sent}): ${HELP}`;
+    const result = this._results.get(key);
+    if (!result) return;
+    result.nonces.add(nonce);
+    result.sent += 1;
+    if (result.state === "wait") result.text = "sent, waiting for the vehicle …";
+    else if (result.open) result.text = `no answer yet, sent again (${result.sent}): ${HELP}`;
   }
 
   _acknowledged(key, ack) {
-    const mine = this._told.get(key)?.nonces.has(ack.nonce);
+    const mine = this._results.get(key)?.nonces.has(ack.nonce);
     const who = mine ? "" : `${ack.operator}: `;
-    this._tell(key, ack.accepted ? "done" : "no", `${ack.accepted ? "✓ " : "✗ "}${who}${ack.text}`, false);
+    this._setResult(key, ack.accepted ? "done" : "no", `${ack.accepted ? "✓ " : "✗ "}${who}${ack.text}`, false);
   }
 
-  _tell(key, state, text, open = true) {
-    const told = this._told.get(key) ?? { nonces: new Set(), sent: 0 };
-    this._told.set(key, { ...told, state, text, open, atMs: this._now() });
+  _setResult(key, state, text, open = true) {
+    const result = this._results.get(key) ?? { nonces: new Set(), sent: 0 };
+    this._results.set(key, { ...result, state, text, open, atMs: this._now() });
   }
 
   /** Called at least every 100 ms. */
-  draw(about) {
-    this._about = about;
+  draw(context) {
+    this._context = context;
     const now = this._now();
-    const general = about.canCommand ? refusal("hold", about) : about.whyNot || "This page may only watch.";
+    const general = context.canCommand ? refusal("hold", context) : context.whyNot || "This page is view only.";
     setHidden(byId("commands-why"), general === null);
     setText(byId("commands-why"), general ?? "");
     for (const [name, { button, hint, output }] of this._buttons) {
-      const why = refusal(name, about);
+      const why = refusal(name, context);
       if (button.disabled !== (why !== null)) button.disabled = why !== null;
       setText(hint, button.dataset.press !== "long" || general !== null ? "" : why ?? "press and hold");
-      const told = about.vehicle === null ? undefined : this._told.get(`${about.vehicle.name} ${name}`);
-      if (told?.state === "wait" && now - told.atMs > NO_ANSWER_MS) Object.assign(told, { state: "no", text: `no answer from the monitor: ${HELP}` });
-      setText(output, told?.text ?? "");
-      setData(output, "state", told?.state ?? "");
-      setData(button, "state", told && now - told.atMs < FRESH_MS ? told.state : "");
+      const result = context.vehicle === null ? undefined : this._results.get(`${context.vehicle.name} ${name}`);
+      if (result?.state === "wait" && now - result.atMs > NO_ANSWER_MS) Object.assign(result, { state: "no", text: `no answer from the monitor: ${HELP}` });
+      setText(output, result?.text ?? "");
+      setData(output, "state", result?.state ?? "");
+      setData(button, "state", result && now - result.atMs < FRESH_MS ? result.state : "");
     }
   }
 }
 
 /** A button that must be pressed for 0.8 s, by pointer or key. */
 class LongPress {
-  /** @param look a text of what is shown: the press ends when it changes; @param act what is done after 0.8 s */
-  constructor(button, now, look, act) {
+  /** @param readTarget returns the target as text: the press ends when it changes; @param action called after 0.8 s */
+  constructor(button, now, readTarget, action) {
     this._button = button;
     this._now = now;
-    this._look = look;
-    this._act = act;
+    this._readTarget = readTarget;
+    this._action = action;
     this._startMs = null;
     button.addEventListener("pointerdown", (event) => event.button === 0 && this._start());
     for (const name of ["pointerup", "pointerleave", "pointercancel", "blur"]) button.addEventListener(name, () => this._stop());
@@ -155,17 +155,17 @@ class LongPress {
   _start() {
     if (this._button.disabled) return;
     this._startMs = this._now();
-    this._seen = this._look();
+    this._startTarget = this._readTarget();
     this._grow();
   }
 
   _grow() {
     if (this._startMs === null) return;
     const part = Math.min(1, (this._now() - this._startMs) / PRESS_MS);
-    if (this._button.disabled || this._look() !== this._seen) this._stop();
+    if (this._button.disabled || this._readTarget() !== this._startTarget) this._stop();
     else if (part >= 1) {
       this._stop();
-      this._act();
+      this._action();
     } else {
       this._button.style.setProperty("--pressed", String(part));
       requestAnimationFrame(() => this._grow());

@@ -1,4 +1,4 @@
-// Small helpers. Text from outside becomes text, never markup: nothing on this page is made from HTML strings.
+// DOM helpers. Text from the network is only set as text: no element of this page is built from HTML strings.
 
 export const byId = (id) => document.getElementById(id);
 
@@ -12,7 +12,7 @@ export function make(tag, { className = "", text = null, data = {}, children = [
   return element;
 }
 
-/** Change an element's text only if it is another one: no needless layout, no needless words from a screen reader. */
+/** Set an element's text if it differs: avoids needless layout and needless announcements of a screen reader. */
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -25,7 +25,7 @@ export function setHidden(element, hidden) {
   if (element.hidden !== hidden) element.hidden = hidden;
 }
 
-/** Make the backing store of a canvas fit its size on the screen. Returns its size in CSS pixels, null while it has none. */
+/** Fit a canvas's backing store to its size on the screen. Return its context and size in CSS pixels, or null while it has no size. */
 export function fitCanvas(canvas) {
   const width = canvas.clientWidth;
   const height = canvas.clientHeight;

@@ -1,16 +1,16 @@
-// Numbers and texts as people read them.
+// Formatting of numbers and texts.
 
 export const NOTHING = "–";
 const DEGREES = 180 / Math.PI;
 
-/** A number with fixed decimals; a dash for what is not known. */
+/** A number with fixed decimals; a dash for an unknown value. */
 export function fixed(value, digits) {
   if (typeof value !== "number" || !Number.isFinite(value)) return NOTHING;
   const text = value.toFixed(digits);
   return Number(text) === 0 && text.startsWith("-") ? text.slice(1) : text;
 }
 
-/** The same with a unit behind it. */
+/** A number with fixed decimals and its unit. */
 export function quantity(value, digits, unit) {
   const text = fixed(value, digits);
   return text === NOTHING ? text : `${text} ${unit}`;
@@ -20,12 +20,12 @@ export function degrees(rad) {
   return typeof rad === "number" ? rad * DEGREES : null;
 }
 
-/** Euclidean norm; null for what is not known. */
+/** Euclidean norm; null for an unknown value. */
 export function norm(vector) {
   return Array.isArray(vector) ? Math.hypot(...vector) : null;
 }
 
-/** How old something is, short: 0.1 s, 12.3 s, 4 min. */
+/** An age in short form: 0.1 s, 12.3 s, 4 min. */
 export function age(seconds) {
   if (!Number.isFinite(seconds)) return NOTHING;
   if (seconds < 100) return `${seconds.toFixed(1)} s`;
@@ -40,7 +40,7 @@ export function clockTime(seconds) {
   return `${seconds < 0 ? "-" : ""}${Math.floor(tenths / 600)}:${rest < 10 ? "0" : ""}${rest.toFixed(1)}`;
 }
 
-/** Words of an identifier: autopilot_land -> autopilot land. */
-export function words(identifier) {
+/** An identifier as text: autopilot_land -> autopilot land. */
+export function readable(identifier) {
   return String(identifier ?? "").replaceAll("_", " ");
 }

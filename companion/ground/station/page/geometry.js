@@ -1,4 +1,4 @@
-// Where the machine's parts are. World: z up, m. Body: x forward, y left, z up. Quaternions (w, x, y, z) turn body vectors into the world.
+// Geometry of the machine's parts. World: z up, m. Body: x forward, y left, z up. Quaternions (w, x, y, z) turn body vectors into the world.
 
 export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
@@ -7,7 +7,7 @@ export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const mix = (a, b, k) => add(scale(a, 1 - k), scale(b, k));
 export const LEVEL = [1, 0, 0, 0];
 
-/** A body vector in the world. */
+/** Rotate a body vector into the world. */
 export function rotate(q, v) {
   const [w, x, y, z] = q;
   const tx = 2 * (y * v[2] - z * v[1]);
@@ -16,7 +16,7 @@ export function rotate(q, v) {
   return [v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx];
 }
 
-/** Heading of the body's x axis seen from above, rad. */
+/** Heading of the body's x axis, rad. */
 export function heading(q) {
   const forward = rotate(q, [1, 0, 0]);
   return Math.atan2(forward[1], forward[0]);
@@ -46,7 +46,7 @@ export function circle(centre, u, v, radius, count = 28) {
   return points;
 }
 
-/** Where f falls to zero between low and high; f(low) > 0. */
+/** Zero of f between low and high; f(low) > 0. */
 function bisect(f, low, high) {
   for (let k = 0; k < 60; k += 1) {
     const middle = (low + high) / 2;
@@ -57,8 +57,8 @@ function bisect(f, low, high) {
 }
 
 /**
- * A line of a given length that hangs between two points, and lies on the floor where it would hang through it: points from a to b.
- * Its weight alone shapes it (catenary); a line that is too short is drawn straight.
+ * Points of a slack line of a given length between two points; the part that would hang below the floor lies on it.
+ * The line is a catenary; one that is too short is drawn straight.
  */
 export function hanging(a, b, length, floor = 0) {
   const level = Math.hypot(b[0] - a[0], b[1] - a[1]);
@@ -94,7 +94,7 @@ function freeLine(level, rise, length) {
   return points;
 }
 
-/** The same with its middle on the floor: two arcs that touch down level, and what is left between them. */
+/** A slack line with its middle on the floor: two arcs that end horizontally, and the rest between them. */
 function floorLine(level, highA, highB, length, floor) {
   const reach = (a, high) => (high > 0 ? a * Math.acosh(1 + high / a) : 0);
   const arc = (a, high) => Math.sqrt(high * high + 2 * a * Math.max(high, 0));
@@ -121,7 +121,7 @@ function floorLine(level, highA, highB, length, floor) {
   return points;
 }
 
-/** What lies loose on the floor, in bends: (along, up, aside). */
+/** The loose part on the floor, in bends: (along, up, aside). */
 function loose(from, to, spare, floor) {
   const straight = Math.max(to - from, 0.05);
   if (spare < 0.01) return [];

@@ -1,9 +1,9 @@
-// The WebSocket to the monitor: says its token, reconnects for ever, and is opened anew when it has gone dumb.
+// The WebSocket to the monitor: sends the token, reconnects by itself, and can be renewed when no data arrives.
 
 const BACKOFF_MS = [200, 400, 800, 1500, 2000];
 const TOKEN_KEY = "companion-token";
 
-/** The token of the address (#token=...). It is kept for reloads of this tab and leaves the address line. */
+/** The token from the address (#token=...). It is kept for reloads of this tab and removed from the address line. */
 export function takeToken() {
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
   try {
@@ -13,15 +13,15 @@ export function takeToken() {
     }
     return given ?? sessionStorage.getItem(TOKEN_KEY);
   } catch {
-    return given; // storage is switched off: the token lasts until the next reload
+    return given; // storage is disabled: the token is lost at the next reload
   }
 }
 
 export class Link {
   /**
-   * @param token what the server printed, or null: view only
-   * @param onMessage called with each message, parsed
-   * @param onChange called when the connection comes or goes
+   * @param token the token that the server printed, or null for view only
+   * @param onMessage called with each parsed message
+   * @param onChange called when the connection opens or closes
    */
   constructor(token, onMessage, onChange) {
     this.open = false;
@@ -34,14 +34,14 @@ export class Link {
     this._connect();
   }
 
-  /** Send a message. False: there is no connection, nothing was sent. */
+  /** Send a message; return false if there is no connection. */
   send(message) {
     if (!this.open) return false;
     this._socket.send(JSON.stringify(message));
     return true;
   }
 
-  /** Give the connection up and make a new one at once. */
+  /** Close the connection and open a new one at once. */
   renew() {
     this._ended(this._socket);
     clearTimeout(this._timer);
@@ -70,7 +70,7 @@ export class Link {
     try {
       message = JSON.parse(text);
     } catch {
-      return; // the server speaks JSON only; what is none has no meaning here
+      return; // the server sends only JSON; ignore anything else
     }
     if (message && typeof message.kind === "string") this._onMessage(message);
   }

@@ -1,4 +1,4 @@
-// A worker that fetches a log and hands it over in pieces, so that the page stays alive however long it is.
+// A worker that fetches a log and passes it on in pieces, so that the page stays responsive.
 
 const PIECE = 300;
 

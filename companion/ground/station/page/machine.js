@@ -1,17 +1,17 @@
-// Draws the vehicle: frame, rotors, heading, arm, net, what it caught, and its ghost at the reference.
+// Draws the vehicle: frame, rotors, heading, arm, net, caught payload, and the reference pose as a ghost.
 
 import { colours } from "./colours.js";
 import { add, armBody, circle, rotate, scale, yawOnly } from "./geometry.js";
 
-// Share of the horizontal reach that the rotors' hubs stand at; four disks side by side.
+// Distance of the rotor hubs as a share of the horizontal reach; the four disks nearly touch.
 const HUB = 0.6;
 const DISK = 1 - HUB;
 const HUBS = [[1, 1], [1, -1], [-1, 1], [-1, -1]].map(([x, y]) => [x * Math.SQRT1_2 * HUB, y * Math.SQRT1_2 * HUB]);
 const X = [1, 0, 0];
 const Y = [0, 1, 0];
 
-/** Vehicle at a pose; parts that are farther away are drawn first. */
-export function drawMachine(pen, scene, position, attitude, { arm = null, caught = false, armed = false } = {}) {
+/** Draw the vehicle at a pose, the farther parts first. */
+export function drawMachine(renderer, scene, position, attitude, { arm = null, caught = false, armed = false } = {}) {
   const world = (body) => add(position, rotate(attitude, body));
   const turn = (body) => rotate(attitude, body);
   const radius = scene.radius_m;
@@ -19,82 +19,82 @@ export function drawMachine(pen, scene, position, attitude, { arm = null, caught
   const parts = [];
   for (const [x, y] of HUBS) {
     const hub = world([x * radius, y * radius, high]);
-    parts.push([hub, () => drawRotor(pen, world([0, 0, 0]), hub, turn, radius * DISK, x > 0, armed)]);
+    parts.push([hub, () => drawRotor(renderer, world([0, 0, 0]), hub, turn, radius * DISK, x > 0, armed)]);
   }
-  parts.push([world([0, 0, -0.06]), () => drawBody(pen, world, scene, radius)]);
-  if (arm) parts.push([world(armBody(scene, arm).elbow), () => drawArm(pen, scene, world, turn, arm, caught)]);
-  parts.map(([at, draw]) => [pen.depth(at), draw]).sort((a, b) => b[0] - a[0]).forEach(([, draw]) => draw());
-  pen.arrow(world([0.1 * radius, 0, high]), world([1.25 * radius, 0, high]), colours.accent, 3);
+  parts.push([world([0, 0, -0.06]), () => drawBody(renderer, world, scene, radius)]);
+  if (arm) parts.push([world(armBody(scene, arm).elbow), () => drawArm(renderer, scene, world, turn, arm, caught)]);
+  parts.map(([at, draw]) => [renderer.depth(at), draw]).sort((a, b) => b[0] - a[0]).forEach(([, draw]) => draw());
+  renderer.arrow(world([0.1 * radius, 0, high]), world([1.25 * radius, 0, high]), colours.accent, 3);
 }
 
-function drawRotor(pen, centre, hub, turn, radius, front, armed) {
-  pen.line([centre, hub], colours.machine, { width: 3 });
+function drawRotor(renderer, centre, hub, turn, radius, front, armed) {
+  renderer.line([centre, hub], colours.machine, { width: 3 });
   const disk = circle(hub, turn(X), turn(Y), radius, 26);
   const colour = front ? colours.accent : colours.machine;
-  pen.area(disk, colour, armed ? 0.28 : 0.12);
-  pen.line(disk, colour, { width: 1.4, alpha: armed ? 1 : 0.6 });
-  pen.ball(hub, 0.018, colours.machine, { least: 2 });
+  renderer.area(disk, colour, armed ? 0.28 : 0.12);
+  renderer.line(disk, colour, { width: 1.4, alpha: armed ? 1 : 0.6 });
+  renderer.ball(hub, 0.018, colours.machine, { least: 2 });
 }
 
-function drawBody(pen, world, scene, radius) {
+function drawBody(renderer, world, scene, radius) {
   const [long, wide] = [0.32 * radius, 0.22 * radius];
   const plate = [[long, wide], [long, -wide], [-long, -wide], [-long, wide]];
   const foot = -scene.ground_clearance_m;
   for (const side of [1, -1]) {
     const skid = [world([0.4 * radius, side * 0.45 * radius, foot]), world([-0.4 * radius, side * 0.45 * radius, foot])];
-    pen.line(skid, colours.machine, { width: 2, alpha: 0.75 });
+    renderer.line(skid, colours.machine, { width: 2, alpha: 0.75 });
     for (const x of [0.2, -0.2]) {
-      pen.line([world([x * radius, side * wide, 0]), world([x * radius, side * 0.45 * radius, foot])], colours.machine, { width: 1.5, alpha: 0.6 });
+      renderer.line([world([x * radius, side * wide, 0]), world([x * radius, side * 0.45 * radius, foot])], colours.machine, { width: 1.5, alpha: 0.6 });
     }
   }
   for (const z of [-0.05, 0.03]) {
-    pen.area(plate.map(([x, y]) => world([x, y, z])), colours.machine, 0.92);
-    pen.line([...plate, plate[0]].map(([x, y]) => world([x, y, z])), colours.card, { width: 1 });
+    renderer.area(plate.map(([x, y]) => world([x, y, z])), colours.machine, 0.92);
+    renderer.line([...plate, plate[0]].map(([x, y]) => world([x, y, z])), colours.card, { width: 1 });
   }
 }
 
-function drawArm(pen, scene, world, turn, angles, caught) {
+function drawArm(renderer, scene, world, turn, angles, caught) {
   const { shoulder, elbow, net, along } = armBody(scene, angles);
-  pen.line([world(shoulder), world(elbow)], colours.link, { width: 5 });
+  renderer.line([world(shoulder), world(elbow)], colours.link, { width: 5 });
   const mouth = add(net, scale(along, -scene.net_radius_m));
-  pen.line([world(elbow), world(mouth)], colours.link, { width: 4 });
-  for (const joint of [shoulder, elbow]) pen.ball(world(joint), 0.02, colours.machine, { least: 3.5, edge: colours.card });
+  renderer.line([world(elbow), world(mouth)], colours.link, { width: 4 });
+  for (const joint of [shoulder, elbow]) renderer.ball(world(joint), 0.02, colours.machine, { least: 3.5, edge: colours.card });
   const across = [-along[2], 0, along[0]];
   const hoops = [[along, Y], [along, across], [across, Y]];
   for (const [u, v] of hoops) {
-    pen.line(circle(world(net), turn(u), turn(v), scene.net_radius_m, 20), colours.net, { width: 1.3, alpha: 0.9 });
+    renderer.line(circle(world(net), turn(u), turn(v), scene.net_radius_m, 20), colours.net, { width: 1.3, alpha: 0.9 });
   }
-  if (caught) pen.ball(world(net), 0.05, colours.warn, { least: 4, edge: colours.card });
+  if (caught) renderer.ball(world(net), 0.05, colours.warn, { least: 4, edge: colours.card });
 }
 
-/** Where the vehicle should be. */
-export function drawGhost(pen, scene, reference, yaw, arm) {
+/** Draw the reference pose. */
+export function drawGhost(renderer, scene, reference, yaw, arm) {
   const attitude = yawOnly(yaw ?? 0);
   const world = (body) => add(reference, rotate(attitude, body));
   for (const [x, y] of HUBS) {
     const hub = world([x * scene.radius_m, y * scene.radius_m, 0.05]);
-    pen.line(circle(hub, rotate(attitude, X), rotate(attitude, Y), scene.radius_m * DISK, 22), colours.ghost, { width: 1, dash: [2, 4] });
-    pen.line([reference, hub], colours.ghost, { width: 1, dash: [2, 4] });
+    renderer.line(circle(hub, rotate(attitude, X), rotate(attitude, Y), scene.radius_m * DISK, 22), colours.ghost, { width: 1, dash: [2, 4] });
+    renderer.line([reference, hub], colours.ghost, { width: 1, dash: [2, 4] });
   }
   if (!arm) return;
   const { shoulder, elbow, net } = armBody(scene, arm);
-  pen.line([shoulder, elbow, net].map(world), colours.ghost, { width: 1.5, dash: [2, 4] });
+  renderer.line([shoulder, elbow, net].map(world), colours.ghost, { width: 1.5, dash: [2, 4] });
 }
 
-/** Its shadow straight below, and how high it is. */
-export function drawShadow(pen, scene, position, floor) {
+/** Draw the vehicle's shadow and its height above the floor. */
+export function drawShadow(renderer, scene, position, floor) {
   const below = [position[0], position[1], floor];
-  pen.area(circle(below, X, Y, scene.radius_m * 0.9, 26), colours.machine, 0.13);
-  pen.line([position, below], colours.soft, { width: 1, dash: [3, 4], alpha: 0.8 });
+  renderer.area(circle(below, X, Y, scene.radius_m * 0.9, 26), colours.machine, 0.13);
+  renderer.line([position, below], colours.soft, { width: 1, dash: [3, 4], alpha: 0.8 });
 }
 
-/** A force on the net, 0.08 m per newton. */
-export function drawForce(pen, scene, position, attitude, arm, force) {
+/** Draw a force on the net, 0.08 m per newton. */
+export function drawForce(renderer, scene, position, attitude, arm, force) {
   const strength = Math.hypot(...force);
   if (strength < 0.4) return;
   const from = add(position, rotate(attitude, armBody(scene, arm).net));
   const to = add(from, scale(force, Math.min(0.08, 1.2 / strength)));
-  pen.arrow(from, to, colours.force, 3);
-  pen.text(to, `${strength.toFixed(1)} N`, { colour: colours.force, dx: 14, dy: 8, align: "left", size: 13 });
+  renderer.arrow(from, to, colours.force, 3);
+  renderer.text(to, `${strength.toFixed(1)} N`, { colour: colours.force, dx: 14, dy: 8, align: "left", size: 13 });
 }
 

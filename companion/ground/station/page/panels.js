@@ -1,12 +1,12 @@
-// Figures that are read from afar, lights, preflight, and the inside of the controller.
+// Key figures, device health, preflight rows, and internal values of the controller.
 
 import { byId, make, setData, setText } from "./dom.js";
-import { fixed, NOTHING, norm, quantity, words } from "./format.js";
+import { fixed, NOTHING, norm, quantity, readable } from "./format.js";
 import { tetherLevel, trackingLevel } from "./verdict.js";
 
-const worstLight = (stream, name) => stream?.lights?.find((light) => light.name.toLowerCase().includes(name))?.light ?? "unknown";
+const levelOf = (stream, name) => stream?.lights?.find((light) => light.name.toLowerCase().includes(name))?.light ?? "unknown";
 
-/** The tiles: name, unit, decimals, and what to read from (stream, scene): value, note, level. */
+/** The tiles: name, unit, decimals, and a function of (stream, scene) that returns value, note and level. */
 const TILES = [
   {
     id: "tether", title: "Tether slack", unit: "m", digits: 2,
@@ -27,12 +27,12 @@ const TILES = [
     id: "battery", title: "Battery", unit: "%", digits: 0,
     read: (s) => ({
       value: typeof s.battery_remaining === "number" ? s.battery_remaining * 100 : null,
-      level: worstLight(s, "battery"), note: quantity(s.battery_v, 1, "V"),
+      level: levelOf(s, "battery"), note: quantity(s.battery_v, 1, "V"),
     }),
   },
   {
     id: "latency", title: "Latency", unit: "ms", digits: 1,
-    read: (s) => ({ value: s.timing.mocap_to_setpoint_ms, level: worstLight(s, "loop"), note: "mocap to PX4" }),
+    read: (s) => ({ value: s.timing.mocap_to_setpoint_ms, level: levelOf(s, "loop"), note: "mocap to PX4" }),
   },
 ];
 
@@ -58,9 +58,9 @@ export class Figures {
   }
 }
 
-const LIGHT_WORDS = { ok: "well", warn: "warning", bad: "bad", off: "off" };
+const LEVEL_WORDS = { ok: "ok", warn: "warning", bad: "bad", off: "off" };
 
-export class Lights {
+export class DeviceList {
   constructor(list) {
     this._list = list;
     this._rows = [];
@@ -74,14 +74,14 @@ export class Lights {
       const row = this._rows[index];
       setData(row.element, "light", light.light);
       setText(row.name, light.name);
-      setText(row.state, LIGHT_WORDS[light.light] ?? light.light);
+      setText(row.state, LEVEL_WORDS[light.light] ?? light.light);
       setText(row.text, light.text);
     });
   }
 
   clear() {
     this._rows = [];
-    this._list.replaceChildren(make("li", { className: "soft", text: "Nothing heard yet." }));
+    this._list.replaceChildren(make("li", { className: "soft", text: "No data yet." }));
   }
 
   _build(count) {
@@ -110,27 +110,27 @@ export class PreflightList {
     const rows = [...(preflight?.rows ?? [])].sort((a, b) => (WORST_FIRST[a.level] ?? 1) - (WORST_FIRST[b.level] ?? 1));
     const count = (level) => rows.filter((row) => row.level === level).length;
     const parts = [["refuse", "refused"], ["warn", count("warn") === 1 ? "warning" : "warnings"], ["ok", "ok"], ["skipped", "skipped"]];
-    const told = parts.filter(([level]) => count(level) > 0).map(([level, word]) => `${count(level)} ${word}`);
-    setText(byId("preflight-count"), told.join(", ") || "not known");
+    const counts = parts.filter(([level]) => count(level) > 0).map(([level, word]) => `${count(level)} ${word}`);
+    setText(byId("preflight-count"), counts.join(", ") || "not known");
     byId("preflight-list").replaceChildren(...rows.map((row) => make("li", {
       data: { level: row.level },
-      children: [make("span", { className: "level", text: row.level }), make("span", { text: `${words(row.id)}: ${row.text}` })],
+      children: [make("span", { className: "level", text: row.level }), make("span", { text: `${readable(row.id)}: ${row.text}` })],
     })));
   }
 }
 
 const vector = (value, digits, unit) => (Array.isArray(value) ? `${value.map((part) => fixed(part, digits)).join("  ")} ${unit}` : NOTHING);
 
-/** Rows of the control details: name, and text from a vehicle with a stream. */
+/** Rows of the control details: name, and a function that returns the text for a vehicle with a stream. */
 const DETAILS = [
-  ["mode of PX4", ({ stream: s }) => [words(s.mode ?? "not known"), s.armed ? "armed" : "disarmed", words(s.landed)].filter(Boolean).join(", ")],
-  ["safety action", ({ stream: s }) => words(s.action)],
-  ["reference bent for", ({ stream: s }) => (s.bent_by.length > 0 ? s.bent_by.map(words).join(", ") : "nothing")],
+  ["PX4 mode", ({ stream: s }) => [readable(s.mode ?? "unknown"), s.armed ? "armed" : "disarmed", readable(s.landed)].filter(Boolean).join(", ")],
+  ["safety action", ({ stream: s }) => readable(s.action)],
+  ["reference constrained by", ({ stream: s }) => (s.bent_by.length > 0 ? s.bent_by.map(readable).join(", ") : "nothing")],
   ["position", ({ stream: s }) => vector(s.position_world_m, 2, "m")],
   ["reference", ({ stream: s }) => vector(s.reference_world_m, 2, "m")],
   ["pose from", ({ stream: s }) => s.pose_from ?? NOTHING],
-  ["force wanted", ({ stream: s }) => vector(s.control?.tau, 1, "N")],
-  ["force felt", ({ stream: s }) => vector(s.control?.force_ext_world_n, 1, "N")],
+  ["commanded force", ({ stream: s }) => vector(s.control?.tau, 1, "N")],
+  ["external force", ({ stream: s }) => vector(s.control?.force_ext_world_n, 1, "N")],
   ["arm torque", ({ stream: s }) => vector(s.control?.arm_torque_nm, 2, "N m")],
   ["ρ", ({ stream: s }) => fixed(s.control?.rho, 5)],
   ["H", ({ stream: s }) => (s.control ? s.control.h_hat.map((part) => part.toExponential(1)).join("  ") : NOTHING)],
@@ -138,7 +138,7 @@ const DETAILS = [
   ["saturated", ({ stream: s }) => (s.control ? (s.control.saturated ? "yes" : "no") : NOTHING)],
   ["payload", ({ stream: s }) => quantity(s.control?.payload_estimate_kg, 2, "kg")],
   ["stopping slack", ({ stream: s }) => quantity(s.tether?.stop_slack_m, 2, "m")],
-  ["turns of the tether", ({ stream: s }) => fixed(s.tether?.turns, 2)],
+  ["tether turns", ({ stream: s }) => fixed(s.tether?.turns, 2)],
   ["joint read to write", ({ stream: s }) => quantity(s.timing.joint_read_to_write_ms, 1, "ms")],
   ["bus read", ({ stream: s }) => quantity(s.timing.bus_read_ms, 2, "ms")],
   ["whole tick", ({ stream: s }) => quantity(s.timing.whole_ms, 2, "ms")],

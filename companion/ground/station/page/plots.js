@@ -1,19 +1,19 @@
-// The plots: what they show, and one time cursor through all of them.
+// The plots: their series and limits, and a common time cursor.
 
 import { StripChart } from "./chart.js";
 import { degrees, norm } from "./format.js";
 
 export const WINDOW_S = 30;
-const AHEAD_S = 10; // of a log the page knows what comes
+const AHEAD_S = 10; // a replay also shows the time ahead
 
 const ANGLES = ["α₁", "α₂"];
 const joint = (field, index) => (record) => degrees(record[field]?.[index]);
 const joints = (scene) => [0, 1].flatMap((index) => [
-  { value: degrees(scene.joint_max_rad[index]), label: `${ANGLES[index]} wall`, level: "bad" },
-  { value: degrees(scene.joint_min_rad[index]), label: `${ANGLES[index]} wall`, level: "bad" },
+  { value: degrees(scene.joint_max_rad[index]), label: `${ANGLES[index]} limit`, level: "bad" },
+  { value: degrees(scene.joint_min_rad[index]), label: `${ANGLES[index]} limit`, level: "bad" },
 ]);
 
-/** Every plot, from top to bottom. */
+/** All plots, from top to bottom. */
 export const PLOTS = [
   {
     title: "Position error ‖e_p‖, m", digits: 3, floor: 0, span: 0.02,
@@ -69,7 +69,7 @@ export const PLOTS = [
   },
 ];
 
-/** Window of time for a vehicle: {from, to, now}. */
+/** Time window of a vehicle: {from, to, now}. */
 export function windowOf(vehicle) {
   const now = vehicle.stream?.t_s ?? 0;
   if (!vehicle.replayed) return { from: now - WINDOW_S, to: now, now };
@@ -82,7 +82,7 @@ export function windowOf(vehicle) {
 export class Plots {
   constructor(parent, changed) {
     this.charts = PLOTS.map((spec) => new StripChart(spec));
-    this._cursor = null; // share of the window under the pointer
+    this._cursor = null; // position of the pointer in the window, 0 to 1
     this._parent = parent;
     parent.append(...this.charts.map((chart) => chart.element));
     for (const chart of this.charts) {

@@ -1,8 +1,8 @@
-// Draws lines, surfaces and labels of the world on a canvas, as a camera sees them.
+// Draws lines, areas and labels of the world on a canvas, projected by a camera.
 
 import { FONT, colours } from "./colours.js";
 
-export class Pen {
+export class Renderer {
   constructor(context, camera) {
     this.context = context;
     this.camera = camera;
@@ -38,7 +38,7 @@ export class Pen {
     context.globalAlpha = 1;
   }
 
-  /** A ball of a radius in metres, at least so many pixels. */
+  /** Draw a ball with a radius in metres, and at least `least` pixels. */
   ball(point, radius_m, colour, { least = 1.5, alpha = 1, edge = null } = {}) {
     const at = this.camera.project(point);
     if (!at) return;
@@ -57,7 +57,7 @@ export class Pen {
     context.globalAlpha = 1;
   }
 
-  /** Text beside a point; with an edge it is a label on a plate. */
+  /** Draw text next to a point; with `edge` on a plate. */
   text(point, text, { colour = colours.soft, edge = null, dx = 0, dy = 0, size = 12, align = "center" } = {}) {
     const at = this.camera.project(point);
     if (!at) return;
@@ -83,7 +83,7 @@ export class Pen {
     context.fillText(text, x, y);
   }
 
-  /** A line with a head at its end. */
+  /** Draw an arrow. */
   arrow(from, to, colour, width = 3) {
     this.line([from, to], colour, { width });
     const [a, b] = [this.camera.project(from), this.camera.project(to)];

@@ -1,4 +1,4 @@
-// Plays logs: picks, loads, scrubs, runs at a speed.
+// Replay of logs: choose, load, scrub, play at a speed.
 
 import { byId, make, setHidden, setText } from "./dom.js";
 import { clockTime, fixed } from "./format.js";
@@ -9,8 +9,8 @@ const STEP_S = 1;
 const FINE_S = 0.05;
 
 export class Replay {
-  /** @param changed called when another instant is shown; @param said called with a line for people, or null */
-  constructor(logs, changed, said) {
+  /** @param changed called when another time is displayed; @param notify called with a line for the user, or null */
+  constructor(logs, changed, notify) {
     this.vehicle = null;
     this.playing = false;
     this.speed = 1;
@@ -18,15 +18,15 @@ export class Replay {
     this.name = "";
     this._logs = logs;
     this._changed = changed;
-    this._said = said;
+    this._notify = notify;
     this._worker = null;
     this._lastMs = null;
     setHidden(byId("replay"), false);
-    byId("control").open = true; // the commands leave room for it
+    byId("control").open = true; // a replay has no command buttons, so there is room
     document.body.dataset.replay = "true";
     this._wire();
     if (logs.length > 0) this.open(0);
-    else said("No log to replay.");
+    else notify("No log to replay.");
   }
 
   _wire() {
@@ -63,7 +63,7 @@ export class Replay {
     act();
   }
 
-  /** Load a log by its number; what was shown is forgotten. */
+  /** Load a log by its index, replacing the displayed one. */
   open(index) {
     this.play(false);
     this._worker?.terminate();
@@ -72,7 +72,7 @@ export class Replay {
     const worker = new Worker("loader.js", { type: "module" });
     this._worker = worker;
     let count = 0;
-    this._said(`Loading ${this.name} …`);
+    this._notify(`Loading ${this.name} …`);
     worker.addEventListener("message", ({ data }) => {
       if (worker !== this._worker) return;
       if (data.kind === "head") {
@@ -81,13 +81,13 @@ export class Replay {
       } else if (data.kind === "streams") {
         this._more(data.streams, count);
       } else {
-        this._said(data.kind === "failed" ? `${this.name} cannot be loaded: ${data.text}` : null);
+        this._notify(data.kind === "failed" ? `${this.name} cannot be loaded: ${data.text}` : null);
         this._end();
         worker.terminate();
       }
       this._changed();
     });
-    worker.addEventListener("error", () => this._said(`${this.name} cannot be loaded: the loader did not start.`));
+    worker.addEventListener("error", () => this._notify(`${this.name} cannot be loaded: the loader did not start.`));
     worker.postMessage({ url: `replay/${index}.json` });
     this._changed();
   }
@@ -103,7 +103,7 @@ export class Replay {
     this.vehicle.load(streams);
     if (first && streams.length > 0) this.seek(streams[0].t_s);
     this._range();
-    this._said(`Loading ${this.name}: ${Math.round((100 * this.vehicle.records.length) / count)} %`);
+    this._notify(`Loading ${this.name}: ${Math.round((100 * this.vehicle.records.length) / count)} %`);
   }
 
   _range() {
@@ -113,7 +113,7 @@ export class Replay {
     slider.value = String(this.t_s);
   }
 
-  /** All is there: marks of the events on the slider. */
+  /** Draw the event marks on the slider once the log is loaded. */
   _end() {
     const lines = this.vehicle?.events?.lines ?? [];
     const span = this._to() - this._from() || 1;

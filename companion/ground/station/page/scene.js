@@ -1,4 +1,4 @@
-// The picture of the room: floor, walls, tether, planned and flown path, and the machine in it.
+// The 3D scene: room, tether, planned and flown path, and the machine.
 
 import { Camera, steer } from "./camera.js";
 import { colours, levelColour } from "./colours.js";
@@ -7,10 +7,10 @@ import { fixed, quantity } from "./format.js";
 import { add, circle, hanging, LEVEL, mix, rotate } from "./geometry.js";
 import { tetherLevel } from "./verdict.js";
 import { drawForce, drawGhost, drawMachine, drawShadow } from "./machine.js";
-import { Pen } from "./renderer.js";
+import { Renderer } from "./renderer.js";
 
 export class SceneView {
-  /** @param changed called when it should be drawn again */
+  /** @param changed called when the scene should be drawn again */
   constructor(canvas, presets, changed) {
     this.canvas = canvas;
     this.camera = new Camera();
@@ -42,52 +42,52 @@ export class SceneView {
       context.fillStyle = colours.soft;
       context.font = "15px system-ui, sans-serif";
       context.textAlign = "center";
-      context.fillText("No picture yet: the vehicle has not told its room.", width / 2, height / 2);
+      context.fillText("No scene yet: the vehicle has not sent its geometry.", width / 2, height / 2);
       return;
     }
     const room = { min: scene.room_min_world_m, max: scene.room_max_world_m };
     const position = stream?.position_world_m ?? null;
     const attitude = stream?.attitude_wxyz ?? LEVEL;
     this.camera.aim(width, height, room, position, attitude);
-    const pen = new Pen(context, this.camera);
-    drawRoom(pen, room);
-    drawReach(pen, scene, stream, position);
-    if (scene.path_world_m.length > 1) pen.line(scene.path_world_m, colours.plan, { width: 2, dash: [7, 6] });
-    drawTrail(pen, vehicle.flown());
-    drawAnchor(pen, scene);
+    const renderer = new Renderer(context, this.camera);
+    drawRoom(renderer, room);
+    drawReach(renderer, scene, stream, position);
+    if (scene.path_world_m.length > 1) renderer.line(scene.path_world_m, colours.plan, { width: 2, dash: [7, 6] });
+    drawTrail(renderer, vehicle.flown());
+    drawAnchor(renderer, scene);
     if (position === null || stream === null) return;
-    drawShadow(pen, scene, position, room.min[2]);
-    if (stream.reference_world_m) drawGhost(pen, scene, stream.reference_world_m, stream.reference_yaw_rad, stream.reference_arm_rad);
-    const behind = pen.depth(scene.anchor_world_m) > pen.depth(position);
-    if (behind) drawTether(pen, scene, stream, position, attitude);
+    drawShadow(renderer, scene, position, room.min[2]);
+    if (stream.reference_world_m) drawGhost(renderer, scene, stream.reference_world_m, stream.reference_yaw_rad, stream.reference_arm_rad);
+    const behind = renderer.depth(scene.anchor_world_m) > renderer.depth(position);
+    if (behind) drawTether(renderer, scene, stream, position, attitude);
     const caught = vehicle.eventLines().some((line) => line.id === "catch");
-    drawMachine(pen, scene, position, attitude, { arm: stream.arm_rad ?? null, caught, armed: Boolean(stream.armed) });
-    if (!behind) drawTether(pen, scene, stream, position, attitude);
+    drawMachine(renderer, scene, position, attitude, { arm: stream.arm_rad ?? null, caught, armed: Boolean(stream.armed) });
+    if (!behind) drawTether(renderer, scene, stream, position, attitude);
     const force = stream.control?.force_ext_world_n;
-    if (force && stream.arm_rad) drawForce(pen, scene, position, attitude, stream.arm_rad, force);
-    if (this.camera.pitch < 1.2) pen.text([position[0], position[1], room.min[2]], `${fixed(position[2], 2)} m`, { dx: 26, dy: 8, align: "left", colour: colours.soft });
-    drawSlack(pen, scene, stream, position, attitude);
+    if (force && stream.arm_rad) drawForce(renderer, scene, position, attitude, stream.arm_rad, force);
+    if (this.camera.pitch < 1.2) renderer.text([position[0], position[1], room.min[2]], `${fixed(position[2], 2)} m`, { dx: 26, dy: 8, align: "left", colour: colours.soft });
+    drawSlack(renderer, scene, stream, position, attitude);
   }
 }
 
-function drawRoom(pen, { min, max }) {
+function drawRoom(renderer, { min, max }) {
   const [x0, y0, z0] = min;
   const [x1, y1, z1] = max;
-  pen.area([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]], colours.floor);
+  renderer.area([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]], colours.floor);
   const step = Math.max(x1 - x0, y1 - y0) > 8 ? 1 : 0.5;
   const grid = (value) => (Math.abs(value) < 1e-9 ? { width: 1.6 } : { width: 1 });
-  for (let x = Math.ceil(x0 / step) * step; x <= x1 + 1e-9; x += step) pen.line([[x, y0, z0], [x, y1, z0]], colours.grid, grid(x));
-  for (let y = Math.ceil(y0 / step) * step; y <= y1 + 1e-9; y += step) pen.line([[x0, y, z0], [x1, y, z0]], colours.grid, grid(y));
-  for (let x = Math.ceil(x0); x <= x1; x += 1) pen.text([x, y0, z0], `${x}`, { dy: 10, size: 11 });
-  for (let y = Math.ceil(y0); y <= y1; y += 1) pen.text([x1, y, z0], `${y}`, { dx: 10, size: 11 });
+  for (let x = Math.ceil(x0 / step) * step; x <= x1 + 1e-9; x += step) renderer.line([[x, y0, z0], [x, y1, z0]], colours.grid, grid(x));
+  for (let y = Math.ceil(y0 / step) * step; y <= y1 + 1e-9; y += step) renderer.line([[x0, y, z0], [x1, y, z0]], colours.grid, grid(y));
+  for (let x = Math.ceil(x0); x <= x1; x += 1) renderer.text([x, y0, z0], `${x}`, { dy: 10, size: 11 });
+  for (let y = Math.ceil(y0); y <= y1; y += 1) renderer.text([x1, y, z0], `${y}`, { dx: 10, size: 11 });
   for (const z of [z0, z1]) {
-    pen.line([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z], [x0, y0, z]], colours.room, { width: z === z0 ? 2 : 1.2 });
+    renderer.line([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z], [x0, y0, z]], colours.room, { width: z === z0 ? 2 : 1.2 });
   }
-  for (const [x, y] of [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) pen.line([[x, y, z0], [x, y, z1]], colours.room, { width: 1.2 });
+  for (const [x, y] of [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) renderer.line([[x, y, z0], [x, y, z1]], colours.room, { width: 1.2 });
 }
 
-/** How far the tether lets the machine go, less the margin: where the sphere meets the floor and the machine's height, inside the room. */
-function drawReach(pen, scene, stream, position) {
+/** Draw the reach of the tether less its margin: the sphere's circles on the floor and at the machine's height, inside the room. */
+function drawReach(renderer, scene, stream, position) {
   const [ax, ay, az] = scene.anchor_world_m;
   const reach = scene.tether_length_m - scene.tether_margin_m;
   const colour = levelColour(tetherLevel(stream?.tether, scene));
@@ -102,49 +102,49 @@ function drawReach(pen, scene, stream, position) {
       if (inside) {
         piece.push(point);
       } else {
-        if (piece.length > 1) pen.line(piece, colour, { width: 1.3, dash: [2, 5], alpha });
+        if (piece.length > 1) renderer.line(piece, colour, { width: 1.3, dash: [2, 5], alpha });
         piece = [];
       }
     }
-    if (piece.length > 1) pen.line(piece, colour, { width: 1.3, dash: [2, 5], alpha });
+    if (piece.length > 1) renderer.line(piece, colour, { width: 1.3, dash: [2, 5], alpha });
   }
 }
 
-function drawTrail(pen, points) {
+function drawTrail(renderer, points) {
   if (points.length < 2) return;
   const recent = points.findIndex((point) => point[3] > points.at(-1)[3] - 6);
-  if (recent > 1) pen.line(points.slice(0, recent + 1), colours.trail, { width: 1.5, alpha: 0.5 });
-  pen.line(points.slice(Math.max(recent, 0)), colours.trail, { width: 2.6 });
+  if (recent > 1) renderer.line(points.slice(0, recent + 1), colours.trail, { width: 1.5, alpha: 0.5 });
+  renderer.line(points.slice(Math.max(recent, 0)), colours.trail, { width: 2.6 });
 }
 
-function drawAnchor(pen, scene) {
+function drawAnchor(renderer, scene) {
   const [x, y, z] = scene.anchor_world_m;
   const s = 0.07;
-  pen.area([[x - s, y - s, z], [x + s, y - s, z], [x + s, y + s, z], [x - s, y + s, z]], colours.soft);
-  pen.ball(scene.anchor_world_m, 0.035, colours.ink, { least: 3 });
-  pen.text(scene.anchor_world_m, "anchor", { dy: 15, size: 12 });
+  renderer.area([[x - s, y - s, z], [x + s, y - s, z], [x + s, y + s, z], [x - s, y + s, z]], colours.soft);
+  renderer.ball(scene.anchor_world_m, 0.035, colours.ink, { least: 3 });
+  renderer.text(scene.anchor_world_m, "anchor", { dy: 15, size: 12 });
 }
 
 const attachment = (scene, position, attitude) => add(position, rotate(attitude, scene.attachment_body_m));
 
-function drawTether(pen, scene, stream, position, attitude) {
+function drawTether(renderer, scene, stream, position, attitude) {
   const end = attachment(scene, position, attitude);
   const level = tetherLevel(stream.tether, scene);
-  // A line that pulls is straight, whatever its length says.
+  // A taut tether is drawn straight, whatever its nominal length.
   const points = level === "bad" ? [scene.anchor_world_m, end] : hanging(scene.anchor_world_m, end, scene.tether_length_m, scene.room_min_world_m[2]);
-  pen.line(points, colours.card, { width: 5.5, alpha: 0.7 });
-  pen.line(points, levelColour(level), { width: level === "bad" ? 4 : 2.8 });
+  renderer.line(points, colours.card, { width: 5.5, alpha: 0.7 });
+  renderer.line(points, levelColour(level), { width: level === "bad" ? 4 : 2.8 });
 }
 
-function drawSlack(pen, scene, stream, position, attitude) {
+function drawSlack(renderer, scene, stream, position, attitude) {
   const { tether } = stream;
   if (!tether) return;
   const level = tetherLevel(tether, scene);
   const word = tether.snagged ? "SNAGGED · " : tether.taut ? "TAUT · " : "";
   const end = attachment(scene, position, attitude);
-  const [from, to] = [pen.camera.project(scene.anchor_world_m), pen.camera.project(end)];
-  // Beside the line, away from the vehicle.
+  const [from, to] = [renderer.camera.project(scene.anchor_world_m), renderer.camera.project(end)];
+  // Next to the line, away from the vehicle.
   const aside = from && to && from[0] > to[0] + 20 ? 84 : -84;
   const middle = mix(scene.anchor_world_m, end, 0.3);
-  pen.text(pen.camera.project(middle) ? middle : end, `${word}slack ${quantity(tether.slack_m, 2, "m")}`, { colour: level === "unknown" ? colours.soft : levelColour(level), edge: levelColour(level), size: 13, dx: aside });
+  renderer.text(renderer.camera.project(middle) ? middle : end, `${word}slack ${quantity(tether.slack_m, 2, "m")}`, { colour: level === "unknown" ? colours.soft : levelColour(level), edge: levelColour(level), size: 13, dx: aside });
 }

@@ -1,7 +1,7 @@
-// The top bar, the banner of staleness, and who else is there.
+// The top bar: status, staleness banner, choice of vehicle.
 
 import { byId, make, setData, setHidden, setText } from "./dom.js";
-import { age, clockTime, fixed, NOTHING, words } from "./format.js";
+import { age, clockTime, fixed, NOTHING, readable } from "./format.js";
 
 export class TopBar {
   constructor(onPick) {
@@ -74,7 +74,7 @@ export class TopBar {
 
   _course(vehicle) {
     const stream = vehicle?.stream ?? null;
-    setText(byId("phase"), stream ? words(stream.phase) : NOTHING);
+    setText(byId("phase"), stream ? readable(stream.phase) : NOTHING);
     const planned = vehicle?.scene?.mission_s;
     setText(byId("mission-time"), stream ? `${clockTime(stream.mission_t_s)}${planned ? ` of ${clockTime(planned)}` : ""}` : NOTHING);
     const progress = byId("progress");

@@ -1,9 +1,9 @@
-// What is known of one vehicle: newest records, the last seconds for the plots, the path that it flew.
+// State of one vehicle: newest records, recent stream messages for the plots, the flown path.
 
 const HISTORY_S = 40;
 const TRAIL_STEP_M = 0.02;
 const TRAIL_MAX = 6000;
-const DRIFT = 1e-4; // two clocks may run apart by so much
+const DRIFT = 1e-4; // largest relative drift between two clocks
 
 /** Index of the first record later than t_s, in records that are sorted by t_s. */
 export function after(records, t_s) {
@@ -28,23 +28,23 @@ export class Vehicle {
     this.forget();
   }
 
-  /** Everything of the stream: a new session starts with nothing. */
+  /** Discard all stream data, for a new session. */
   forget() {
     this.stream = null;
     this.records = [];
     this.trail = [];
     this.lost = 0;
-    this.heardMs = null;
+    this.receivedMs = null;
     this.takeoff_s = null;
     this._offsetMs = null;
     this._lateS = 0;
   }
 
-  /** A record of this vehicle; `lateS`: how old it was when the monitor got it. */
+  /** Add a record of this vehicle; `lateS` is its delay until it reached the monitor. */
   take(kind, data, nowMs, lateS = 0) {
     if (kind === "stream") this._takeStream(data, nowMs, lateS);
     else if (kind === "state" || kind === "scene" || kind === "preflight" || kind === "events") this[kind] = data;
-    if (kind === "state" && this.heardMs === null) this.heardMs = nowMs;
+    if (kind === "state" && this.receivedMs === null) this.receivedMs = nowMs;
   }
 
   _takeStream(data, nowMs, lateS) {
@@ -53,9 +53,9 @@ export class Vehicle {
     if (last !== null && data.t_s <= last.t_s) return;
     if (last !== null) this.lost += Math.max(0, data.seq - last.seq - 1);
     const offsetMs = nowMs - data.t_s * 1000;
-    const passedMs = this.heardMs === null ? 0 : nowMs - this.heardMs;
+    const passedMs = this.receivedMs === null ? 0 : nowMs - this.receivedMs;
     this._offsetMs = this._offsetMs === null ? offsetMs : Math.min(offsetMs, this._offsetMs + passedMs * DRIFT);
-    this.heardMs = nowMs;
+    this.receivedMs = nowMs;
     this._lateS = lateS;
     this.stream = data;
     this.records.push(data);
@@ -65,7 +65,7 @@ export class Vehicle {
     this._follow(data);
   }
 
-  /** Records of a log, in order; they may come in several pieces. */
+  /** Add stream messages of a log, in order; may be called repeatedly. */
   load(streams) {
     for (const data of streams) {
       this.records.push(data);
@@ -73,7 +73,7 @@ export class Vehicle {
     }
   }
 
-  /** Show the instant t_s of a log. */
+  /** Select the time t_s of a log. */
   seek(t_s) {
     if (this.records.length === 0) return;
     this.stream = this.records[Math.max(0, after(this.records, t_s) - 1)];
@@ -90,21 +90,21 @@ export class Vehicle {
   }
 
   /**
-   * Age of what is shown, s: time since the newest stream record was made, as far as can be told without common clocks. A record that
-   * was long on its way is old when it arrives. null: there never was one.
+   * Age of the displayed data, s: time since the newest stream message was sent, estimated without a common clock. A message that
+   * was delayed is old when it arrives. null if there was none.
    */
   ageS(nowMs) {
     if (this.stream === null || this._offsetMs === null) return null;
     const byItsClockS = (nowMs - this._offsetMs) / 1000 - this.stream.t_s;
-    return Math.max(0, byItsClockS, this._lateS + (nowMs - this.heardMs) / 1000);
+    return Math.max(0, byItsClockS, this._lateS + (nowMs - this.receivedMs) / 1000);
   }
 
-  /** Seconds since anything was known of it, where no stream was ever heard. */
+  /** Seconds since the vehicle became known, if no stream message has arrived. */
   silentS(nowMs) {
-    return this.heardMs === null ? null : (nowMs - this.heardMs) / 1000;
+    return this.receivedMs === null ? null : (nowMs - this.receivedMs) / 1000;
   }
 
-  /** Events of the session that is shown, up to the instant that is shown; oldest first, each with its number in the session. */
+  /** Events of the displayed session up to the displayed time, oldest first, each with its number in the session. */
   eventLines() {
     if (this.events === null || (this.stream !== null && this.events.session !== this.stream.session)) return [];
     const first = this.events.count - this.events.lines.length;
@@ -112,7 +112,7 @@ export class Vehicle {
     return this.replayed && this.stream !== null ? lines.filter((line) => line.t_s <= this.stream.t_s + 1e-9) : lines;
   }
 
-  /** The flown path up to the instant that is shown. */
+  /** The flown path up to the displayed time. */
   flown() {
     if (!this.replayed || this.stream === null) return this.trail;
     const end = this.trail.findIndex((point) => point[3] > this.stream.t_s);

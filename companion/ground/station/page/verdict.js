@@ -1,14 +1,14 @@
-// Is it safe? Pure judgement of what is known of a vehicle: the big word, why, how grave, how old.
+// Assessment of a vehicle's state for the top bar: status word, reason, level, age. Pure.
 
-import { age, quantity, words } from "./format.js";
+import { age, quantity, readable } from "./format.js";
 
-/** Older than this is stale. The page looks every 100 ms: the banner is there within 0.5 s of the last message. */
+/** Age at which data is stale. The page updates every 100 ms, so the banner appears within 0.5 s of the last message. */
 export const STALE_AFTER_S = 0.4;
 
 const RANK = { unknown: 0, ok: 1, warn: 2, bad: 3 };
 const ACTIONS = {
-  hold: ["HOLDING", "warn", "comes to rest on the planned way and stays"],
-  retract: ["RETURNING", "warn", "arm folds, back along the tether, then it lands"],
+  hold: ["HOLDING", "warn", "stops on the planned path and holds"],
+  retract: ["RETURNING", "warn", "folds the arm, returns along the tether, then lands"],
   land: ["LANDING", "warn", "the companion lands"],
   autopilot_land: ["LANDING", "bad", "PX4 lands by itself"],
   terminate: ["TERMINATED", "bad", "rotors are stopped"],
@@ -30,12 +30,12 @@ export function trackingLevel(e_p_m, scene) {
   return e_p_m >= scene.tracking_warn_m ? "warn" : "ok";
 }
 
-/** The graver of two levels. */
-export function graver(a, b) {
+/** The worse of two levels. */
+export function worse(a, b) {
   return RANK[b] > RANK[a] ? b : a;
 }
 
-/** Presence with one's own eyes: a stream that flows outweighs what an older session left behind. */
+/** Presence of a vehicle: a live stream outweighs the retained state of an older session. */
 export function presenceOf(vehicle, ageS) {
   const { state, stream } = vehicle;
   if (state === null) return stream === null ? "unknown" : "flying";
@@ -48,23 +48,23 @@ export function presenceOf(vehicle, ageS) {
  * @param link {open, broker: {connected, text}, everOpen}
  * @returns {word, why, level, presence, stale, ended, ageS, banner: null | {word, text}}
  */
-export function judge(vehicle, link, nowMs) {
-  const cut = linkTrouble(link);
+export function assess(vehicle, link, nowMs) {
+  const broken = linkProblem(link);
   if (vehicle === null || (vehicle.state === null && vehicle.stream === null)) {
     const idle = { word: "WAITING", why: "for a vehicle", level: "unknown", presence: "unknown", stale: false, ended: false, ageS: null };
-    return { ...idle, stale: cut !== null, banner: cut };
+    return { ...idle, stale: broken !== null, banner: broken };
   }
-  if (vehicle.replayed) return judgeReplayed(vehicle);
+  if (vehicle.replayed) return assessReplay(vehicle);
   const ageS = vehicle.ageS(nowMs);
   const presence = presenceOf(vehicle, ageS);
-  const verdict = presence === "flying" && vehicle.stream !== null ? judgeStream(vehicle) : judgePresence(vehicle, presence);
+  const verdict = presence === "flying" && vehicle.stream !== null ? assessStream(vehicle) : assessPresence(vehicle, presence);
   const ended = presence === "ended";
   const tooOld = ageS === null ? (vehicle.silentS(nowMs) ?? 0) > STALE_AFTER_S : ageS > STALE_AFTER_S;
-  const stale = cut !== null || presence === "lost" || presence === "silent" || (!ended && tooOld);
-  return { ...verdict, presence, ended, ageS, stale, banner: stale ? staleWords(vehicle, verdict, presence, ageS, cut) : null };
+  const stale = broken !== null || presence === "lost" || presence === "silent" || (!ended && tooOld);
+  return { ...verdict, presence, ended, ageS, stale, banner: stale ? staleBanner(vehicle, verdict, presence, ageS, broken) : null };
 }
 
-function linkTrouble(link) {
+function linkProblem(link) {
   if (!link.open) {
     return link.everOpen ? { word: "NO CONNECTION", text: "to the monitor on the ground, trying again" } : null;
   }
@@ -72,43 +72,43 @@ function linkTrouble(link) {
   return null;
 }
 
-function staleWords(vehicle, verdict, presence, ageS, cut) {
+function staleBanner(vehicle, verdict, presence, ageS, broken) {
   const known = presence === "flying" && verdict.level !== "unknown";
-  const was = known ? `it was ${verdict.word} in "${words(vehicle.stream.phase)}"; nobody knows now` : verdict.why;
-  const old = ageS === null ? "nothing was ever heard from it" : "";
+  const was = known ? `last known: ${verdict.word} in "${readable(vehicle.stream.phase)}"` : verdict.why;
+  const old = ageS === null ? "no data was ever received" : "";
   const joined = (...parts) => parts.filter(Boolean).join(" · ");
-  if (cut !== null) return { word: cut.word, text: joined(cut.text, known ? was : "", old) };
+  if (broken !== null) return { word: broken.word, text: joined(broken.text, known ? was : "", old) };
   if (presence === "lost" || presence === "silent") return { word: presence.toUpperCase(), text: joined(verdict.why, old) };
   return { word: "STALE", text: joined(ageS === null ? "" : was, old) };
 }
 
-function judgePresence(vehicle, presence) {
+function assessPresence(vehicle, presence) {
   const text = vehicle.state?.text;
-  if (presence === "lost") return { word: "LOST", why: text || "its connection broke without a word", level: "bad" };
-  if (presence === "silent") return { word: "SILENT", why: text || "the flight process says nothing; the guardian may be landing it", level: "bad" };
-  if (presence === "ended") return judgeEnd(vehicle.state);
+  if (presence === "lost") return { word: "LOST", why: text || "its connection was lost", level: "bad" };
+  if (presence === "silent") return { word: "SILENT", why: text || "the flight process sends nothing; the guardian may be landing the vehicle", level: "bad" };
+  if (presence === "ended") return assessEnd(vehicle.state);
   return { word: "WAITING", why: "for its first data", level: "unknown" };
 }
 
-function judgeEnd(state) {
+function assessEnd(state) {
   const outcome = state?.outcome;
   const level = outcome === "completed" ? "ok" : outcome === "crashed" || outcome === "lost" ? "bad" : outcome ? "warn" : "unknown";
-  return { word: "ENDED", why: [words(outcome ?? "outcome not known"), state?.text].filter(Boolean).join(": "), level };
+  return { word: "ENDED", why: [readable(outcome ?? "unknown outcome"), state?.text].filter(Boolean).join(": "), level };
 }
 
-function judgeReplayed(vehicle) {
+function assessReplay(vehicle) {
   const { records, stream, state } = vehicle;
   const rest = { presence: "flying", stale: false, ended: false, ageS: null, banner: null };
   if (stream === null) return { ...rest, word: "LOADING", why: "the log", level: "unknown" };
-  if (stream === records.at(-1) && state?.outcome) return { ...rest, ...judgeEnd(state) };
-  return { ...rest, ...judgeStream(vehicle) };
+  if (stream === records.at(-1) && state?.outcome) return { ...rest, ...assessEnd(state) };
+  return { ...rest, ...assessStream(vehicle) };
 }
 
-function judgeStream({ stream, scene }) {
+function assessStream({ stream, scene }) {
   const acting = ACTIONS[stream.action];
   const airborne = stream.kind === "takeoff" || stream.kind === "flight" || stream.kind === "landing";
   const onGround = stream.kind === "ground" || stream.kind === "done";
-  let word = KINDS[stream.kind] ?? words(stream.kind).toUpperCase();
+  let word = KINDS[stream.kind] ?? readable(stream.kind).toUpperCase();
   let level = stream.action === "warn" ? "warn" : "ok";
   const reasons = [];
   if (acting && !(onGround && stream.action === "hold")) {
@@ -116,22 +116,22 @@ function judgeStream({ stream, scene }) {
     level = acting[1];
     reasons.push(acting[2]);
   }
-  if (stream.waits_for_start) reasons.push("all is well: it waits for START");
+  if (stream.waits_for_start) reasons.push("ready: waits for START");
   if (onGround && stream.armed) reasons.push("rotors are armed");
-  const trouble = troubles(stream, scene, airborne);
-  for (const item of trouble) level = graver(level, item.level);
-  trouble.sort((a, b) => RANK[b.level] - RANK[a.level]);
-  return { word, level, why: [...trouble.map((item) => item.text), ...reasons].slice(0, 3).join(" · ") || "all is well" };
+  const found = problems(stream, scene, airborne);
+  for (const item of found) level = worse(level, item.level);
+  found.sort((a, b) => RANK[b.level] - RANK[a.level]);
+  return { word, level, why: [...found.map((item) => item.text), ...reasons].slice(0, 3).join(" · ") || "all is well" };
 }
 
-function troubles(stream, scene, airborne) {
+function problems(stream, scene, airborne) {
   const found = [];
   for (const light of stream.lights ?? []) {
     if (light.light === "warn" || light.light === "bad") found.push({ level: light.light, text: `${light.name}: ${light.text}` });
   }
   const tether = tetherLevel(stream.tether, scene);
-  const told = found.some((item) => item.text.startsWith("tether"));
-  if (airborne && !told && (tether === "warn" || tether === "bad")) {
+  const reported = found.some((item) => item.text.startsWith("tether"));
+  if (airborne && !reported && (tether === "warn" || tether === "bad")) {
     const how = stream.tether.snagged ? "tether snagged" : stream.tether.taut ? "tether taut" : "little tether left";
     found.push({ level: tether, text: `${how}, slack ${quantity(stream.tether.slack_m, 2, "m")}` });
   }
