@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import signal
 import sys
-import termios
 import threading
 import time
-import tty
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
 
 from companion.config.loader import FlightConfig
 from companion.io.devices import AvailableDevices, Devices
@@ -28,6 +23,7 @@ from companion.preflight.checks import Check
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.hand_test.run import TOLD, HandResult, HandSample, HandTest, HandView, Step
+from companion.runtime.terminal import Bars, pressed, raw_keys
 
 LOOK_PERIOD_S: Final = 0.004
 ARM_PERIOD_S: Final = 0.02
@@ -82,16 +78,18 @@ async def perform(
         return f"{missing} is not open"
     test, clock, arm_due_s = HandTest(), _StampClock(), 0.0
     stop = asyncio.Event()
-    with (
-        _ended_by_hand(stop),
-        _Screen(Console(stderr=True) if json and console.file is sys.stdout else console) as screen,
-    ):
+    if json and console.file is sys.stdout:
+        console = Console(stderr=True)
+    console.print(
+        "[bold]hand test[/]  battery in, motors disarmed, propellers off; the operator carries the vehicle (any key ends the test)"
+    )
+    with _interrupted(stop), raw_keys() as keys, Bars(console, ["hand test"]) as bars:
         while True:
             pose, vehicle, status = mocap.latest(), autopilot.vehicle(), autopilot.status()
             now_s = clock.now(pose, vehicle, status)
             view = test.update(HandSample(now_s, pose, vehicle, _armed(status, now_s, config)))
-            screen.show(view)
-            if view.result is not None or view.ended or stop.is_set():
+            _show(bars, view)
+            if view.result is not None or view.ended or stop.is_set() or pressed(keys):
                 break
             if arm is not None and now_s >= arm_due_s:
                 arm_due_s = now_s + ARM_PERIOD_S
@@ -139,68 +137,22 @@ class _StampClock:
 
 
 @contextlib.contextmanager
-def _ended_by_hand(stop: asyncio.Event) -> Iterator[None]:
-    """Set the event on any key at a terminal, or on Ctrl-C."""
-    loop = asyncio.get_running_loop()
-    with contextlib.ExitStack() as stack:
-        if threading.current_thread() is threading.main_thread():
-            before = signal.getsignal(signal.SIGINT)
-            loop.add_signal_handler(signal.SIGINT, stop.set)
-            stack.callback(signal.signal, signal.SIGINT, before)
-            stack.callback(loop.remove_signal_handler, signal.SIGINT)
-        if sys.stdin is not None and sys.stdin.isatty():
-            descriptor = sys.stdin.fileno()
-            settings = termios.tcgetattr(descriptor)
-            stack.callback(termios.tcsetattr, descriptor, termios.TCSANOW, settings)
-            tty.setcbreak(descriptor, termios.TCSANOW)
-
-            def on_key() -> None:
-                os.read(descriptor, 64)
-                stop.set()
-
-            loop.add_reader(descriptor, on_key)
-            stack.callback(loop.remove_reader, descriptor)
+def _interrupted(stop: asyncio.Event) -> Iterator[None]:
+    """Set the event on Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
         yield
+        return
+    loop, before = asyncio.get_running_loop(), signal.getsignal(signal.SIGINT)
+    loop.add_signal_handler(signal.SIGINT, stop.set)
+    try:
+        yield
+    finally:
+        loop.remove_signal_handler(signal.SIGINT)
+        signal.signal(signal.SIGINT, before)
 
 
-class _Screen:
-    """Progress display: a bar for the current step; without a terminal one line per step."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._step: Step | None = None
-        self._notice = ""
-        self._progress = Progress(
-            TextColumn("  {task.description:<10}"),
-            BarColumn(bar_width=28),
-            TextColumn("{task.fields[seen]}", markup=False),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._progress.add_task("", total=1.0, seen="")
-
-    def __enter__(self) -> _Screen:
-        self._console.print(
-            "[bold]hand test[/]  battery in, motors disarmed, propellers off; the operator carries the vehicle (any key ends the test)"
-        )
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def show(self, view: HandView) -> None:
-        """Show the newest state."""
-        if view.step is not self._step:
-            self._step = view.step
-            number = f"{_STEPS.index(view.step) + 1}/{len(_STEPS)}" if view.step in _STEPS else "   "
-            self._line(f"{number}  {TOLD[view.step]}")
-        if view.notice != self._notice:
-            self._notice = view.notice
-            if view.notice:
-                self._line(f"     [yellow]{escape(view.notice)}[/]")
-        self._progress.update(self._task, description=view.step.value, completed=view.progress, seen=view.seen)
-
-    def _line(self, text: str) -> None:
-        self._progress.console.print(f"  {text}", highlight=False)
+def _show(bars: Bars, view: HandView) -> None:
+    """Show the step, how far it is, and why the last attempt did not count."""
+    number = f"{_STEPS.index(view.step) + 1}/{len(_STEPS)}" if view.step in _STEPS else "   "
+    bars.say(f"   {view.notice}" if view.notice else f"{number}  {TOLD[view.step]}", "yellow" if view.notice else "")
+    bars.show([view.progress], [f"{view.step.value}  {view.seen}"])
