@@ -11,8 +11,6 @@ import pytest
 
 from companion.commissioning.latency import fit as latency_fit
 from companion.commissioning.latency.fit import (
-    ImuSample,
-    PoseSample,
     Tap,
     TapDelay,
     agreeing,
@@ -23,6 +21,7 @@ from companion.commissioning.latency.fit import (
 )
 from companion.commissioning.latency.tools import Measured, rows, text
 from companion.model.types import Quat, Vec3
+from companion.preflight.hand_test.motion import ImuAt, PoseAt
 
 TAPS_AT_S = (2.0, 3.13, 4.21, 5.4, 6.52, 7.61)
 TAP_S = 0.024
@@ -40,7 +39,7 @@ def tapped(
     accel_noise: float = 0.15,
     mocap_noise_m: float = 0.0002,
     seed: int = 3,
-) -> tuple[list[ImuSample], list[PoseSample]]:
+) -> tuple[list[ImuAt], list[PoseAt]]:
     """A machine that is held by a spring and tapped along x and z: continuous truth at 10 kHz, sampled as IMU and motion capture do."""
     rng = np.random.default_rng(seed)
     dt = 1e-4
@@ -64,17 +63,17 @@ def tapped(
         mean = (total[int(now / dt)] - total[int(before / dt)]) / (int(now / dt) - int(before / dt)) / dt
         force = way * mean + np.array([0.0, 0.0, 9.81]) + rng.normal(0.0, accel_noise, 3)
         rate = rng.normal(0.0, 0.01, 3)
-        imu.append(ImuSample(float(now), vector(force), vector(rate)))
+        imu.append(ImuAt(float(now), vector(force), vector(rate)))
     poses = []
     for exposed_s in np.arange(0.1, 8.7, 0.005):
         place = way * x[int(exposed_s / dt)] + rng.normal(0.0, mocap_noise_m, 3)
         turn = rng.normal(0.0, 0.5 * math.radians(0.05), 3)
         attitude: Quat = (1.0, float(turn[0]), float(turn[1]), float(turn[2]))
-        poses.append(PoseSample(float(exposed_s) + delay_s, vector(place), attitude))
+        poses.append(PoseAt(float(exposed_s) + delay_s, vector(place), attitude))
     return imu, poses
 
 
-def measured(imu: list[ImuSample], poses: list[PoseSample]) -> list[TapDelay]:
+def measured(imu: list[ImuAt], poses: list[PoseAt]) -> list[TapDelay]:
     noise = mocap_noise(poses)
     return [measure_tap(tap, imu, poses, noise) for tap in find_taps(imu)]
 

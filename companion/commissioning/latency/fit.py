@@ -1,10 +1,10 @@
-"""How late motion capture is, from taps on the airframe: what the IMU felt against what was seen. Pure.
+"""Delay of motion capture from taps on the airframe, by comparing it with the IMU. Pure.
 
 A tap is a kink in the position: too small for a second difference of motion capture, whose noise of 0.2 mm makes 20 m/s^2 at 200 Hz.
-So the IMU is integrated instead. Around each tap the specific force is turned into the world and integrated twice, the gyro once;
-position and rotation by motion capture are regressed on that, shifted by a delay, beside a polynomial that takes up whatever is slow:
-starting values, gravity, bias, a hand that sways. The delay with the least residual is where the two correlate best; a parabola through
-it tells it finer than the samples, and its curvature tells the error.
+So the IMU is integrated instead. Around each tap the specific force is rotated into the world and integrated twice, the gyro once.
+Position and rotation by motion capture are regressed on that, shifted by a delay, and on a polynomial for everything slow: initial
+values, gravity, bias, the sway of the hand. The residual is least at the delay; a parabola through the minimum gives it finer than the
+samples, and its curvature the error. IMU samples are on the companion's clock, poses are stamped on arrival at the companion.
 """
 
 from __future__ import annotations
@@ -13,59 +13,43 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.model.frames import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
-from companion.model.types import Quat, Vec3
-from companion.preflight.hand_test.motion import mean_attitude, rotation_vector
+from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate
+from companion.model.types import Quat
+from companion.preflight.hand_test.motion import ImuAt, PoseAt, mean_attitude, rotation_vector, turned
 
 Floats = NDArray[np.float64]
 
 DELAY_SPAN_S: Final = (-0.020, 0.150)
 TAPS_MIN: Final = 5
 STRENGTH_MIN_M_S2: Final = 1.5
-"""Peak of the specific force beside what is slow."""
+"""Peak of the specific force without its slow part."""
 NOISE_FACTOR: Final = 7.0
-"""A tap stands out of the IMU's own noise by this."""
+"""Ratio of a tap to the IMU's noise."""
 CORRELATION_MIN: Final = 0.5
 TAP_ERROR_MAX_S: Final = 0.004
 """Standard error of one tap's delay."""
 ERROR_MAX_S: Final = 0.0015
 """Standard error of the result."""
 BEFORE_S, AFTER_S = 0.08, 0.16
-"""Of the tap, as far as motion capture is compared."""
+"""Span around a tap in which motion capture is compared."""
 SETTLE_S: Final = 0.35
-"""After a tap until all of it has arrived, delay included."""
+"""Time after a tap until all of it has arrived, delay included."""
 APART_S: Final = 0.45
 _SLOW_S: Final = 0.10
-"""Half the width of the moving mean that tells what is slow."""
+"""Half the width of the moving mean that separates the slow part."""
 _COARSE_S, _FINE_S = 0.004, 0.0005
 _POLYNOMIAL_POSITION, _POLYNOMIAL_ROTATION = 3, 1
 _GRAVITY: Final = np.array([0.0, 0.0, 9.81])
 
 
-class ImuSample(NamedTuple):
-    """PX4's IMU, body FLU; its own stamp of the sample, told on the companion's clock."""
-
-    t_s: float
-    force_m_s2: Vec3
-    rate_rad_s: Vec3
-
-
-class PoseSample(NamedTuple):
-    """Motion capture, world ENU and body FLU; stamped on arrival at the companion."""
-
-    t_s: float
-    position_m: Vec3
-    attitude: Quat
-
-
 @dataclass(frozen=True, slots=True)
 class Tap:
-    """One tap as the IMU felt it."""
+    """One tap as the IMU measured it."""
 
     t_s: float
     strength_m_s2: float
@@ -73,22 +57,22 @@ class Tap:
 
 @dataclass(frozen=True, slots=True)
 class TapDelay:
-    """What one tap says."""
+    """The delay by one tap."""
 
     tap: Tap
     delay_s: float
     """From exposure, by PX4's clock, to the arrival of the pose at the companion."""
     error_s: float
-    """Standard error by the curvature of the residual."""
+    """Standard error from the curvature of the residual."""
     correlation: float
-    """Of what is not slow: 1 if the shifted IMU explains all of it."""
+    """Without the slow part: 1 if the shifted IMU explains all of the motion."""
     problem: str
-    """Why it does not count; empty: it does."""
+    """Why it does not count; empty if it does."""
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """All taps together."""
+    """The delay by all taps."""
 
     delay_s: float
     error_s: float
@@ -98,8 +82,8 @@ class Delay:
     used: tuple[TapDelay, ...]
 
 
-def find_taps(imu: Sequence[ImuSample]) -> list[Tap]:
-    """Taps in order of time: short, strong, and quiet before."""
+def find_taps(imu: Sequence[ImuAt]) -> list[Tap]:
+    """Return the taps in order of time: peaks of the specific force that are strong and `APART_S` from stronger ones."""
     if len(imu) < 100:
         return []
     t = np.array([sample.t_s for sample in imu])
@@ -118,10 +102,8 @@ def find_taps(imu: Sequence[ImuSample]) -> list[Tap]:
     return sorted(taps, key=lambda tap: tap.t_s)
 
 
-def measure_tap(
-    tap: Tap, imu: Sequence[ImuSample], poses: Sequence[PoseSample], noise: tuple[float, float]
-) -> TapDelay:
-    """The delay that this tap shows.
+def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: tuple[float, float]) -> TapDelay:
+    """Measure the delay by one tap.
 
     Args:
         tap: found in `imu`.
@@ -141,7 +123,7 @@ def measure_tap(
         if step_s == _FINE_S:
             first_s, last_s = delay_s - 2.0 * _COARSE_S, delay_s + 2.0 * _COARSE_S
         grid = np.arange(first_s, last_s + 0.5 * step_s, step_s)
-        # The coarse round looks wherever the tap may have arrived, the fine one around where it did.
+        # The coarse round covers every possible delay, the fine one the neighbourhood of the best.
         centre_s = tap.t_s + (delay_s if step_s == _FINE_S else 0.0)
         until_s = centre_s + AFTER_S + (high if step_s == _COARSE_S else 0.0)
         window = [pose for pose in seen if centre_s - BEFORE_S <= pose.t_s <= until_s]
@@ -158,9 +140,9 @@ def measure_tap(
     error_s = math.sqrt(2.0 * scatter / curvature) if curvature > 0.0 else math.inf
     problem = ""
     if correlation < CORRELATION_MIN:
-        problem = f"too weak: what was felt explains too little of what was seen (correlation {correlation:.2f})"
+        problem = f"too weak: the IMU explains too little of what motion capture saw (correlation {correlation:.2f})"
     elif error_s > TAP_ERROR_MAX_S:
-        problem = f"too weak: its time is known to {1e3 * error_s:.1f} ms only"
+        problem = f"too weak: its time is only known to {1e3 * error_s:.1f} ms"
     return TapDelay(tap, delay_s, error_s, correlation, problem)
 
 
@@ -175,7 +157,7 @@ def agreeing(taps: Sequence[TapDelay]) -> list[TapDelay]:
 
 
 def combine(taps: Sequence[TapDelay]) -> Delay | str:
-    """The mean of all taps that count and agree; or why there is none."""
+    """Return the mean of all taps that count and agree, or why there is none."""
     good = agreeing(taps)
     if len(good) < TAPS_MIN:
         weak = [tap.problem for tap in taps if tap.problem]
@@ -186,28 +168,28 @@ def combine(taps: Sequence[TapDelay]) -> Delay | str:
     error_s = spread_s / math.sqrt(len(good))
     if error_s > ERROR_MAX_S:
         return (
-            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), the mean is known to {1e3 * error_s:.1f} ms only, "
+            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), the mean is only known to {1e3 * error_s:.1f} ms, "
             f"{1e3 * ERROR_MAX_S:g} ms are needed"
         )
     return Delay(float(values.mean()), error_s, spread_s, tuple(good))
 
 
-def mocap_noise(poses: Sequence[PoseSample]) -> tuple[float, float]:
-    """One sigma of one axis, m and rad, from third differences: motion is smoother than noise. At least 20 poses."""
+def mocap_noise(poses: Sequence[PoseAt]) -> tuple[float, float]:
+    """Return the noise of one axis (one sigma, m and rad) from third differences of at least 20 poses, which motion hardly changes."""
     p = np.array([pose.position_m for pose in poses])
     turns = np.array(
         [rotation_vector(quat_multiply(quat_conjugate(a.attitude), b.attitude)) for a, b in pairwise(poses)]
     )
     third, second = np.diff(p, 3, axis=0), np.diff(turns, 2, axis=0)
-    # Third differences of white noise have a variance of 20; the median bears a few taps.
+    # Third differences of white noise have a variance of 20; the median tolerates a few taps.
     sigma = [float(np.median(np.abs(values))) / 0.6745 / math.sqrt(20.0) for values in (third, second)]
     return max(sigma[0], 1e-6), max(sigma[1], 1e-6)
 
 
 class _Course:
-    """Position and rotation that the IMU's samples make, at any time between them."""
+    """Position and rotation by integration of the IMU, at any time between its samples."""
 
-    def __init__(self, imu: Sequence[ImuSample], start: Quat) -> None:
+    def __init__(self, imu: Sequence[ImuAt], start: Quat) -> None:
         self._start = start
         self._t = np.array([sample.t_s for sample in imu])
         q = start
@@ -217,7 +199,7 @@ class _Course:
         for before, now in pairwise(imu):
             # A sample is the mean since the one before it, as PX4 integrates.
             dt = now.t_s - before.t_s
-            half = _turned(q, now.rate_rad_s, 0.5 * dt)
+            half = turned(q, now.rate_rad_s, 0.5 * dt)
             a = np.array(quat_rotate(half, now.force_m_s2)) - _GRAVITY
             rate = np.array(quat_rotate(quat_multiply(quat_conjugate(start), half), now.rate_rad_s))
             pulls.append(a)
@@ -225,17 +207,15 @@ class _Course:
             p = p + v * dt + 0.5 * a * dt * dt
             v = v + a * dt
             r = r + rate * dt
-            q = _turned(q, now.rate_rad_s, dt)
+            q = turned(q, now.rate_rad_s, dt)
             places.append(p)
             speeds.append(v)
             turns.append(r)
         self._p, self._v, self._a = np.array(places), np.array(speeds), np.array([*pulls, pulls[-1]])
         self._r, self._w = np.array(turns), np.array([*rates, rates[-1]])
 
-    def costs(
-        self, window: Sequence[PoseSample], delays: Floats, noise: tuple[float, float]
-    ) -> tuple[Floats, float, int]:
-        """Of each delay: residual in units of the noise; the residual without an IMU; degrees of freedom."""
+    def costs(self, window: Sequence[PoseAt], delays: Floats, noise: tuple[float, float]) -> tuple[Floats, float, int]:
+        """Return the residual of each delay in units of the noise, the residual without an IMU, and the degrees of freedom."""
         t = np.array([pose.t_s for pose in window])
         s = (t - t[0]) / (t[-1] - t[0])
         place = np.array([pose.position_m for pose in window])
@@ -253,7 +233,7 @@ class _Course:
                 fast = (felt - slow @ (slow.T @ felt)) / sigma
                 power = float((fast**2).sum())
                 share = float((fast * seen).sum()) / power if power > 0.0 else 0.0
-                # A metre felt may be a little more or less than one seen, never its opposite.
+                # The scales of both may differ a little, their signs may not.
                 share = min(1.5, max(0.0, share))
                 cost += float(((seen - share * fast) ** 2).sum())
             costs.append(cost)
@@ -268,12 +248,12 @@ class _Course:
 
 
 def _slow(s: Floats, degree: int) -> Floats:
-    """Orthonormal columns that span the polynomials up to that degree."""
+    """Return orthonormal columns that span the polynomials up to that degree."""
     return np.linalg.qr(np.vander(2.0 * s - 1.0, degree + 1))[0]
 
 
 def _vertex(grid: Floats, costs: Floats, best: int) -> tuple[float, float]:
-    """Of the parabola through the least cost and its neighbours: where, and its second derivative."""
+    """Return minimum and second derivative of the parabola through the least cost and its neighbours."""
     step = float(grid[1] - grid[0])
     a, b, c = (float(costs[best + k]) for k in (-1, 0, 1))
     bend = a - 2.0 * b + c
@@ -284,8 +264,3 @@ def _moving_mean(t: Floats, values: Floats) -> Floats:
     first, last = np.searchsorted(t, t - _SLOW_S), np.searchsorted(t, t + _SLOW_S, side="right")
     total = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
     return np.asarray((total[last] - total[first]) / (last - first)[:, None], dtype=np.float64)
-
-
-def _turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
-    x, y, z = (0.5 * dt_s * part for part in rate_rad_s)
-    return quat_normalize(quat_multiply(q, (1.0, x, y, z)))

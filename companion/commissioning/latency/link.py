@@ -1,7 +1,7 @@
-"""PX4's IMU with PX4's own stamps, and PX4's clock against ours: HIGHRES_IMU and TIMESYNC beside the autopilot driver. I/O only.
+"""PX4's IMU with PX4's own stamps, and PX4's clock against ours, by HIGHRES_IMU and TIMESYNC. I/O only.
 
-HIGHRES_IMU says when its sample was taken (`time_usec`), so the way of the message does not matter. TIMESYNC with `tc1` 0 is answered
-with PX4's clock at once: half of the round trip is the way back.
+HIGHRES_IMU carries the time of its sample (`time_usec`), so the latency of the message does not matter. PX4 answers TIMESYNC with `tc1`
+0 at once with its clock: half of the round trip is the way back.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self
 
-from companion.commissioning.latency.fit import ImuSample
 from companion.config.vehicle import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import flu_from_frd
+from companion.preflight.hand_test.motion import ImuAt
 from companion.runtime.clock import Clock
 
 SYNC_PERIOD_S: Final = 0.1
 _SYNC_MIN: Final = 5
 _SYNC_DEADLINE_S: Final = 5.0
 _NEAR: Final = 30
-"""Answers around a moment that its clock offset is told from."""
+"""Number of answers around a moment from which its clock offset is computed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """One question for PX4's clock."""
+    """One answer with PX4's clock."""
 
     t_s: float
     """Half way between question and answer, our clock."""
@@ -42,7 +42,7 @@ class Sync:
 
 
 class LatencyLink(MavsdkAutopilot):
-    """The autopilot driver, which also keeps every IMU sample and asks for PX4's clock ten times a second."""
+    """The autopilot's driver, which also keeps every IMU sample and requests PX4's clock ten times a second."""
 
     def __init__(self, device: AutopilotDevice, clock: Clock) -> None:
         super().__init__(device, clock)
@@ -51,7 +51,7 @@ class LatencyLink(MavsdkAutopilot):
         self._asked_ns: set[int] = set()
         self._asking: asyncio.Task[None] | None = None
         self.syncs: list[Sync] = []
-        self._raw: list[tuple[float, float, ImuSample]] = []
+        self._raw: list[tuple[float, float, ImuAt]] = []
 
     async def __aenter__(self) -> Self:
         """Open the link as for a flight, then wait for PX4's clock.
@@ -73,17 +73,17 @@ class LatencyLink(MavsdkAutopilot):
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the questions, then as the driver does."""
+        """Stop the requests, then close the link."""
         if self._asking is not None:
             self._asking.cancel()
             await asyncio.wait((self._asking,))
         await super().__aexit__(kind, error, trace)
 
-    def imu(self, last_s: float = math.inf) -> list[ImuSample]:
-        """All samples so far on our clock, or those of the last `last_s`."""
+    def imu(self, last_s: float = math.inf) -> list[ImuAt]:
+        """Return all samples so far on our clock, or those of the last `last_s`."""
         self._read()
         offsets = _Offsets(self.syncs)
-        found: list[ImuSample] = []
+        found: list[ImuAt] = []
         from_s = self._raw[-1][1] - last_s if self._raw else 0.0
         first = bisect_left(self._raw, from_s, key=lambda one: one[1])
         for _, px4_s, sample in self._raw[first:]:
@@ -93,14 +93,14 @@ class LatencyLink(MavsdkAutopilot):
         return found
 
     def imu_age_s(self) -> float | None:
-        """Median from a sample to the arrival of its message; None: none came."""
+        """Return the median time from a sample to the arrival of its message; None if none came."""
         self._read()
         offsets = _Offsets(self.syncs)
         ages = [arrived_s - (px4_s - offsets.at(px4_s)) for arrived_s, px4_s, _ in self._raw]
         return statistics.median(ages) if ages else None
 
     def round_trip_s(self) -> float:
-        """Median of all questions."""
+        """Return the median round trip of TIMESYNC."""
         self._read()
         return statistics.median(sync.round_trip_s for sync in self.syncs)
 
@@ -125,7 +125,7 @@ class LatencyLink(MavsdkAutopilot):
             await asyncio.sleep(SYNC_PERIOD_S)
 
     def _on_message(self, message: Any, _: Any) -> None:
-        """A thread of MAVSDK's: stamped and kept."""
+        """Stamp and keep a message; runs in a thread of MAVSDK."""
         self._heard.append((self._now(), message.message_name, message.fields_json))
 
     def _read(self) -> None:
@@ -138,11 +138,11 @@ class LatencyLink(MavsdkAutopilot):
                 force = flu_from_frd((float(fields["xacc"]), float(fields["yacc"]), float(fields["zacc"])))
                 rate = flu_from_frd((float(fields["xgyro"]), float(fields["ygyro"]), float(fields["zgyro"])))
                 px4_s = 1e-6 * int(fields["time_usec"])
-                self._raw.append((arrived_s, px4_s, ImuSample(0.0, force, rate)))
+                self._raw.append((arrived_s, px4_s, ImuAt(0.0, force, rate)))
 
     def _take_sync(self, arrived_s: float, px4_ns: int, asked_ns: int) -> None:
         if px4_ns == 0 or asked_ns not in self._asked_ns:
-            return  # PX4's own question, or the answer to somebody else
+            return  # PX4's own request, or an answer to another program
         self._asked_ns.discard(asked_ns)
         asked_s = 1e-9 * asked_ns
         middle_s = 0.5 * (asked_s + arrived_s)
@@ -150,7 +150,7 @@ class LatencyLink(MavsdkAutopilot):
 
 
 class _Offsets:
-    """PX4's clock less ours at any time: the median of the quicker half of the questions around it."""
+    """PX4's clock minus ours at any time: the median of the faster half of the answers around it."""
 
     def __init__(self, syncs: list[Sync]) -> None:
         self._px4_s = [sync.t_s + sync.offset_s for sync in syncs]
@@ -158,7 +158,7 @@ class _Offsets:
         self._known: dict[int, float] = {}
 
     def at(self, px4_s: float) -> float:
-        """By PX4's clock."""
+        """Return the offset at a time of PX4's clock."""
         key = int(2.0 * px4_s)
         if key not in self._known:
             order = sorted(range(len(self._syncs)), key=lambda k: abs(self._px4_s[k] - px4_s))[:_NEAR]

@@ -13,7 +13,6 @@ from companion.commissioning.latency.fit import (
     SETTLE_S,
     STRENGTH_MIN_M_S2,
     Delay,
-    PoseSample,
     Tap,
     TapDelay,
     agreeing,
@@ -28,6 +27,7 @@ from companion.io.protocols import DeviceError
 from companion.model.rows import Row
 from companion.model.types import MocapPose
 from companion.preflight.checks import Check
+from companion.preflight.hand_test.motion import PoseAt
 from companion.px4.wanted import WANTED
 from companion.runtime.clock import Clock, flight_clock
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
@@ -142,7 +142,7 @@ async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list
         if not felt:
             break
         session.say("enough taps; measuring")
-        seen = [PoseSample(p.stamp_s, p.position_world_m, p.attitude_wxyz) for p in poses if p.tracking_valid]
+        seen = [PoseAt(p.stamp_s, p.position_world_m, p.attitude_wxyz) for p in poses if p.tracking_valid]
         if len(seen) < _HISTORY_POSES_MIN:
             break
         noise, imu = mocap_noise(seen), link.imu()

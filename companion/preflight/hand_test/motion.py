@@ -120,15 +120,16 @@ def _felt(imu: Sequence[ImuAt], times: Sequence[float], bias: Vec3) -> tuple[lis
             next_s = imu[index + 1].t_s if index + 1 < len(imu) else math.inf
             step_s = min(until_s, next_s) - now_s
             rate = _minus(imu[index].rate_rad_s, bias)
-            half = _turned(q, rate, 0.5 * step_s)
+            half = turned(q, rate, 0.5 * step_s)
             v = _plus(v, _scaled(quat_rotate(half, imu[index].force_m_s2), step_s))
-            q = _turned(q, rate, step_s)
+            q = turned(q, rate, step_s)
             now_s += step_s
         velocity.append(v)
     return velocity, q
 
 
-def _turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
+def turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
+    """Return the attitude after a rotation at a body rate."""
     angle = norm(rate_rad_s) * dt_s
     if angle < 1e-12:
         return q
