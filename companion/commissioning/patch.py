@@ -1,4 +1,4 @@
-"""A change of the vehicle file that a commissioning tool proposes: printed for people and scripts, written only when asked."""
+"""A proposed change of the vehicle file: printed for people and scripts, written only with `--write`."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _BOM = "\ufeff"
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One value."""
+    """One value that changes."""
 
     location: Location
     old: Data
-    """None also where the file leaves the key to its default."""
+    """None if the file does not have the key."""
     new: Data
     origin: Origin | None
-    """Where the old value stands; None: it is not in the file."""
+    """Place of the old value; None if the file does not have the key."""
 
     @property
     def key(self) -> str:
-        """`arm.joints[1].sign`."""
+        """Return the location as `arm.joints[1].sign`."""
         return key_path(self.location)
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the JSON document's part."""
         at = self.origin
         return {
             "key": self.key,
@@ -50,7 +50,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Changes that one vehicle file needs. Empty: it says all that already."""
+    """Changes that a vehicle file needs; false if it has all these values already."""
 
     path: Path
     shown: str
@@ -65,7 +65,7 @@ class Patch:
 
     @property
     def text(self) -> str:
-        """For people: the lines for the file, in its own shape, each with the line that it replaces."""
+        """Return the lines for the file in its own shape, each with the line that it replaces."""
         if not self.changes:
             return f"# {self.shown}: nothing to change"
         lines: list[tuple[str, str]] = [(f"# {self.shown}", "")]
@@ -77,21 +77,19 @@ class Patch:
         return "\n".join(f"{left:<{width}}  # {right}" if right else left for left, right in lines)
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the JSON document's part."""
         return {"file": self.shown, "changes": [change.as_json() for change in self.changes], "text": self.text}
 
     def write(self) -> Path:
-        """Write the file, the old one beside it; returns the backup's path.
+        """Write the file and keep the old one beside it; return the path of that backup.
 
         Raises:
-            ConfigError: the file has changed meanwhile, or cannot be written; then it is as it was.
+            ConfigError: the file has changed meanwhile, or cannot be written; it is unchanged then.
         """
         path = self.path.resolve()
         try:
             if path.read_bytes() != self.before:
-                raise ConfigError(
-                    [f"{self.shown}: has been changed meanwhile; nothing was written, run the tool again"]
-                )
+                raise ConfigError([f"{self.shown}: has changed meanwhile; nothing was written, run the tool again"])
             backup = _back_up(path, self.before)
             write_whole(path, self.after, mode=stat.S_IMODE(path.stat().st_mode), durable=True)
         except OSError as error:
@@ -102,15 +100,15 @@ class Patch:
 
 
 def propose(vehicle_path: str | Path, changes: Mapping[Location, Data]) -> Patch:
-    """The patch that makes the vehicle file say what was found. Nothing is written.
+    """Return the patch that brings values into the vehicle file. Nothing is written.
 
     Args:
         vehicle_path: vehicle file.
-        changes: new values by location, in the file's units: `{("arm", "joints", 0, "sign"): -1}`. What the file says already is
-            left out; keys that it leaves to their default are added. Round before: values are written as they are given.
+        changes: new values by location, in the file's units: `{("arm", "joints", 0, "sign"): -1}`. Values that it has
+            already are left out, missing keys are added. Values are written as given: round them before.
 
     Raises:
-        ConfigError: the file cannot be read, or would not be a vehicle file any more; one line per problem.
+        ConfigError: the file cannot be read, or would not be valid any more; one line per problem.
     """
     path, shown = Path(vehicle_path), str(vehicle_path)
     document = read_document(path)
@@ -142,7 +140,7 @@ def _same(old: Data, new: Data) -> bool:
 
 
 def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
-    """The text says what it was to say, and is a vehicle file."""
+    """Check that the text has the new values and is a valid vehicle file."""
     data = parse_value(text, Origin(shown))
     assert isinstance(data, dict)
     document = Document(shown, data)
@@ -156,7 +154,7 @@ def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
 
 
 def _lines(open_steps: Location, change: Change, shown: str) -> list[tuple[str, str]]:
-    """The change's own line and those of the blocks that it opens."""
+    """Return the change's own line and those of the blocks that it opens."""
     *way, last = change.location
     common = 0
     while common < min(len(open_steps), len(way)) and open_steps[common] == way[common]:
@@ -178,7 +176,7 @@ def _lines(open_steps: Location, change: Change, shown: str) -> list[tuple[str, 
 
 
 def _indent(way: list[str | int] | Location, dash: bool = False) -> str:
-    """Two columns for each step; the first key of a list's item stands behind its dash."""
+    """Return two columns per step; the first key of a list item follows its dash."""
     width = 2 * len(way)
     return " " * (width - 2) + "- " if dash else " " * width
 

@@ -109,7 +109,7 @@ class Session:
         return sys.stdin.readline().strip().lower() in ("y", "yes")
 
     def confirm(self, question: str) -> bool:
-        """Return whether the user agrees; say that nothing is done if there is no terminal to ask at."""
+        """Return whether the user agrees; without a terminal print that nothing is done."""
         answer = self.ask(question)
         if answer is None:
             self.say(f"{question} not done: there is no terminal to ask at, say --yes")
@@ -128,7 +128,7 @@ class Tool(Generic[_T]):
     fit: Callable[[_T, Vehicle], Report]
     """Judge what was measured. Pure."""
     device: Check | None = None
-    """The row for a device that does not open or goes silent; None if one line on standard error says it."""
+    """The row for a device that does not open or goes silent; None if it is reported as one line on standard error."""
     no_data: Mapping[str, Any] = field(default_factory=dict)
     """`Report.data` when a device fails."""
 

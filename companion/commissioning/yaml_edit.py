@@ -1,7 +1,4 @@
-"""Single values of a YAML text replaced or added where they stand; comments, order and everything else stay as they are. Pure.
-
-`companion.config.yaml_strict` knows the place of every node; here its nodes are looked at once more, for where they end.
-"""
+"""Replace or add single values of a YAML text; comments, order and everything else stay as they are. Pure."""
 
 from __future__ import annotations
 
@@ -18,11 +15,11 @@ from companion.config.yaml_text import flow_text
 
 
 class EditError(Exception):
-    """The text cannot be edited there; one line without the file's name."""
+    """The text cannot be edited there; the message is one line without the file's name."""
 
 
 class Edit(NamedTuple):
-    """Characters `begin` to `end` of a text give way to `text`."""
+    """Replace the characters from `begin` to `end` by `text`."""
 
     begin: int
     end: int
@@ -30,18 +27,18 @@ class Edit(NamedTuple):
 
 
 def edited(text: str, changes: Mapping[Location, Data]) -> str:
-    """The text with every change made.
+    """Return the text with every change made.
 
     Args:
         text: YAML whose top level is a mapping, as `read_document` takes it.
         changes: new values by location; missing keys, and mappings on the way to them, are added.
 
     Raises:
-        EditError: a location leads through a list index that is not there or through a single value, or a list in block style
-            changes its length.
+        EditError: a location leads through a missing list index or through a single value, or a list in block style would
+            change its length.
     """
     for location, value in changes.items():
-        # One after the other: each change moves what stands behind it.
+        # One after the other: each change moves what follows it.
         text = _edited(text, location, value)
     return text
 
@@ -61,7 +58,7 @@ def _edited(text: str, location: Location, value: Data) -> str:
             found = below
             continue
         if not isinstance(found, yaml.MappingNode) or not isinstance(step, str):
-            raise EditError(f"{key_path(location[: depth + 1])}: there is no such place; write it by hand")
+            raise EditError(f"{key_path(location[: depth + 1])}: there is no such place; change it by hand")
         return _added(text, found, location[depth:], value)
     edits = _replaced(text, found, value, location)
     for begin, end, new in sorted(edits, reverse=True):
@@ -84,24 +81,17 @@ def _replaced(text: str, node: yaml.Node, value: Data, location: Location) -> li
         new = flow_text(value)
         if end > begin and text[end - 1] == "\n":  # a block of text ends with its line
             new += "\n"
-        if begin == end:  # nothing stands behind the key
+        if begin == end:  # a key without a value
             new = f" {new}" if text[begin - 1] == ":" else new
         return [Edit(begin, end, new)]
     if isinstance(node, yaml.SequenceNode) and isinstance(value, list) and len(value) == len(node.value):
         pairs = [(item, value[index], (*location, index)) for index, item in enumerate(node.value)]
-    elif (
-        isinstance(node, yaml.MappingNode)
-        and isinstance(value, dict)
-        and set(value) == {k.value for k, _ in node.value}
-    ):
-        pairs = [(item, value[key.value], (*location, key.value)) for key, item in node.value]
-    else:
-        raise EditError(f"{key_path(location)}: a block of another shape stands there; write it by hand")
-    return [edit for item, new, at in pairs for edit in _replaced(text, item, new, at)]
+        return [edit for item, new, at in pairs for edit in _replaced(text, item, new, at)]
+    raise EditError(f"{key_path(location)}: the file has a block of another shape there; change it by hand")
 
 
 def _aligned(text: str, end: int, longer: int) -> str:
-    """What follows a value, a comment behind it moved back to its column as far as there is room."""
+    """Return what follows a value, with its comment moved back to its column as far as there is room."""
     rest = text[end:]
     comment = re.match(r"( {2,})#", rest)
     if comment is None or longer == 0:
@@ -113,7 +103,7 @@ def _aligned(text: str, end: int, longer: int) -> str:
 def _added(text: str, parent: yaml.MappingNode, steps: Location, value: Data) -> str:
     for step in reversed(steps[1:]):
         if not isinstance(step, str):
-            raise EditError(f"{key_path(steps)}: there is no such list; write it by hand")
+            raise EditError(f"{key_path(steps)}: there is no such list; change it by hand")
     if parent.flow_style:
         for step in reversed(steps[1:]):
             value = {str(step): value}
@@ -131,7 +121,7 @@ def _added(text: str, parent: yaml.MappingNode, steps: Location, value: Data) ->
 
 
 def _last_line_of_plain_values(parent: yaml.MappingNode) -> int:
-    """Index of a character on the line behind which a new key reads best: behind the last value that is no block."""
+    """Return the index of a character on the line after which a new key is added: that of the last value that is no block."""
     plain = [value for _, value in parent.value if _is_flow(value)]
     last: yaml.Node = (plain or [parent.value[-1][1]])[-1]
     while not _is_flow(last):
@@ -141,11 +131,11 @@ def _last_line_of_plain_values(parent: yaml.MappingNode) -> int:
 
 
 def _is_flow(node: yaml.Node) -> bool:
-    """Its end mark is its end; that of a block stands behind the comments that follow."""
+    """Return whether the node's end mark is its end; that of a block is after the comments that follow."""
     return isinstance(node, yaml.ScalarNode) or (isinstance(node, yaml.CollectionNode) and bool(node.flow_style))
 
 
 def _line_end(text: str, index: int) -> int:
-    """Just behind the end of the line."""
+    """Return the index after the end of the line."""
     end = text.find("\n", index)
     return len(text) if end < 0 else end + 1

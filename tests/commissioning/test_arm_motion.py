@@ -141,7 +141,7 @@ def test_hot_servos_and_hardware_errors_stop_it(vehicle: Vehicle) -> None:
     for change, words in (
         ({"temperature_c": 66.0}, "66 degC"),
         ({"errors": (0, 0x20)}, "joint 2: hardware error: overload"),
-        ({"errors": (0x80, 0)}, "joint 1: the bus watchdog let go"),
+        ({"errors": (0x80, 0)}, "joint 1: the bus watchdog tripped"),
     ):
         bench = Bench(vehicle)
         bench.motion.go(0, math.radians(120.0), math.radians(20.0))

@@ -25,7 +25,7 @@ class Leader(Protocol):
     """Decides where the arm goes next."""
 
     def begin(self, state: ArmState) -> Sequence[Vec2]:
-        """Return every pose (rad) that the arm will be led to, as far as that is known."""
+        """Return every pose (rad) that the arm will go to, as far as that is known."""
         ...
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
@@ -49,7 +49,7 @@ class Driven:
 
 
 async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
-    """Open the arm, follow the leader, let go. Cancelled at any time, the arm is limp within a few ms.
+    """Open the arm, follow the leader, make it limp. Cancelled at any time, the arm is limp within a few ms.
 
     Raises:
         DeviceError: the arm does not open, or a pose is too heavy.

@@ -181,7 +181,7 @@ class Motion:
             name = f"joint {joint + 1}"
             error = state.hardware_error[joint]
             if error & WATCHDOG_ERROR:
-                return f"{name}: the bus watchdog let go: this computer was busy elsewhere, or a cable is loose"
+                return f"{name}: the bus watchdog tripped: this computer was too busy, or a cable is loose"
             if error:
                 return f"{name}: hardware error: {hardware_error_text(error)}; remove the cause, then cycle the servos' power"
             if state.temperature_c[joint] >= safety.servo_warn_c:

@@ -117,7 +117,7 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
 
 
 def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None] = lambda _: None) -> None:
-    """Write what the plans say, servo after servo.
+    """Write what the plans contain, servo after servo.
 
     Args:
         port: serial device.

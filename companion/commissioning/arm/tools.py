@@ -92,7 +92,7 @@ def _judge_zero(result: ZeroResult, vehicle: Vehicle) -> Report:
 
 
 async def _drive(session: Session, leader: Leader, what: str) -> Driven:
-    """Say what will happen, ask, move."""
+    """Announce the motion, ask, move."""
     part = session.arguments.part
     session.say(f"{part}: {what}", "bold")
     session.say(f"  propellers off; {_stand_text(session.vehicle)}")

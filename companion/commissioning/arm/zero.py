@@ -187,8 +187,8 @@ class ZeroGuide:
         turns = self.steps[at]
         sign = 1 if (counts[at] - counts[at - 1]) * turns.by_deg > 0.0 else -1
         last = at + turns.exact
-        tells = list(zip(counts, self.steps, strict=True))[:last]
-        zeros = [count - sign * step.pose_deg[joint] / _DEG_PER_COUNT for count, step in tells]
+        shown = list(zip(counts, self.steps, strict=True))[:last]
+        zeros = [count - sign * step.pose_deg[joint] / _DEG_PER_COUNT for count, step in shown]
         zero = round(sum(zeros) / len(zeros))
         low_deg, high_deg = self._arm.joints[joint].angle_deg
         if high_deg - low_deg < 360.0:

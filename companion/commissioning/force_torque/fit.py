@@ -36,7 +36,7 @@ SCALE = Check(
 DIRECTION = Check(
     "ft.direction",
     "force sensor direction",
-    "the weight pulls where `tool.sensor_rpy_deg` says, within 8 deg",
+    "the weight pulls in the direction by `tool.sensor_rpy_deg`, within 8 deg",
     "the law would respond to every force in a wrong direction",
 )
 POSE = Check(
@@ -119,7 +119,7 @@ def rows(fit: WeightFit) -> Iterator[Row]:
         "sensor is another model (this one has 50 counts per N) or has to be calibrated by its maker"
     )
     yield SCALE.row(abs(fit.scale - 1.0) <= SCALE_TOLERANCE, read, f"within {100 * SCALE_TOLERANCE:g} %", fix)
-    read = f"{fit.off_deg:.0f} deg from where tool.sensor_rpy_deg says"
+    read = f"{fit.off_deg:.0f} deg from the direction by tool.sensor_rpy_deg"
     fix = (
         "let the weight hang from the net's centre, and nothing touch it; check the arm's angles (companion arm zero); level the "
         "machine; raise link 2 to some 30 deg below level, and repeat"

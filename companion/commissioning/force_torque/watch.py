@@ -82,7 +82,7 @@ async def arm_angles(
     try:
         await arm.__aenter__()
     except DeviceError as error:
-        raise DeviceError(f"{error}; or say where the arm is: --arm-pose A1,A2 in deg") from None
+        raise DeviceError(f"{error}; or give the joint angles: --arm-pose A1,A2 in deg") from None
     try:
         yield read
     finally:

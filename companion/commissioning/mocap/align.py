@@ -76,7 +76,7 @@ def world_row(found: Alignment, tolerance_deg: float) -> Row | None:
     yaw_deg = found.world_yaw_deg
     if yaw_deg is None:
         return None
-    limit_deg = max(tolerance_deg, YAW_MAX_DEG)  # nobody moves it forward to the degree
+    limit_deg = max(tolerance_deg, YAW_MAX_DEG)  # a hand is not exact to the degree
     read = f"forward is {yaw_deg:+.0f} deg from the mission's start yaw"
     fix = (
         f"if the machine stood as the mission's start.yaw_deg says, Motive's ground plane is turned by {yaw_deg:+.0f} deg: set it anew "

@@ -41,7 +41,7 @@ STEADY = Check(
 DELAY = Check(
     "mocap.delay",
     "mocap latency against EKF2_EV_DELAY",
-    "exposure to transmission within 3 ms of what the project's parameter file says",
+    "exposure to transmission within 3 ms of the project's parameter file",
     "PX4 fuses each pose in the wrong place: the estimate swings with the machine",
 )
 NETWORK = Check("mocap.network", "way to the server", "a cable", "Wi-Fi holds frames back in bursts", warns=True)
@@ -51,7 +51,7 @@ MOVED_MIN_M: Final = 0.05
 RATE_TOLERANCE: Final = 0.05
 DELAY_TOLERANCE_S: Final = 0.003
 EV_DELAY_MS: Final = next(float(one.value or 0.0) for one in WANTED if one.name == "EKF2_EV_DELAY")
-"""What the project's parameter file says."""
+"""Value in the project's parameter file."""
 _BINS: Final = 9
 _BAR: Final = 40
 

@@ -74,7 +74,7 @@ async def watch(session: Session) -> Watched | NotStreaming:
 
 
 def judge(seen: Watched | NotStreaming, vehicle: Vehicle) -> Report:
-    """Judge the stream, or say where to look for it."""
+    """Judge the stream, or propose where to find it."""
     if isinstance(seen, Watched):
         rows, changes = mocap_judge.judge(seen, vehicle)
         return Report(rows, mocap_judge.as_json(seen), mocap_judge.text(seen), changes)
@@ -90,7 +90,7 @@ def judge(seen: Watched | NotStreaming, vehicle: Vehicle) -> Report:
             fix = f"set devices.mocap.server: {address}"
             changes = {("devices", "mocap", "server"): address}
     else:
-        advice = ["nobody answers on this segment: Motive is not running, does not stream, or is on another network"]
+        advice = ["no server answers on this segment: Motive is not running, does not stream, or is on another network"]
     return Report([mocap_judge.SERVER.bad(seen.problem, "", fix)], _NO_DATA, changes=changes, advice=advice)
 
 
