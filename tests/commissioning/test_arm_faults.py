@@ -119,11 +119,8 @@ def test_two_servos_with_one_id_are_set_up_one_at_a_time(tmp_path: Path) -> None
         assert code == EXIT_REFUSED and bad_ids(found) == {"arm.scan.ids"}, "the other one is not there"
 
 
-SWAPPED = "world.servos=[{id: 2, zero_error_deg: 12}, {id: 1, reversed: true}]"
-
-
 def test_swapped_servos_a_reversed_sign_and_a_wrong_zero_are_found_by_hand(tmp_path: Path) -> None:
-    with rig(tmp_path, SWAPPED, HAND) as one:
+    with rig(tmp_path, "world.servos=[{id: 2, zero_error_deg: 12}, {id: 1, reversed: true}]", HAND) as one:
         assert not one.check_rows()["arm.device"].ok
         code, found = one.json("zero", "--write")
         assert code == EXIT_OK and found["swapped"]

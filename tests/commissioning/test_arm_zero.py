@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cache
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.commissioning.arm.poses import steps_of
@@ -24,9 +24,9 @@ FOLDED: Vec2 = (165.0, 140.0)
 
 
 @cache
-def arm_with(walls: tuple[Vec2, Vec2] = ((60.0, 175.0), (-10.0, 150.0))) -> Arm:
-    return load_vehicle(SHIPPED, [f"vehicle.arm.joints[{i}].angle_deg={list(walls[i])}" for i in (0, 1)]
-                        + [f"vehicle.safety.fold_arm_deg={[sum(wall) / 2 for wall in walls]}"]).arm  # fmt: skip
+def arm_with(limits: tuple[Vec2, Vec2] = ((60.0, 175.0), (-10.0, 150.0))) -> Arm:
+    return load_vehicle(SHIPPED, [f"vehicle.arm.joints[{i}].angle_deg={list(limits[i])}" for i in (0, 1)]
+                        + [f"vehicle.safety.fold_arm_deg={[sum(limit) / 2 for limit in limits]}"]).arm  # fmt: skip
 
 
 class Bench:
@@ -68,6 +68,7 @@ class Bench:
         return view
 
 
+@settings(max_examples=50)
 @given(
     st.tuples(st.sampled_from((-1, 1)), st.sampled_from((-1, 1))),
     st.tuples(st.integers(0, 4095), st.integers(0, 4095)),
@@ -76,8 +77,8 @@ class Bench:
         (((60.0, 175.0), (-10.0, 150.0)), ((-20.0, 175.0), (-150.0, 150.0)), ((70.0, 130.0), (-140.0, 40.0)))
     ),
 )
-def test_every_sign_zero_and_plug_is_told(signs: Vec2, zeros: Vec2, swapped: bool, walls: tuple[Vec2, Vec2]) -> None:
-    arm = arm_with(walls)
+def test_every_sign_zero_and_plug_is_told(signs: Vec2, zeros: Vec2, swapped: bool, limits: tuple[Vec2, Vec2]) -> None:
+    arm = arm_with(limits)
     bench = Bench(arm, [int(s) for s in signs], [int(z) for z in zeros], (1, 0) if swapped else (0, 1))
     result = bench.through().result
     assert result is not None and result.swapped == swapped
@@ -152,8 +153,8 @@ def test_an_arm_that_sways_is_not_held() -> None:
         assert bench.look().number == 1
 
 
-@pytest.mark.parametrize("walls", [((100.0, 175.0), (-10.0, 150.0)), ((85.0, 100.0), (-10.0, 150.0))])
-def test_walls_that_leave_no_pose_are_one_line(walls: tuple[Vec2, Vec2]) -> None:
+@pytest.mark.parametrize("limits", [((100.0, 175.0), (-10.0, 150.0)), ((85.0, 100.0), (-10.0, 150.0))])
+def test_joint_limits_that_leave_no_pose_are_one_line(limits: tuple[Vec2, Vec2]) -> None:
     with pytest.raises(ConfigError) as caught:
-        steps_of(arm_with(walls))
+        steps_of(arm_with(limits))
     assert len(caught.value.lines) == 1 and caught.value.lines[0].startswith("arm.joints[")

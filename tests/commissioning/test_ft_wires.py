@@ -96,11 +96,11 @@ def test_bad_input_opens_nothing(options: tuple[str, ...]) -> None:
     assert len(ended.err_lines) == 1
 
 
-def test_ctrl_c_while_the_weight_is_awaited(sandbox: Sandbox) -> None:
+def test_ctrl_c_ends_the_check(sandbox: Sandbox) -> None:
     with World(sandbox) as world:
         running = sandbox.start("ft", "check", "--weight", 1, "--vehicle", VEHICLE, *world.addresses())
         with running:
-            wait_for_error(running, "hang 1 kg")
+            wait_for_error(running, "hands off")
             running.signal(signal.SIGINT)
             ended = running.end()
     assert ended.code == EXIT_ABORTED
