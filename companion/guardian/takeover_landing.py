@@ -169,11 +169,11 @@ class TakeoverLanding:
         self._check_pilot(t_s)
         if self._landing is None:
             self._attempts += 1
-            self._landing = AutopilotLanding(
+            self._landing = AutopilotLanding.begin(
                 t_s, self._clearance_m, self._tilt_max_rad, self._pilot, pose_s=self._pose_s
             )
         self._tick += 1
-        step = self._landing.step(self._inputs(t_s, status))
+        self._landing, step = self._landing.step(self._inputs(t_s, status))
         self.overturned = self.overturned or self._landing.overturned
         self._apply(t_s, status, step)
 

@@ -10,7 +10,7 @@ flipped or tipped over. Pure; time is an argument.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from companion.model.flight_stage import in_offboard, is_armed, on_ground, people_chose
 from companion.model.types import AutopilotRequest, FlightMode, Inputs
@@ -22,7 +22,7 @@ from companion.safety.rotor_stop import (
     fresh_pose,
     hears_px4,
 )
-from companion.safety.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking
+from companion.safety.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking, low_below_m
 
 ZERO_THRUST_STREAM_S = 0.6
 """Zero-thrust setpoints are streamed for this time before OFFBOARD is requested, so that no older setpoint takes effect."""
@@ -49,20 +49,32 @@ class LandingStep:
     """Message to report, or an empty text."""
 
 
+@dataclass(frozen=True, slots=True)
 class AutopilotLanding:
-    """One landing in LAND mode.
+    """One landing in LAND mode."""
 
-    Args:
-        start_s: flight time at its start.
-        clearance_m: height of the body's origin when the vehicle stands on the ground.
-        tilt_max_rad: `safety.tilt_abort_deg`; a vehicle on the ground beyond this tilt is tipped over.
-        pilot: a pilot has taken over: monitor only, request nothing. A later takeover is seen by PX4's mode.
-        pose_s: flight time of the newest pose sent to PX4; with -inf its estimate is not used until poses arrive.
-        flipped: the vehicle is known to have been flipped for the required time.
-    """
+    start_s: float
+    """Flight time at its start."""
+    clearance_m: float
+    """Height of the body's origin when the vehicle stands."""
+    pilot: bool
+    """A pilot has taken over: watch only, request nothing."""
+    pose_s: float
+    """Flight time of the newest pose that PX4 has had; -inf: its estimate counts for nothing until poses come."""
+    stop: RotorStop
+    height: HeightEvidence
+    sinking: Sinking = field(default_factory=Sinking)
+    was_landing: bool = False
+    standing_since_s: float | None = None
+    touched_s: float | None = None
+    landing_since_s: float | None = None
+    zero_thrust_since_s: float | None = None
+    overturned: bool = False
+    """The vehicle was flipped or tipped over, and its rotors were to be stopped for that."""
 
-    def __init__(
-        self,
+    @classmethod
+    def begin(
+        cls,
         start_s: float,
         clearance_m: float,
         tilt_max_rad: float,
@@ -70,110 +82,112 @@ class AutopilotLanding:
         *,
         pose_s: float,
         flipped: bool = False,
-    ) -> None:
-        self._start_s = start_s
-        self._clearance_m = clearance_m
-        self._pilot = pilot
-        self._was_landing = False
-        self._height = HeightEvidence(clearance_m)
-        self._sinking = Sinking()
-        self._standing_since_s: float | None = None
-        self._touched_s: float | None = None
-        self._landing_since_s: float | None = None
-        self._zero_thrust_since_s: float | None = None
-        self.overturned = False
-        """Whether the vehicle was flipped or tipped over and a stop of its rotors was requested for that reason."""
-        self._pose_s = pose_s
-        self._stop = RotorStop(clearance_m, tilt_max_rad, pose_s, flipped=flipped)
+    ) -> AutopilotLanding:
+        """Return the landing before its first tick.
 
-    @property
-    def pilot(self) -> bool:
-        """Whether a pilot has control."""
-        return self._pilot
+        Args:
+            start_s: flight time.
+            clearance_m: height of the body's origin when the vehicle stands.
+            tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
+            pilot: a pilot has taken over. One who takes over later is seen by PX4's mode.
+            pose_s: flight time of the newest pose that PX4 has had; -inf if that is not known.
+            flipped: the vehicle is known to be flipped, and has been for long enough.
+        """
+        stop = RotorStop.begin(clearance_m, tilt_max_rad, pose_s, flipped=flipped)
+        return cls(start_s, clearance_m, pilot, pose_s, stop, HeightEvidence(low_below_m(clearance_m)))
 
-    def step(self, i: Inputs) -> LandingStep:
-        """Run one tick."""
-        elapsed = i.t_s - self._start_s
+    def step(self, i: Inputs) -> tuple[AutopilotLanding, LandingStep]:
+        """Return the landing after one more tick, and what that tick requests."""
+        elapsed = i.t_s - self.start_s
         heard = hears_px4(i)
-        self._stop.update(i)
-        if not self._pilot and heard and self._pilot_takes_over(i):
-            self._pilot = True
-            return LandingStep(AutopilotRequest.NONE, False, False, False, "a pilot took over")
+        now = replace(self, stop=self.stop.update(i))
+        if not now.pilot and heard:
+            now, takes_over = now._watch_mode(i)
+            if takes_over:
+                text = "a pilot took over"
+                return replace(now, pilot=True), LandingStep(AutopilotRequest.NONE, False, False, False, text)
         if heard and not is_armed(i.status) and elapsed > 0.5:
-            text = "the vehicle was flipped or tipped over; it is disarmed" if self.overturned else None
-            return LandingStep(AutopilotRequest.NONE, False, True, True, text)
-        if elapsed > TIMEOUT_S and not (self._pilot and heard):  # a pilot may fly on for as long as they like
-            return LandingStep(AutopilotRequest.NONE, False, True, False, "the landing could not be confirmed")
-        if not heard and self._stands_by_mocap(i):
-            text = "the vehicle stands, motion capture says; PX4 does not answer: go and disarm it by hand, with care"
-            return LandingStep(AutopilotRequest.NONE, False, True, True, text)
-        if self._pilot:
-            return LandingStep(AutopilotRequest.NONE, False, False, False)
-        if self._stop.overturned:
-            text = None if self.overturned else FLIPPED if self._stop.flipped else TIPPED
-            self.overturned = True
-            return LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False, text)
-        if self._touched_s is None and heard and self._touches(i):
-            self._touched_s = i.t_s
-            return LandingStep(AutopilotRequest.LAND, True, False, False, "touchdown")
-        if self._touched_s is None:
-            done = on_ground(i.status) and elapsed > 1.0 and self._stop.may_disarm
-            return LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND, False, False, False)
-        if on_ground(i.status) and self._stop.may_disarm:
-            return LandingStep(AutopilotRequest.DISARM, True, False, False)
-        if self._unnoticed(i):
-            return LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False)
-        wait = i.t_s - self._touched_s < ZERO_THRUST_STREAM_S or in_offboard(i.status)
-        return LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
+            overturned = "the vehicle was flipped or tipped over; it is disarmed" if now.overturned else None
+            return now, LandingStep(AutopilotRequest.NONE, False, True, True, overturned)
+        if elapsed > TIMEOUT_S and not (now.pilot and heard):  # a pilot may fly on for as long as they like
+            text = "the landing could not be confirmed"
+            return now, LandingStep(AutopilotRequest.NONE, False, True, False, text)
+        if not heard:
+            now, stands = now._watch_standing(i)
+            if stands:
+                text = (
+                    "the vehicle stands, motion capture says; PX4 does not answer: go and disarm it by hand, with care"
+                )
+                return now, LandingStep(AutopilotRequest.NONE, False, True, True, text)
+        if now.pilot:
+            return now, LandingStep(AutopilotRequest.NONE, False, False, False)
+        if now.stop.overturned:
+            found = None if now.overturned else FLIPPED if now.stop.flipped else TIPPED
+            return replace(now, overturned=True), LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False, found)
+        if now.touched_s is None and heard:
+            now, touches = now._watch_touchdown(i)
+            if touches:
+                now = replace(now, touched_s=i.t_s)
+                return now, LandingStep(AutopilotRequest.LAND, True, False, False, "touchdown")
+        if now.touched_s is None:
+            done = on_ground(i.status) and elapsed > 1.0 and now.stop.may_disarm
+            return now, LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND, False, False, False)
+        if on_ground(i.status) and now.stop.may_disarm:
+            return now, LandingStep(AutopilotRequest.DISARM, True, False, False)
+        touched_s = now.touched_s
+        now, unnoticed = now._watch_zero_thrust(i)
+        if unnoticed:
+            return now, LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False)
+        wait = i.t_s - touched_s < ZERO_THRUST_STREAM_S or in_offboard(i.status)
+        return now, LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
 
-    def _pilot_takes_over(self, i: Inputs) -> bool:
-        """Return whether PX4 is in a manual mode or, once PX4 was landing, in any mode that only a pilot selects."""
+    def _watch_mode(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
+        """A pilot takes over: a mode in which somebody steers; or, once PX4 was landing, any that only a pilot chooses."""
         mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
-        self._was_landing = self._was_landing or mode is FlightMode.LAND
+        now = self if self.was_landing or mode is not FlightMode.LAND else replace(self, was_landing=True)
         chosen = i.status is not None and people_chose(i.status)
-        return mode is FlightMode.MANUAL or (self._was_landing and chosen)
+        return now, mode is FlightMode.MANUAL or (now.was_landing and chosen)
 
-    def _touches(self, i: Inputs) -> bool:
-        """Return whether PX4 is landing, its valid height shows the vehicle on the ground, and motion capture does not contradict."""
-        pose = fresh_pose(i)
-        if pose is not None:
-            self._pose_s = pose.stamp_s
-        sink_m_s = self._sinking.update(i.t_s, i.mocap)
-        vehicle = i.vehicle
-        landing = i.status is not None and i.status.mode in (FlightMode.LAND, FlightMode.OTHER)
-        if not landing:
-            self._landing_since_s = None
-        elif self._landing_since_s is None:
-            self._landing_since_s = i.t_s
-        begun = self._landing_since_s is not None and i.t_s - self._landing_since_s > BEGUN_S
-        fresh = vehicle is not None and i.t_s - vehicle.position_stamp_s < STATE_FRESH_S
-        if vehicle is None or not fresh or not begun or i.t_s - self._pose_s > ESTIMATE_TRUSTED_S:
-            self._height = HeightEvidence(self._clearance_m)
-            return False
-        height, sink = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
-        stands = self._height.update(i.t_s, height, sink, height - 1.0)
-        return stands and not (pose is not None and self._flies_by_mocap(i, sink_m_s))
+    def _watch_touchdown(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
+        """PX4 is landing, its height says that the vehicle stands, and motion capture does not contradict."""
+        pose, vehicle, t_s = fresh_pose(i), i.vehicle, i.t_s
+        pose_s = pose.stamp_s if pose is not None else self.pose_s
+        sinking = self.sinking.update(t_s, i.mocap)
+        since_s = self.landing_since_s
+        if i.status is None or i.status.mode not in (FlightMode.LAND, FlightMode.OTHER):
+            since_s = None
+        elif since_s is None:
+            since_s = t_s
+        begun = since_s is not None and t_s - since_s > BEGUN_S
+        fresh = vehicle is not None and t_s - vehicle.position_stamp_s < STATE_FRESH_S
+        now = replace(self, pose_s=pose_s, sinking=sinking, landing_since_s=since_s)
+        if vehicle is None or not fresh or not begun or t_s - pose_s > ESTIMATE_TRUSTED_S:
+            return replace(now, height=replace(self.height, since_s=None)), False
+        height_m, up_m_s = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
+        height = self.height.update(t_s, height_m, up_m_s, height_m - 1.0)
+        flies = pose is not None and self._flies_by_mocap(i, sinking.speed_m_s)
+        return replace(now, height=height), height.stands(t_s) and not flies
 
     def _flies_by_mocap(self, i: Inputs, sink_m_s: float | None) -> bool:
-        high = i.mocap is not None and i.mocap.position_world_m[2] > self._clearance_m + NEVER_ABOVE_M
+        high = i.mocap is not None and i.mocap.position_world_m[2] > self.clearance_m + NEVER_ABOVE_M
         return high or sink_m_s is None or sink_m_s > STILL_M_S
 
-    def _unnoticed(self, i: Inputs) -> bool:
-        """Return whether the vehicle has stood in OFFBOARD without thrust for `FORCE_DISARM_S` while PX4's land detector has not
-        responded.
-        """
+    def _watch_zero_thrust(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
+        """The vehicle has stood in OFFBOARD without thrust for `FORCE_DISARM_S`, and PX4's land detector has not noticed."""
+        since_s = self.zero_thrust_since_s
         if not in_offboard(i.status):
-            self._zero_thrust_since_s = None
-        elif self._zero_thrust_since_s is None:
-            self._zero_thrust_since_s = i.t_s
-        since_s = self._zero_thrust_since_s
-        return since_s is not None and i.t_s - since_s >= FORCE_DISARM_S and self._stop.may_force
+            since_s = None
+        elif since_s is None:
+            since_s = i.t_s
+        unnoticed = since_s is not None and i.t_s - since_s >= FORCE_DISARM_S and self.stop.may_force
+        return replace(self, zero_thrust_since_s=since_s), unnoticed
 
-    def _stands_by_mocap(self, i: Inputs) -> bool:
-        pose = fresh_pose(i)
-        if pose is None or pose.position_world_m[2] >= self._clearance_m + HEIGHT_MARGIN_M:
-            self._standing_since_s = None
-            return False
-        if self._standing_since_s is None:
-            self._standing_since_s = i.t_s
-        return i.t_s - self._standing_since_s >= STANDING_S
+    def _watch_standing(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
+        """Motion capture has seen the vehicle at standing height for `STANDING_S`."""
+        pose, since_s = fresh_pose(i), self.standing_since_s
+        if pose is None or pose.position_world_m[2] >= self.clearance_m + HEIGHT_MARGIN_M:
+            since_s = None
+        elif since_s is None:
+            since_s = i.t_s
+        stands = since_s is not None and i.t_s - since_s >= STANDING_S
+        return replace(self, standing_since_s=since_s), stands

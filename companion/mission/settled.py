@@ -8,7 +8,7 @@ with motion capture's while the machine stands.
 from __future__ import annotations
 
 import math
-from collections import deque
+from dataclasses import dataclass
 
 from companion.model.flight_stage import TARE_S
 from companion.model.frames import euler_zyx_from_quat, wrap_rad
@@ -24,37 +24,34 @@ YAW_OFF_MAX_RAD = math.radians(5.0)
 YAW_SPREAD_MAX_RAD = math.radians(2.0)
 
 
+@dataclass(frozen=True, slots=True)
 class SettledEstimate:
     """Differences between PX4's estimate and motion capture over the last `SETTLED_S`."""
 
-    def __init__(self) -> None:
-        self._seen: deque[tuple[float, Vec3, float]] = deque()
-        self._since_s: float | None = None
+    seen: tuple[tuple[float, Vec3, float], ...] = ()
+    """Flight time, position and yaw of the estimate less motion capture's: s, m, rad."""
+    since_s: float | None = None
+    """Flight time of the first tick; None before it."""
 
-    def forget(self) -> None:
-        """Start again, because inputs were missing."""
-        self._seen.clear()
-        self._since_s = None
-
-    def take(self, t_s: float, vehicle: VehicleState, pose: MocapPose) -> None:
-        """Add one tick."""
-        if self._since_s is None:
-            self._since_s = t_s
+    def take(self, t_s: float, vehicle: VehicleState, pose: MocapPose) -> SettledEstimate:
+        """Return the evidence with one more tick."""
         (x, y, z), (a, b, c) = vehicle.position_world_m, pose.position_world_m
         yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2] - euler_zyx_from_quat(pose.attitude_wxyz)[2]
-        self._seen.append((t_s, (x - a, y - b, z - c), wrap_rad(yaw_rad)))
-        while self._seen[0][0] < t_s - SETTLED_S:
-            self._seen.popleft()
+        first = 0
+        while first < len(self.seen) and self.seen[first][0] < t_s - SETTLED_S:
+            first += 1
+        seen = (*self.seen[first:], (t_s, (x - a, y - b, z - c), wrap_rad(yaw_rad)))
+        return SettledEstimate(seen, t_s if self.since_s is None else self.since_s)
 
     def problem(self, t_s: float) -> str | None:
         """Return what has not converged, as a message, or None if all has for `SETTLED_S`."""
-        if self._since_s is None or t_s - self._since_s < SETTLED_S:
+        if self.since_s is None or t_s - self.since_s < SETTLED_S:
             return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s at a time"
-        count = len(self._seen)
-        mean = [math.fsum(off[axis] for _, off, _ in self._seen) / count for axis in range(3)]
-        spread_m = math.sqrt(math.fsum(math.dist(off, mean) ** 2 for _, off, _ in self._seen) / count)
-        yaw_rad = math.fsum(yaw for _, _, yaw in self._seen) / count
-        yaw_spread_rad = math.sqrt(math.fsum((yaw - yaw_rad) ** 2 for _, _, yaw in self._seen) / count)
+        count = len(self.seen)
+        mean = [math.fsum(off[axis] for _, off, _ in self.seen) / count for axis in range(3)]
+        spread_m = math.sqrt(math.fsum(math.dist(off, mean) ** 2 for _, off, _ in self.seen) / count)
+        yaw_rad = math.fsum(yaw for _, _, yaw in self.seen) / count
+        yaw_spread_rad = math.sqrt(math.fsum((yaw - yaw_rad) ** 2 for _, _, yaw in self.seen) / count)
         off_m = math.hypot(*mean)
         wrong = []
         if off_m > OFF_MAX_M or spread_m > SPREAD_MAX_M:

@@ -21,6 +21,7 @@ tilted so low is a tether that pulls the vehicle over; it then falls by `LOW_WIT
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field, replace
 
 from companion.model.flight_stage import HEARTBEAT_FRESH_S, people_fly
 from companion.model.frames import tilt_rad
@@ -88,87 +89,105 @@ def _tilted_by_px4(i: Inputs, limit_rad: float) -> bool:
     return tilt_rad(vehicle.attitude_wxyz) > limit_rad
 
 
+@dataclass(frozen=True, slots=True)
 class RotorStop:
-    """Judges tick by tick whether the rotors may be stopped.
+    """Evidence, tick by tick, whether the rotors may be stopped."""
 
-    Args:
-        clearance_m: height of the body's origin when the vehicle stands.
-        tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
-        pose_s: flight time of the newest pose that PX4 has had; -inf if that is not known.
-        flipped: it is known to be flipped, and has been for long enough.
-    """
+    low_m: float
+    """Below this height the vehicle may stand."""
+    tilt_max_rad: float
+    """`safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over."""
+    pose_s: float = -math.inf
+    """Flight time of the newest pose that PX4 has had; -inf if that is not known."""
+    sinking: Sinking = field(default_factory=Sinking)
+    rest: tuple[float, Places] | None = None
+    """Since when the vehicle stands still, and where; None if it does not."""
+    flipped_since_s: float | None = None
+    tipped_since_s: float | None = None
+    may_disarm: bool = False
+    """DISARM may be requested now."""
+    may_force: bool = False
+    """FORCE_DISARM of a vehicle that stands may be requested now."""
+    flipped: bool = False
+    tipped: bool = False
 
-    def __init__(
-        self, clearance_m: float, tilt_max_rad: float, pose_s: float = -math.inf, *, flipped: bool = False
-    ) -> None:
-        self._low_m = clearance_m + LOW_WITHIN_M
-        self._tilt_max_rad = tilt_max_rad
-        self._sinking = Sinking()
-        self._pose_s = pose_s
-        self._rest: tuple[float, Places] | None = None
-        """Since when it stands still, and where; None if it does not."""
-        self._flipped_since_s = -math.inf if flipped else None
-        self._tipped_since_s: float | None = None
-        self.may_disarm = self.may_force = self.flipped = self.tipped = False
-        """Whether DISARM may be requested now, and FORCE_DISARM of a vehicle that stands, is flipped, or is tipped over."""
+    @classmethod
+    def begin(
+        cls, clearance_m: float, tilt_max_rad: float, pose_s: float = -math.inf, *, flipped: bool = False
+    ) -> RotorStop:
+        """Return the evidence before the first tick.
 
-    def update(self, i: Inputs) -> None:
-        """Judge one tick. Call it in every tick of the stage, or what held before counts for nothing."""
-        self._judge_rest(i)
-        rest_s = i.t_s - self._rest[0] if self._rest is not None else -math.inf
-        self.may_disarm = rest_s >= DISARM_STILL_S
-        self.may_force = rest_s >= FORCE_DISARM_S and self._rest is not None and "mocap" in self._rest[1]
-        if not seems_flipped(i) or people_fly(i.status):
-            self._flipped_since_s = None
-        elif self._flipped_since_s is None:
-            self._flipped_since_s = i.t_s
-        self.flipped = self._flipped_since_s is not None and i.t_s - self._flipped_since_s >= FLIPPED_HOLD_S
-        if not self._lies_tilted(i):
-            self._tipped_since_s = None
-        elif self._tipped_since_s is None:
-            self._tipped_since_s = i.t_s
-        self.tipped = self._tipped_since_s is not None and i.t_s - self._tipped_since_s >= TIPPED_HOLD_S
+        Args:
+            clearance_m: height of the body's origin when the vehicle stands.
+            tilt_max_rad: `safety.tilt_abort_deg`.
+            pose_s: flight time of the newest pose that PX4 has had; -inf if that is not known.
+            flipped: the vehicle is known to be flipped, and has been for long enough.
+        """
+        return cls(clearance_m + LOW_WITHIN_M, tilt_max_rad, pose_s, flipped_since_s=-math.inf if flipped else None)
+
+    def update(self, i: Inputs) -> RotorStop:
+        """Return the evidence after one more tick. Call it in every tick of the stage: all conditions hold without a break."""
+        pose, t_s = fresh_pose(i), i.t_s
+        sinking = self.sinking.update(t_s, pose)
+        pose_s = max(self.pose_s, i.mocap.stamp_s) if i.mocap is not None and i.mocap.tracking_valid else self.pose_s
+        rest = self._rest(i, _low_and_still(i, pose, sinking.speed_m_s, self.low_m, pose_s))
+        rest_s = t_s - rest[0] if rest is not None else -math.inf
+        flipped_since_s = _since(self.flipped_since_s, t_s, seems_flipped(i) and not people_fly(i.status))
+        tipped_since_s = _since(self.tipped_since_s, t_s, self._lies_tilted(i, pose))
+        return replace(
+            self,
+            pose_s=pose_s,
+            sinking=sinking,
+            rest=rest,
+            flipped_since_s=flipped_since_s,
+            tipped_since_s=tipped_since_s,
+            may_disarm=rest_s >= DISARM_STILL_S,
+            may_force=rest_s >= FORCE_DISARM_S and rest is not None and "mocap" in rest[1],
+            flipped=flipped_since_s is not None and t_s - flipped_since_s >= FLIPPED_HOLD_S,
+            tipped=tipped_since_s is not None and t_s - tipped_since_s >= TIPPED_HOLD_S,
+        )
 
     @property
     def overturned(self) -> bool:
         """The vehicle is flipped or tipped over: FORCE_DISARM may be requested now."""
         return self.flipped or self.tipped
 
-    def _lies_tilted(self, i: Inputs) -> bool:
-        """In our mode, low by motion capture, and tilted beyond the limit by motion capture and by PX4, in this tick."""
-        pose = fresh_pose(i)
-        if pose is None or pose.position_world_m[2] >= self._low_m or not is_ours(i):
-            return False
-        return tilt_rad(pose.attitude_wxyz) > self._tilt_max_rad and _tilted_by_px4(i, self._tilt_max_rad)
-
-    def _judge_rest(self, i: Inputs) -> None:
-        pose = fresh_pose(i)
-        places = self._low_and_still(i, pose)
-        rest = self._rest
+    def _rest(self, i: Inputs, places: Places) -> tuple[float, Places] | None:
         if not places or not is_ours(i):
-            self._rest = None
-        elif rest is None or rest[1].keys() != places.keys() or _moved_m(rest[1], places) > STILL_WITHIN_M:
-            self._rest = (i.t_s, places)
+            return None
+        rest = self.rest
+        if rest is None or rest[1].keys() != places.keys() or _moved_m(rest[1], places) > STILL_WITHIN_M:
+            return (i.t_s, places)
+        return rest
 
-    def _low_and_still(self, i: Inputs, pose: MocapPose | None) -> Places:
-        """Where every source that can be trusted sees the vehicle; empty unless all say low and the best one says still."""
-        sink_m_s = self._sinking.update(i.t_s, pose)
-        if i.mocap is not None and i.mocap.tracking_valid:
-            self._pose_s = max(self._pose_s, i.mocap.stamp_s)
-        places: Places = {}
-        vehicle = i.vehicle
-        if vehicle is not None and i.t_s - vehicle.position_stamp_s < STATE_FRESH_S:
-            places["PX4"] = vehicle.position_world_m
-            speed_m_s: float | None = vehicle.velocity_world_m_s[2]
-        else:
-            speed_m_s = None
-        if pose is not None:
-            places["mocap"] = pose.position_world_m
-            speed_m_s = sink_m_s
-        elif i.t_s - self._pose_s > ESTIMATE_TRUSTED_S:
-            return {}
-        still = speed_m_s is not None and abs(speed_m_s) < STILL_M_S
-        return places if still and all(place[2] < self._low_m for place in places.values()) else {}
+    def _lies_tilted(self, i: Inputs, pose: MocapPose | None) -> bool:
+        """In an own mode, low by motion capture, and tilted beyond the limit by motion capture and by PX4, in this tick."""
+        if pose is None or pose.position_world_m[2] >= self.low_m or not is_ours(i):
+            return False
+        return tilt_rad(pose.attitude_wxyz) > self.tilt_max_rad and _tilted_by_px4(i, self.tilt_max_rad)
+
+
+def _since(before_s: float | None, t_s: float, holds: bool) -> float | None:
+    """Return since when a condition has held; None if it does not."""
+    return (t_s if before_s is None else before_s) if holds else None
+
+
+def _low_and_still(i: Inputs, pose: MocapPose | None, sink_m_s: float | None, low_m: float, pose_s: float) -> Places:
+    """Return where every source that can be trusted sees the vehicle; empty unless all say low and the best one says still."""
+    places: Places = {}
+    vehicle = i.vehicle
+    if vehicle is not None and i.t_s - vehicle.position_stamp_s < STATE_FRESH_S:
+        places["PX4"] = vehicle.position_world_m
+        speed_m_s: float | None = vehicle.velocity_world_m_s[2]
+    else:
+        speed_m_s = None
+    if pose is not None:
+        places["mocap"] = pose.position_world_m
+        speed_m_s = sink_m_s
+    elif i.t_s - pose_s > ESTIMATE_TRUSTED_S:
+        return {}
+    still = speed_m_s is not None and abs(speed_m_s) < STILL_M_S
+    return places if still and all(place[2] < low_m for place in places.values()) else {}
 
 
 def _moved_m(before: Places, now: Places) -> float:

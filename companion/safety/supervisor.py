@@ -1,8 +1,8 @@
 """The safety ladder: one pure update, latched.
 
-NOMINAL -> WARN -> HOLD -> RETRACT -> LAND -> AUTOPILOT_LAND -> TERMINATE. An event carries the rung it asks for; the ladder goes to the
-highest rung asked for. Of itself it only goes on upwards: a HOLD that lasts too long becomes a LAND, and so does a RETRACT. The one way
-down is people's: `operator_resume` ends a HOLD, and nothing else, and only if nothing stands that it must hold for.
+NOMINAL -> WARN -> HOLD -> RETRACT -> LAND -> AUTOPILOT_LAND -> TERMINATE. An event carries the action that it asks for; the ladder goes
+to the gravest one. By itself it only goes up: a HOLD that lasts too long becomes a LAND, and so does a RETRACT. Only the operator takes
+it down: `operator_resume` ends a HOLD and nothing else, and only if no active rule asks for a HOLD or more.
 """
 
 from __future__ import annotations
@@ -12,59 +12,53 @@ from dataclasses import dataclass
 
 from companion.config.vehicle import Safety
 from companion.model.types import Event, SafetyAction
-
-RESUME = "operator_resume"
-HOLD_EXPIRED, RETRACT_EXPIRED = "hold_expired", "retract_expired"
-"""Causes of a LAND that no event asked for."""
-RETRACT_DONE = "retract_done"
-"""The event by which the core says that a RETRACT has arrived."""
+from companion.safety.events import OPERATOR_RESUME
+from companion.safety.notices import HOLD_EXPIRED, RETRACT_EXPIRED
 
 
 @dataclass(frozen=True, slots=True)
 class LadderTimes:
-    """How long the rungs may last that are no end in themselves."""
+    """How long a HOLD and a RETRACT may last, s."""
 
     hold_max_s: float
     retract_max_s: float
 
     @classmethod
     def of(cls, safety: Safety) -> LadderTimes:
-        """As the vehicle file says."""
+        """Return those of the vehicle file."""
         return cls(safety.hold_max_s, safety.retract_max_s)
 
 
 @dataclass(frozen=True, slots=True)
 class SupervisorState:
-    """Where the ladder stands."""
+    """The state of the ladder."""
 
     action: SafetyAction = SafetyAction.NOMINAL
     cause: str | None = None
-    """Id of the event that brought it there."""
+    """Id of the event that asked for the action."""
     since_s: float = 0.0
 
 
 def update(
     state: SupervisorState, events: Iterable[Event], t_s: float, times: LadderTimes, standing: str | None = None
 ) -> SupervisorState:
-    """The ladder after these events, at this time. The same object if nothing changes.
+    """Return the ladder after the events of a tick; the same object if nothing changes.
 
     Args:
-        state: where it stands.
+        state: before the tick.
         events: of this tick.
         t_s: flight clock.
-        times: how long rungs may last.
-        standing: what the vehicle must hold for now, in words; None: nothing, and people may let it go on.
+        times: how long a HOLD and a RETRACT may last.
+        standing: what the vehicle must hold for now; None if nothing does, and the operator may end a HOLD.
     """
-    held = (
-        state.action is SafetyAction.HOLD
-    )  # nobody ends a hold that begins in this very tick: it was not there when they spoke
+    held = state.action is SafetyAction.HOLD  # a RESUME does not end a HOLD that begins in the same tick
     for event in events:
         if event.action.rank > state.action.rank:
             state = SupervisorState(event.action, event.id, event.t_s)
-        elif event.id == RESUME and held and state.action is SafetyAction.HOLD and standing is None:
+        elif event.id == OPERATOR_RESUME and held and state.action is SafetyAction.HOLD and standing is None:
             state = SupervisorState(SafetyAction.NOMINAL, event.id, event.t_s)
     if state.action is SafetyAction.HOLD and t_s - state.since_s > times.hold_max_s:
-        return SupervisorState(SafetyAction.LAND, HOLD_EXPIRED, t_s)
+        return SupervisorState(SafetyAction.LAND, HOLD_EXPIRED.id, t_s)
     if state.action is SafetyAction.RETRACT and t_s - state.since_s > times.retract_max_s:
-        return SupervisorState(SafetyAction.LAND, RETRACT_EXPIRED, t_s)
+        return SupervisorState(SafetyAction.LAND, RETRACT_EXPIRED.id, t_s)
     return state

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import dataclass, field, replace
 
 from companion.model.types import MocapPose, VehicleState
 
@@ -32,66 +32,80 @@ SINK_WINDOW_S = 0.15
 MOCAP_FRESH_S = 0.3
 
 
+@dataclass(frozen=True, slots=True)
 class HeightEvidence:
-    """By PX4's estimate: low and still, held for a while.
+    """PX4's estimate: low and still, for `HEIGHT_HOLD_S`."""
 
-    Args:
-        clearance_m: height of the body's origin when the vehicle stands.
-    """
+    low_m: float
+    """Below this height the vehicle may stand: `low_below_m`."""
+    since_s: float | None = None
+    """Flight time since when it has been low and still."""
 
-    def __init__(self, clearance_m: float) -> None:
-        self._low_m = clearance_m + HEIGHT_MARGIN_M
-        self._since_s: float | None = None
-
-    def update(self, t_s: float, height_m: float, vertical_m_s: float, reference_height_m: float) -> bool:
-        """Whether it says that the vehicle stands."""
+    def update(self, t_s: float, height_m: float, vertical_m_s: float, reference_height_m: float) -> HeightEvidence:
+        """Return the evidence after one more tick."""
         pressed = reference_height_m < height_m - REFERENCE_BELOW_M
-        if not (height_m < self._low_m and abs(vertical_m_s) < STILL_M_S and pressed):
-            self._since_s = None
-            return False
-        if self._since_s is None:
-            self._since_s = t_s
-        return t_s - self._since_s >= HEIGHT_HOLD_S
+        if not (height_m < self.low_m and abs(vertical_m_s) < STILL_M_S and pressed):
+            return replace(self, since_s=None)
+        return replace(self, since_s=t_s) if self.since_s is None else self
+
+    def stands(self, t_s: float) -> bool:
+        """Whether it says that the vehicle stands."""
+        return self.since_s is not None and t_s - self.since_s >= HEIGHT_HOLD_S
 
 
+def low_below_m(clearance_m: float) -> float:
+    """Return the height below which a vehicle may stand; `clearance_m` is that of its origin when it stands."""
+    return clearance_m + HEIGHT_MARGIN_M
+
+
+@dataclass(frozen=True, slots=True)
 class Sinking:
-    """Speed down by motion capture alone, over `SINK_WINDOW_S`."""
+    """Speed downward by motion capture alone, over `SINK_WINDOW_S`."""
 
-    def __init__(self) -> None:
-        self._seen: deque[tuple[float, float]] = deque()
+    seen: tuple[tuple[float, float], ...] = ()
+    """Stamp and height of the poses, s and m."""
 
-    def update(self, t_s: float, pose: MocapPose | None) -> float | None:
-        """m/s, down positive; None: motion capture does not tell."""
-        seen = self._seen
+    def update(self, t_s: float, pose: MocapPose | None) -> Sinking:
+        """Return the evidence after one more tick; empty without a fresh pose."""
         if pose is None or not pose.tracking_valid or t_s - pose.stamp_s >= MOCAP_FRESH_S:
-            seen.clear()
-            return None
+            return Sinking()
+        seen = self.seen
         if not seen or pose.stamp_s > seen[-1][0]:
-            seen.append((pose.stamp_s, pose.position_world_m[2]))
-        while len(seen) > 2 and seen[1][0] <= seen[-1][0] - SINK_WINDOW_S:
-            seen.popleft()
-        (first_s, first_m), (last_s, last_m) = seen[0], seen[-1]
+            seen = (*seen, (pose.stamp_s, pose.position_world_m[2]))
+        first = 0
+        while len(seen) - first > 2 and seen[first + 1][0] <= seen[-1][0] - SINK_WINDOW_S:
+            first += 1
+        return Sinking(seen[first:])
+
+    @property
+    def speed_m_s(self) -> float | None:
+        """Downward positive; None if motion capture does not tell."""
+        if not self.seen:
+            return None
+        (first_s, first_m), (last_s, last_m) = self.seen[0], self.seen[-1]
         return (first_m - last_m) / (last_s - first_s) if last_s - first_s >= 0.5 * SINK_WINDOW_S else None
 
 
+@dataclass(frozen=True, slots=True)
 class Touchdown:
-    """Two of three, in a landing that the companion flies itself.
+    """Two of three sources, in a landing that the companion flies itself."""
 
-    Args:
-        clearance_m: height of the body's origin when the vehicle stands.
-    """
+    ceiling_m: float
+    """Above this height by motion capture, thrust and PX4 prove nothing."""
+    height: HeightEvidence
+    sinking: Sinking = field(default_factory=Sinking)
+    thrust_since_s: float | None = None
+    alone_since_s: float | None = None
+    last_s: float | None = None
+    relief: float = 1.0
+    """Share of its thrust that the law may give."""
+    certain: bool = False
+    """The vehicle stands."""
 
-    def __init__(self, clearance_m: float) -> None:
-        self._ceiling_m = clearance_m + NEVER_ABOVE_M
-        self._height = HeightEvidence(clearance_m)
-        self._sinking = Sinking()
-        self._thrust_since_s: float | None = None
-        self._alone_since_s: float | None = None
-        self._last_s: float | None = None
-        self.relief = 1.0
-        """Share of its thrust that the law may give."""
-        self.found: tuple[str, ...] = ()
-        """Who says that the vehicle stands."""
+    @classmethod
+    def begin(cls, clearance_m: float) -> Touchdown:
+        """Return the evidence before a landing; `clearance_m` is the height of the body's origin when the vehicle stands."""
+        return cls(clearance_m + NEVER_ABOVE_M, HeightEvidence(low_below_m(clearance_m)))
 
     def update(
         self,
@@ -101,46 +115,38 @@ class Touchdown:
         reference_height_m: float,
         thrust_share: float,
         landed: bool,
-    ) -> bool:
-        """One tick of a landing; True once touch-down is certain.
+    ) -> Touchdown:
+        """Return the evidence after one tick of a landing.
 
         Args:
             t_s: flight clock.
             vehicle: PX4's state.
-            pose: motion capture, as far as it is believed.
+            pose: motion capture, if it is believed.
             reference_height_m: where the law wants the body's origin.
             thrust_share: of hover thrust, in the last command.
             landed: PX4's land detector says that the vehicle stands.
         """
-        dt_s = 0.0 if self._last_s is None else t_s - self._last_s
-        self._last_s = t_s
-        height = self._height.update(
-            t_s, vehicle.position_world_m[2], vehicle.velocity_world_m_s[2], reference_height_m
-        )
-        sink_m_s = self._sinking.update(t_s, pose)
-        thrust = self._carried(t_s, sink_m_s, thrust_share)
-        below = pose is not None and pose.position_world_m[2] < self._ceiling_m
-        said = (("height", height), ("thrust", thrust), ("PX4", landed))
-        self.found = tuple(name for name, says in said if says)
-        if len(self.found) >= 2 and (height or below):
-            return True
-        self._relieve(t_s, dt_s, sink_m_s, (height or thrust) and below)
-        return False
-
-    def _carried(self, t_s: float, sink_m_s: float | None, thrust_share: float) -> bool:
+        dt_s = 0.0 if self.last_s is None else t_s - self.last_s
+        height = self.height.update(t_s, vehicle.position_world_m[2], vehicle.velocity_world_m_s[2], reference_height_m)
+        sinking = self.sinking.update(t_s, pose)
+        sink_m_s = sinking.speed_m_s
+        thrust_since_s = self.thrust_since_s
         if sink_m_s is None or sink_m_s > STILL_M_S or thrust_share > THRUST_SHARE:
-            self._thrust_since_s = None
-            return False
-        if self._thrust_since_s is None:
-            self._thrust_since_s = t_s
-        return t_s - self._thrust_since_s >= THRUST_HOLD_S
+            thrust_since_s = None
+        elif thrust_since_s is None:
+            thrust_since_s = t_s
+        carried = thrust_since_s is not None and t_s - thrust_since_s >= THRUST_HOLD_S
+        low = height.stands(t_s)
+        below = pose is not None and pose.position_world_m[2] < self.ceiling_m
+        after = replace(self, height=height, sinking=sinking, thrust_since_s=thrust_since_s, last_s=t_s)
+        if low + carried + landed >= 2 and (low or below):
+            return replace(after, certain=True)
+        return after._relieved(t_s, dt_s, sink_m_s, (low or carried) and below)
 
-    def _relieve(self, t_s: float, dt_s: float, sink_m_s: float | None, seems_to_stand: bool) -> None:
-        """Less thrust while one source says that the vehicle stands, all of it at once when it does sink."""
+    def _relieved(self, t_s: float, dt_s: float, sink_m_s: float | None, seems_to_stand: bool) -> Touchdown:
+        """Less thrust while one source says that the vehicle stands, all of it at once when the vehicle does sink."""
         if not seems_to_stand or sink_m_s is None or sink_m_s > RELIEF_SINK_MAX_M_S:
-            self.relief, self._alone_since_s = 1.0, None
-            return
-        if self._alone_since_s is None:
-            self._alone_since_s = t_s
-        if t_s - self._alone_since_s > ALONE_S:
-            self.relief = max(0.0, self.relief - dt_s / RELIEF_S)
+            return replace(self, relief=1.0, alone_since_s=None)
+        since_s = t_s if self.alone_since_s is None else self.alone_since_s
+        relief = max(0.0, self.relief - dt_s / RELIEF_S) if t_s - since_s > ALONE_S else self.relief
+        return replace(self, relief=relief, alone_since_s=since_s)

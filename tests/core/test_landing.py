@@ -171,7 +171,7 @@ def test_nobody_takes_thrust_back_from_what_sinks() -> None:
     """The detector alone: height stands by itself, thrust is taken back, the poses sink, all of it is given again."""
     from companion.safety.touchdown import Touchdown
 
-    detector, z, reliefs = Touchdown(0.3), 0.5, []
+    detector, z, reliefs = Touchdown.begin(0.3), 0.5, []
     vehicle = ordinary()[1].inputs[1000].vehicle
     assert isinstance(vehicle, VehicleState)
     frozen = replace(vehicle, position_world_m=(0.0, 0.0, 0.4), velocity_world_m_s=(0.0, 0.0, 0.0))
@@ -181,7 +181,8 @@ def test_nobody_takes_thrust_back_from_what_sinks() -> None:
         sink_m_s = max(0.0, sink_m_s + 0.005 * 9.81 * (1.0 - detector.relief) - 0.01 * (detector.relief == 1.0))
         z -= 0.005 * sink_m_s
         pose = MocapPose(t_s, None, k, (0.0, 0.0, z), (1.0, 0.0, 0.0, 0.0), True, 0.0)
-        assert not detector.update(t_s, frozen, pose, 0.2, 0.9, landed=False)
+        detector = detector.update(t_s, frozen, pose, 0.2, 0.9, landed=False)
+        assert not detector.certain
         reliefs.append(detector.relief)
     assert 0.6 < min(reliefs) < 1.0
 
@@ -190,14 +191,15 @@ def test_hanging_on_the_tether_is_no_touchdown() -> None:
     """Thrust next to nothing, nothing sinks, PX4's detector agrees: and it is a metre up."""
     from companion.safety.touchdown import Touchdown
 
-    detector = Touchdown(0.3)
+    detector = Touchdown.begin(0.3)
     vehicle = ordinary()[1].inputs[1000].vehicle
     assert isinstance(vehicle, VehicleState)
     hangs = replace(vehicle, position_world_m=(0.0, 0.0, 1.2), velocity_world_m_s=(0.0, 0.0, 0.0))
     for k in range(1000):
         t_s = 1.0 + 0.005 * k
         pose = MocapPose(t_s, None, k, (0.0, 0.0, 1.2), (1.0, 0.0, 0.0, 0.0), True, 0.0)
-        assert not detector.update(t_s, hangs, pose, 0.0, 0.1, landed=True)
+        detector = detector.update(t_s, hangs, pose, 0.0, 0.1, landed=True)
+        assert not detector.certain
         assert detector.relief == 1.0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 import shlex
@@ -19,7 +18,7 @@ from companion.config.loader import PRESETS, load_flight
 from companion.config.vehicle import Safety
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_CODES
 from companion.model.types import SafetyAction
-from companion.safety.supervisor import HOLD_EXPIRED, RETRACT_DONE, RETRACT_EXPIRED
+from companion.safety import notices
 from companion.sitl_config.faults import KINDS
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import Fault, World
@@ -180,25 +179,11 @@ def test_monitors_and_ladder_match() -> None:
     assert {key for key in Safety.model_fields if key not in named} <= told
 
 
-def constants(node: ast.expr) -> list[str]:
-    """A text, or both texts of `a if c else b`."""
-    nodes = [node.body, node.orelse] if isinstance(node, ast.IfExp) else [node]
-    return [one.value for one in nodes if isinstance(one, ast.Constant) and isinstance(one.value, str)]
-
-
-def calls(path: Path, *names: str) -> Iterator[ast.Call]:
-    for node in ast.walk(ast.parse(text_of(path))):
-        if isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", None)) in names:
-            yield node
-
-
-def test_events_match() -> None:
-    told = {codes(row[0])[0] for row in table(SAFETY, "id", "when")}
-    made = {HOLD_EXPIRED, RETRACT_DONE, RETRACT_EXPIRED}
-    for source in ("companion/core/flight_core.py", "companion/core/stages.py"):
-        for call in calls(ROOT / source, "tell", "_refuse"):
-            made |= set(constants(call.args[1]))
-    assert told == made
+def test_every_notice_is_reported_by_the_core() -> None:
+    core = "".join(text_of(path) for path in sorted((ROOT / "companion/core").glob("*.py")))
+    names = {name for name, value in vars(notices).items() if isinstance(value, notices.Notice)}
+    assert len(names) == len({notice.id for notice in notices.NOTICES}) == len(notices.NOTICES)
+    assert names == set(re.findall(r"\bnotices\.([A-Z_]+)\b", core))
 
 
 def test_ladder_matches() -> None:

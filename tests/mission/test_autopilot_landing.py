@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding
+from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -49,8 +49,19 @@ def seen(
     )
 
 
+class Landing:
+    """A landing that goes on from step to step."""
+
+    def __init__(self, pilot: bool) -> None:
+        self._now = AutopilotLanding.begin(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot, pose_s=0.0)
+
+    def step(self, i: Inputs) -> LandingStep:
+        self._now, step = self._now.step(i)
+        return step
+
+
 def test_it_asks_for_land_until_touchdown_then_takes_offboard_back_with_zero_thrust_and_disarms() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False, pose_s=0.0)
+    landing = Landing(pilot=False)
     step = landing.step(seen(0.1, 1.0, sink_m_s=0.7, mocap=False))
     assert (step.request, step.zero_thrust) == (AutopilotRequest.LAND, False)
     requests = []
@@ -75,7 +86,7 @@ def test_it_asks_for_land_until_touchdown_then_takes_offboard_back_with_zero_thr
 
 def test_a_height_that_nobody_can_vouch_for_is_no_touchdown() -> None:
     """Without vision for longer than PX4's height holds, thrust is not cut on its word."""
-    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False, pose_s=0.0)
+    landing = Landing(pilot=False)
     for k in range(400):
         step = landing.step(seen(5.0 + k * 0.005, 0.31, mocap=False))
         assert not step.zero_thrust
@@ -83,7 +94,7 @@ def test_a_height_that_nobody_can_vouch_for_is_no_touchdown() -> None:
 
 def test_a_height_that_does_not_arrive_any_more_is_no_touchdown() -> None:
     """PX4's attitude goes on and its position does not: the last one, low and still, said for good that the vehicle stands."""
-    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False, pose_s=0.0)
+    landing = Landing(pilot=False)
     landing.step(seen(0.2, 0.31, mocap=False))
     steps = [landing.step(seen(1.5 + k * 0.005, 0.31, mocap=False, position_s=1.2)) for k in range(400)]
     assert {step.request for step in steps} == {AutopilotRequest.LAND}
@@ -91,13 +102,13 @@ def test_a_height_that_does_not_arrive_any_more_is_no_touchdown() -> None:
 
 
 def test_sinking_is_no_touchdown() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False, pose_s=0.0)
+    landing = Landing(pilot=False)
     for k in range(300):
         assert not landing.step(seen(1.0 + k * 0.005, 0.35, sink_m_s=0.2)).zero_thrust
 
 
 def test_nothing_is_asked_against_a_pilot_for_as_long_as_they_fly() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=True, pose_s=0.0)
+    landing = Landing(pilot=True)
     for t_s in (0.1, 1.0, TIMEOUT_S + 1.0, 600.0):
         step = landing.step(seen(t_s, 1.0, mode=FlightMode.MANUAL))
         assert step.request is AutopilotRequest.NONE
@@ -107,12 +118,12 @@ def test_nothing_is_asked_against_a_pilot_for_as_long_as_they_fly() -> None:
 
 
 def test_a_silent_px4_that_stands_is_landed_and_one_in_the_air_is_not() -> None:
-    landing = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False, pose_s=0.0)
+    landing = Landing(pilot=False)
     steps = [landing.step(seen(4.0 + k * 0.05, 0.31, heard_s=0.0)) for k in range(80)]
     assert steps[-1].ended
     assert steps[-1].landed
     assert "by hand" in (steps[-1].text or "")
-    hovering = AutopilotLanding(0.0, CLEARANCE_M, TILT_MAX_RAD, pilot=False, pose_s=0.0)
+    hovering = Landing(pilot=False)
     assert not any(hovering.step(seen(4.0 + k * 0.05, 1.0, heard_s=0.0)).ended for k in range(80))
     late = hovering.step(seen(TIMEOUT_S + 1.0, 1.0, heard_s=0.0))
     assert late.ended

@@ -58,7 +58,7 @@ def test_any_holds_and_resumptions_are_smooth_and_on_the_planned_way(
     t_s = START_S + first_s
     samples = [course.reference(t_s)]
     for count, pause_s in enumerate(pauses_s):
-        (course.resume if count % 2 else course.hold)(t_s)
+        course = (course.resume if count % 2 else course.hold)(t_s)
         assert course.held is (count % 2 == 0)
         for _ in range(math.ceil(pause_s / STEP_S)):
             t_s += STEP_S
@@ -74,8 +74,8 @@ def test_a_hold_comes_to_rest_and_stays_and_the_rest_of_the_plan_follows(at_s: f
     whole = plan("catch")
     course = Course(whole, START_S)
     before = course.reference(START_S + at_s)
-    course.hold(START_S + at_s)
-    course.hold(START_S + at_s + 0.1)  # asked again: nothing new
+    course = course.hold(START_S + at_s)
+    course = course.hold(START_S + at_s + 0.1)  # asked again: nothing new
     speed = math.hypot(*before.velocity_world_m_s)
     rest_s = START_S + at_s + max(0.5, 1.875 * speed / HOLD_DECELERATION_M_S2) + 1e-9
     rest = course.reference(rest_s)
@@ -83,7 +83,7 @@ def test_a_hold_comes_to_rest_and_stays_and_the_rest_of_the_plan_follows(at_s: f
     assert accelerations(rest) == pytest.approx([0.0] * 5, abs=1e-9)
     assert course.reference(rest_s + 30.0) == rest
     assert math.dist(rest.position_world_m, before.position_world_m) <= 1.2 * speed * (rest_s - START_S - at_s)
-    course.resume(rest_s + 30.0)
+    course = course.resume(rest_s + 30.0)
     left_s = course.left_s(rest_s + 30.0)
     assert course.left_s(rest_s + 40.0) == pytest.approx(left_s - 10.0 + 0.25, abs=0.3)
     end = course.reference(rest_s + 30.0 + left_s + 10.0)

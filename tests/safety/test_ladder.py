@@ -9,11 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.model.types import Event, SafetyAction, Severity
+from companion.safety.events import OPERATOR_RESUME as RESUME
 from companion.safety.events import RULES
+from companion.safety.notices import HOLD_EXPIRED, RETRACT_EXPIRED
 from companion.safety.supervisor import (
-    HOLD_EXPIRED,
-    RESUME,
-    RETRACT_EXPIRED,
     LadderTimes,
     SupervisorState,
     update,
@@ -44,9 +43,9 @@ def test_every_state_and_every_event(now: SafetyAction, asked: tuple[str, Safety
     ("action", "t_s", "cause"),
     [
         (SafetyAction.HOLD, 20.9, None),
-        (SafetyAction.HOLD, 21.1, HOLD_EXPIRED),
+        (SafetyAction.HOLD, 21.1, HOLD_EXPIRED.id),
         (SafetyAction.RETRACT, 12.9, None),
-        (SafetyAction.RETRACT, 13.1, RETRACT_EXPIRED),
+        (SafetyAction.RETRACT, 13.1, RETRACT_EXPIRED.id),
         (SafetyAction.WARN, 1e6, None),
         (SafetyAction.LAND, 1e6, None),
         (SafetyAction.AUTOPILOT_LAND, 1e6, None),
@@ -63,7 +62,7 @@ def test_the_same_event_again_does_not_prolong_a_hold() -> None:
     for t_s in range(2, 22):
         state = update(state, [event("too_fast", SafetyAction.HOLD, float(t_s))], float(t_s), TIMES)
     assert state.cause == "too_fast"
-    assert update(state, [], 21.1, TIMES).cause == HOLD_EXPIRED
+    assert update(state, [], 21.1, TIMES).cause == HOLD_EXPIRED.id
 
 
 def test_going_on_in_the_tick_of_something_graver_changes_nothing() -> None:

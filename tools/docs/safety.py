@@ -13,24 +13,13 @@ from pydantic import BaseModel
 from companion.config.vehicle import ForceDevice, Safety, Tether
 from companion.model.types import Event, SafetyAction, Severity
 from companion.safety.events import RULES
+from companion.safety.notices import HOLD_EXPIRED, NO_ROOM_TO_STAY, NOTICES, RETRACT_DONE, RETRACT_EXPIRED
 from companion.safety.rule import Repeat, Rule, Subject
-from companion.safety.supervisor import (
-    HOLD_EXPIRED,
-    RETRACT_DONE,
-    RETRACT_EXPIRED,
-    LadderTimes,
-    SupervisorState,
-    update,
-)
+from companion.safety.supervisor import LadderTimes, SupervisorState, update
 from tools.docs.tables import write_page
 
 _SECTIONS: dict[str, type[BaseModel]] = {"": Safety, "tether.": Tether, "devices.force.": ForceDevice}
 _TIMES = LadderTimes(1.0, 1.0)
-_OWN_EVENTS = (
-    (RETRACT_DONE, SafetyAction.LAND),
-    ("no_room_to_stay", SafetyAction.LAND),
-)
-"""Events of the core that the ladder listens to."""
 
 
 def _default(key: str) -> str:
@@ -91,21 +80,27 @@ def ladder_table() -> str:
         f"|---|{'---|' * len(states)}",
     ]
     events = [(rule.id, rule.air) for rule in RULES if rule.air is not None]
-    for event_id, asks in (*events, *_OWN_EVENTS):
+    events += [(notice.id, notice.action) for notice in (RETRACT_DONE, NO_ROOM_TO_STAY)]
+    for event_id, asks in events:
         cells = [after(state, event_id, asks) for state in states]
         shown = ["" if cell is state else cell.value for cell, state in zip(cells, states, strict=True)]
         rows.append(f"| `{event_id}` | {' | '.join(shown)} |")
     late = SupervisorState(SafetyAction.HOLD, "before", 0.0), SupervisorState(SafetyAction.RETRACT, "before", 0.0)
-    for name, key, start in ((HOLD_EXPIRED, "hold_max_s", late[0]), (RETRACT_EXPIRED, "retract_max_s", late[1])):
+    for notice, key, start in ((HOLD_EXPIRED, "hold_max_s", late[0]), (RETRACT_EXPIRED, "retract_max_s", late[1])):
         end = update(start, [], 2.0, _TIMES)
         shown = [end.action.value if state is start.action else "" for state in states]
-        rows.append(f"| `{name}`, after {_default(key)} s | {' | '.join(shown)} |")
+        rows.append(f"| `{notice.id}`, after {_default(key)} s | {' | '.join(shown)} |")
     return "\n".join(rows)
+
+
+def notices_table() -> str:
+    """One row per notice."""
+    return "\n".join(["| id | when |", "|---|---|", *(f"| `{notice.id}` | {notice.when} |" for notice in NOTICES)])
 
 
 def tables() -> dict[str, str]:
     """By the names of their places."""
-    return {"monitors": monitors_table(), "ladder": ladder_table()}
+    return {"monitors": monitors_table(), "notices": notices_table(), "ladder": ladder_table()}
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,0 +1,153 @@
+"""What the safety state means for the flight: the supervisor's update, and the reaction when the action becomes graver. Pure."""
+
+from __future__ import annotations
+
+from companion.core.transition import Transition
+from companion.mission.plan import landing_from
+from companion.mission.retract import inward_only, retract_from
+from companion.model import flight_stage as seq
+from companion.model.flight_stage import Stage
+from companion.model.types import OperatorCommand, Outcome, PhaseKind, Reference, SafetyAction, Vec3
+from companion.safety import notices
+from companion.safety.events import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, PILOT_TOOK_OVER
+from companion.safety.supervisor import update
+
+HOLD_ABOVE_M = 0.3
+"""Margin over standing height below which the vehicle lands instead of holding."""
+_BY_OPERATOR = (OPERATOR_LAND, OPERATOR_ABORT, notices.CALLED_OFF.id)
+_EXPIRED = {
+    notices.HOLD_EXPIRED.id: (notices.HOLD_EXPIRED, "nobody ended the hold"),
+    notices.RETRACT_EXPIRED.id: (notices.RETRACT_EXPIRED, "the way back took too long"),
+}
+# Looking up members of an enum costs time in every tick.
+_HOLD, _RETRACT = SafetyAction.HOLD, SafetyAction.RETRACT
+_COMMANDED_HOLD = OperatorCommand.HOLD
+
+
+def supervise(t: Transition) -> None:
+    """Update the supervisor by this tick's events, and react to its new action."""
+    i, state = t.i, t.state
+    if i.command is _COMMANDED_HOLD and state.stage in seq.BEFORE_LIFT:
+        _hold_on_ground(t)
+    action = state.supervisor.action
+    if action is _RETRACT and state.course is not None and state.course.left_s(i.t_s) <= 0.0:
+        t.report(notices.RETRACT_DONE, "back along the tether; landing")
+    if t.events or action is _HOLD or action is _RETRACT:
+        _escalate(t)
+
+
+def _escalate(t: Transition) -> None:
+    before, standing = t.state.supervisor, None
+    if before.action is _HOLD and any(event.id == OPERATOR_RESUME for event in t.events):
+        standing = t.o.standing
+    after = update(before, t.events, t.i.t_s, t.parameters.times, standing)
+    if after is not before:
+        t.change(supervisor=after)
+    if after.action is before.action:
+        if standing is not None:
+            t.report(notices.RESUME_REFUSED, standing)
+        return
+    if after.cause in _EXPIRED:
+        t.report(*_EXPIRED[after.cause])
+    if after.action.rank > before.action.rank:
+        _react(t)
+    elif t.state.course is not None:  # the operator has ended the hold
+        t.change(course=t.state.course.resume(t.i.t_s))
+        t.resumed = True
+
+
+def _react(t: Transition) -> None:
+    """The action has become graver."""
+    state, action = t.state, t.state.supervisor.action
+    if action.rank < _HOLD.rank:
+        return
+    if state.stage in seq.BEFORE_ARMING and t.o.airborne:
+        t.finish(Outcome.ABORTED)
+        t.enter_landing(seq.people_fly(t.i.status), float("-inf"))
+    elif state.stage in seq.BEFORE_LIFT:
+        if action.rank >= SafetyAction.LAND.rank:
+            t.stand_down(Outcome.ABORTED if state.supervisor.cause in _BY_OPERATOR else Outcome.REFUSED)
+    elif state.pilot_flies:
+        return
+    elif action is SafetyAction.TERMINATE:
+        t.finish(Outcome.CRASHED)
+        t.enter(Stage.AUTOPILOT_LAND, flipped=True)
+    elif action is SafetyAction.AUTOPILOT_LAND:
+        if state.stage in seq.LIFTING:
+            t.finish(Outcome.ABORTED)
+            t.enter(Stage.AUTOPILOT_LAND, pilot_flies=state.supervisor.cause == PILOT_TOOK_OVER)
+    elif state.stage is Stage.SPOOL:
+        t.finish(Outcome.ABORTED)
+        t.enter(Stage.TOUCHDOWN)
+    elif state.stage is Stage.PLAN:
+        if action is _HOLD:
+            _hold(t)
+        elif action is _RETRACT:
+            _retract(t)
+        else:
+            _land(t)
+
+
+def _hold_on_ground(t: Transition) -> None:
+    """On the ground HOLD means not to lift. A flight that waits for its start does that already."""
+    waits = t.parameters.waits_for_start and t.state.stage in (Stage.WAIT, Stage.READY)
+    if not waits and not t.state.armed_by_others:
+        text = "a stop was asked for before take-off; it stays on the ground"
+        t.report(notices.CALLED_OFF, text)
+
+
+def _hold(t: Transition) -> None:
+    """Come to rest and stay; a landing goes on, and near the floor the hold becomes one."""
+    course, t_s = t.state.course, t.i.t_s
+    if course is None or course.segment(t_s).kind is PhaseKind.LANDING:
+        return
+    if course.reference(t_s).position_world_m[2] < t.parameters.clearance_m + HOLD_ABOVE_M:
+        _land_instead(t, "too low to stay")
+    else:
+        t.change(course=course.hold(t_s))
+
+
+def _retract(t: Transition) -> None:
+    now, course = t.o.reference, t.state.course
+    if now is None or course is None or course.segment(t.i.t_s).kind is PhaseKind.LANDING:
+        _land_instead(t, "landing already")
+        return
+    arm_rad = t.i.arm.angle_rad if t.i.arm is not None else now.arm_rad
+    p = t.parameters
+    t.leave_mission(
+        retract_from(now.position_world_m, now.velocity_world_m_s, now.yaw_rad, arm_rad, p.fold_rad, p.vehicle)
+    )
+
+
+def _land_instead(t: Transition, text: str) -> None:
+    t.report(notices.NO_ROOM_TO_STAY, text)
+    t.change(supervisor=update(t.state.supervisor, t.events, t.i.t_s, t.parameters.times))
+    _land(t)
+
+
+def _land(t: Transition) -> None:
+    """From the last reference on: stop, fold, descend."""
+    now, p = t.o.reference, t.parameters
+    if now is None:  # the law has never flown
+        t.finish(Outcome.ABORTED)
+        t.enter(Stage.AUTOPILOT_LAND)
+        return
+    t.leave_mission(
+        landing_from(
+            now.position_world_m,
+            _allowed_velocity(t, now),
+            now.yaw_rad,
+            t.i.arm.angle_rad if t.i.arm is not None else now.arm_rad,
+            p.fold_rad,
+            p.vehicle.safety.land_speed_m_s,
+            p.vehicle,
+        )
+    )
+
+
+def _allowed_velocity(t: Transition, now: Reference) -> Vec3:
+    """The velocity that a stop may begin with, m/s: nothing outward or up while the tether pulls."""
+    tether = t.o.tether
+    if tether is not None and (tether.taut or tether.snagged):
+        return inward_only(now.velocity_world_m_s, now.position_world_m, t.parameters.vehicle.tether.anchor_world_m)
+    return now.velocity_world_m_s

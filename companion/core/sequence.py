@@ -1,0 +1,333 @@
+"""The stages of one flight: what each waits for, requests from PX4, and does when it takes too long. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from companion.core.flight_state import Tare
+from companion.core.transition import Transition
+from companion.mission.autopilot_landing import FLIPPED, TIPPED
+from companion.mission.check import check_start
+from companion.mission.course import Course
+from companion.mission.plan import Plan
+from companion.mission.settled import SettledEstimate
+from companion.model import flight_stage as seq
+from companion.model.flight_stage import Stage
+from companion.model.frames import euler_zyx_from_quat
+from companion.model.types import AutopilotRequest, Inputs, Outcome, PhaseKind, SafetyAction, Severity
+from companion.safety import notices
+from companion.safety.events import CRASHED, PILOT_TOOK_OVER
+from companion.safety.mocap import unfused
+from companion.safety.notices import Notice
+
+ARMED_SHOWN_S = 1.5
+"""PX4's HEARTBEAT reports once a second whether it is armed: after a request to arm, an older "not armed" proves nothing."""
+NO_TOUCHDOWN_S = 5.0
+"""After the plan's end."""
+_NONE = AutopilotRequest.NONE
+
+
+def advance(t: Transition) -> AutopilotRequest:
+    """Move the sequence on and return the request of the present stage."""
+    i, state = t.i, t.state
+    assert state.entered_s is not None
+    if i.mocap is not None and i.mocap.tracking_valid:
+        t.pose_s = i.mocap.stamp_s
+    return _STAGES[state.stage](t, i.t_s - state.entered_s)
+
+
+# -- on the ground -------------------------------------------------------------------------------------------------
+
+
+def _wait(t: Transition, elapsed_s: float) -> AutopilotRequest:
+    _wait_for_readiness(t, elapsed_s)
+    if t.start_asked:
+        _decline_start(t)
+    return _NONE
+
+
+def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
+    """Until every input is there and PX4 demonstrably follows motion capture, for as long as the tare takes."""
+    i, was_ready = t.i, t.state.waiting.was_ready
+    overdue = elapsed_s > seq.WAIT_TIMEOUT_S and not was_ready
+    missing = missing_inputs(i)
+    problem = _nothing_from(missing) if missing else unfused(i)
+    if problem is not None:
+        t.change_waiting(unready=problem, tare_start_s=None, settled=SettledEstimate())
+        if overdue:
+            _refuse(t, notices.INPUTS_MISSING if missing else notices.VISION_NOT_FUSED, problem)
+        return
+    if t.state.waiting.tare_start_s is None:
+        _begin_tare(t)
+    _weigh(t)
+    tare_start_s = t.state.waiting.tare_start_s
+    assert tare_start_s is not None
+    if i.t_s - tare_start_s < seq.TARE_S:
+        t.change_waiting(unready="the force sensor is still being weighed")
+        return
+    wanders = t.state.waiting.settled.problem(i.t_s)
+    if wanders is not None:
+        t.change_waiting(unready=wanders)
+        if overdue:
+            _refuse(t, notices.ESTIMATE_UNSTEADY, wanders)
+        return
+    t.tare.append(Tare.FINISH)
+    problems = _misplaced(t)
+    if not problems:
+        _is_ready(t)
+    elif was_ready:  # somebody moved it; they may put it back
+        t.change_waiting(unready=problems[0])
+    else:
+        for problem in problems:
+            t.report(notices.START_REFUSED, problem)
+        t.stand_down(Outcome.REFUSED)
+
+
+def _is_ready(t: Transition) -> None:
+    if not t.parameters.waits_for_start:
+        _take_off(t)
+        return
+    t.change_waiting(was_ready=True, unready="it has become ready just now; say it again", looked_s=t.i.t_s)
+    _begin_tare(t)
+    t.enter(Stage.READY)
+
+
+def _ready(t: Transition, _: float) -> AutopilotRequest:
+    """Everything is there; until the operator starts the take-off, or something is lost again."""
+    i, waiting = t.i, t.state.waiting
+    missing = missing_inputs(i)
+    problem = _nothing_from(missing) if missing else unfused(i)
+    if problem is None:
+        assert waiting.tare_start_s is not None
+        _weigh(t)
+        if i.t_s - waiting.tare_start_s >= seq.TARE_S:
+            t.tare.append(Tare.FINISH)
+            _begin_tare(t)
+        if t.start_asked or i.t_s - waiting.looked_s >= seq.LOOK_AGAIN_S:
+            t.change_waiting(looked_s=i.t_s)
+            problem = t.state.waiting.settled.problem(i.t_s) or next(iter(_misplaced(t)), None)
+    else:
+        t.change_waiting(settled=SettledEstimate())
+    if problem is not None:
+        t.change_waiting(unready=problem, tare_start_s=None)
+        t.report(notices.NOT_READY, f"not ready any more: {problem}")
+        t.enter(Stage.WAIT)
+        if t.start_asked:
+            _decline_start(t)
+    elif t.start_asked:
+        _take_off(t)
+    return _NONE
+
+
+def _begin_tare(t: Transition) -> None:
+    t.tare.append(Tare.BEGIN)
+    t.change_waiting(tare_start_s=t.i.t_s)
+
+
+def _weigh(t: Transition) -> None:
+    i = t.i
+    assert i.vehicle is not None and i.mocap is not None
+    t.tare.append(Tare.COLLECT)
+    t.change_waiting(settled=t.state.waiting.settled.take(i.t_s, i.vehicle, i.mocap))
+
+
+def _misplaced(t: Transition) -> list[str]:
+    """In what the vehicle does not stand as the mission says."""
+    vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
+    assert vehicle is not None and arm is not None
+    yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
+    return check_start(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, arm.angle_rad)
+
+
+def _take_off(t: Transition) -> None:
+    """From where the vehicle stands now."""
+    vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
+    assert vehicle is not None and arm is not None
+    yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
+    t.change(plan=Plan.build(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, arm.angle_rad))
+    t.enter(Stage.OFFBOARD)
+
+
+def _decline_start(t: Transition) -> None:
+    waits = t.parameters.waits_for_start
+    text = t.state.waiting.unready if waits else "this flight takes off by itself as soon as it can"
+    t.report(notices.START_DECLINED, text)
+
+
+def _refuse(t: Transition, notice: Notice, text: str) -> None:
+    t.report(notice, text)
+    t.stand_down(Outcome.REFUSED)
+
+
+def _offboard(t: Transition, elapsed_s: float) -> AutopilotRequest:
+    # After a landing PX4 is in OFFBOARD already, but it arms only on a stream of setpoints.
+    if seq.in_offboard(t.i.status) and elapsed_s > seq.STREAM_BEFORE_OFFBOARD_S:
+        t.enter(Stage.ARM)
+    elif elapsed_s > seq.OFFBOARD_TIMEOUT_S:
+        _refuse(t, notices.OFFBOARD_REFUSED, "PX4 did not enter OFFBOARD")
+    elif elapsed_s > seq.STREAM_BEFORE_OFFBOARD_S:
+        return AutopilotRequest.OFFBOARD
+    return _NONE
+
+
+def _arm(t: Transition, elapsed_s: float) -> AutopilotRequest:
+    t_s = t.i.t_s
+    if seq.is_armed(t.i.status):
+        assert t.state.plan is not None
+        t.change(course=Course(t.state.plan, t_s + seq.SPOOL_S))
+        t.enter(Stage.SPOOL)
+    elif elapsed_s > seq.ARM_TIMEOUT_S:
+        _refuse(t, notices.ARMING_REFUSED, "PX4 did not arm")
+    else:
+        t.change(arm_requested_s=t_s)
+        return AutopilotRequest.ARM
+    return _NONE
+
+
+def _stand_down(t: Transition, elapsed_s: float) -> AutopilotRequest:
+    i = t.i
+    if not seq.is_armed(i.status) and i.t_s - t.state.arm_requested_s > ARMED_SHOWN_S:
+        t.enter(Stage.DONE)
+    elif not _left_to_pilot(t) and elapsed_s > seq.DISARM_TIMEOUT_S:
+        text = "PX4 did not disarm: its rotors may turn; disarm it by its switch or from a ground station"
+        t.report(notices.DISARM_REFUSED, text)
+        t.enter(Stage.DONE)
+    elif t.state.stage is Stage.STAND_DOWN:
+        t.change(rotor_stop=t.state.rotor_stop.update(i))
+        return AutopilotRequest.DISARM if t.state.rotor_stop.may_disarm else _NONE
+    return _NONE
+
+
+# -- with the rotors lifting ---------------------------------------------------------------------------------------
+
+
+def _spool(t: Transition, elapsed_s: float) -> AutopilotRequest:
+    if elapsed_s >= seq.SPOOL_S:
+        assert t.state.plan is not None
+        t.change(mission_start_s=t.i.t_s, course=Course(t.state.plan, t.i.t_s))
+        t.enter(Stage.PLAN)
+        t.report(notices.TAKEOFF, "take-off")
+    return _NONE
+
+
+def _fly(t: Transition, _: float) -> AutopilotRequest:
+    i, course, vehicle = t.i, t.state.course, t.i.vehicle
+    assert course is not None
+    if vehicle is not None and course.segment(i.t_s).kind is PhaseKind.LANDING:
+        reference_m = course.reference(i.t_s).position_world_m[2]
+        touchdown = t.state.touchdown.update(
+            i.t_s, vehicle, i.mocap, reference_m, t.o.thrust_share, seq.on_ground(i.status)
+        )
+        t.change(touchdown=touchdown)
+        if touchdown.certain:
+            t.report(notices.TOUCHDOWN, "touchdown")
+            t.finish(Outcome.COMPLETED)
+            t.enter(Stage.TOUCHDOWN)
+            return _NONE
+    if course.left_s(i.t_s) < -NO_TOUCHDOWN_S:
+        t.report(notices.NO_TOUCHDOWN, "no touchdown was felt")
+        t.finish(Outcome.ABORTED)
+        t.enter(Stage.AUTOPILOT_LAND)
+    return _NONE
+
+
+def _touchdown(t: Transition, elapsed_s: float) -> AutopilotRequest:
+    if elapsed_s >= seq.TOUCHDOWN_RAMP_S:
+        t.enter(Stage.DISARM)
+    return _NONE
+
+
+def _disarm(t: Transition, elapsed_s: float) -> AutopilotRequest:
+    i = t.i
+    if not seq.is_armed(i.status):
+        t.enter(Stage.DONE)
+        return _NONE
+    if _left_to_pilot(t):
+        return _NONE
+    stop = t.state.rotor_stop.update(i)
+    t.change(rotor_stop=stop)
+    if stop.overturned:
+        _crash(t, FLIPPED if stop.flipped else TIPPED)
+        return AutopilotRequest.FORCE_DISARM
+    if elapsed_s > seq.DISARM_TIMEOUT_S or not seq.in_offboard(i.status):
+        text = "PX4 did not disarm" if seq.in_offboard(i.status) else "PX4 left OFFBOARD before it was disarmed"
+        t.report(notices.DISARM_REFUSED, text)
+        t.finish(Outcome.ABORTED)
+        t.enter(Stage.AUTOPILOT_LAND)
+        return _NONE
+    if seq.on_ground(i.status):
+        return AutopilotRequest.DISARM if stop.may_disarm else _NONE
+    return AutopilotRequest.FORCE_DISARM if stop.may_force else _NONE
+
+
+def _autopilot_land(t: Transition, _: float) -> AutopilotRequest:
+    assert t.state.landing is not None
+    landing, step = t.state.landing.step(t.i)
+    t.change(landing=landing, zero_thrust=step.zero_thrust)
+    if landing.overturned and t.state.outcome is not Outcome.CRASHED:
+        _crash(t, step.text or TIPPED)
+    elif step.text is not None:
+        touchdown = step.text == "touchdown"
+        t.report(notices.AUTOPILOT_LANDING, step.text, Severity.INFO if touchdown else Severity.CRITICAL)
+    if step.ended:
+        if not step.landed and t.state.outcome is not Outcome.CRASHED:
+            t.change(outcome=Outcome.LOST)
+        t.enter(Stage.DONE)
+    return step.request
+
+
+def _done(_: Transition, __: float) -> AutopilotRequest:
+    return _NONE
+
+
+def _left_to_pilot(t: Transition) -> bool:
+    """A pilot took over while PX4 was to be disarmed: from now on nothing is sent, and the pilot's own disarm is waited for."""
+    if not seq.people_fly(t.i.status):
+        return False
+    if not any(event.id == PILOT_TOOK_OVER for event in t.events):
+        text = "a pilot took over before PX4 was disarmed; nothing is sent any more"
+        t.report_rule(PILOT_TOOK_OVER, SafetyAction.AUTOPILOT_LAND, text)
+    t.finish(Outcome.ABORTED)
+    t.enter(Stage.AUTOPILOT_LAND, pilot_flies=True)
+    return True
+
+
+def _crash(t: Transition, text: str) -> None:
+    """Reported once: the rule of the same id may have done so."""
+    if t.state.outcome is not Outcome.CRASHED:
+        t.report_rule(CRASHED, SafetyAction.TERMINATE, text)
+        t.finish(Outcome.CRASHED)
+
+
+def missing_inputs(i: Inputs) -> list[str]:
+    """Return the devices that have delivered nothing."""
+    devices = {
+        "PX4 state": i.vehicle,
+        "PX4": i.status,
+        "motion capture": i.mocap,
+        "arm": i.arm,
+        "force sensor": i.force,
+    }
+    return [name for name, value in devices.items() if value is None]
+
+
+def _nothing_from(missing: list[str]) -> str:
+    hint = (
+        "; PX4 sends no local position: check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3" if "PX4 state" in missing else ""
+    )
+    return f"no data from: {', '.join(missing)}{hint}"
+
+
+_STAGES: Mapping[Stage, Callable[[Transition, float], AutopilotRequest]] = {
+    Stage.WAIT: _wait,
+    Stage.READY: _ready,
+    Stage.OFFBOARD: _offboard,
+    Stage.ARM: _arm,
+    Stage.SPOOL: _spool,
+    Stage.PLAN: _fly,
+    Stage.TOUCHDOWN: _touchdown,
+    Stage.DISARM: _disarm,
+    Stage.AUTOPILOT_LAND: _autopilot_land,
+    Stage.STAND_DOWN: _stand_down,
+    Stage.DONE: _done,
+}

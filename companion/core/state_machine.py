@@ -1,0 +1,36 @@
+"""The flight's state machine: one pure transition function. Time is in the inputs.
+
+A transition updates the supervisor by the tick's events and reacts to its action (`companion.core.reactions`); then it moves the
+sequence of stages on (`companion.core.sequence`, `companion.model.flight_stage`).
+"""
+
+from __future__ import annotations
+
+from companion.core.flight_state import FlightState, Observation, Request
+from companion.core.reactions import supervise
+from companion.core.sequence import advance
+from companion.core.transition import Parameters, Transition
+from companion.model.types import Event
+from companion.safety.events import OPERATOR_START
+
+
+def transition(
+    parameters: Parameters, state: FlightState, events: tuple[Event, ...], observation: Observation
+) -> tuple[FlightState, Request]:
+    """Return the state after a tick, and what it requests. Pure: the same arguments give the same results.
+
+    Args:
+        parameters: what does not change during the flight.
+        state: after the tick before; `Parameters.initial_state` in the first tick.
+        events: what the monitors report in this tick.
+        observation: what else is known in this tick.
+    """
+    t = Transition(parameters, state, events, observation)
+    if state.entered_s is None:
+        t.change(entered_s=observation.inputs.t_s)
+    if observation.armed_by_others and not state.armed_by_others:
+        t.change(armed_by_others=True)
+    t.start_asked = any(event.id == OPERATOR_START for event in events)
+    supervise(t)
+    request = advance(t)
+    return t.state, Request(request, tuple(t.events), tuple(t.tare), t.resumed)

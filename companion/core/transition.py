@@ -1,0 +1,138 @@
+"""One transition in progress: the flight's state so far, and what is reported and requested on the way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from companion.config.loader import FlightConfig
+from companion.config.vehicle import Vehicle
+from companion.core.flight_state import FlightState, Observation, Tare
+from companion.mission.autopilot_landing import AutopilotLanding
+from companion.mission.course import Course
+from companion.mission.plan import Plan
+from companion.model import flight_stage as seq
+from companion.model.flight_stage import Stage
+from companion.model.negative_zero import without_negative_zero
+from companion.model.types import Event, Outcome, SafetyAction, Severity, Vec2
+from companion.safety.notices import Notice
+from companion.safety.rotor_stop import RotorStop
+from companion.safety.supervisor import LadderTimes
+from companion.safety.touchdown import Touchdown
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """What does not change during a flight."""
+
+    config: FlightConfig
+    vehicle: Vehicle
+    clearance_m: float
+    """Height of the body's origin when the vehicle stands."""
+    tilt_max_rad: float
+    """`safety.tilt_abort_deg`."""
+    fold_rad: Vec2
+    times: LadderTimes
+    waits_for_start: bool
+    """The operator starts the take-off."""
+
+    @classmethod
+    def of(cls, config: FlightConfig) -> Parameters:
+        """Return those of an effective configuration."""
+        vehicle, safety = config.vehicle, config.vehicle.safety
+        return cls(
+            config=config,
+            vehicle=vehicle,
+            clearance_m=vehicle.airframe.ground_clearance_m,
+            tilt_max_rad=math.radians(safety.tilt_abort_deg),
+            fold_rad=(math.radians(safety.fold_arm_deg[0]), math.radians(safety.fold_arm_deg[1])),
+            times=LadderTimes.of(safety),
+            waits_for_start=config.mission.start.takeoff == "by_operator",
+        )
+
+    def initial_state(self) -> FlightState:
+        """Return the state before the first tick."""
+        return FlightState(Touchdown.begin(self.clearance_m), RotorStop.begin(self.clearance_m, self.tilt_max_rad))
+
+
+def event_of(notice: Notice, t_s: float, text: str, severity: Severity | None = None) -> Event:
+    """Return the event of a notice; with the severity of its row if none is given."""
+    return Event(t_s, notice.id, severity or notice.severity, notice.action, without_negative_zero(text))
+
+
+class Transition:
+    """Collects what a transition changes, reports and requests; lives for one tick.
+
+    Args:
+        parameters: of the flight.
+        state: before the tick.
+        events: of the monitors in this tick.
+        observation: of this tick.
+    """
+
+    __slots__ = ("events", "i", "o", "parameters", "pose_s", "resumed", "start_asked", "state", "tare")
+
+    def __init__(
+        self, parameters: Parameters, state: FlightState, events: tuple[Event, ...], observation: Observation
+    ) -> None:
+        self.parameters = parameters
+        self.state = state
+        self.events = list(events)
+        self.o = observation
+        self.i = observation.inputs
+        self.pose_s = observation.pose_s
+        """Stamp of the newest pose that was passed on to PX4."""
+        self.start_asked = False
+        """The operator asked for take-off in this tick."""
+        self.tare: list[Tare] = []
+        self.resumed = False
+
+    def change(self, **fields: Any) -> None:
+        """Replace fields of the state."""
+        self.state = replace(self.state, **fields)
+
+    def change_waiting(self, **fields: Any) -> None:
+        """Replace fields of `FlightState.waiting`."""
+        self.state = replace(self.state, waiting=replace(self.state.waiting, **fields))
+
+    def report(self, notice: Notice, text: str, severity: Severity | None = None) -> None:
+        """Add an event; with the severity of its row if none is given."""
+        self.events.append(event_of(notice, self.i.t_s, text, severity))
+
+    def report_rule(self, rule_id: str, action: SafetyAction, text: str) -> None:
+        """Add the event of a rule that the sequence finds by itself, with CRITICAL severity."""
+        self.events.append(Event(self.i.t_s, rule_id, Severity.CRITICAL, action, without_negative_zero(text)))
+
+    def enter(self, stage: Stage, *, pilot_flies: bool = False, flipped: bool = False) -> None:
+        """Go to a stage. Of a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is known already."""
+        p, t_s = self.parameters, self.i.t_s
+        if stage is Stage.AUTOPILOT_LAND:
+            self.enter_landing(pilot_flies, self.pose_s, flipped)
+        elif stage in seq.DISARMING:
+            self.change(stage=stage, entered_s=t_s, rotor_stop=RotorStop.begin(p.clearance_m, p.tilt_max_rad))
+        else:
+            self.change(stage=stage, entered_s=t_s)
+
+    def enter_landing(self, pilot_flies: bool, pose_s: float, flipped: bool = False) -> None:
+        """PX4 lands; `pose_s` is the stamp of the newest pose that it has had, -inf if that is not known."""
+        p, t_s = self.parameters, self.i.t_s
+        landing = AutopilotLanding.begin(
+            t_s, p.clearance_m, p.tilt_max_rad, pilot_flies, pose_s=pose_s, flipped=flipped
+        )
+        self.change(stage=Stage.AUTOPILOT_LAND, entered_s=t_s, landing=landing)
+
+    def finish(self, outcome: Outcome) -> None:
+        """Fix the outcome; a graver one replaces it, a better one never does."""
+        if self.state.outcome in (None, Outcome.COMPLETED) or outcome is Outcome.CRASHED:
+            self.change(outcome=outcome)
+
+    def stand_down(self, outcome: Outcome) -> None:
+        """Disarm and end, on the ground."""
+        self.finish(outcome)
+        self.enter(Stage.STAND_DOWN)
+
+    def leave_mission(self, plan: Plan) -> None:
+        """Fly this plan from now on; the mission is over."""
+        self.finish(Outcome.ABORTED)
+        self.change(course=Course(plan, self.i.t_s), aborting=True)

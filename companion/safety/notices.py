@@ -1,0 +1,92 @@
+"""Events that the flight's state machine and the core report themselves: no rule of `companion.safety.events` watches for them.
+
+One row each; docs/safety.md is made from them. Ids are stable: logs, summaries and outside scripts name them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from companion.model.types import SafetyAction, Severity
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """One row."""
+
+    id: str
+    severity: Severity
+    action: SafetyAction
+    """What the supervisor is asked for; the state machine has done all else."""
+    when: str
+    """When it is reported, and what follows."""
+
+
+_INFO, _WARNING, _CRITICAL = Severity.INFO, Severity.WARNING, Severity.CRITICAL
+_NOMINAL, _WARN, _LAND, _PX4_LANDS = (
+    SafetyAction.NOMINAL,
+    SafetyAction.WARN,
+    SafetyAction.LAND,
+    SafetyAction.AUTOPILOT_LAND,
+)
+
+INPUTS_MISSING = Notice("inputs_missing", _CRITICAL, _NOMINAL, "a device delivered nothing within 15 s: refused")
+VISION_NOT_FUSED = Notice(
+    "vision_not_fused", _CRITICAL, _NOMINAL,
+    "PX4's position or yaw does not agree with motion capture (0.10 m, 8 deg): refused",
+)  # fmt: skip
+ESTIMATE_UNSTEADY = Notice(
+    "estimate_unsteady", _CRITICAL, _NOMINAL,
+    "PX4's estimate has not been near motion capture and steady for 1 s (0.05 m, 5 deg in the mean; 0.02 m, 2 deg of wandering): "
+    "refused",
+)  # fmt: skip
+START_REFUSED = Notice(
+    "start_refused", _CRITICAL, _NOMINAL, "the machine does not stand where and as the mission says: refused"
+)
+OFFBOARD_REFUSED = Notice("offboard_refused", _CRITICAL, _NOMINAL, "PX4 did not enter OFFBOARD within 8 s: refused")
+ARMING_REFUSED = Notice("arming_refused", _CRITICAL, _NOMINAL, "PX4 did not arm within 10 s: refused")
+NOT_READY = Notice(
+    "not_ready", _WARNING, _NOMINAL,
+    "a flight that waits for its start has lost what it had: inputs, an estimate that is steady and agrees, its place. "
+    "It waits for it to come back, as long as that takes",
+)  # fmt: skip
+START_DECLINED = Notice(
+    "start_declined", _WARNING, _NOMINAL, "`start` was commanded, and it is not ready; the text says why"
+)
+CALLED_OFF = Notice(
+    "called_off", _INFO, _LAND,
+    "HOLD was commanded before the rotors lift: stand down, aborted. One that waits for its start just goes on waiting",
+)  # fmt: skip
+RESUME_REFUSED = Notice(
+    "resume_refused", _WARNING, _NOMINAL,
+    "going on was asked for while something stands that it must hold for; the text says what",
+)  # fmt: skip
+TAKEOFF = Notice("takeoff", _INFO, _NOMINAL, "the plan begins")
+CATCH = Notice("catch", _INFO, _NOMINAL, "a payload was caught")
+PAYLOAD_LEFT = Notice(
+    "payload_left", _INFO, _NOMINAL,
+    "nothing has pulled on the net for 0.5 s, though the machine does not fall: it is empty, and ready for the next catch",
+)  # fmt: skip
+TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle stands")
+NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "5 s after the plan's end nothing was felt: PX4 lands")
+DISARM_REFUSED = Notice(
+    "disarm_refused", _CRITICAL, _NOMINAL,
+    "PX4 did not disarm within 8 s, or left OFFBOARD before: PX4 lands; if nothing had lifted: people are told to disarm it, "
+    "and the guardian takes over",
+)  # fmt: skip
+AUTOPILOT_LANDING = Notice("autopilot_landing", _CRITICAL, _PX4_LANDS, "what the landing by PX4 has to tell")
+GATE = Notice("gate", _WARNING, _WARN, "the gate held a command back, or cut it")
+HOLD_EXPIRED = Notice("hold_expired", _CRITICAL, _LAND, "a HOLD lasted longer than `hold_max_s`: it lands")
+RETRACT_EXPIRED = Notice(
+    "retract_expired", _CRITICAL, _LAND, "a RETRACT lasted longer than `retract_max_s`: it lands where it is"
+)
+RETRACT_DONE = Notice("retract_done", _INFO, _LAND, "a RETRACT has arrived: it lands")
+NO_ROOM_TO_STAY = Notice(
+    "no_room_to_stay", _CRITICAL, _LAND, "a HOLD lower than 0.3 m above standing, or a RETRACT in a landing: it lands"
+)
+
+NOTICES: tuple[Notice, ...] = (
+    INPUTS_MISSING, VISION_NOT_FUSED, ESTIMATE_UNSTEADY, START_REFUSED, OFFBOARD_REFUSED, ARMING_REFUSED, NOT_READY,
+    START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED,
+    AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
+)  # fmt: skip

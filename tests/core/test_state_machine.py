@@ -1,0 +1,63 @@
+"""The transition is a function: what it is given it neither changes nor remembers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from companion.core import flight_core
+from companion.core.flight_state import FlightState, Observation, Request
+from companion.core.state_machine import transition
+from companion.core.transition import Parameters
+from companion.mission.course import Course
+from companion.mission.plan import Plan
+from companion.model.flight_stage import Stage
+from companion.model.types import Event, Outcome
+from companion.sitl_config.loader import load_sitl
+from sitl.fast.loop import FastFlight
+
+
+def plain(value: object) -> object:
+    """A record as dictionaries, plans left out: each is another object."""
+    if isinstance(value, Plan):
+        return None
+    if isinstance(value, Course):
+        return (value.start_s, value.change)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return value
+
+
+def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    stages, ticks = set(), 0
+
+    def twice(
+        parameters: Parameters, state: FlightState, events: tuple[Event, ...], observation: Observation
+    ) -> tuple[FlightState, Request]:
+        nonlocal ticks
+        ticks += 1
+        stages.add(state.stage)
+        before = plain(state) if ticks % 20 == 0 else None
+        first = transition(parameters, state, events, observation)
+        if before is not None:
+            assert plain(transition(parameters, state, events, observation)[0]) == plain(first[0])
+            assert plain(state) == before
+        return first
+
+    monkeypatch.setattr(flight_core, "transition", twice)
+    landing = ("world.faults=[{kind: mocap_loss, phase: line}]",)
+    outcomes = [
+        FastFlight(load_sitl("configs/missions/catch.yaml", overrides=overrides)).run().outputs[-1].outcome
+        for overrides in ((), landing)
+    ]
+    assert outcomes == [Outcome.COMPLETED, Outcome.ABORTED]
+    assert stages >= {
+        Stage.WAIT,
+        Stage.OFFBOARD,
+        Stage.ARM,
+        Stage.SPOOL,
+        Stage.PLAN,
+        Stage.TOUCHDOWN,
+        Stage.AUTOPILOT_LAND,
+    }
