@@ -16,7 +16,6 @@ from markupsafe import Markup, escape
 
 from companion.analysis.table import Table
 
-_CSS = Path(__file__).with_name("page.css")
 _INDEX = re.compile(r"\b([eMK])_(p|q|z|α|d|tau)\b")
 
 
@@ -42,6 +41,8 @@ class Section:
     """Text below the tables and pictures."""
     folded: Mapping[str, str] = field(default_factory=dict)
     """Long texts by title, shown when the reader opens them."""
+    cards: Sequence[Table] = ()
+    """Small tables beside each other, above everything else."""
 
 
 def write_page(
@@ -53,7 +54,9 @@ def write_page(
     notes: Sequence[str] = (),
     verdict: str = "",
     good: bool = True,
-    width_rem: int = 78,
+    badge: str = "",
+    player_html: str = "",
+    width_rem: int = 86,
 ) -> None:
     """Write a page.
 
@@ -65,13 +68,16 @@ def write_page(
         notes: remarks at the top: what the reader must know before the figures.
         verdict: one sentence above the notes; empty for none.
         good: whether the verdict is good.
+        badge: the outcome, beside the title.
+        player_html: element that plays an animation of the flight; inserted as it is.
         width_rem: largest width of the text.
 
     Raises:
         OSError: the file cannot be written, or a picture cannot be read.
     """
     text = _environment().get_template("page.html").render(
-        title=title, subtitle=subtitle, sections=sections, notes=notes, verdict=verdict, good=good, width_rem=width_rem
+        title=title, subtitle=subtitle, sections=sections, notes=notes, verdict=verdict, good=good,
+        badge=badge, player=Markup(player_html), width_rem=width_rem,
     )  # fmt: skip
     path.write_text(text, encoding="utf-8")
 
@@ -95,29 +101,3 @@ def _indices(text: str) -> Markup:
 
 def _data(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
-
-
-def opening(title: str, style: str) -> str:
-    """Return everything before the body's content. `style` is CSS of this page and sets `--width` of `:root`."""
-    return (
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-        f"<title>{escape(title)}</title><style>{_CSS.read_text(encoding='utf-8')}{style}</style></head><body>"
-    )
-
-
-CLOSING = "</body></html>\n"
-
-
-def picture(path: Path, title: str, caption_html: str) -> str:
-    """Return a PNG embedded in the page."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return (
-        f"<figure><img alt='{escape(title)}' src='data:image/png;base64,{data}'>"
-        f"<figcaption>{caption_html}</figcaption></figure>"
-    )
-
-
-def folded(title: str, text: str) -> str:
-    """Return text behind a disclosure widget, or nothing if it is empty."""
-    return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>" if text else ""

@@ -11,7 +11,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table as TerminalTable
 
-STYLES = {"bad": "red", "warning": "yellow", "critical": "red", "soft": "dim"}
+STYLES = {"bad": "red", "warning": "yellow", "critical": "red", "soft": "dim", "paper": "dim"}
 """Terminal styles of the kinds of cells and rows; `page.html` has a CSS class for each."""
 
 

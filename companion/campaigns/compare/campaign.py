@@ -84,7 +84,7 @@ class Compare(Campaign):
         groups = by_payload(aggregate(rows))
         lead = f"RMS, mean ± standard deviation over seeds. Grey: as printed in the paper ({SOURCE})."
         sections = [
-            Section("Tracking", lead, [tracking_table(groups)]),
+            Section("Tracking before and after the catch", lead, [tracking_table(groups)]),
             Section("After the catch", tables=[compliance_table(groups)], text=EXPLAINED),
             *([Section("Pictures", pictures=pictures)] if pictures else []),
         ]
@@ -181,4 +181,4 @@ def _paper(part: str, key: str, digits: int) -> Column:
         figures = group.printed.pre if part == "pre" else group.printed.post
         return "crashed" if figures is None else f"{getattr(figures, key):.{digits}f}"
 
-    return Column("paper", show, kind="soft")
+    return Column("paper", show, kind="paper")

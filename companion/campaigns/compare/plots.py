@@ -142,7 +142,7 @@ def _overview(groups: Sequence[Group], colours: dict[str, str]) -> Figure:
             paper = None if group.printed is None else group.printed.pre if part == "pre" else group.printed.post
             if paper is not None:
                 ax.plot(paper.e_p_m, y, "D", ms=5, mfc="white", mec=INK, mew=1.2, zorder=5)
-        ax.set_xlim(left=0.0)
+    axes[0].set_xlim(left=0.0)
     axes[0].set_yticks(range(len(payloads)), [f"{payload_kg:g} kg" for payload_kg in payloads])
     axes[0].invert_yaxis()
     handles = [axes[0].barh([0], [0], color=colours[label]) for label in labels]
