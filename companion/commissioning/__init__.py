@@ -1,1 +1,1 @@
-"""Tools that bring a machine from a box of parts to its first flight: each finds out, proposes, and writes only when asked."""
+"""Tools that commission a new machine: each measures, proposes a change of the vehicle file, and writes it only when asked."""

@@ -44,11 +44,11 @@ class Family:
     """How the tools of a command treat the user and the vehicle file."""
 
     guides_on_stderr: bool
-    """Instructions go to standard error even without `--json`."""
+    """Whether instructions go to standard error even without `--json`."""
     asks_before_writing: bool
-    """`--write` alone asks before it writes the vehicle file."""
+    """Whether `--write` without `--yes` asks before it writes the vehicle file."""
     ok_when_written: bool
-    """Exit code 0 once the proposed change is written; otherwise the user has to measure again."""
+    """Whether the exit code is 0 once the proposed change is written; if not, the user has to measure again."""
 
 
 ARM: Final = Family(guides_on_stderr=False, asks_before_writing=False, ok_when_written=True)
@@ -57,7 +57,7 @@ SENSORS: Final = Family(guides_on_stderr=True, asks_before_writing=True, ok_when
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a tool found."""
+    """Result of a tool."""
 
     rows: Sequence[Row] = ()
     data: Mapping[str, Any] = field(default_factory=dict)
@@ -121,7 +121,7 @@ class Tool(Generic[_T]):
     """One commissioning tool."""
 
     name: str
-    """As in `companion NAME`."""
+    """Words after `companion`."""
     family: Family
     collect: Callable[[Session], _T | Coroutine[Any, Any, _T]]
     """Check the options, open the devices, guide the user, return what was measured. Ctrl-C cancels it if it is a coroutine."""

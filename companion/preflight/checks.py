@@ -16,9 +16,9 @@ class Check:
     """Id of its row."""
     title: str
     """Title of its row."""
-    wanted: str
-    """Expected result in general words, for the table of all checks. The row states it with figures."""
-    why: str
+    wanted: str = ""
+    """Expected result in general words, for the table of the preflight's checks. The row states it with figures."""
+    why: str = ""
     """Consequence if the check fails."""
     warns: bool = False
     """Whether a failure only warns."""

@@ -29,7 +29,7 @@ class Leader(Protocol):
         ...
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """Take over after each control step; `moved` is None before the first. Return True when all is done."""
+        """Decide what to do after a control step; `moved` is None before the first. Return True when all is done."""
         ...
 
     def status(self) -> str:

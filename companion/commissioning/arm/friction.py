@@ -35,9 +35,9 @@ FRICTION_SAME_NM: Final = 0.008
 JOINTS_SAME: Final = 0.06
 """Relative difference of the torque constants of two servos of one model."""
 PLAUSIBLE_NM_A: Final = (0.7, 2.2)
-"""Of an XM430-W210, whose stall torque and current make 1.3."""
+"""Plausible torque constants of an XM430-W210; its stall torque over its stall current is 1.3."""
 _SURE: Final = 3.0
-"""Standard errors."""
+"""Number of standard errors at which a difference is certain."""
 
 _Array = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class JointFit:
-    """One joint."""
+    """Torque constant and friction of one joint."""
 
     torque_per_amp_nm_a: Estimate
     dry_nm: Estimate
@@ -71,12 +71,12 @@ class JointFit:
 
 @dataclass(frozen=True, slots=True)
 class FrictionFit:
-    """Both joints, and the values for the vehicle file."""
+    """Torque constant and friction of both joints, and the values for the vehicle file."""
 
     joints: tuple[JointFit | None, JointFit | None]
-    """None if there were too few samples."""
+    """Fit of each joint; None with too few samples."""
     torque_per_amp_nm_a: Estimate | None
-    """Of both joints; None if the data cannot tell."""
+    """Mean of both joints; None if the data cannot tell."""
     joint_friction_nm: Estimate | None
     notes: tuple[str, ...]
     """Remarks, one line each."""

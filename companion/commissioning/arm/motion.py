@@ -20,7 +20,7 @@ from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
 SPEED_MAX_DEG_S: Final = 20.0
 ACCELERATION_DEG_S2: Final = 60.0
 TORQUE_SHARE: Final = 0.6
-"""Of `torque_max_nm`: the limit of each servo here."""
+"""Share of `torque_max_nm` that limits each servo here."""
 LOAD_NM: Final = 0.5
 """Torque beside gravity that means an obstacle if it lasts for `LOAD_S`."""
 LOAD_S: Final = 0.15
@@ -50,7 +50,7 @@ def limits_deg(arm: Arm, joint: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """One control step."""
+    """Result of one control step."""
 
     torque_nm: Vec2
     reference_rad: Vec2
@@ -123,7 +123,7 @@ class Motion:
         return ""
 
     def step(self, state: ArmState, dt_s: float) -> Moved:
-        """One control step.
+        """Compute one control step.
 
         Args:
             state: the newest.

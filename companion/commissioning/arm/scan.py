@@ -24,23 +24,19 @@ SYSFS: Final = Path("/sys/class/tty")
 SEARCHED: tuple[int, ...] = tuple(reversed(bus.BAUDS))
 """Baud rates of a full scan, in this order after the vehicle file's."""
 
-_NO_ARM = "the flight needs the arm"
-IDS = Check("arm.scan.ids", "servo ids", "those of arm.joints[].servo_id", _NO_ARM)
-BAUD = Check("arm.scan.baud", "baud rate", "devices.arm.baud", "servos at another rate receive nothing")
-COLLISION = Check("arm.scan.collision", "one servo per id", "every answer is readable", "answers that collide are lost")
-MODEL = Check("arm.scan.model", "servo models", "XM430-W210 (model 1030)", preflight.MODEL.why)
-FIRMWARE = Check("arm.scan.firmware", "servo firmware", "38 or newer, the same on both", preflight.FIRMWARE.why)
-ERROR = Check("arm.scan.error", "servo hardware error", "none (register 70)", preflight.ERROR.why)
-VOLTAGE = Check("arm.scan.voltage", "servo supply", "10.0 to 14.8 V", preflight.VOLTAGE.why)
-TEMPERATURE = Check(
-    "arm.scan.temperature", "servo temperature", "below safety.servo_warn_c", preflight.TEMPERATURE.why, warns=True
-)
-USB = Check("arm.scan.usb_latency", "USB latency timer", "1 ms, or no FTDI adapter", preflight.USB.why, warns=True)
+IDS = Check("arm.scan.ids", "servo ids", why=preflight.DEVICE.why)
+BAUD = Check("arm.scan.baud", "baud rate", why="servos at another rate receive nothing")
+COLLISION = Check("arm.scan.collision", "one servo per id", why="answers that collide are lost")
+MODEL = Check("arm.scan.model", "servo models", why=preflight.MODEL.why)
+FIRMWARE = Check("arm.scan.firmware", "servo firmware", why=preflight.FIRMWARE.why)
+ERROR = Check("arm.scan.error", "servo hardware error", why=preflight.ERROR.why)
+VOLTAGE = Check("arm.scan.voltage", "servo supply", why=preflight.VOLTAGE.why)
+TEMPERATURE = Check("arm.scan.temperature", "servo temperature", why=preflight.TEMPERATURE.why, warns=True)
+USB = Check("arm.scan.usb_latency", "USB latency timer", why=preflight.USB.why, warns=True)
 WATCHDOG = Check(
     "arm.scan.watchdog",
     "bus watchdog",
-    "not tripped (register 98)",
-    "a servo whose watchdog tripped gives no torque until it is cleared; the companion starts it in every flight",
+    why="a servo whose watchdog tripped gives no torque until it is cleared; the companion starts it in every flight",
     warns=True,
 )
 _SETUP: Final = "companion arm setup"
@@ -53,7 +49,7 @@ class Judgement:
     rows: tuple[Row, ...]
     assignment: Assignment
     changes: Mapping[Location, Data]
-    """Of the vehicle file, where it could take over what the servos have."""
+    """Values that the vehicle file could take over from the servos."""
 
 
 def scan_for(session: Session, only: int | None = None) -> Scan:
@@ -229,7 +225,7 @@ def _settings(index: int, servo: FoundServo, arm: Arm, device: ArmDevice) -> Ite
         if setting.register not in (bus.ID, bus.BAUD):
             name = setting.register.name
             key = f"arm.scan.joint{index + 1}.{name.replace(' ', '_').lower()}"
-            check = Check(key, f"joint {index + 1}: {name}", "", setting.why)
+            check = Check(key, f"joint {index + 1}: {name}", why=setting.why)
             yield check.row(setting.right, setting.shown(setting.found), setting.shown(setting.wanted), _SETUP)
 
 

@@ -37,7 +37,7 @@ class FoundServo:
     model: int
     firmware: int
     registers: dict[str, int]
-    """By the register's name; empty if it only answers pings."""
+    """Register values by name; empty if the servo only answers pings."""
 
     def value(self, register: Register) -> int:
         """Return a register's value.
@@ -141,11 +141,11 @@ class Assignment:
     """Which servo belongs to which joint."""
 
     joints: tuple[FoundServo | None, FoundServo | None]
-    """By id; one servo that is left over belongs to the missing joint."""
+    """Servo of each joint, by id; one servo that is left over belongs to the missing joint."""
     renamed: int | None
     """The joint whose servo has another id than the vehicle file says."""
     others: tuple[FoundServo, ...]
-    """Not the arm's, or of an unknown joint."""
+    """Servos that are not the arm's, or of an unknown joint."""
 
 
 def assign(servos: Sequence[FoundServo], arm: Arm) -> Assignment:

@@ -25,12 +25,12 @@ from companion.io.protocols import DeviceError
 
 @dataclass(frozen=True, slots=True)
 class ServoPlan:
-    """What one servo is to be set to."""
+    """Settings for one servo."""
 
     joint: int
     servo: FoundServo
     settings: tuple[Setting, ...]
-    """All that the companion needs, in the order in which they are written."""
+    """All settings that the companion needs, in the order of writing."""
 
     @property
     def writes(self) -> tuple[Setting, ...]:
@@ -70,7 +70,7 @@ class SetupPlan:
     refusal: str = ""
     """Why nothing may be done, with what to do instead; empty if it may."""
     one_at_a_time: bool = False
-    """What to do instead is to connect one servo alone."""
+    """Whether one servo alone has to be connected."""
     absent: tuple[int, ...] = ()
     """Joints whose servo was not found."""
 
@@ -171,7 +171,7 @@ class Done:
     text: tuple[str, ...]
     """Remarks, one line each."""
     right: bool
-    """Every servo is as the companion needs it."""
+    """Whether every servo is as the companion needs it."""
 
 
 def set_up(session: Session) -> Done:

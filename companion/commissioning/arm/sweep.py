@@ -29,12 +29,12 @@ class Leg:
     goal_deg: float
     speed_deg_s: float
     counts: bool = False
-    """Its samples are for the fit."""
+    """Whether its samples are used for the fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One joint at constant speed."""
+    """One sample of a joint at constant speed."""
 
     leg: int
     joint: int
@@ -43,7 +43,7 @@ class Sample:
     angle_rad: Vec2
     velocity_rad_s: float
     current_a: float
-    """In the direction of the joint angle."""
+    """Motor current, positive in the direction of the joint angle."""
 
 
 def legs_of(arm: Arm) -> tuple[Leg, ...]:

@@ -21,9 +21,9 @@ STILL_DEG: Final = 1.5
 BEGUN_DEG: Final = 5.0
 """Motion that begins a step."""
 NEAR_SHARE: Final = 0.35
-"""Of an exact turn: largest error."""
+"""Largest error of an exact turn, as a share of it."""
 ALONE_SHARE: Final = 0.35
-"""Of a turn: largest motion of the other joint."""
+"""Largest motion of the other joint, as a share of the turn."""
 HAND_DEG: Final = 2.0
 """Accuracy of a link held level or plumb; a zero of the vehicle file within this is kept."""
 DISAGREE_DEG: Final = 8.0
@@ -35,7 +35,7 @@ Counts = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class ZeroJoint:
-    """One joint."""
+    """Servo, direction and zero of one joint."""
 
     servo_id: int
     sign: int
@@ -47,7 +47,7 @@ class ZeroJoint:
 
 @dataclass(frozen=True, slots=True)
 class ZeroResult:
-    """Both joints, shoulder first."""
+    """Servos, directions and zeros of both joints, shoulder first."""
 
     joints: tuple[ZeroJoint, ZeroJoint]
     swapped: bool
@@ -80,7 +80,7 @@ class ZeroView:
     """The step under way; None at the end."""
     number: int
     moved_deg: tuple[float, float]
-    """Since the step began, as each servo counts, in the order of the vehicle file's servos."""
+    """Motion since the step began, as each servo counts, in the order of the vehicle file's servos."""
     held: float
     """Share of `HELD_S` for which the arm has been held, 0 to 1."""
     notice: str

@@ -23,28 +23,14 @@ from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import angle_rad, norm
 
-STUCK = Check(
-    "ft.stuck",
-    "force sensor alive",
-    "never the very same reading for longer than `safety.force_stuck_s`",
-    "a stuck sensor reports plausible values and measures nothing",
-)
-WEIGHT = Check("ft.weight", "known weight", "the sensor measures it", "scale and direction stay unknown")
-SCALE = Check(
-    "ft.scale", "force sensor scale", "force over m g within 5 %", "the law would see more or less force than there is"
-)
+STUCK = Check("ft.stuck", "force sensor alive", why="a stuck sensor reports plausible values and measures nothing")
+WEIGHT = Check("ft.weight", "known weight", why="scale and direction stay unknown")
+SCALE = Check("ft.scale", "force sensor scale", why="the law would see more or less force than there is")
 DIRECTION = Check(
-    "ft.direction",
-    "force sensor direction",
-    "the weight pulls in the direction by `tool.sensor_rpy_deg`, within 8 deg",
-    "the law would respond to every force in a wrong direction",
+    "ft.direction", "force sensor direction", why="the law would respond to every force in a wrong direction"
 )
 POSE = Check(
-    "ft.pose",
-    "pose of the arm",
-    "no other right-angle turn of the sensor explains the weight as well",
-    "a sensor that is turned about the weight's own direction looks right",
-    warns=True,
+    "ft.pose", "pose of the arm", why="a sensor that is turned about the weight's own direction looks right", warns=True
 )
 
 SCALE_TOLERANCE: Final = 0.05
@@ -62,7 +48,7 @@ class WeightFit:
     expected_n: float
     measured_n: float
     scale: float
-    """Measured over expected."""
+    """Measured over expected weight."""
     off_deg: float
     """Angle between the measured weight and its direction by the vehicle file."""
     turn: AxisMap
@@ -72,7 +58,7 @@ class WeightFit:
     others: tuple[AxisMap, ...]
     """Turns that explain it nearly as well."""
     rpy_deg: Vec3
-    """`tool.sensor_rpy_deg` with that turn."""
+    """Value of `tool.sensor_rpy_deg` with that turn."""
 
 
 def down_in_link2(arm_rad: Vec2) -> Vec3:
@@ -167,7 +153,7 @@ class Drift:
     """Standard deviation about the drift."""
     per_minute_n: float
     standard_error_n: float
-    """Of `per_minute_n`, from the scatter of means over a second."""
+    """Standard error of `per_minute_n`, from the scatter of means over a second."""
 
 
 def drift(samples: Sequence[ForceSample]) -> list[Drift]:

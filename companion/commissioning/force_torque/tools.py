@@ -26,7 +26,7 @@ from companion.runtime.clock import flight_clock
 WATCH_S: Final = 3.0
 LOADED_S: Final = 2.0
 TARE_S: Final = 1.0
-"""As long as a flight tares."""
+"""Duration of a flight's tare."""
 DRIFT_WARN_N_MIN: Final = 0.3
 ZERO_MAX_N: Final = 0.3
 _EMPTY: Final = "the machine stands level on its legs, the net is empty, hands off"
@@ -34,13 +34,10 @@ _EMPTY: Final = "the machine stands level on its legs, the net is empty, hands o
 DRIFT = Check(
     "ft.drift",
     "force sensor drift",
-    "below 0.3 N in a minute",
-    "drift after the tare looks like a force; let the sensor warm up before a flight",
+    why="drift after the tare looks like a force; let the sensor warm up before a flight",
     warns=True,
 )
-BIAS_SET = Check(
-    "ft.bias_set", "sensor's own bias", "the reading is zero right after it was set", "the sensor ignored the command"
-)
+BIAS_SET = Check("ft.bias_set", "sensor's own bias", why="the sensor ignored the command")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +49,9 @@ class Watched:
     stream: ForceStream
     usb_latency_ms: int | None
     weight_kg: float | None
-    """None if no weight was announced."""
+    """Announced weight; None if there is none."""
     loaded: Sequence[ForceSample] = ()
-    """Empty if no weight was recognised."""
+    """Samples under the weight; empty if no weight was recognised."""
     loaded_arm_rad: Vec2 = (0.0, 0.0)
     problem: str = ""
     """Why a device failed after the measurement at rest; empty if none did."""
@@ -156,10 +153,10 @@ class Tared:
 
     samples: Sequence[ForceSample]
     first: Sequence[ForceSample]
-    """The first of them, as long as a flight tares."""
+    """The first samples, as many as in a flight's tare."""
     arm_rad: Vec2
     zeroed: Sequence[ForceSample] = ()
-    """Empty if the sensor's own zero was not set."""
+    """Samples after the sensor's own zero was set; empty if it was not."""
 
 
 async def watch_drift(session: Session) -> Tared:

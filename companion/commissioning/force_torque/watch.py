@@ -22,10 +22,10 @@ WEIGHT_TIMEOUT_S: Final = 90.0
 _LOOK_S: Final = 0.5
 _STILL_S: Final = 1.5
 _STILL_N: Final = 0.3
-"""Between means over `_LOOK_S`, once the weight has stopped swinging."""
+"""Largest difference between means over `_LOOK_S` once the weight has stopped swinging."""
 _CHANGE_MIN_N: Final = 0.5
 _CHANGE_SHARE: Final = 0.15
-"""Of the weight: a sensor that reads too little has to be found, too."""
+"""Share of the weight that counts as a weight: a sensor that reads too little has to be recognised, too."""
 
 
 class FtSensor(RobotousForceTorque):

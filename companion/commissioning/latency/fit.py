@@ -61,11 +61,11 @@ class TapDelay:
 
     tap: Tap
     delay_s: float
-    """From exposure, by PX4's clock, to the arrival of the pose at the companion."""
+    """Time from exposure, by PX4's clock, to the arrival of the pose at the companion."""
     error_s: float
     """Standard error from the curvature of the residual."""
     correlation: float
-    """Without the slow part: 1 if the shifted IMU explains all of the motion."""
+    """Correlation without the slow part: 1 if the shifted IMU explains all of the motion."""
     problem: str
     """Why it does not count; empty if it does."""
 

@@ -35,9 +35,9 @@ class Sync:
     """One answer with PX4's clock."""
 
     t_s: float
-    """Half way between question and answer, our clock."""
+    """Middle of request and answer, our clock."""
     offset_s: float
-    """PX4's clock less ours."""
+    """PX4's clock minus ours."""
     round_trip_s: float
 
 

@@ -41,23 +41,17 @@ _LOOK_S: Final = 0.5
 _WINDOW_S: Final = 3.0
 _HISTORY_POSES_MIN: Final = 50
 _DIGITS: Final = 1
-"""Of a delay in ms."""
+"""Decimals of a delay in ms."""
 
-DEVICES = Check(
-    "latency.devices", "PX4 and motion capture", "both are there, PX4 is disarmed", "there is nothing to compare"
-)
-TAPS = Check("latency.taps", "taps", "at least 5 that IMU and motion capture both show", "the delay stays unknown")
+DEVICES = Check("latency.devices", "PX4 and motion capture", why="there is nothing to compare")
+TAPS = Check("latency.taps", "taps", why="the delay stays unknown")
 DELAY = Check(
-    "latency.delay",
-    "EKF2_EV_DELAY",
-    "as measured, within 3 ms",
-    "PX4 fuses each pose in the wrong place: the estimate swings with the machine",
+    "latency.delay", "EKF2_EV_DELAY", why="PX4 fuses each pose in the wrong place: the estimate swings with the machine"
 )
 LONG = Check(
     "latency.long",
     "delay of motion capture",
-    "within what the project's parameters allow",
-    "the filter works that far in the past; every loop that depends on it becomes slower",
+    why="the filter works that far in the past; every loop that depends on it becomes slower",
 )
 
 
@@ -67,11 +61,11 @@ class Measured:
 
     taps: tuple[TapDelay, ...]
     delay: Delay | str
-    """At the companion; or why there is none."""
+    """Delay from exposure to the companion, or why there is none."""
     round_trip_s: float
     imu_age_s: float | None
     mocap_latency_s: float | None
-    """Mid-exposure to transmission by the server's stamps, median."""
+    """Median time from mid-exposure to transmission, by the server's stamps."""
     px4_ms: float | None
     """EKF2_EV_DELAY as it is; None if PX4 has no such parameter."""
     written_ms: float | None = None
@@ -79,7 +73,7 @@ class Measured:
 
     @property
     def total_ms(self) -> float | None:
-        """Exposure to arrival in PX4, which is what EKF2_EV_DELAY means; None without a delay."""
+        """Time from exposure to arrival in PX4, which is what EKF2_EV_DELAY means; None without a delay."""
         return None if isinstance(self.delay, str) else 1e3 * (self.delay.delay_s + 0.5 * self.round_trip_s)
 
 

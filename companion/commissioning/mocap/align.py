@@ -17,12 +17,7 @@ from companion.preflight.hand_test.evaluation import LEVEL_MAX_DEG, YAW_MAX_DEG,
 from companion.preflight.hand_test.motion import angle_rad
 from companion.preflight.hand_test.run import HandResult
 
-WORLD_YAW = Check(
-    "align.world_yaw",
-    "world's yaw",
-    "forward in the stream is the mission's `start.yaw_deg`",
-    "room, tether and course are given in these axes",
-)
+WORLD_YAW = Check("align.world_yaw", "world's yaw", why="room, tether and course are given in these axes")
 _UP: Final[Vec3] = (0.0, 0.0, 1.0)
 
 

@@ -22,29 +22,15 @@ from companion.preflight import mocap as preflight
 from companion.preflight.checks import Check
 from companion.px4.wanted import WANTED
 
-SERVER = Check(
-    "mocap.server", "mocap server", "answers at `devices.mocap.server`", "nothing is streamed to the vehicle"
-)
-OWN = Check(
-    "mocap.own",
-    "rigid body of the vehicle",
-    "`devices.mocap.rigid_body_id` is streamed, and moves when the vehicle does",
-    "the pose of another body would be used",
-)
-STEADY = Check(
-    "mocap.steady",
-    "mocap jitter",
-    "99 % of the frames within half a period of even",
-    "EKF2 subtracts one fixed delay from all of them",
-    warns=True,
-)
+SERVER = Check("mocap.server", "mocap server", why="nothing is streamed to the vehicle")
+OWN = Check("mocap.own", "rigid body of the vehicle", why="the pose of another body would be used")
+STEADY = Check("mocap.steady", "mocap jitter", why="EKF2 subtracts one fixed delay from all of them", warns=True)
 DELAY = Check(
     "mocap.delay",
     "mocap latency against EKF2_EV_DELAY",
-    "exposure to transmission within 3 ms of the project's parameter file",
-    "PX4 fuses each pose in the wrong place: the estimate swings with the machine",
+    why="PX4 fuses each pose in the wrong place: the estimate swings with the machine",
 )
-NETWORK = Check("mocap.network", "way to the server", "a cable", "Wi-Fi holds frames back in bursts", warns=True)
+NETWORK = Check("mocap.network", "way to the server", why="Wi-Fi holds frames back in bursts", warns=True)
 CHECKS = (SERVER, OWN, STEADY, DELAY, NETWORK)
 
 MOVED_MIN_M: Final = 0.05
@@ -61,12 +47,12 @@ class FrameSeen:
     """One frame of data with all of its rigid bodies, in the axes that the server streams."""
 
     arrived_s: float
-    """Flight clock, when its datagram was read."""
+    """Time on the flight clock when its datagram was read."""
     number: int
     timestamp_s: float
-    """On the server's own time base."""
+    """Time on the server's own time base."""
     latency_s: float | None
-    """Mid-exposure to transmission."""
+    """Time from mid-exposure to transmission."""
     bodies: tuple[RigidBody, ...]
 
 
@@ -77,7 +63,7 @@ class Route:
     transport: str
     local_address: str
     interface: str
-    """Name of the network interface; empty: not found."""
+    """Name of the network interface; empty if unknown."""
     wireless: bool
 
 
@@ -106,7 +92,7 @@ class Timing:
 
     rate_hz: float
     server_rate_hz: float | None
-    """By frame numbers and the server's own time stamps; None if it sends none."""
+    """Rate by frame numbers and the server's own time stamps; None if it sends none."""
     period_s: float
     lost: int
     gap_s: float
@@ -114,7 +100,7 @@ class Timing:
     off_s: tuple[float, ...]
     """Delay of each arrival against an even stream, sorted; the 5th percentile is 0."""
     latency_s: tuple[float, ...]
-    """Mid-exposure to transmission, sorted."""
+    """Times from mid-exposure to transmission, sorted."""
 
     def percentile_off_s(self, share: float) -> float:
         """Return a percentile of `off_s`; `share` is 0 to 1."""
@@ -182,14 +168,14 @@ class Watched:
     """A stream that was watched."""
 
     frames: Sequence[FrameSeen]
-    """In order of arrival."""
+    """Frames in order of arrival."""
     names: Mapping[int, str]
-    """Of the rigid bodies, by id."""
+    """Names of the rigid bodies, by id."""
     info: ServerInfo
     route: Route
     duration_s: float
     moving: bool
-    """The vehicle was moved meanwhile."""
+    """Whether the vehicle was moved meanwhile."""
 
 
 def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location, Data]]:
