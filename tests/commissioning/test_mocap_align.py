@@ -8,6 +8,10 @@ import pytest
 
 from companion.commissioning.mocap import align as mocap_align
 from companion.commissioning.mocap.align import Alignment
+from companion.io.mocap.natnet import z_up_from_y_up
+from companion.model.observations import Observations
+from companion.model.types import MocapPose
+from companion.preflight import frames
 from companion.preflight.hand_test.run import HandResult, HandTest
 from tests.preflight.hand_rig import Standing, world
 
@@ -41,6 +45,28 @@ def test_a_y_up_stream_becomes_the_up_axis() -> None:
     a = found('mocap_axes=["x","z","-y"]')
     assert mocap_align.changes(a, "z") == {("devices", "mocap", "up_axis"): "y"}
     assert mocap_align.world_row(a, 15.0) is None
+
+
+def test_a_y_up_stream_read_as_such_is_right() -> None:
+    """By the setting that is proposed, in the preflight."""
+    config, poses, states = world('mocap_axes=["x","z","-y"]'), {}, []
+    for sample in Standing(config).samples(3.0):
+        if sample.t_s > 2.0 and sample.pose is not None and sample.vehicle is not None:
+            position_m, attitude = z_up_from_y_up(sample.pose.position_world_m, sample.pose.attitude_wxyz)
+            poses[sample.pose.frame_number] = MocapPose(
+                stamp_s=sample.pose.stamp_s,
+                latency_s=None,
+                frame_number=sample.pose.frame_number,
+                position_world_m=position_m,
+                attitude_wxyz=attitude,
+                tracking_valid=True,
+                marker_error_m=0.0,
+            )
+            states.append(sample.vehicle)
+    seen = Observations(2.0, 1.0, vehicle=tuple(states), mocap=tuple(poses.values()))
+    rows = frames.rows(seen, config.mission, config.vehicle)
+    names = ("frames.gravity", "frames.height", "frames.place", "frames.yaw")
+    assert {row.id: row.ok for row in rows if row.id in names} == dict.fromkeys(names, True)
 
 
 @pytest.mark.parametrize("yaw_deg", [-90.0, 35.0, 180.0])

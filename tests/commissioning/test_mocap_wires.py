@@ -181,13 +181,3 @@ def test_a_y_up_stream_is_found_and_written(sandbox: Sandbox, vehicle: Path) -> 
     assert {"hand.lift", "hand.turn"} <= set(bad(found))
     assert "up_axis: y " in vehicle.read_text(encoding="utf-8")
     assert "lift it straight up" in ended.err
-
-
-def test_a_y_up_stream_read_as_such_is_right(sandbox: Sandbox) -> None:
-    """By the setting that the test above has written."""
-    with World(sandbox, overrides=['world.mocap_axes=["x","z","-y"]']) as world:
-        right = set_options(**{"vehicle.devices.mocap.up_axis": "y"})
-        words = ["check", CATCH, "--json", *addresses(world, "up_axis"), *right]
-        rows = json.loads(sandbox.run(*words).out)["rows"]
-    names = ("frames.gravity", "frames.height", "frames.place", "frames.yaw")
-    assert {row["id"]: row["ok"] for row in rows if row["id"] in names} == dict.fromkeys(names, True)
