@@ -198,17 +198,17 @@ def judge(slots: list[Slot], folder: Path) -> list[Row]:
         period_ms = 1e3 * NOMINAL_DT_S
         rows.append(
             Row(
-                condition,
-                len(ticks),
-                float(p50),
-                float(p99),
-                float(p999),
-                float(ticks.max()),
-                int((ticks > period_ms).sum()),
-                float(e50),
-                float(e99),
-                float(beside.max()),
-                int((beside > period_ms).sum()),
+                condition=condition,
+                ticks=len(ticks),
+                p50=float(p50),
+                p99=float(p99),
+                p999=float(p999),
+                max=float(ticks.max()),
+                missed=int((ticks > period_ms).sum()),
+                empty_p50=float(e50),
+                empty_p99=float(e99),
+                empty_max=float(beside.max()),
+                empty_missed=int((beside > period_ms).sum()),
             )
         )
     return sorted(rows, key=lambda row: row.condition != NO_BROKER)

@@ -232,42 +232,78 @@ def measure(
     name = f"{config.controller.law}/{config.controller.preset}"
     rows = [
         Row(
-            "raw_step_us",
-            "raw mj_step, same model",
-            raw_us,
-            "us/step",
-            f"{PHYSICS_DT_S * 1e6 / raw_us:.0f} x real time",
-        ),
-        Row("tick_us", "FastFlight", tick_us, "us/tick", f"{tick_us / raw_tick_us:.1f} x raw MuJoCo"),
-        Row("real_time", "FastFlight, one core", speed, "x real time", "", ">= 50", f"{len(inputs)} ticks"),
-        Row(
-            "core_p50_us",
-            "FlightCore.step p50",
-            steps[len(steps) // 2],
-            "us",
-            f"p99 {steps[len(steps) * 99 // 100]:.0f} us",
+            key="raw_step_us",
+            what="raw mj_step, same model",
+            value=raw_us,
+            unit="us/step",
+            ratio=f"{PHYSICS_DT_S * 1e6 / raw_us:.0f} x real time",
         ),
         Row(
-            "law_us",
-            f"law {name}",
-            law,
-            "us/update",
-            f"{law / reference:.2f} x reference",
-            "<= 10",
-            f"{updates} updates",
+            key="tick_us",
+            what="FastFlight",
+            value=tick_us,
+            unit="us/tick",
+            ratio=f"{tick_us / raw_tick_us:.1f} x raw MuJoCo",
         ),
-        Row("reference_us", f"reference loop, {_REFERENCE_TURNS} turns of x = x / 2 + i", reference, "us"),
+        Row(
+            key="real_time",
+            what="FastFlight, one core",
+            value=speed,
+            unit="x real time",
+            ratio="",
+            target=">= 50",
+            note=f"{len(inputs)} ticks",
+        ),
+        Row(
+            key="core_p50_us",
+            what="FlightCore.step p50",
+            value=steps[len(steps) // 2],
+            unit="us",
+            ratio=f"p99 {steps[len(steps) * 99 // 100]:.0f} us",
+        ),
+        Row(
+            key="law_us",
+            what=f"law {name}",
+            value=law,
+            unit="us/update",
+            ratio=f"{law / reference:.2f} x reference",
+            target="<= 10",
+            note=f"{updates} updates",
+        ),
+        Row(
+            key="reference_us",
+            what=f"reference loop, {_REFERENCE_TURNS} turns of x = x / 2 + i",
+            value=reference,
+            unit="us",
+        ),
     ]
     if workers:
         say("two workers beside one")
         one, two = two_workers(config)
-        rows.append(Row("one_worker", "one process", one, "flights/s"))
-        rows.append(Row("two_workers", "two workers", two, "flights/s", f"{two / one:.2f} x one", ">= 1.8 x"))
+        rows.append(Row(key="one_worker", what="one process", value=one, unit="flights/s"))
+        rows.append(
+            Row(
+                key="two_workers",
+                what="two workers",
+                value=two,
+                unit="flights/s",
+                ratio=f"{two / one:.2f} x one",
+                target=">= 1.8 x",
+            )
+        )
     if rotorpy is not None:
         say("RotorPy")
         figures = rotorpy_s(rotorpy)
         if figures is None:
-            rows.append(Row("rotorpy_s", "RotorPy", None, "", note="rotorpy not installed: pip install rotorpy"))
+            rows.append(
+                Row(
+                    key="rotorpy_s",
+                    what="RotorPy",
+                    value=None,
+                    unit="",
+                    note="rotorpy not installed: pip install rotorpy",
+                )
+            )
         else:
             rows += _rotorpy_rows(figures, tick_us * 1e-6 / TICK_S)
     return rows
@@ -278,10 +314,24 @@ def _rotorpy_rows(figures: dict[str, Any], ours_s: float) -> list[Row]:
     note = f"{figures['version']}, {figures['rate_hz']:g} Hz"
     unit = "ms CPU per simulated s"
     return [
-        Row("ours_s", "FastFlight", ours_s * 1e3, unit),
-        Row("rotorpy_bare_s", "RotorPy: SE3 + dynamics", bare * 1e3, unit, f"{bare / ours_s:.1f} x ours", "", note),
+        Row(key="ours_s", what="FastFlight", value=ours_s * 1e3, unit=unit),
         Row(
-            "rotorpy_whole_s", "RotorPy: with its sensors", whole * 1e3, unit, f"{whole / ours_s:.1f} x ours", "", note
+            key="rotorpy_bare_s",
+            what="RotorPy: SE3 + dynamics",
+            value=bare * 1e3,
+            unit=unit,
+            ratio=f"{bare / ours_s:.1f} x ours",
+            target="",
+            note=note,
+        ),
+        Row(
+            key="rotorpy_whole_s",
+            what="RotorPy: with its sensors",
+            value=whole * 1e3,
+            unit=unit,
+            ratio=f"{whole / ours_s:.1f} x ours",
+            target="",
+            note=note,
         ),
     ]
 

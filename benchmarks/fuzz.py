@@ -121,12 +121,12 @@ def fuzz(name: str, inputs: int, seed: int, jobs: int, progress: Progress, until
     done = [stretches[k] for k in range(jobs)]
     progress.update(bar, completed=total)
     return Row(
-        name,
-        sum(stretch.inputs for stretch in done),
-        time.monotonic() - start_s,
-        max(stretch.slowest_s for stretch in done),
-        max((stretch.memory_bytes for stretch in done), key=lambda memory: memory[1] - memory[0]),
-        tuple(finding for stretch in done for finding in stretch.findings),
+        target=name,
+        inputs=sum(stretch.inputs for stretch in done),
+        duration_s=time.monotonic() - start_s,
+        slowest_s=max(stretch.slowest_s for stretch in done),
+        memory_bytes=max((stretch.memory_bytes for stretch in done), key=lambda memory: memory[1] - memory[0]),
+        findings=tuple(finding for stretch in done for finding in stretch.findings),
     )
 
 

@@ -167,13 +167,45 @@ def _said(tick: int, t_s: float) -> tuple[Inputs, Outputs]:
     events: tuple[Event, ...] = ()
     if tick % VALUES_EVERY == 0:
         text = "tether: 0.12 m of slack where the machine could stop, want 0.30 m"
-        events = (Event(t_s, "tether_short", Severity.WARNING, SafetyAction.HOLD, text),)
-    inputs = Inputs(tick, t_s, None, None, None, None, None, OperatorCommand.NONE, 0)
-    tether = TetherState(1.5, 0.75, 0.5, 0.0, 1.0, 0.0, 0.0, False, False, False)
+        events = (Event(t_s=t_s, id="tether_short", severity=Severity.WARNING, action=SafetyAction.HOLD, text=text),)
+    inputs = Inputs(
+        tick=tick,
+        t_s=t_s,
+        vehicle=None,
+        status=None,
+        mocap=None,
+        arm=None,
+        force=None,
+        command=OperatorCommand.NONE,
+        recorder_dropped=0,
+    )
+    tether = TetherState(
+        range_m=1.5,
+        slack_m=0.75,
+        stop_slack_m=0.5,
+        elevation_rad=0.0,
+        clearance_m=1.0,
+        turns=0.0,
+        pull_n=0.0,
+        taut=False,
+        snagged=False,
+        separated=False,
+        vehicle_turns=0.0,
+    )
     outputs = Outputs(
-        *(tick, t_s, 0.0, f"phase{tick // VALUES_EVERY}", PhaseKind.FLIGHT, 0.25, None, _LEVEL, None),
-        *(AutopilotRequest.NONE, SafetyAction.NOMINAL, events, None, None),
+        tick=tick,
+        t_s=t_s,
+        mission_t_s=0.0,
+        phase=f"phase{tick // VALUES_EVERY}",
+        phase_kind=PhaseKind.FLIGHT,
+        progress=0.25,
+        attitude=_LEVEL,
+        request=AutopilotRequest.NONE,
+        action=SafetyAction.NOMINAL,
+        events=events,
+        mocap_trusted=True,
         tether=tether,
+        bent_by=(),
     )
     return inputs, outputs
 
@@ -184,7 +216,15 @@ class _Mocap(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         (sent_s,) = _POSE.unpack(data)
-        pose = MocapPose(sent_s, 0.0, 0, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), True, 0.0)
+        pose = MocapPose(
+            stamp_s=sent_s,
+            latency_s=0.0,
+            frame_number=0,
+            position_world_m=(0.0, 0.0, 1.0),
+            attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+            tracking_valid=True,
+            marker_error_m=0.0,
+        )
         self._autopilot.send_vision(pose)
 
 

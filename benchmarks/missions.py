@@ -163,7 +163,7 @@ def _wind(rng: random.Random) -> list[float]:
 def fly(number: int, phases_max: int = 4) -> Row:
     """Check mission `number`, and fly it if it was accepted."""
     config = drawn(number, phases_max)
-    row = Row(number, refused=check_mission(config.mission, config.vehicle))
+    row = Row(number=number, refused=check_mission(config.mission, config.vehicle))
     if row.refused:
         return row
     flight = FastFlight(config)

@@ -96,20 +96,44 @@ def measure(samples: int, flight: Callable[[], Path] | None) -> list[Row]:
     edge_inside, edge_wire = autopilot_edge(frames)
     bus = bare_dynamixel(frames)
     rows = [
-        Row(MOCAP_TO_SETPOINT, "bare MAVSDK", mavsdk_inside),
-        Row(MOCAP_TO_SETPOINT, "MavsdkAutopilot", edge_inside, edge_inside.p99 / mavsdk_inside.p99),
+        Row(path=MOCAP_TO_SETPOINT, loop="bare MAVSDK", latency_ms=mavsdk_inside),
+        Row(
+            path=MOCAP_TO_SETPOINT,
+            loop="MavsdkAutopilot",
+            latency_ms=edge_inside,
+            ratio_p99_to_bare=edge_inside.p99 / mavsdk_inside.p99,
+        ),
     ]
-    joints = [Row(JOINT_READ_TO_WRITE, "bare SDK", bus.command_ms)]
+    joints = [Row(path=JOINT_READ_TO_WRITE, loop="bare SDK", latency_ms=bus.command_ms)]
     if flown is not None:
         flown_setpoint, flown_joints = flown
-        rows.append(Row(MOCAP_TO_SETPOINT, "flight", flown_setpoint, flown_setpoint.p99 / mavsdk_inside.p99))
-        joints.append(Row(JOINT_READ_TO_WRITE, "flight", flown_joints, flown_joints.p99 / bus.command_ms.p99))
+        rows.append(
+            Row(
+                path=MOCAP_TO_SETPOINT,
+                loop="flight",
+                latency_ms=flown_setpoint,
+                ratio_p99_to_bare=flown_setpoint.p99 / mavsdk_inside.p99,
+            )
+        )
+        joints.append(
+            Row(
+                path=JOINT_READ_TO_WRITE,
+                loop="flight",
+                latency_ms=flown_joints,
+                ratio_p99_to_bare=flown_joints.p99 / bus.command_ms.p99,
+            )
+        )
     return [
         *rows,
-        Row(MOCAP_TO_SETPOINT_WIRE, "bare MAVSDK", mavsdk_wire),
-        Row(MOCAP_TO_SETPOINT_WIRE, "MavsdkAutopilot", edge_wire, edge_wire.p99 / mavsdk_wire.p99),
+        Row(path=MOCAP_TO_SETPOINT_WIRE, loop="bare MAVSDK", latency_ms=mavsdk_wire),
+        Row(
+            path=MOCAP_TO_SETPOINT_WIRE,
+            loop="MavsdkAutopilot",
+            latency_ms=edge_wire,
+            ratio_p99_to_bare=edge_wire.p99 / mavsdk_wire.p99,
+        ),
         *joints,
-        Row(BUS_CYCLE, "bare SDK", bus.cycle_ms),
+        Row(path=BUS_CYCLE, loop="bare SDK", latency_ms=bus.cycle_ms),
     ]
 
 

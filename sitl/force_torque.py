@@ -59,7 +59,7 @@ class ForceTorqueServer:
         self._rate_code = 0
         self._streaming = False
         self._due_s: float | None = None
-        self._reading = Wrench(_ZERO, _ZERO, 0)
+        self._reading = Wrench(force_n=_ZERO, torque_nm=_ZERO, overload_bits=0)
 
     @property
     def port(self) -> str:
@@ -112,7 +112,9 @@ class ForceTorqueServer:
         for value, bit in zip(self._torque_nm, _TORQUE_BITS, strict=True):
             bits |= bit if abs(value) > TORQUE_CAPACITY_NM else 0
         self._reading = Wrench(
-            _subtract(self._force_n, self._bias_force_n), _subtract(self._torque_nm, self._bias_torque_nm), bits
+            force_n=_subtract(self._force_n, self._bias_force_n),
+            torque_nm=_subtract(self._torque_nm, self._bias_torque_nm),
+            overload_bits=bits,
         )
         return self._reading
 

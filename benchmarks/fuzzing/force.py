@@ -120,12 +120,18 @@ class ForceTarget(Target):
 
 
 def _wrench(force_n: float) -> bytes:
-    return rft.encode_wrench(Command.START, Wrench((force_n, 0.0, 0.0), (0.0, 0.0, 0.0), 0))
+    return rft.encode_wrench(
+        Command.START, Wrench(force_n=(force_n, 0.0, 0.0), torque_nm=(0.0, 0.0, 0.0), overload_bits=0)
+    )
 
 
 def _corpus() -> list[bytes]:
     """Every kind of response, alone and streamed; commands too, which a wrong cable echoes."""
-    awkward = Wrench((0x55AA / 50, -0x55AB / 50, 0x5555 / 50), (-0x5556 / 2000, 0x55AA / 2000, 0x55AA / 2000), 0x3F)
+    awkward = Wrench(
+        force_n=(0x55AA / 50, -0x55AB / 50, 0x5555 / 50),
+        torque_nm=(-0x5556 / 2000, 0x55AA / 2000, 0x55AA / 2000),
+        overload_bits=0x3F,
+    )
     stream = b"".join(_wrench(0.1 * k) for k in range(20))
     asked = (
         (Command.PRODUCT_NAME, b"RFT60-HA01"),

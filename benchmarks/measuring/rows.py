@@ -58,12 +58,12 @@ def _why(*found: Any) -> str:
 def _lateness(hover: Figures) -> Section:
     rows = [
         Row(
-            "lateness of a tick, ms",
-            beside,
-            _spread(_at(hover, "flight", "lateness_ms")),
-            _spread(_at(hover, key, "lateness_ms")),
-            target,
-            _why(hover),
+            what="lateness of a tick, ms",
+            beside=beside,
+            figures=_spread(_at(hover, "flight", "lateness_ms")),
+            beside_figures=_spread(_at(hover, key, "lateness_ms")),
+            target=target,
+            why_not=_why(hover),
         )
         for beside, key, target in (
             ("empty asyncio loop", "plain", Target(1.5, ("p99",))),
@@ -77,15 +77,22 @@ def _late(hover: Figures) -> Section:
     why = _why(hover)
     alone = _at(hover, "late_alone")
     own = Row(
-        "later than two periods while the empty loop was not late",
-        "",
-        _value(None if alone is None else len(alone)),
-        {},
-        Target(0.0, VALUE, ratio=False),
-        why,
+        what="later than two periods while the empty loop was not late",
+        beside="",
+        figures=_value(None if alone is None else len(alone)),
+        beside_figures={},
+        target=Target(0.0, VALUE, ratio=False),
+        why_not=why,
     )
     counted = [
-        Row(what, "empty loop", _value(_at(hover, "flight", key)), _value(_at(hover, "empty", key)), None, why)
+        Row(
+            what=what,
+            beside="empty loop",
+            figures=_value(_at(hover, "flight", key)),
+            beside_figures=_value(_at(hover, "empty", key)),
+            target=None,
+            why_not=why,
+        )
         for what, key in (
             ("ticks", "ticks"),
             ("later than one period", "later_than_one"),
@@ -102,21 +109,28 @@ def _setpoints(hover: Figures, loops: Figures) -> Section:
     what = "mocap to setpoint, ms: flight"
     rows = [
         Row(
-            what,
-            "bare loop on native MAVSDK, in the same minutes",
-            flight,
-            _spread(_at(bare, "inside")),
-            Target(1.5),
-            _why(hover, bare),
+            what=what,
+            beside="bare loop on native MAVSDK, in the same minutes",
+            figures=flight,
+            beside_figures=_spread(_at(bare, "inside")),
+            target=Target(1.5),
+            why_not=_why(hover, bare),
         ),
-        Row(what, "bare loop over gRPC", flight, _spread(_at(grpc, "wire")), Target(0.2), _why(hover, loops, grpc)),
         Row(
-            "tick begun to setpoint, ms: flight",
-            "bare loop on native MAVSDK, in the same minutes",
-            _spread(_at(hover, "start_to_setpoint_ms")),
-            _spread(_at(bare, "inside")),
-            None,
-            _why(hover, bare),
+            what=what,
+            beside="bare loop over gRPC",
+            figures=flight,
+            beside_figures=_spread(_at(grpc, "wire")),
+            target=Target(0.2),
+            why_not=_why(hover, loops, grpc),
+        ),
+        Row(
+            what="tick begun to setpoint, ms: flight",
+            beside="bare loop on native MAVSDK, in the same minutes",
+            figures=_spread(_at(hover, "start_to_setpoint_ms")),
+            beside_figures=_spread(_at(bare, "inside")),
+            target=None,
+            why_not=_why(hover, bare),
         ),
     ]
     for which, end in (("inside", "to setpoint"), ("wire", "to setpoint, wire to wire")):
@@ -128,12 +142,12 @@ def _setpoints(hover: Figures, loops: Figures) -> Section:
             loop = _at(loops, key) or loops
             rows.append(
                 Row(
-                    f"mocap {end}, ms: {name}",
-                    "bare loop on native MAVSDK",
-                    _spread(_at(loop, which)),
-                    _spread(_at(native, which)),
-                    None,
-                    _why(loops, loop, native),
+                    what=f"mocap {end}, ms: {name}",
+                    beside="bare loop on native MAVSDK",
+                    figures=_spread(_at(loop, which)),
+                    beside_figures=_spread(_at(native, which)),
+                    target=None,
+                    why_not=_why(loops, loop, native),
                 )
             )
     return Section("Motion capture to setpoint", texts.SETPOINT, P50_P99, rows)
@@ -146,28 +160,28 @@ def _joints(hover: Figures, joints: Figures) -> Section:
     bare = "bare dynamixel-sdk, the world's bus"
     rows = [
         Row(
-            "joint read begun to currents written, ms: flight",
-            bare,
-            _spread(_at(hover, "bus_cycle_ms")),
-            _spread(_at(in_world, "cycle_ms")),
-            Target(1.3),
-            _why(hover, joints, in_world),
+            what="joint read begun to currents written, ms: flight",
+            beside=bare,
+            figures=_spread(_at(hover, "bus_cycle_ms")),
+            beside_figures=_spread(_at(in_world, "cycle_ms")),
+            target=Target(1.3),
+            why_not=_why(hover, joints, in_world),
         ),
         Row(
-            "the same, ms: bare dynamixel-sdk, a bus of its own",
-            "bytes on the wire",
-            _spread(_at(alone, "cycle_ms")),
-            limit,
-            None,
-            _why(joints, alone),
+            what="the same, ms: bare dynamixel-sdk, a bus of its own",
+            beside="bytes on the wire",
+            figures=_spread(_at(alone, "cycle_ms")),
+            beside_figures=limit,
+            target=None,
+            why_not=_why(joints, alone),
         ),
         Row(
-            "answers there to currents written, ms: flight",
-            bare,
-            _spread(_at(hover, "read_to_write_ms")),
-            _spread(_at(in_world, "command_ms")),
-            None,
-            _why(hover, joints, in_world),
+            what="answers there to currents written, ms: flight",
+            beside=bare,
+            figures=_spread(_at(hover, "read_to_write_ms")),
+            beside_figures=_spread(_at(in_world, "command_ms")),
+            target=None,
+            why_not=_why(hover, joints, in_world),
         ),
     ]
     failed = [
@@ -197,23 +211,37 @@ def _core(hover: Figures, core: Figures) -> Section:
     tick = _us(_at(core, "core_ms"))
     law, whole = _at(core, "law_us"), _at(core, "tick_us")
     rows = [
-        Row("FlightCore.step, us", "raw MuJoCo", tick, raw_us, Target(100.0, ("p50",), ratio=False), why),
-        Row("the law alone, us", "raw MuJoCo", {} if law is None else {"p50": law}, raw_us, None, why),
         Row(
-            "a tick of the fast closed loop, plant and all, us",
-            "raw MuJoCo",
-            {} if whole is None else {"p50": whole},
-            raw_us,
-            None,
-            why,
+            what="FlightCore.step, us",
+            beside="raw MuJoCo",
+            figures=tick,
+            beside_figures=raw_us,
+            target=Target(100.0, ("p50",), ratio=False),
+            why_not=why,
         ),
         Row(
-            "FlightCore.step in the flight, us",
-            "the fast closed loop",
-            _us(_at(hover, "core_ms")),
-            tick,
-            None,
-            _why(hover, core),
+            what="the law alone, us",
+            beside="raw MuJoCo",
+            figures={} if law is None else {"p50": law},
+            beside_figures=raw_us,
+            target=None,
+            why_not=why,
+        ),
+        Row(
+            what="a tick of the fast closed loop, plant and all, us",
+            beside="raw MuJoCo",
+            figures={} if whole is None else {"p50": whole},
+            beside_figures=raw_us,
+            target=None,
+            why_not=why,
+        ),
+        Row(
+            what="FlightCore.step in the flight, us",
+            beside="the fast closed loop",
+            figures=_us(_at(hover, "core_ms")),
+            beside_figures=tick,
+            target=None,
+            why_not=_why(hover, core),
         ),
     ]
     return Section("Computing", texts.CORE, P50_P99, rows)
@@ -233,11 +261,36 @@ def _cost(hover: Figures) -> Section:
         ("minor page faults of the flight process, a second", "minor_faults_s", None),
     ):
         target = None if at_most is None else Target(at_most, VALUE, ratio=False)
-        rows.append(Row(what, "empty loop", of("flight", key), of("empty loop", key), target, why))
+        rows.append(
+            Row(
+                what=what,
+                beside="empty loop",
+                figures=of("flight", key),
+                beside_figures=of("empty loop", key),
+                target=target,
+                why_not=why,
+            )
+        )
     for role in ("recorder", "guardian", "bare loop"):
         rows.append(
-            Row(f"CPU time of the {role}, %", "flight", of(role, "cpu_percent"), of("flight", "cpu_percent"), None, why)
+            Row(
+                what=f"CPU time of the {role}, %",
+                beside="flight",
+                figures=of(role, "cpu_percent"),
+                beside_figures=of("flight", "cpu_percent"),
+                target=None,
+                why_not=why,
+            )
         )
     for role in ("recorder", "guardian"):
-        rows.append(Row(f"memory of the {role}, MB", "flight", of(role, "rss_mb"), of("flight", "rss_mb"), None, why))
+        rows.append(
+            Row(
+                what=f"memory of the {role}, MB",
+                beside="flight",
+                figures=of(role, "rss_mb"),
+                beside_figures=of("flight", "rss_mb"),
+                target=None,
+                why_not=why,
+            )
+        )
     return Section("What it costs", texts.COST, VALUE, rows)

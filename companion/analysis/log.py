@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
 from companion.analysis.timing import Stopwatch, Timing, timing_of
-from companion.model.codec import RecordError, from_jsonable
+from companion.model.codec import RecordError, from_json
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import Inputs, Outputs, Sent
 
@@ -73,7 +73,7 @@ class FlightLog:
                 elif isinstance(record, Message):
                     topic = channels[record.channel_id]
                     if topic in _RECORDS:
-                        rows.take(topic, from_jsonable(_RECORDS[topic], json.loads(record.data)))
+                        rows.take(topic, from_json(_RECORDS[topic], record.data))
                 elif isinstance(record, Metadata):
                     metadata[record.name] = dict(record.metadata)
                 elif isinstance(record, Footer):

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from companion import __version__
 from companion.analysis.log import FlightLog, LogError, writer
-from companion.model.codec import differences, fingerprint
+from companion.model.codec import differences, fingerprint, from_packet, to_packet
 from companion.model.types import Inputs, Outputs, Sent
 
 
@@ -60,7 +60,10 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
         reason = str(error).splitlines()[0]
         raise LogError(f"{log.path}: the recorded configuration does not fit this version: {reason}") from None
     for k, (inputs, logged) in enumerate(zip(log.inputs, log.outputs, strict=True)):
-        found = differences(logged, core.step(inputs))
+        recomputed = from_packet(
+            Outputs, to_packet(core.step(inputs))
+        )  # as a log holds it: 1 in a float's place is 1.0
+        found = differences(logged, recomputed)
         if found is not None:
             field, old, new = found
             return ReplayResult(k + 1, Difference(inputs.tick, inputs.t_s, field or "outputs", old, new))

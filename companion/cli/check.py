@@ -126,8 +126,8 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
             config = replace_device_settings(config, world.devices(line.world))
         line("recorder")
         known = Observations(
-            0.0,
-            0.0,
+            start_s=0.0,
+            duration_s=0.0,
             plan=plan,
             mission_s=None if plan else Plan.build(config.mission, config.vehicle).duration_s,
             recorder=_recorder(config, scratch),

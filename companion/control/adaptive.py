@@ -174,21 +174,23 @@ class AdaptiveController:
         gamma = impedance.advance(dt_s, e_tau)
         self._desired.advance(dt_s, force)
         log = ControlLog(
-            error,
-            error_rate,
-            s,
-            gamma,
-            (f0, f1, f2, 0.0, 0.0, 0.0, t6, t7),
-            e_tau,
-            adaptation.h,
-            adaptation.zeta,
-            rho,
-            force,
-            sent.roll_pitch_yaw_rad,
-            self.hover_thrust,
-            sent.clipped,
+            error=error,
+            error_rate=error_rate,
+            sliding=s,
+            gamma=gamma,
+            tau=(f0, f1, f2, 0.0, 0.0, 0.0, t6, t7),
+            e_tau=e_tau,
+            h_hat=adaptation.h,
+            zeta=adaptation.zeta,
+            rho=rho,
+            force_ext_world_n=force,
+            attitude_desired_rad=sent.roll_pitch_yaw_rad,
+            hover_thrust=self.hover_thrust,
+            saturated=sent.clipped,
         )
-        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
+        return Wrench(
+            attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
+        )
 
     def _torque_error(self, arm_rad: Vec2, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Vec8, Vec2, Vec2]:
         """Return e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that hold the arm against gravity."""

@@ -67,19 +67,21 @@ class ModelBasedLaw:
         sent = self._actuation
         (fx, fy, fz), (t1, t2) = sent.force_world_n, sent.arm_torque_nm
         log = ControlLog(
-            error,
-            error_rate,
-            ZERO8,  # sliding
-            ZERO8,  # gamma
-            (fx, fy, fz, 0.0, 0.0, 0.0, t1, t2),
-            e_tau,
-            (0.0, 0.0, 0.0, 0.0),  # h_hat
-            0.0,  # zeta
-            0.0,  # rho
-            force_world_n,
-            sent.roll_pitch_yaw_rad,
-            self.hover_thrust,
-            sent.clipped,
-            payload_estimate_kg,
+            error=error,
+            error_rate=error_rate,
+            sliding=ZERO8,  # sliding
+            gamma=ZERO8,  # gamma
+            tau=(fx, fy, fz, 0.0, 0.0, 0.0, t1, t2),
+            e_tau=e_tau,
+            h_hat=(0.0, 0.0, 0.0, 0.0),  # h_hat
+            zeta=0.0,  # zeta
+            rho=0.0,  # rho
+            force_ext_world_n=force_world_n,
+            attitude_desired_rad=sent.roll_pitch_yaw_rad,
+            hover_thrust=self.hover_thrust,
+            saturated=sent.clipped,
+            payload_estimate_kg=payload_estimate_kg,
         )
-        return Wrench(sent.attitude_wxyz, sent.collective_n, sent.arm_torque_nm, log)
+        return Wrench(
+            attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
+        )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from companion.config.loader import FlightConfig
 from companion.control.arm_hold import hold_torque_nm
@@ -13,8 +12,8 @@ from companion.control.hover import HoverThrust, off_the_ground
 from companion.control.manipulator import GRAVITY_M_S2, Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
 from companion.control.types import Controller, PlantState
+from companion.model.codec import Record
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
-from companion.model.frozen import quick
 from companion.model.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2, Vec3
 
 FOLD_RATE_RAD_S = 1.2
@@ -22,9 +21,7 @@ PULL_TIME_S, PULL_LAG_S, PULL_MAX_N = 0.1, 0.05, 100.0
 """Parameters of the disturbance estimate for the safety monitors."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(Record, frozen=True):
     """Command of one tick, before the gate."""
 
     attitude: AttitudeSetpoint | None = None
@@ -113,7 +110,7 @@ class Pilot:
             now[0] + max(-step, min(step, goal[0] - now[0])),
             now[1] + max(-step, min(step, goal[1] - now[1])),
         )
-        return Command(None, self._hold(i))
+        return Command(attitude=None, arm_torque_nm=self._hold(i))
 
     def _hold(self, i: Inputs) -> Vec2 | None:
         if i.arm is None or i.vehicle is None:
@@ -134,14 +131,14 @@ class Pilot:
         if i.force is not None and i.t_s - i.force.stamp_s <= self._force_timeout_s:
             force = self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
         state = PlantState(
-            vehicle.position_world_m,
-            vehicle.velocity_world_m_s,
-            self._acceleration.update(vehicle),
-            vehicle.attitude_wxyz,
-            vehicle.angular_rate_body_rad_s,
-            arm_rad,
-            arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
-            force,
+            position_world_m=vehicle.position_world_m,
+            velocity_world_m_s=vehicle.velocity_world_m_s,
+            acceleration_world_m_s2=self._acceleration.update(vehicle),
+            attitude_wxyz=vehicle.attitude_wxyz,
+            angular_rate_body_rad_s=vehicle.angular_rate_body_rad_s,
+            arm_rad=arm_rad,
+            arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
+            force_ext_world_n=force,
         )
         self._state = state
         if self._hover_adapts:
@@ -155,7 +152,9 @@ class Pilot:
         thrust = wrench.collective_n * hover / self._weight_n
         self._thrust_sent = thrust if thrust < 1.0 else 1.0
         torque = wrench.arm_torque_nm if arm is not None else None
-        return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, wrench.log)
+        return Command(
+            attitude=AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), arm_torque_nm=torque, log=wrench.log
+        )
 
     def _watch_disturbance(self, dt_s: float, state: PlantState, vertical_scale: float) -> None:
         """Update the disturbance estimate with the measured attitude, because a slow attitude response is not a disturbance."""

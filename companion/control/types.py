@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
-from companion.model.frozen import quick
+from companion.model.codec import Record
 from companion.model.types import ControlLog, Quat, Reference, Vec2, Vec3
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class PlantState:
+class PlantState(Record, frozen=True, kw_only=True):
     """State of the machine at one tick as a controller sees it; world ENU, body FLU."""
 
     position_world_m: Vec3
@@ -22,13 +19,11 @@ class PlantState:
     angular_rate_body_rad_s: Vec3
     arm_rad: Vec2
     arm_rate_rad_s: Vec2
-    force_ext_world_n: Vec3 | None
+    force_ext_world_n: Vec3 | None = None
     """Force on the net, tared, without the net's weight, not filtered; None without a valid sample."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Wrench:
+class Wrench(Record, frozen=True, kw_only=True):
     """Force on the vehicle and joint torques of one tick."""
 
     attitude_wxyz: Quat

@@ -5,8 +5,9 @@ One `step` is one control tick: monitors -> state machine -> reference -> govern
 
 from __future__ import annotations
 
-import dataclasses
 import math
+
+import msgspec
 
 from companion.config.loader import FlightConfig
 from companion.control.pilot import Command, Pilot
@@ -92,26 +93,25 @@ class FlightCore:
             self._report_refused(t_s, verdict.refused, events)
         phase, kind = state.phase(t_s)
         start_s = state.mission_start_s
-        # In the order of the fields: names cost time here.
         return Outputs(
-            inputs.tick,
-            t_s,
-            t_s - start_s if start_s is not None else 0.0,
-            phase,
-            kind,
-            state.progress(t_s),
-            reference,
-            verdict.attitude,
-            verdict.arm_torque_nm,
-            request.autopilot,
-            state.supervisor.action,
-            tuple(events),
-            command.log,
-            state.over,
-            self._monitors.mocap_trusted,
-            self._situation.tether,
-            self._bent_by,
-            self._monitors.mocap_innovation_m,
+            tick=inputs.tick,
+            t_s=t_s,
+            mission_t_s=t_s - start_s if start_s is not None else 0.0,
+            phase=phase,
+            phase_kind=kind,
+            progress=state.progress(t_s),
+            reference=reference,
+            attitude=verdict.attitude,
+            arm_torque_nm=verdict.arm_torque_nm,
+            request=request.autopilot,
+            action=state.supervisor.action,
+            events=tuple(events),
+            control=command.log,
+            outcome=state.over,
+            mocap_trusted=self._monitors.mocap_trusted,
+            tether=self._situation.tether,
+            bent_by=self._bent_by,
+            mocap_innovation_m=self._monitors.mocap_innovation_m,
         )
 
     def _dt_s(self, t_s: float) -> float:
@@ -197,10 +197,12 @@ class FlightCore:
         if stage in (Stage.WAIT, Stage.READY, Stage.DONE):
             return None, Command()
         if stage is Stage.STAND_DOWN and state.armed_by_others:
-            return None, dataclasses.replace(self._pilot.wait(i), attitude=None)
+            return None, msgspec.structs.replace(self._pilot.wait(i), attitude=None)
         if stage is Stage.AUTOPILOT_LAND:
             folding = self._pilot.fold(i, dt_s)
-            return None, dataclasses.replace(folding, attitude=self._pilot.level(i)) if state.zero_thrust else folding
+            return None, msgspec.structs.replace(
+                folding, attitude=self._pilot.level(i)
+            ) if state.zero_thrust else folding
         course = state.course
         if course is None or not (stage is _PLAN or stage is _SPOOL or stage is _TOUCHDOWN):
             return None, self._pilot.wait(i)

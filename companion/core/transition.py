@@ -58,7 +58,13 @@ class Parameters:
 
 def event_of(notice: Notice, t_s: float, text: str, severity: Severity | None = None) -> Event:
     """Return the event of a notice; with the severity of its row if none is given."""
-    return Event(t_s, notice.id, severity or notice.severity, notice.action, without_negative_zero(text))
+    return Event(
+        t_s=t_s,
+        id=notice.id,
+        severity=severity or notice.severity,
+        action=notice.action,
+        text=without_negative_zero(text),
+    )
 
 
 class Transition:
@@ -102,7 +108,11 @@ class Transition:
 
     def report_rule(self, rule_id: str, action: SafetyAction, text: str) -> None:
         """Add the event of a rule that the sequence finds by itself, with CRITICAL severity."""
-        self.events.append(Event(self.i.t_s, rule_id, Severity.CRITICAL, action, without_negative_zero(text)))
+        self.events.append(
+            Event(
+                t_s=self.i.t_s, id=rule_id, severity=Severity.CRITICAL, action=action, text=without_negative_zero(text)
+            )
+        )
 
     def enter(self, stage: Stage, *, pilot_flies: bool = False, flipped: bool = False) -> None:
         """Go to a stage. Of a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is known already."""

@@ -186,7 +186,11 @@ class Flight:
                 "PX4 was armed when the companion started and has disarmed since; no take-off happened: start again to fly"
             ]
         for text in lines:
-            self._tell(0, outputs, Event(outputs.t_s, REATTACHED, Severity.WARNING, SafetyAction.WARN, text))
+            self._tell(
+                0,
+                outputs,
+                Event(t_s=outputs.t_s, id=REATTACHED, severity=Severity.WARNING, action=SafetyAction.WARN, text=text),
+            )
             self._recorder.client.text(outputs.t_s, Severity.WARNING, REATTACHED, text)
         return goes_on
 

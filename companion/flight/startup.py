@@ -69,7 +69,7 @@ async def check_before_flight(
 
     # A path takes seconds to plan, once in a process: here, where motion capture goes on flowing meanwhile.
     plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
-    known = Observations(0.0, 0.0, mission_s=plan.duration_s)
+    known = Observations(start_s=0.0, duration_s=0.0, mission_s=plan.duration_s)
     rows = await preflight.preflight(devices, config, clock, out=out, tell=tell, known=known, sitl=sitl)
     ipc.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
     try:

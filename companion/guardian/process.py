@@ -25,10 +25,10 @@ from companion.guardian.mocap import MocapClient, MocapProblem
 from companion.guardian.monitors import StallWatch
 from companion.guardian.settings import Settings, read_settings
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
-from companion.model.codec import pack_plain
+from companion.model.codec import to_packet
+from companion.model.packets import LogLine
 from companion.model.types import SafetyAction, Severity
 from companion.runtime import ipc
-from companion.runtime.packets import TEXT, UNNUMBERED
 from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
 
 PERIOD_S = 0.01
@@ -340,7 +340,7 @@ class Guardian:
         ipc.send(self._channel, message)
         _log_line(f"{notice.t_s:.3f} {notice.id}: {notice.text}")
         if self._heartbeats.recorder is not None:
-            packet = pack_plain((TEXT, UNNUMBERED, notice.t_s, notice.severity.value, notice.id, notice.text))
+            packet = to_packet(LogLine(t_s=notice.t_s, severity=notice.severity, source=notice.id, text=notice.text))
             with contextlib.suppress(OSError):
                 self._heartbeats.recorder.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 

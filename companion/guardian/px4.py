@@ -53,7 +53,15 @@ class Px4State:
         if self._heartbeat is None:
             return None
         stamp_s, armed, mode, system = self._heartbeat
-        return AutopilotStatus(stamp_s, armed, mode, messages.landed_state(self._landed), None, None, system)
+        return AutopilotStatus(
+            heartbeat_stamp_s=stamp_s,
+            armed=armed,
+            mode=mode,
+            landed=messages.landed_state(self._landed),
+            battery_voltage_v=None,
+            battery_remaining=None,
+            system_status=system,
+        )
 
     def vehicle(self) -> VehicleState | None:
         """Return the vehicle's state, or None before the first attitude.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
+import msgspec
+
+from companion.model.codec import Record
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
 
 
-@dataclass(frozen=True, slots=True)
-class EstimatorReport:
+class EstimatorReport(Record, frozen=True, kw_only=True):
     """ESTIMATOR_STATUS (MAVLink 230), stamped on arrival with the flight clock."""
 
     stamp_s: float
@@ -24,8 +25,7 @@ class EstimatorReport:
     position_vertical_accuracy_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class ServoReport:
+class ServoReport(Record, frozen=True, kw_only=True):
     """One servo's identity and settings, registers of the XM430 control table."""
 
     servo_id: int
@@ -45,8 +45,7 @@ class ServoReport:
     """Register 144."""
 
 
-@dataclass(frozen=True, slots=True)
-class Machine:
+class Machine(Record, frozen=True, kw_only=True):
     """The computer itself; None: not told here."""
 
     disk_free_bytes: int | None
@@ -64,8 +63,7 @@ class Machine:
     force_latency_ms: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class MocapCounts:
+class MocapCounts(Record, frozen=True, kw_only=True):
     """Counts of the motion-capture driver since it was opened."""
 
     frames: int
@@ -81,8 +79,7 @@ class MocapCounts:
     """First exception that the receiver of the poses raised."""
 
 
-@dataclass(frozen=True, slots=True)
-class MocapServer:
+class MocapServer(Record, frozen=True):
     """The program that streams motion capture."""
 
     name: str
@@ -91,8 +88,7 @@ class MocapServer:
     """Such as `4.1`."""
 
 
-@dataclass(frozen=True, slots=True)
-class ForceCounts:
+class ForceCounts(Record, frozen=True, kw_only=True):
     """Counts of the force sensor's driver since the port was opened."""
 
     samples: int
@@ -103,8 +99,7 @@ class ForceCounts:
     """Why the port is no longer read; None while it is."""
 
 
-@dataclass(frozen=True, slots=True)
-class MocapStream:
+class MocapStream(Record, frozen=True, kw_only=True):
     """What the motion-capture driver counted while it was watched."""
 
     frames: int
@@ -119,8 +114,7 @@ class MocapStream:
     """Of ours, as the server says it; empty: it does not."""
 
 
-@dataclass(frozen=True, slots=True)
-class ForceStream:
+class ForceStream(Record, frozen=True, kw_only=True):
     """What the force sensor's driver counted while it was watched."""
 
     samples: int
@@ -132,8 +126,7 @@ class ForceStream:
     """Why the port is not read any more; None: it is."""
 
 
-@dataclass(frozen=True, slots=True)
-class StateCounts:
+class StateCounts(Record, frozen=True):
     """Messages of PX4's state while it was watched."""
 
     position: int
@@ -144,8 +137,7 @@ class StateCounts:
     """HIGHRES_IMU."""
 
 
-@dataclass(frozen=True, slots=True)
-class Observations:
+class Observations(Record, frozen=True, kw_only=True):
     """Everything that was seen in `duration_s`, newest last. Empty or None: nothing came."""
 
     start_s: float
@@ -153,7 +145,7 @@ class Observations:
     duration_s: float
     firmware: str | None = None
     """As `MavsdkAutopilot.firmware` tells it: `PX4 1.16.1 release (git ...)`."""
-    params: Mapping[str, float | int] = field(default_factory=dict)
+    params: Mapping[str, float | int] = msgspec.field(default_factory=dict)
     """PX4's parameters by name; one that PX4 does not have is absent."""
     vehicle: tuple[VehicleState, ...] = ()
     status: tuple[AutopilotStatus, ...] = ()
@@ -180,12 +172,11 @@ class Observations:
     """Why the mission cannot be flown as written, one line each; None: that was looked at before."""
     recorder: str | None = None
     """None: not tried. Empty: a log could be opened. Else why not."""
-    failures: Mapping[str, str] = field(default_factory=dict)
+    failures: Mapping[str, str] = msgspec.field(default_factory=dict)
     """Device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`), and the driver's error line."""
 
 
-@dataclass(frozen=True, slots=True)
-class Waiting:
+class Waiting(Record, frozen=True):
     """What is worth waiting for, beyond the observation itself."""
 
     what: str

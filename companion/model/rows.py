@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
+
+import msgspec
+
+from companion.model.codec import Record
 
 
 class Level(Enum):
@@ -17,8 +20,7 @@ class Level(Enum):
     """People are told, and decide."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(Record, frozen=True, kw_only=True):
     """The result of one check."""
 
     id: str
@@ -49,7 +51,7 @@ class Row:
 
     def as_json(self) -> dict[str, Any]:
         """For `--json`, the log and the status channel."""
-        return {**asdict(self), "level": self.level.value}
+        return {**msgspec.structs.asdict(self), "level": self.level.value}
 
 
 def refusals(rows: Iterable[Row]) -> list[Row]:

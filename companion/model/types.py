@@ -12,10 +12,9 @@ Conventions
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
-from companion.model.frozen import quick
+from companion.model.codec import Record
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -119,8 +118,7 @@ class OperatorCommand(Enum):
     ABORT = "abort"  # land at once, the arm folds; recorded as what it is
 
 
-@dataclass(frozen=True, slots=True)
-class GroundCommand:
+class GroundCommand(Record, frozen=True, kw_only=True):
     """A command that came over the air, verified by the recorder process; in `Inputs` only what was asked for goes on."""
 
     command: OperatorCommand
@@ -128,13 +126,11 @@ class GroundCommand:
     """Name of the one whose key signed it."""
     nonce: str
     """The answer names it."""
-    hold: int = 0
+    hold: int
     """Number of the hold that a RESUME is to end, `Sent.hold`; 0: none, and in every other command."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class VehicleState:
+class VehicleState(Record, frozen=True, kw_only=True):
     """PX4's fused state, converted to world ENU / body FLU by the autopilot driver."""
 
     position_stamp_s: float
@@ -154,30 +150,26 @@ class VehicleState:
     """Integral of the specific force over all IMU samples since the link was opened, up to `imu_boot_s`; None: unknown."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class AutopilotStatus:
+class AutopilotStatus(Record, frozen=True, kw_only=True):
     """Slow state of the autopilot."""
 
     heartbeat_stamp_s: float
     armed: bool
     mode: FlightMode
     landed: LandedState
-    battery_voltage_v: float | None
-    battery_remaining: float | None
+    battery_voltage_v: float | None = None
+    battery_remaining: float | None = None
     """0 to 1."""
     system_status: int | None = None
     """HEARTBEAT.system_status (MAV_STATE); None if unknown, as in logs written before it was recorded."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class MocapPose:
+class MocapPose(Record, frozen=True, kw_only=True):
     """One motion-capture frame of the vehicle's rigid body, already in the world frame of the mission."""
 
     stamp_s: float
     """When the datagram arrived."""
-    latency_s: float | None
+    latency_s: float | None = None
     """Mid-exposure to transmission, by the server's own clock (NatNet >= 3.0)."""
     frame_number: int
     position_world_m: Vec3
@@ -188,9 +180,7 @@ class MocapPose:
     """Mid-exposure on the server's own clock (NatNet >= 3.0), s; None: unknown, as in old logs."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class ArmState:
+class ArmState(Record, frozen=True, kw_only=True):
     """Joint state in the paper's angles: alpha_1 from body +x turning down, alpha_2 turning link 2 the other way."""
 
     stamp_s: float
@@ -210,9 +200,7 @@ class ArmState:
     """When the bus thread began this read."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class ForceSample:
+class ForceSample(Record, frozen=True, kw_only=True):
     """One sample of the force-torque sensor in its own frame, as measured (tare and gravity not removed)."""
 
     stamp_s: float
@@ -221,27 +209,23 @@ class ForceSample:
     overload: bool
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Inputs:
+class Inputs(Record, frozen=True, kw_only=True):
     """Everything that `FlightCore.step` may look at."""
 
     tick: int
     t_s: float
-    vehicle: VehicleState | None
-    status: AutopilotStatus | None
-    mocap: MocapPose | None
-    arm: ArmState | None
-    force: ForceSample | None
+    vehicle: VehicleState | None = None
+    status: AutopilotStatus | None = None
+    mocap: MocapPose | None = None
+    arm: ArmState | None = None
+    force: ForceSample | None = None
     command: OperatorCommand
     recorder_dropped: int
     guardian_ready: bool | None = None
     """The guardian said within the last second that it could take over; None: none stands by (fast loop)."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Reference:
+class Reference(Record, frozen=True, kw_only=True):
     """Where the machine should be at one instant."""
 
     position_world_m: Vec3
@@ -252,13 +236,11 @@ class Reference:
     arm_rad: Vec2
     arm_rate_rad_s: Vec2
     arm_acceleration_rad_s2: Vec2
-    jerk_world_m_s3: Vec3 = (0.0, 0.0, 0.0)
+    jerk_world_m_s3: Vec3
     """For laws that feed the acceleration forward ahead of time."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class AttitudeSetpoint:
+class AttitudeSetpoint(Record, frozen=True):
     """SET_ATTITUDE_TARGET in the companion's frames."""
 
     attitude_wxyz: Quat
@@ -266,9 +248,7 @@ class AttitudeSetpoint:
     """Collective, normalised 0 to 1."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(Record, frozen=True, kw_only=True):
     """Something that happened and that a person may have to understand afterwards."""
 
     t_s: float
@@ -278,9 +258,7 @@ class Event:
     text: str
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class ControlLog:
+class ControlLog(Record, frozen=True, kw_only=True):
     """What the law computed in one tick; rows are chi = [p; q; alpha]."""
 
     error: Vec8
@@ -304,9 +282,7 @@ class ControlLog:
     """Mass that the law believes to carry beyond the machine's own; None: the law estimates none."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class TetherState:
+class TetherState(Record, frozen=True, kw_only=True):
     """What is known of the safety tether in one tick."""
 
     range_m: float
@@ -330,13 +306,11 @@ class TetherState:
     """A pull towards the anchor or to the side although there is slack."""
     separated: bool
     """Farther away than the line is long, and nothing pulls."""
-    vehicle_turns: float = 0.0
-    """Winding of the line about the vehicle: turns of the anchor's direction in the body's x-y plane."""
+    vehicle_turns: float
+    """Always 0; `turns` is the larger of the two windings. Logs have the field."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Outputs:
+class Outputs(Record, frozen=True, kw_only=True):
     """Everything that one tick decides."""
 
     tick: int
@@ -347,34 +321,32 @@ class Outputs:
     phase_kind: PhaseKind
     progress: float
     """0 to 1 of the whole mission's duration."""
-    reference: Reference | None
-    attitude: AttitudeSetpoint | None
+    reference: Reference | None = None
+    attitude: AttitudeSetpoint | None = None
     """None: nothing is to be sent to the autopilot in this tick."""
-    arm_torque_nm: Vec2 | None
+    arm_torque_nm: Vec2 | None = None
     """None: nothing is to be sent to the arm in this tick (its bus watchdog will let go)."""
     request: AutopilotRequest
     action: SafetyAction
     events: tuple[Event, ...]
-    control: ControlLog | None
-    outcome: Outcome | None
+    control: ControlLog | None = None
+    outcome: Outcome | None = None
     """Set when the flight is over."""
-    mocap_trusted: bool = True
+    mocap_trusted: bool
     """Motion capture is plausible; while False no pose is to be passed on to PX4."""
     tether: TetherState | None = None
-    bent_by: tuple[str, ...] = ()
+    bent_by: tuple[str, ...]
     """What the governor bent the reference for."""
     mocap_innovation_m: float | None = None
     """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged, None in old logs."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Sent:
+class Sent(Record, frozen=True, kw_only=True):
     """What really left in one tick, and when: the drivers' answer to `Outputs`."""
 
     tick: int
     attitude_sent: bool
-    arm_torque_sent_nm: Vec2 | None
+    arm_torque_sent_nm: Vec2 | None = None
     """After rounding to current counts and clipping."""
     start_s: float
     """When the tick began, flight clock."""
@@ -390,8 +362,7 @@ class Sent:
     the vehicle holds already. None: it does not hold."""
 
 
-@dataclass(frozen=True, slots=True)
-class LinkIdentity:
+class LinkIdentity(Record, frozen=True, kw_only=True):
     """What another process must know to go on speaking on the MAVLink link to PX4."""
 
     autopilot_system: int

@@ -43,7 +43,16 @@ class Check:
 
     def _row(self, ok: bool, read: str, wanted: str, fix: str, level: Level) -> Row:
         plain = without_negative_zero
-        return Row(self.id, self.title, ok, plain(read), plain(wanted), self.why, plain(fix), level)
+        return Row(
+            id=self.id,
+            title=self.title,
+            ok=ok,
+            read=plain(read),
+            wanted=plain(wanted),
+            why=self.why,
+            fix=plain(fix),
+            level=level,
+        )
 
     @property
     def _level(self) -> Level:

@@ -9,9 +9,11 @@ import os
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
+
+from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
 from companion.io.devices import AvailableDevices, Devices
@@ -86,7 +88,7 @@ async def observe(
     """
     watcher = _Watcher(devices, config, clock)
     duration_s = config.vehicle.safety.preflight_s
-    base = known or Observations(0.0, 0.0)
+    base = known or Observations(start_s=0.0, duration_s=0.0)
     failures = dict(devices.failures) if isinstance(devices, AvailableDevices) else {}
     base = replace(base, machine=machine_of(config, out), failures=failures)
     async with asyncio.TaskGroup() as group:
@@ -262,7 +264,9 @@ class _Watcher:
             return None
         counts = force.counts()
         product = f"{force.product_name}, firmware {force.firmware}" if force.firmware else force.product_name
-        return ForceStream(now.force_samples - first.force_samples, counts.bad_sums, product, counts.lost)
+        return ForceStream(
+            samples=now.force_samples - first.force_samples, bad_sums=counts.bad_sums, product=product, lost=counts.lost
+        )
 
 
 def _take(kept: deque[_T], newest: _T | None) -> None:

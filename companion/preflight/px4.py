@@ -34,7 +34,15 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
         if firmware is not None:
             why = "PX4's behaviour would be unknown"
             found.append(
-                Row(UNREAD_ID, "PX4 parameters", False, "none was read", "", why, "check the link, then try again")
+                Row(
+                    id=UNREAD_ID,
+                    title="PX4 parameters",
+                    ok=False,
+                    read="none was read",
+                    wanted="",
+                    why=why,
+                    fix="check the link, then try again",
+                )
             )
         return found
     return [*found, *_param_rows(params, vehicle)]
@@ -47,7 +55,16 @@ def firmware_row(firmware: str) -> Row:
     wanted = "1.16.x or 1.18.x, a release"
 
     def row(ok: bool, level: Level = Level.WARN, fix: str = "") -> Row:
-        return Row(FIRMWARE_ID, "PX4 firmware", ok, firmware, wanted, _FIRMWARE_WHY, fix, level)
+        return Row(
+            id=FIRMWARE_ID,
+            title="PX4 firmware",
+            ok=ok,
+            read=firmware,
+            wanted=wanted,
+            why=_FIRMWARE_WHY,
+            fix=fix,
+            level=level,
+        )
 
     match = _FIRMWARE.match(firmware)
     if match is None:
@@ -74,10 +91,28 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
             continue
         if value is None:
             fix = "check the firmware: PX4 1.16 and 1.18 have it"
-            yield Row(row_id, wanted.name, False, "PX4 does not have it", text, wanted.why, fix, Level.WARN)
+            yield Row(
+                id=row_id,
+                title=wanted.name,
+                ok=False,
+                read="PX4 does not have it",
+                wanted=text,
+                why=wanted.why,
+                fix=fix,
+                level=Level.WARN,
+            )
             continue
         ok = wanted.accepts(value, vehicle)
-        yield Row(row_id, wanted.name, ok, text_of(value), text, wanted.why, "" if ok else fix_of(wanted), wanted.level)
+        yield Row(
+            id=row_id,
+            title=wanted.name,
+            ok=ok,
+            read=text_of(value),
+            wanted=text,
+            why=wanted.why,
+            fix="" if ok else fix_of(wanted),
+            level=wanted.level,
+        )
 
 
 def fix_of(wanted: Wanted) -> str:

@@ -2,7 +2,7 @@
 
 The recorder answers on the same channel: a full disk, commands from the ground, the state of its telemetry.
 
-The channel is a Unix SOCK_SEQPACKET pair; packets are `marshal` data of one interpreter (`companion.model.codec`). If the channel is
+The channel is a Unix SOCK_SEQPACKET pair; its packets are `companion.model.packets`. If the channel is
 full the packet is dropped and counted. If the recorder is dead every packet is counted as dropped and the flight goes on. If the
 flight process is killed, its packets are still in the socket: the recorder writes them, closes the log and exits.
 """
@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from companion.io.protocols import DeviceError
-from companion.model.codec import pack_plain, plain
+from companion.model.codec import to_packet
+from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Packet, Tick
 from companion.model.types import GroundCommand, Inputs, OperatorCommand, Outputs, SafetyAction, Sent, Severity
-from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK
 
 _BUFFER_BYTES = 8 * 2**20
 _MESSAGE_MAX_BYTES = 4096
@@ -59,7 +59,7 @@ class RecorderClient:
 
     def record(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> bool:
         """Send one tick, then read the recorder's messages. Return False if the tick was dropped (and counted)."""
-        taken = self._send((TICK, self._offered, plain(inputs), plain(outputs), plain(sent)))
+        taken = self._send(Tick(number=self._offered, inputs=inputs, outputs=outputs, sent=sent))
         self.samples += taken
         try:
             data = self._socket.recv(_MESSAGE_MAX_BYTES)
@@ -100,16 +100,27 @@ class RecorderClient:
             t_s: flight clock of the tick that handled it.
             phase, action: of that tick's `Outputs`.
         """
-        what = (nonce, operator, command.value, accepted, text, t_s, phase, action.value)
-        return self._send((ACK, self._offered, *what))
+        return self._send(
+            CommandAnswer(
+                number=self._offered,
+                nonce=nonce,
+                operator=operator,
+                command=command,
+                accepted=accepted,
+                text=text,
+                t_s=t_s,
+                phase=phase,
+                action=action,
+            )
+        )
 
     def text(self, t_s: float, severity: Severity, source: str, text: str) -> bool:
         """Write a line to the log's `/log` channel; `t_s` is the flight clock."""
-        return self._send((TEXT, self._offered, t_s, severity.value, source, text))
+        return self._send(LogLine(number=self._offered, t_s=t_s, severity=severity, source=source, text=text))
 
     def metadata(self, name: str, values: Mapping[str, str]) -> bool:
         """Write a metadata record that becomes known only during the flight (autopilot version, parameters, ...)."""
-        return self._send((METADATA, self._offered, name, dict(values)))
+        return self._send(Metadata(self._offered, name, dict(values)))
 
     def fileno(self) -> int:
         """Return the socket's descriptor, for callers that may wait until it is writable (the flight may not)."""
@@ -118,19 +129,19 @@ class RecorderClient:
     def close(self) -> None:
         """End the log: the recorder writes the packets that it has received and closes the file."""
         if not self._dead:
-            self._send((CLOSE, self._offered))
+            self._send(Close(self._offered))
         self._dead = True
         self._socket.close()
 
-    def _send(self, packet: tuple[Any, ...]) -> bool:
+    def _send(self, packet: Packet) -> bool:
         self._offered += 1
         if not self._dead:
             try:
-                self._socket.send(pack_plain(packet))
+                self._socket.send(to_packet(packet))
                 return True
             except BlockingIOError:
                 pass  # full
-            except ValueError as error:  # marshal: a value that is not plain data
+            except (ValueError, TypeError, OverflowError) as error:  # a value that no record holds
                 self.error = f"recorder: a record could not be packed: {error}"
             except OSError as error:
                 if isinstance(error, (BrokenPipeError, ConnectionError)):
@@ -161,7 +172,7 @@ class RecorderClient:
             case {"command": str(name), "operator": str(operator), "nonce": str(nonce), "hold": int(hold)} if (
                 name in _COMMANDS
             ):
-                self._commands.append(GroundCommand(_COMMANDS[name], operator, nonce, hold))
+                self._commands.append(GroundCommand(command=_COMMANDS[name], operator=operator, nonce=nonce, hold=hold))
             case {"ground": str(text)}:
                 self.telemetry_status = text
 

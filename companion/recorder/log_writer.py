@@ -8,7 +8,6 @@ clock of its tick as log time, publish time and header stamp.
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import foxglove
 from foxglove.channels import LogChannel
@@ -16,8 +15,8 @@ from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel
 
 from companion.ground.protocol.messages import EventLine
-from companion.model.codec import json_schema, json_text, jsonable_from_plain
-from companion.model.types import Inputs, Outputs, Sent
+from companion.model.codec import Record, json_schema, to_json
+from companion.model.types import Event, Inputs, Outputs, Sent
 from companion.recorder.log_file import LogFile
 from companion.recorder.viewer_channels import ViewerChannels, timestamp
 
@@ -54,25 +53,22 @@ class LogWriter:
         """Whether the open chunk should be flushed."""
         return self._unflushed_bytes >= self._chunk_bytes
 
-    def tick(self, inputs_plain: Any, outputs_plain: Any, sent_plain: Any) -> None:
+    def tick(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> None:
         """Write one tick: three full-rate messages, its events, and the viewer messages that are due."""
-        inputs = jsonable_from_plain(Inputs, inputs_plain)
-        outputs = jsonable_from_plain(Outputs, outputs_plain)
-        sent = jsonable_from_plain(Sent, sent_plain)
         # Encode all records first: one that cannot be encoded must not leave half a tick behind.
-        texts = [json_text(record).encode() for record in (inputs, outputs, sent)]
-        stamp_ns = self._stamp_ns(inputs["t_s"])
+        texts = [to_json(record) for record in (inputs, outputs, sent)]
+        stamp_ns = self._stamp_ns(inputs.t_s)
         for channel, text in zip((self._inputs, self._outputs, self._sent), texts, strict=True):
             channel.log(text, log_time=stamp_ns)
             self._unflushed_bytes += len(text)
         # The tick is recorded; an error in its viewer messages must not count it as lost.
         try:
-            for event in outputs["events"]:
-                self._event(stamp_ns, outputs["mission_t_s"], event)
-            self._viewers.tick(inputs["t_s"], stamp_ns, inputs, outputs)
+            for event in outputs.events:
+                self._event(stamp_ns, outputs.mission_t_s, event)
+            self._viewers.tick(stamp_ns, inputs, outputs)
         except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
             if self.viewer_error is None:
-                self.viewer_error = f"tick {inputs['tick']}: {type(error).__name__}: {error}"
+                self.viewer_error = f"tick {inputs.tick}: {type(error).__name__}: {error}"
                 self._line(stamp_ns, "warning", "recorder", f"viewer messages left out: {self.viewer_error}")
 
     def text(self, t_s: float, severity: str, source: str, text: str) -> None:
@@ -102,13 +98,20 @@ class LogWriter:
         """Write the summary, which completes the file."""
         self._mcap.close()
 
-    def _json_channel(self, topic: str, cls: type) -> foxglove.Channel:
+    def _json_channel(self, topic: str, cls: type[Record]) -> foxglove.Channel:
         return foxglove.Channel(topic, schema=json_schema(cls), context=self._context)
 
-    def _event(self, stamp_ns: int, mission_t_s: float, event: dict[str, Any]) -> None:
-        line = {"t_s": event["t_s"], "mission_t_s": mission_t_s, **event}
-        self._events.log(json_text(line).encode(), log_time=stamp_ns)
-        self._line(stamp_ns, event["severity"], event["id"], event["text"])
+    def _event(self, stamp_ns: int, mission_t_s: float, event: Event) -> None:
+        line = EventLine(
+            t_s=event.t_s,
+            mission_t_s=mission_t_s,
+            id=event.id,
+            severity=event.severity.value,
+            action=event.action.value,
+            text=event.text,
+        )
+        self._events.log(to_json(line), log_time=stamp_ns)
+        self._line(stamp_ns, event.severity.value, event.id, event.text)
 
     def _line(self, stamp_ns: int, severity: str, source: str, text: str) -> None:
         level = _LEVELS.get(severity, LogLevel.Unknown)

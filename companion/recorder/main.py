@@ -24,7 +24,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from companion.model.codec import fingerprint, unpack_plain
+from companion.model.codec import RecordError, fingerprint
+from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Tick, read_packet
 from companion.model.types import Inputs, Outputs, Sent
 from companion.recorder.channel import FLUSH_PERIOD_S, Channel
 from companion.recorder.log_file import LogFile
@@ -32,7 +33,6 @@ from companion.recorder.log_writer import LogWriter
 from companion.recorder.telemetry import TelemetryThread, broker_configured
 from companion.recorder.versions import versions
 from companion.runtime.cores import keep_off
-from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK, UNNUMBERED
 
 LOG_FORMAT = "1"
 SYNC_PERIOD_S = 1.0
@@ -57,7 +57,7 @@ class Recorder:
         self.error: str | None = None
 
     def run(self) -> None:
-        """Run until a CLOSE packet arrives, or the last process that holds the channel ends."""
+        """Run until a `Close` packet arrives, or the last process that holds the channel ends."""
         flushed_s = synced_s = time.monotonic()
         for packet in self._channel.packets():
             if packet is not None:
@@ -85,36 +85,36 @@ class Recorder:
         """Return the number of lost records, and why recording stopped (or None). Called from another thread."""
         return self.dropped, self.error
 
-    def _handle(self, packet: bytes) -> None:
-        kind, number, *rest = unpack_plain(packet)
-        if number != UNNUMBERED:
-            self.dropped += number - self._expected
-            self._expected = number + (kind != CLOSE)
-        self._closed = kind == CLOSE
+    def _handle(self, data: bytes) -> None:
+        try:
+            packet = read_packet(data)
+        except RecordError as error:  # the number of the next packet shows that this one is missing
+            self.error = self.error or f"recorder: packet {self._expected} could not be written: {error}"
+            return
+        if packet.number is not None:
+            self.dropped += packet.number - self._expected
+            self._expected = packet.number + (not isinstance(packet, Close))
+        self._closed = isinstance(packet, Close)
         if self._log_file.error is not None:
-            self.dropped += kind != CLOSE
+            self.dropped += not self._closed
             return
         try:
-            if kind == TICK:
-                self._writer.tick(*rest)
-                self._in_chunk += 1
-            elif kind == TEXT:
-                self._writer.text(*rest)
-            elif kind == METADATA:
-                self._writer.metadata(*rest)
-            elif kind == ACK:
-                self._log_ack(*rest)
+            match packet:
+                case Tick():
+                    self._writer.tick(packet.inputs, packet.outputs, packet.sent)
+                    self._in_chunk += 1
+                case LogLine():
+                    self._writer.text(packet.t_s, packet.severity.value, packet.source, packet.text)
+                case Metadata():
+                    self._writer.metadata(packet.name, packet.values)
+                case CommandAnswer():
+                    severity = "info" if packet.accepted else "warning"
+                    text = f"{packet.command.value} of {packet.operator}: {packet.text} ({packet.nonce})"
+                    self._writer.text(packet.t_s, severity, "ground", text)
         except (ValueError, TypeError, LookupError, OverflowError, RuntimeError) as error:
             self.dropped += 1
-            self.error = (
-                self.error or f"recorder: packet {number} could not be written: {type(error).__name__}: {error}"
-            )
-
-    def _log_ack(
-        self, nonce: str, operator: str, command: str, accepted: bool, text: str, t_s: float, phase: str, action: str
-    ) -> None:
-        severity = "info" if accepted else "warning"
-        self._writer.text(t_s, severity, "ground", f"{command} of {operator}: {text} ({nonce})")
+            what = f"packet {packet.number} could not be written: {type(error).__name__}: {error}"
+            self.error = self.error or f"recorder: {what}"
 
     def _flush(self) -> None:
         """Close the chunk; only ticks that reached the disk count as recorded."""

@@ -15,6 +15,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from companion.model.codec import to_packet
+from companion.model.packets import LogLine
+from companion.model.types import Severity
+
 if TYPE_CHECKING:
     from companion.recorder.telemetry_link import Counts, FlightSide
 
@@ -132,8 +136,6 @@ class TelemetryThread:
             self._packets.clear()
 
     def _report(self, text: str) -> None:
-        from companion.model.codec import pack_plain
-        from companion.runtime.packets import TEXT, UNNUMBERED
-
         self._flight.send({"ground": text})
-        self._flight.inject(pack_plain((TEXT, UNNUMBERED, 0.0, "warning", "ground", text)))
+        line = LogLine(t_s=0.0, severity=Severity.WARNING, source="ground", text=text)
+        self._flight.inject(to_packet(line))

@@ -20,9 +20,10 @@ from companion.ground.protocol.commands import Verifier
 from companion.ground.protocol.connection import Connection, error_text
 from companion.ground.protocol.keys import load_operators
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, RETAINED, STREAM_PERIOD_S, Command, Topic
-from companion.model.codec import pack_plain
+from companion.model.codec import to_packet
+from companion.model.packets import LogLine
+from companion.model.types import Severity
 from companion.recorder.telemetry_session import INFO, WARNING, Outgoing, TelemetrySession
-from companion.runtime.packets import TEXT, UNNUMBERED
 
 ANSWER_S = 4.0
 """Timeout for each answer of the broker."""
@@ -170,7 +171,8 @@ class Uplink:
         outbox = self._outbox
         self._counts.refused = self._session.refused
         for t_s, severity, text in out.log:
-            self._flight.inject(pack_plain((TEXT, UNNUMBERED, t_s, severity, "ground", text)))
+            line = LogLine(t_s=t_s, severity=Severity(severity), source="ground", text=text)
+            self._flight.inject(to_packet(line))
         outbox.put(out)
         if out.stream is not None and self._connected:
             self._counts.stream_dropped += outbox.stream is not None

@@ -8,7 +8,9 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from companion.config.ground import topic_name
 from companion.config.loader import FlightConfig
@@ -28,9 +30,8 @@ from companion.ground.protocol.messages import (
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import StreamBuilder, truncated
-from companion.model.codec import restore, unpack_plain
-from companion.model.types import Inputs, Outcome, Outputs, Sent
-from companion.runtime.packets import ACK, CLOSE, METADATA, TEXT, TICK
+from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Tick, read_packet
+from companion.model.types import Outcome
 
 SILENT_S = 0.5
 """Time without a tick after which the vehicle is reported as silent."""
@@ -147,22 +148,21 @@ class TelemetrySession:
         text = "the connection to the vehicle was lost"
         return encode(replace(self._state, presence=Presence.LOST, wall_s=0.0, commands=False, text=text))
 
-    def take_packet(self, received_s: float, packet: bytes) -> None:
+    def take_packet(self, received_s: float, data: bytes) -> None:
         """Process one packet of the flight's or the guardian's channel. Never raises: the log has the packet in any case."""
         try:
-            kind, _, *rest = unpack_plain(packet)
-            if kind == TICK:
-                self._tick(received_s, *rest)
-            elif kind == TEXT:
-                t_s, severity, source, text = rest
-                self._stream.add_line(t_s, severity, source, text)
-            elif kind == ACK:
-                self._ack(*rest)
-            elif kind == METADATA:
-                self._metadata(*rest)
-            elif kind == CLOSE:
-                self.end(in_order=True)
-        except (ValueError, TypeError, LookupError, AttributeError, EOFError, OverflowError) as error:
+            match packet := read_packet(data):
+                case Tick():
+                    self._tick(received_s, packet)
+                case LogLine():
+                    self._stream.add_line(packet.t_s, packet.severity.value, packet.source, packet.text)
+                case CommandAnswer():
+                    self._answered(packet)
+                case Metadata():
+                    self._metadata(packet.name, packet.values)
+                case Close():
+                    self.end(in_order=True)
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
             self._packet_error = self._packet_error or f"telemetry: malformed packet: {type(error).__name__}: {error}"
 
     def notify(self, now_s: float, severity: str, text: str, *, event: bool = True) -> None:
@@ -205,6 +205,7 @@ class TelemetrySession:
                 t_s=self.flight_s(now_s) or 0.0,
                 phase=newest.phase if newest is not None else "",
                 action=newest.action.value if newest is not None else "nominal",
+                proof="",
             )
         )
 
@@ -260,10 +261,9 @@ class TelemetrySession:
         self._log.clear()
         return out
 
-    def _tick(self, received_s: float, inputs_plain: object, outputs_plain: object, sent_plain: object) -> None:
-        inputs = restore(Inputs, inputs_plain)  # type: ignore[arg-type]
-        outputs = restore(Outputs, outputs_plain)  # type: ignore[arg-type]
-        self._stream.add_tick(inputs, outputs, restore(Sent, sent_plain))  # type: ignore[arg-type]
+    def _tick(self, received_s: float, tick: Tick) -> None:
+        inputs, outputs = tick.inputs, tick.outputs
+        self._stream.add_tick(inputs, outputs, tick.sent)
         self._new_ticks = True
         self._tick_s = received_s
         if math.isfinite(inputs.t_s):
@@ -271,11 +271,21 @@ class TelemetrySession:
         if outputs.outcome is not None:
             self._outcome = outputs.outcome
 
-    def _ack(
-        self, nonce: str, operator: str, command: str, accepted: bool, text: str, t_s: float, phase: str, action: str
-    ) -> None:
+    def _answered(self, answer: CommandAnswer) -> None:
         self._acks.append(
-            Ack(VERSION, self.session, nonce, operator, CommandName(command), accepted, text, t_s, phase, action)
+            Ack(
+                v=VERSION,
+                session=self.session,
+                nonce=answer.nonce,
+                operator=answer.operator,
+                command=CommandName(answer.command.value),
+                accepted=answer.accepted,
+                text=answer.text,
+                t_s=answer.t_s,
+                phase=answer.phase,
+                action=answer.action.value,
+                proof="",
+            )
         )
 
     def _proven(self, ack: Ack) -> Ack:
@@ -306,7 +316,7 @@ class TelemetrySession:
         self._set_state(presence=Presence.SILENT if silent else Presence.FLYING, text=text)
 
     def _set_state(self, **values: object) -> None:
-        state = replace(self._state, **values)  # type: ignore[arg-type]
+        state = replace(self._state, **values)
         if state != self._state:
             self._state = state
             self._state_sent_s = -math.inf

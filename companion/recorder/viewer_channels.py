@@ -45,7 +45,7 @@ from foxglove.messages import (
 
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
-from companion.model.types import Quat, Vec3
+from companion.model.types import Inputs, Outputs, Quat, Reference, TetherState, Vec3
 from companion.recorder.viewer_scene import (
     Machine,
     machine_of,
@@ -101,14 +101,14 @@ class ViewerChannels:
         self._planned = path_of(path)
         self._static_due = True
 
-    def tick(self, t_s: float, stamp_ns: int, inputs: dict[str, Any], outputs: dict[str, Any]) -> None:
+    def tick(self, stamp_ns: int, inputs: Inputs, outputs: Outputs) -> None:
         """Write the messages that are due in this tick.
 
         Args:
-            t_s: flight clock; after a step back everything is due.
             stamp_ns: wall clock of the tick, for every message and its header.
-            inputs, outputs: the tick's records in their jsonable form.
+            inputs, outputs: the tick's records. After a step back of the flight clock everything is due.
         """
+        t_s = inputs.t_s
         frames_due, scene_due = _due(t_s, self._due_s, PERIOD_S), _due(t_s, self._scene_due_s, SCENE_PERIOD_S)
         if not (frames_due or scene_due) or not math.isfinite(t_s):
             return
@@ -117,25 +117,25 @@ class ViewerChannels:
             self._static_due = False
             entities = static_entities(self._machine, self._planned, stamp)
             self._static.log(SceneUpdate(entities=entities), log_time=stamp_ns)
-        pose = _vehicle_pose(t_s, inputs)
+        pose = _vehicle_pose(inputs)
         if frames_due:
             self._due_s = t_s
             self._frames(stamp, stamp_ns, pose, inputs, outputs)
         if scene_due:
             self._scene_due_s = t_s
             if pose is not None:
-                self._tether(stamp, stamp_ns, pose, outputs.get("tether"))
-            self._paths(t_s, stamp, stamp_ns, pose, outputs.get("reference"))
+                self._tether(stamp, stamp_ns, pose, outputs.tether)
+            self._paths(t_s, stamp, stamp_ns, pose, outputs.reference)
 
     def _frames(
         self,
         stamp: Timestamp,
         stamp_ns: int,
         pose: tuple[Vec3, Quat] | None,
-        inputs: dict[str, Any],
-        outputs: dict[str, Any],
+        inputs: Inputs,
+        outputs: Outputs,
     ) -> None:
-        mocap, arm, reference = inputs.get("mocap"), inputs.get("arm"), outputs.get("reference")
+        mocap, arm, reference = inputs.mocap, inputs.arm, outputs.reference
         if pose is not None:
             (x, y, z), (w, i, j, k) = pose
             message = FrameTransform(
@@ -147,15 +147,15 @@ class ViewerChannels:
             )
             self._tf.log(message, log_time=stamp_ns)
         if arm is not None:
-            self._joints.log(self._arm, stamp, stamp_ns, arm["angle_rad"])
-        if mocap is not None and mocap["tracking_valid"]:
-            _log_pose(self._pose, stamp, stamp_ns, mocap["position_world_m"], mocap["attitude_wxyz"])
+            self._joints.log(self._arm, stamp, stamp_ns, arm.angle_rad)
+        if mocap is not None and mocap.tracking_valid:
+            _log_pose(self._pose, stamp, stamp_ns, mocap.position_world_m, mocap.attitude_wxyz)
         if reference is not None:
-            half = 0.5 * reference["yaw_rad"]
+            half = 0.5 * reference.yaw_rad
             turned = (math.cos(half), 0.0, 0.0, math.sin(half)) if math.isfinite(half) else (math.nan,) * 4
-            _log_pose(self._reference, stamp, stamp_ns, reference["position_world_m"], turned)
+            _log_pose(self._reference, stamp, stamp_ns, reference.position_world_m, turned)
 
-    def _tether(self, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat], watched: dict[str, Any] | None) -> None:
+    def _tether(self, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat], watched: TetherState | None) -> None:
         tether = self._machine.tether
         if tether is None:
             return
@@ -163,7 +163,7 @@ class ViewerChannels:
         bx, by, bz = quat_rotate(attitude, tether.attachment_body_m)
         end = (px + bx, py + by, pz + bz)
         slack_m = tether.length_m - math.dist(tether.anchor_world_m, end)
-        held = watched is not None and (watched["taut"] or watched["snagged"])
+        held = watched is not None and (watched.taut or watched.snagged)
         points = hanging_line_m(tether.anchor_world_m, end, tether.length_m, self._machine.floor_m)
         line = trail([point3(p) for p in points], tether_colour(tether, slack_m, held=held), 4.0)
         entity = SceneEntity(timestamp=stamp, frame_id="world", id="tether", lifetime=_LIFETIME, lines=[line])
@@ -175,12 +175,12 @@ class ViewerChannels:
         stamp: Timestamp,
         stamp_ns: int,
         pose: tuple[Vec3, Quat] | None,
-        reference: dict[str, Any] | None,
+        reference: Reference | None,
     ) -> None:
         if pose is not None:
             self._flown_trail.add(t_s, pose[0])
         if reference is not None:
-            self._reference_trail.add(t_s, reference["position_world_m"])
+            self._reference_trail.add(t_s, reference.position_world_m)
         if not _due(t_s, self._path_due_s, PATH_PERIOD_S):
             return
         self._path_due_s = t_s
@@ -273,14 +273,14 @@ def timestamp(stamp_ns: int) -> Timestamp:
     return Timestamp(stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
 
 
-def _vehicle_pose(t_s: float, inputs: dict[str, Any]) -> tuple[Vec3, Quat] | None:
+def _vehicle_pose(inputs: Inputs) -> tuple[Vec3, Quat] | None:
     """Return position and attitude from motion capture, or from PX4 if that is stale, untracked or not finite; None if both are."""
-    mocap, vehicle = inputs.get("mocap"), inputs.get("vehicle")
-    if mocap is not None and mocap["tracking_valid"] and t_s - mocap["stamp_s"] <= _FRESH_S:
-        if _usable(mocap["position_world_m"], mocap["attitude_wxyz"]):
-            return mocap["position_world_m"], mocap["attitude_wxyz"]
-    if vehicle is not None and _usable(vehicle["position_world_m"], vehicle["attitude_wxyz"]):
-        return vehicle["position_world_m"], vehicle["attitude_wxyz"]
+    mocap, vehicle = inputs.mocap, inputs.vehicle
+    if mocap is not None and mocap.tracking_valid and inputs.t_s - mocap.stamp_s <= _FRESH_S:
+        if _usable(mocap.position_world_m, mocap.attitude_wxyz):
+            return mocap.position_world_m, mocap.attitude_wxyz
+    if vehicle is not None and _usable(vehicle.position_world_m, vehicle.attitude_wxyz):
+        return vehicle.position_world_m, vehicle.attitude_wxyz
     return None
 
 

@@ -81,7 +81,7 @@ class Evaluation:
                 last_s = math.inf if rule.repeat is Repeat.NEVER else t_s
                 self._active[id_] = (action, last_s, rule, values)
                 text = without_negative_zero(rule.message.format(*values))
-                events.append(Event(t_s, id_, severity, action, text))
+                events.append(Event(t_s=t_s, id=id_, severity=severity, action=action, text=text))
         if self._active:
             self._expire(t_s)
         return tuple(events)

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
+from companion.model.codec import Record
 from companion.model.frames import tilt_rad
-from companion.model.frozen import quick
 from companion.model.types import AttitudeSetpoint, Vec2
 
 SLEW_MEMORY_S = 0.1
@@ -29,9 +29,7 @@ class Refusal:
     text: str
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(Record, frozen=True):
     """What may leave, and why the rest may not."""
 
     attitude: AttitudeSetpoint | None

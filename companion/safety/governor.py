@@ -14,11 +14,10 @@ the mission check, which asks the same `SafeSet`, is never bent.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
-from companion.model.frozen import quick
+from companion.model.codec import Record
 from companion.model.types import Reference, TetherState, Vec3
 from companion.safety.stop import StopModel
 
@@ -39,9 +38,7 @@ _HALVINGS = 5
 _PROJECTIONS = 6
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Governed:
+class Governed(Record, frozen=True):
     """What the controller is to follow."""
 
     reference: Reference
@@ -160,14 +157,15 @@ class Governor:
             self._tighten()
         assert self._p is not None
         bent = Reference(
-            self._p,
-            self._v,
-            acceleration,
-            reference.yaw_rad,
-            reference.yaw_rate_rad_s,
-            reference.arm_rad,
-            reference.arm_rate_rad_s,
-            reference.arm_acceleration_rad_s2,
+            position_world_m=self._p,
+            velocity_world_m_s=self._v,
+            acceleration_world_m_s2=acceleration,
+            yaw_rad=reference.yaw_rad,
+            yaw_rate_rad_s=reference.yaw_rate_rad_s,
+            arm_rad=reference.arm_rad,
+            arm_rate_rad_s=reference.arm_rate_rad_s,
+            arm_acceleration_rad_s2=reference.arm_acceleration_rad_s2,
+            jerk_world_m_s3=(0.0, 0.0, 0.0),
         )
         return Governed(bent, reasons)
 

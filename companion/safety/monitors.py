@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import msgspec
 
 from companion.config.vehicle import Vehicle
 from companion.model.types import Event, Inputs, VehicleState
@@ -91,11 +91,11 @@ class Monitors:
             self._arm.update(i, awake_s)
             self._force.update(i, situation, awake_s, gap_s, moving)
             if not self._mocap.trusted:
-                i = dataclasses.replace(i, mocap=None)
+                i = msgspec.structs.replace(i, mocap=None)
             if airborne:
                 self._flight.update(i, situation, gap_s)
             if not self._force.trusted:
-                i = dataclasses.replace(i, force=None)
+                i = msgspec.structs.replace(i, force=None)
         self.trusted = i
         return self._evaluation.events(inputs.t_s, airborne, situation.waiting)
 

@@ -164,14 +164,15 @@ class TetherWatch:
         about_anchor = self._about_anchor.update(-lx, -ly)
         about_vehicle = self._about_vehicle.update(straight[0] * range_m, straight[1] * range_m)
         return TetherState(
-            range_m,
-            slack,
-            stop_slack,
-            math.atan2(-lz, level_m),
-            self._clearance.least_m(straight, hanging, arm_rad),
-            about_anchor if abs(about_anchor) >= abs(about_vehicle) else about_vehicle,
-            max(0.0, pull.pull_n),
-            used_up or (pull.pulling and pull.growing),
-            (pull.pulling or pull.sideways) and not used_up,
-            slack < -self._separation_m and not pull.pulling,
+            range_m=range_m,
+            slack_m=slack,
+            stop_slack_m=stop_slack,
+            elevation_rad=math.atan2(-lz, level_m),
+            clearance_m=self._clearance.least_m(straight, hanging, arm_rad),
+            turns=about_anchor if abs(about_anchor) >= abs(about_vehicle) else about_vehicle,
+            pull_n=max(0.0, pull.pull_n),
+            taut=used_up or (pull.pulling and pull.growing),
+            snagged=(pull.pulling or pull.sideways) and not used_up,
+            separated=slack < -self._separation_m and not pull.pulling,
+            vehicle_turns=0.0,
         )

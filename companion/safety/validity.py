@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
+
+import msgspec
 
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
 from companion.safety.situation import Values
@@ -56,7 +57,7 @@ class InputFilter:
             else:
                 invalid["status"] = status
         self.invalid = invalid
-        return dataclasses.replace(i, **dict.fromkeys(invalid)) if invalid else i  # type: ignore[arg-type]
+        return msgspec.structs.replace(i, **dict.fromkeys(invalid)) if invalid else i
 
 
 def invalid(field: str) -> Callable[[InputFilter, None], Values | None]:

@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from companion.analysis import metrics
@@ -118,10 +119,26 @@ def _with_catch(result: FastResult, caught_t_s: float | None) -> tuple[Outputs, 
     if caught_t_s is not None and not seen:
         at = next((k for k, output in enumerate(outputs) if output.t_s >= caught_t_s), None)
         if at is not None:
-            event = Event(outputs[at].t_s, "catch", Severity.INFO, SafetyAction.NOMINAL, "true catch, not detected")
-            outputs[at] = dataclasses.replace(outputs[at], events=(*outputs[at].events, event))
+            event = Event(
+                t_s=outputs[at].t_s,
+                id="catch",
+                severity=Severity.INFO,
+                action=SafetyAction.NOMINAL,
+                text="true catch, not detected",
+            )
+            outputs[at] = msgspec.structs.replace(outputs[at], events=(*outputs[at].events, event))
     return tuple(outputs)
 
 
 def _sent(i: Inputs, o: Outputs) -> Sent:
-    return Sent(i.tick, o.attitude is not None, o.arm_torque_nm, i.t_s, 0.0, i.t_s, i.t_s, i.t_s, i.t_s)
+    return Sent(
+        tick=i.tick,
+        attitude_sent=o.attitude is not None,
+        arm_torque_sent_nm=o.arm_torque_nm,
+        start_s=i.t_s,
+        lateness_s=0.0,
+        joint_read_s=i.t_s,
+        core_s=i.t_s,
+        setpoint_sent_s=i.t_s,
+        current_sent_s=i.t_s,
+    )

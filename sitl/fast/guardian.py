@@ -115,7 +115,9 @@ class FastGuardian:
         self._watch = StallWatch(vehicle.safety.guardian_timeout_s)
         self._beat: Heartbeat | None = None
         system = px4.params.integer("MAV_SYS_ID")
-        self._heartbeats = Heartbeats(LinkIdentity(system, *_OWN, local_port=0), origin_s=0.0)
+        self._heartbeats = Heartbeats(
+            LinkIdentity(autopilot_system=system, own_system=_OWN[0], own_component=_OWN[1], local_port=0), origin_s=0.0
+        )
         self._round_s = 0.0
         self.events: list[Event] = []
         self.alive = True
@@ -147,7 +149,9 @@ class FastGuardian:
         return Landing(self._beat, self._vehicle, self._px4, t_s, self._notify)
 
     def _notify(self, notice: Notice) -> None:
-        self.events.append(Event(notice.t_s, notice.id, notice.severity, notice.action, notice.text))
+        self.events.append(
+            Event(t_s=notice.t_s, id=notice.id, severity=notice.severity, action=notice.action, text=notice.text)
+        )
 
 
 class Landing:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import contextlib
 import gc
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
+
+from msgspec.structs import replace
 
 from companion.core.flight_core import FlightCore
 from companion.io.dynamixel.registers import WATCHDOG_ERROR
@@ -285,7 +287,16 @@ class FastFlight:
         if self.plant.faults is not None:
             exposure_server_s = self.faults.server_clock_s(exposure_s)
             latency_s = self.faults.server_clock_s(t_s) - exposure_server_s
-        return MocapPose(t_s, latency_s, number, position, attitude, valid, 0.0002, exposure_server_s)
+        return MocapPose(
+            stamp_s=t_s,
+            latency_s=latency_s,
+            frame_number=number,
+            position_world_m=position,
+            attitude_wxyz=attitude,
+            tracking_valid=valid,
+            marker_error_m=0.0002,
+            exposure_server_s=exposure_server_s,
+        )
 
     def _inputs(self, tick: int) -> Inputs:
         plant, t_s = self.plant, self.plant.world.t_s
@@ -302,23 +313,23 @@ class FastFlight:
             dropped = self._dropped
         if plant.fault("force_loss") is None:
             force, torque = plant.force_torque()
-            self._force = ForceSample(t_s, force, torque, False)
+            self._force = ForceSample(stamp_s=t_s, force_sensor_n=force, torque_sensor_nm=torque, overload=False)
         if self._arm is None or plant.faults is None or not self._bus_fails():
             self._arm = self._read_arm(t_s)
         else:
             self._arm = replace(self._arm, read_failures=self._arm.read_failures + 1)
         land = self._land_at_s is not None and t_s >= self._land_at_s
         return Inputs(
-            tick,
-            t_s,
-            vehicle,
-            status,
-            self._mocap,
-            self._arm,
-            self._force,
-            _LAND if land else _NO_COMMAND,
-            dropped,
-            guardian_ready,
+            tick=tick,
+            t_s=t_s,
+            vehicle=vehicle,
+            status=status,
+            mocap=self._mocap,
+            arm=self._arm,
+            force=self._force,
+            command=_LAND if land else _NO_COMMAND,
+            recorder_dropped=dropped,
+            guardian_ready=guardian_ready,
         )
 
     def _bus_fails(self) -> bool:
@@ -339,30 +350,30 @@ class FastFlight:
             self._position = (enu_from_ned(estimate.position_ned_m), enu_from_ned(estimate.velocity_ned_m_s), t_s)
         position, velocity, stamp_s = self._position
         return VehicleState(
-            stamp_s,
-            t_s,
-            t_s,
-            position,
-            velocity,
-            attitude_enu_flu_from_ned_frd(estimate.attitude_ned_frd),
-            flu_from_frd(estimate.rates_frd_rad_s),
-            flu_from_frd(estimate.accel_frd_m_s2),
-            None if self.plant.faults is None else t_s - self.px4.booted_at_s,
-            self._heard.total.boot_s,
-            flu_from_frd(self._heard.total.sum_m_s),
+            position_stamp_s=stamp_s,
+            attitude_stamp_s=t_s,
+            imu_stamp_s=t_s,
+            position_world_m=position,
+            velocity_world_m_s=velocity,
+            attitude_wxyz=attitude_enu_flu_from_ned_frd(estimate.attitude_ned_frd),
+            angular_rate_body_rad_s=flu_from_frd(estimate.rates_frd_rad_s),
+            specific_force_body_m_s2=flu_from_frd(estimate.accel_frd_m_s2),
+            boot_s=None if self.plant.faults is None else t_s - self.px4.booted_at_s,
+            imu_boot_s=self._heard.total.boot_s,
+            delta_velocity_body_m_s=flu_from_frd(self._heard.total.sum_m_s),
         )
 
     def _status(self, t_s: float) -> AutopilotStatus:
         commander = self.px4.commander
         remaining = self.plant.battery_remaining()
         return AutopilotStatus(
-            t_s,
-            commander.armed,
-            _MODES.get(commander.nav_state, FlightMode.OTHER),
-            _ON_GROUND if self.px4.land.landed else _IN_AIR,
-            battery_voltage_v(remaining) - self.plant.battery_sag_v(),
-            remaining,
-            system_status(self.px4),
+            heartbeat_stamp_s=t_s,
+            armed=commander.armed,
+            mode=_MODES.get(commander.nav_state, FlightMode.OTHER),
+            landed=_ON_GROUND if self.px4.land.landed else _IN_AIR,
+            battery_voltage_v=battery_voltage_v(remaining) - self.plant.battery_sag_v(),
+            battery_remaining=remaining,
+            system_status=system_status(self.px4),
         )
 
     def _read_arm(self, t_s: float) -> ArmState | None:
@@ -384,13 +395,13 @@ class FastFlight:
         drive1.heard_instruction()
         drive2.heard_instruction()
         return ArmState(
-            t_s,
-            (scale1.angle_rad(position1), scale2.angle_rad(position2)),
-            (scale1.velocity_rad_s(speed1), scale2.velocity_rad_s(speed2)),
-            (scale1.torque_nm(current1), scale2.torque_nm(current2)),
-            errors,
-            temperatures_c,
-            0,
+            stamp_s=t_s,
+            angle_rad=(scale1.angle_rad(position1), scale2.angle_rad(position2)),
+            velocity_rad_s=(scale1.velocity_rad_s(speed1), scale2.velocity_rad_s(speed2)),
+            torque_nm=(scale1.torque_nm(current1), scale2.torque_nm(current2)),
+            hardware_error=errors,
+            temperature_c=temperatures_c,
+            read_failures=0,
         )
 
     def _carry_out(self, outputs: Outputs) -> None:

@@ -137,7 +137,7 @@ class Hand:
             (tx, ty, tz), lever = self._tap(t_s), quat_rotate(attitude, _TAP_LEVER_BODY_M)
             fx, fy, fz = fx + tx, fy + ty, fz + tz
             torque = _plus(torque, _cross(lever, (tx, ty, tz)))
-        return Wrench((fx, fy, fz + grip * self._weight_n), torque)
+        return Wrench(force_n=(fx, fy, fz + grip * self._weight_n), torque_nm=torque)
 
     def _tap(self, t_s: float) -> Vec3:
         """Force of the other hand, world frame."""

@@ -117,27 +117,73 @@ def synthetic_flight(
         joints = (arm[0] + 0.08 * kick + noise.gauss(0, 1e-3), arm[1] - 0.05 * kick + noise.gauss(0, 1e-3))
         events: tuple[Event, ...] = ()
         if kind is not last_kind and kind is not PhaseKind.GROUND:
-            events += (Event(t_s, f"phase_{kind.value}", Severity.INFO, SafetyAction.NOMINAL, f"phase {name}"),)
+            events += (
+                Event(
+                    t_s=t_s,
+                    id=f"phase_{kind.value}",
+                    severity=Severity.INFO,
+                    action=SafetyAction.NOMINAL,
+                    text=f"phase {name}",
+                ),
+            )
         last_kind = kind
         if not caught and after_s >= 0:
             caught = True
-            events += (Event(t_s, "catch", Severity.INFO, SafetyAction.NOMINAL, "payload in the net"),)
+            events += (
+                Event(
+                    t_s=t_s, id="catch", severity=Severity.INFO, action=SafetyAction.NOMINAL, text="payload in the net"
+                ),
+            )
         load_n = 2.0 * (1.0 - math.exp(-max(0.0, after_s) / 0.05)) + 14.0 * max(0.0, kick) ** 8
         velocity: Vec3 = (0.0, 0.0, 0.0)
         inputs = Inputs(
-            tick,
-            t_s,
-            VehicleState(t_s - 0.004, t_s - 0.002, t_s - 0.002, actual, velocity, attitude, velocity, (0.0, 0.0, 9.81)),
-            AutopilotStatus(
-                math.floor(t_s), kind is not PhaseKind.GROUND, FlightMode.OFFBOARD, LandedState.IN_AIR, 15.8, 0.9
+            tick=tick,
+            t_s=t_s,
+            vehicle=VehicleState(
+                position_stamp_s=t_s - 0.004,
+                attitude_stamp_s=t_s - 0.002,
+                imu_stamp_s=t_s - 0.002,
+                position_world_m=actual,
+                velocity_world_m_s=velocity,
+                attitude_wxyz=attitude,
+                angular_rate_body_rad_s=velocity,
+                specific_force_body_m_s2=(0.0, 0.0, 9.81),
             ),
-            MocapPose(t_s - 0.003, 0.002, tick, actual, attitude, True, 2e-4),
-            ArmState(
-                t_s + 4e-4, joints, (0.0, 0.0), (0.1, 0.05), (0, 0), (31.0, 30.0), 0, t_s - period_s + 4e-4 + 1.5e-3
+            status=AutopilotStatus(
+                heartbeat_stamp_s=float(math.floor(t_s)),
+                armed=kind is not PhaseKind.GROUND,
+                mode=FlightMode.OFFBOARD,
+                landed=LandedState.IN_AIR,
+                battery_voltage_v=15.8,
+                battery_remaining=0.9,
             ),
-            ForceSample(t_s - 0.002, (noise.gauss(0, 0.05), 0.0, -load_n), (0.0, 0.0, 0.0), False),
-            OperatorCommand.NONE,
-            0,
+            mocap=MocapPose(
+                stamp_s=t_s - 0.003,
+                latency_s=0.002,
+                frame_number=tick,
+                position_world_m=actual,
+                attitude_wxyz=attitude,
+                tracking_valid=True,
+                marker_error_m=2e-4,
+            ),
+            arm=ArmState(
+                stamp_s=t_s + 4e-4,
+                angle_rad=joints,
+                velocity_rad_s=(0.0, 0.0),
+                torque_nm=(0.1, 0.05),
+                hardware_error=(0, 0),
+                temperature_c=(31.0, 30.0),
+                read_failures=0,
+                written_s=t_s - period_s + 4e-4 + 1.5e-3,
+            ),
+            force=ForceSample(
+                stamp_s=t_s - 0.002,
+                force_sensor_n=(noise.gauss(0, 0.05), 0.0, -load_n),
+                torque_sensor_nm=(0.0, 0.0, 0.0),
+                overload=False,
+            ),
+            command=OperatorCommand.NONE,
+            recorder_dropped=0,
         )
         rho = 1.0 + 3.0 * abs(kick)
         control = ControlLog(
@@ -157,20 +203,34 @@ def synthetic_flight(
         )
         flying = kind not in (PhaseKind.GROUND, PhaseKind.DONE)
         outputs = Outputs(
-            tick,
-            t_s,
-            mission_t_s,
-            name,
-            kind,
-            min(1.0, mission_t_s / LANDED_S),
-            Reference(position, velocity, velocity, 0.0, 0.0, arm, (0.0, 0.0), (0.0, 0.0)) if flying else None,
-            AttitudeSetpoint(quat_from_euler_zyx(0.0, tilt, 0.0), 0.5 + 0.02 * kick) if flying else None,
-            (0.35 + kick, 0.1 - 0.5 * kick) if flying else None,
-            AutopilotRequest.NONE,
-            SafetyAction.NOMINAL,
-            events,
-            control if flying else None,
-            Outcome.COMPLETED if kind is PhaseKind.DONE else None,
+            tick=tick,
+            t_s=t_s,
+            mission_t_s=mission_t_s,
+            phase=name,
+            phase_kind=kind,
+            progress=min(1.0, mission_t_s / LANDED_S),
+            reference=Reference(
+                position_world_m=position,
+                velocity_world_m_s=velocity,
+                acceleration_world_m_s2=velocity,
+                yaw_rad=0.0,
+                yaw_rate_rad_s=0.0,
+                arm_rad=arm,
+                arm_rate_rad_s=(0.0, 0.0),
+                arm_acceleration_rad_s2=(0.0, 0.0),
+                jerk_world_m_s3=(0.0, 0.0, 0.0),
+            )
+            if flying
+            else None,
+            attitude=AttitudeSetpoint(quat_from_euler_zyx(0.0, tilt, 0.0), 0.5 + 0.02 * kick) if flying else None,
+            arm_torque_nm=(0.35 + kick, 0.1 - 0.5 * kick) if flying else None,
+            request=AutopilotRequest.NONE,
+            action=SafetyAction.NOMINAL,
+            events=events,
+            control=control if flying else None,
+            outcome=Outcome.COMPLETED if kind is PhaseKind.DONE else None,
+            mocap_trusted=True,
+            bent_by=(),
         )
         late_s = abs(noise.gauss(0, 6e-4))
         start_s = t_s + late_s
@@ -178,7 +238,17 @@ def synthetic_flight(
             None if outputs.arm_torque_nm is None else (round(0.35 + kick, 2), round(0.1 - 0.5 * kick, 2))
         )
         core_s = start_s + 9e-4 + abs(noise.gauss(0, 1e-4))
-        sent = Sent(tick, flying, written, start_s, late_s, start_s + 8e-4, core_s, core_s + 1e-4, core_s + 2e-4)
+        sent = Sent(
+            tick=tick,
+            attitude_sent=flying,
+            arm_torque_sent_nm=written,
+            start_s=start_s,
+            lateness_s=late_s,
+            joint_read_s=start_s + 8e-4,
+            core_s=core_s,
+            setpoint_sent_s=core_s + 1e-4,
+            current_sent_s=core_s + 2e-4,
+        )
         yield inputs, outputs, sent
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from PIL import Image, ImageSequence
 
 from companion.analysis.animation import FRAMES_PER_S, Movie, movie_of, player_html, write_gif
@@ -63,7 +64,7 @@ def test_without_a_simulated_throw_the_payload_appears_in_the_net() -> None:
 
 
 def test_a_log_without_geometry_has_no_animation() -> None:
-    assert movie_of(replace(flown(), metadata={"config": {"json": json.dumps(CONFIG)}}), SIMULATED) is None
+    assert movie_of(dataclasses.replace(flown(), metadata={"config": {"json": json.dumps(CONFIG)}}), SIMULATED) is None
 
 
 @pytest.mark.parametrize("arm_rad", [(math.radians(165), math.radians(140)), (1.2, -0.1)])

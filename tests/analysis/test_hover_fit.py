@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from companion.analysis.hover_fit import FIT_MIN_S, SLOPE_MIN_V, HoverFitError, fit_hover_thrust
@@ -34,11 +35,11 @@ def with_battery(log: FlightLog, drop_v: float, slope_per_v: float) -> FlightLog
     def change(i: Inputs, o: Outputs) -> tuple[Inputs, Outputs]:
         assert i.status is not None
         voltage_v = 16.0 - drop_v * i.t_s / end_s
-        i = dataclasses.replace(i, status=dataclasses.replace(i.status, battery_voltage_v=voltage_v))
+        i = msgspec.structs.replace(i, status=msgspec.structs.replace(i.status, battery_voltage_v=voltage_v))
         if o.attitude is None:
             return i, o
         thrust = o.attitude.thrust * (1.0 + slope_per_v * (voltage_v - 16.0) / true_hover_thrust())
-        return i, dataclasses.replace(o, attitude=dataclasses.replace(o.attitude, thrust=thrust))
+        return i, msgspec.structs.replace(o, attitude=msgspec.structs.replace(o.attitude, thrust=thrust))
 
     return changed(log, change)
 
@@ -74,7 +75,7 @@ def test_a_voltage_that_hardly_changes_or_is_not_known_gives_no_slope() -> None:
     def forget(i: Inputs, o: Outputs) -> tuple[Inputs, Outputs]:
         if i.status is None or i.tick % 100:
             return i, o
-        return dataclasses.replace(i, status=dataclasses.replace(i.status, battery_voltage_v=None)), o
+        return msgspec.structs.replace(i, status=msgspec.structs.replace(i.status, battery_voltage_v=None)), o
 
     blind = fit_hover_thrust(changed(with_battery(logged(0.0), 1.5, 0.0), forget))
     assert (blind.slope, blind.voltage_mean_v, blind.voltage_span_v) == (None, None, None)

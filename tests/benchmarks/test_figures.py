@@ -13,7 +13,13 @@ from benchmarks.measuring.latency import Latency
 
 
 def row(p50: float, p99: float, target: Target | None, beside: dict[str, float] | None = None) -> Row:
-    return Row("loop", "bare", {"p50": p50, "p99": p99}, {"p50": 1.0, "p99": 2.0} if beside is None else beside, target)
+    return Row(
+        what="loop",
+        beside="bare",
+        figures={"p50": p50, "p99": p99},
+        beside_figures={"p50": 1.0, "p99": 2.0} if beside is None else beside,
+        target=target,
+    )
 
 
 def test_ratios_are_of_each_statistic_to_the_same_of_what_ran_beside() -> None:
@@ -43,17 +49,31 @@ def test_every_figure_that_a_target_names_must_meet_it(
 
 def test_a_ratio_to_what_was_not_measured_is_not_met() -> None:
     assert row(1.0, 1.0, Target(1.5), {}).verdict == NOT_MEASURED
-    assert Row("loop", "bare", {}, {"p50": 1.0}, Target(1.5, ("p50",))).verdict == NOT_MEASURED
-    assert Row("loop", "bare", {}).verdict == NOT_MEASURED
+    assert (
+        Row(what="loop", beside="bare", figures={}, beside_figures={"p50": 1.0}, target=Target(1.5, ("p50",))).verdict
+        == NOT_MEASURED
+    )
+    assert Row(what="loop", beside="bare", figures={}).verdict == NOT_MEASURED
 
 
 def test_a_count_of_zero_meets_zero() -> None:
     for count, verdict in ((0.0, MET), (1.0, NOT_MET)):
-        assert Row("late", "", {"value": count}, {}, Target(0.0, ("value",), ratio=False)).verdict == verdict
+        assert (
+            Row(
+                what="late",
+                beside="",
+                figures={"value": count},
+                beside_figures={},
+                target=Target(0.0, ("value",), ratio=False),
+            ).verdict
+            == verdict
+        )
 
 
 def test_problems_name_what_is_not_met_or_not_measured_and_why() -> None:
-    missing = Row("core", "", {}, {}, Target(1.0), "the bus did not start")
+    missing = Row(
+        what="core", beside="", figures={}, beside_figures={}, target=Target(1.0), why_not="the bus did not start"
+    )
     told = problems(
         [Section("", (), (), [row(1.0, 1.0, Target(1.5)), row(9.0, 9.0, Target(1.5)), row(9.0, 9.0, None), missing])]
     )

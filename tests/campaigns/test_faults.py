@@ -40,7 +40,7 @@ LOST = Variant("mocap_loss")
 
 
 def event(t_s: float, event_id: str, action: SafetyAction) -> Event:
-    return Event(t_s, event_id, Severity.CRITICAL, action, event_id)
+    return Event(t_s=t_s, id=event_id, severity=Severity.CRITICAL, action=action, text=event_id)
 
 
 def flight(
@@ -182,8 +182,26 @@ def test_a_flight_that_left_nothing_behind_is_lost_and_says_why(tmp_path: Path) 
 
 
 def pose(frame: int, stamp_s: float) -> Inputs:
-    seen = MocapPose(stamp_s, 0.005, frame, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), True, 0.0)
-    return Inputs(frame, stamp_s, None, None, seen, None, None, OperatorCommand.NONE, 0)
+    seen = MocapPose(
+        stamp_s=stamp_s,
+        latency_s=0.005,
+        frame_number=frame,
+        position_world_m=(0.0, 0.0, 1.0),
+        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+        tracking_valid=True,
+        marker_error_m=0.0,
+    )
+    return Inputs(
+        tick=frame,
+        t_s=stamp_s,
+        vehicle=None,
+        status=None,
+        mocap=seen,
+        arm=None,
+        force=None,
+        command=OperatorCommand.NONE,
+        recorder_dropped=0,
+    )
 
 
 def test_the_clocks_are_compared_by_the_frame_nearest_to_the_fault_that_both_know() -> None:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from msgspec.structs import replace
 
 from companion.analysis import plots
 from companion.analysis.log import FlightLog
@@ -404,12 +405,12 @@ def test_whatever_a_log_holds_is_text_on_the_page(tmp_path: Path) -> None:
     evil = "<script>alert('$x$')</script>"
 
     def shout(i: Inputs, o: Outputs, s: Sent) -> Row:
-        event = Event(i.t_s, evil, Severity.WARNING, SafetyAction.HOLD, evil)
+        event = Event(t_s=i.t_s, id=evil, severity=Severity.WARNING, action=SafetyAction.HOLD, text=evil)
         return i, replace(o, events=(*o.events, event) if i.tick == 750 else o.events), s
 
     config = configured(mission__name=evil, controller__preset=evil, controller__note=evil, sources__overrides=[evil])
     config[evil] = {evil: evil}
-    bad = replace(
+    bad = dataclasses.replace(
         made("B", change=shout, config=config, about={"version_git": evil, "version_companion": evil}),
         name=evil,
         path=evil,

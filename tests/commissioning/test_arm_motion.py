@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from companion.commissioning.arm.jog import KEY_TIMEOUT_S, STEP_DEG, ByKeys, keys_in
 from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, TORQUE_SHARE, Motion, Moved, limits_deg
@@ -50,9 +50,14 @@ class Bench:
     def state(self) -> ArmState:
         first, second = self.angle
         return ArmState(
-            self.t_s, (first, second), (self.rate[0], self.rate[1]), self.torque, self.errors,
-            (self.temperature_c, self.temperature_c), 0,
-        )  # fmt: skip
+            stamp_s=self.t_s,
+            angle_rad=(first, second),
+            velocity_rad_s=(self.rate[0], self.rate[1]),
+            torque_nm=self.torque,
+            hardware_error=self.errors,
+            temperature_c=(self.temperature_c, self.temperature_c),
+            read_failures=0,
+        )
 
     def step(self) -> Moved:
         self.t_s += DT_S

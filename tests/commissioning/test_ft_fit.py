@@ -105,7 +105,12 @@ def test_a_weight_that_touches_something_is_no_turned_sensor() -> None:
 
 def stream(force_n: np.ndarray, rate_hz: float = 200.0) -> list[ForceSample]:
     return [
-        ForceSample(5.0 + k / rate_hz, (float(x), float(y), float(z)), (0.0, 0.0, 0.0), False)
+        ForceSample(
+            stamp_s=5.0 + k / rate_hz,
+            force_sensor_n=(float(x), float(y), float(z)),
+            torque_sensor_nm=(0.0, 0.0, 0.0),
+            overload=False,
+        )
         for k, (x, y, z) in enumerate(force_n)
     ]
 

@@ -63,7 +63,7 @@ def test_a_y_up_stream_read_as_such_is_right() -> None:
                 marker_error_m=0.0,
             )
             states.append(sample.vehicle)
-    seen = Observations(2.0, 1.0, vehicle=tuple(states), mocap=tuple(poses.values()))
+    seen = Observations(start_s=2.0, duration_s=1.0, vehicle=tuple(states), mocap=tuple(poses.values()))
     rows = frames.rows(seen, config.mission, config.vehicle)
     names = ("frames.gravity", "frames.height", "frames.place", "frames.yaw")
     assert {row.id: row.ok for row in rows if row.id in names} == dict.fromkeys(names, True)

@@ -18,4 +18,13 @@ def at(
     arm_rate: Vec2 = (0.0, 0.0),
     force: Vec3 | None = ZERO,
 ) -> PlantState:
-    return PlantState(position, velocity, ZERO, IDENTITY_QUAT, ZERO, arm, arm_rate, force)
+    return PlantState(
+        position_world_m=position,
+        velocity_world_m_s=velocity,
+        acceleration_world_m_s2=ZERO,
+        attitude_wxyz=IDENTITY_QUAT,
+        angular_rate_body_rad_s=ZERO,
+        arm_rad=arm,
+        arm_rate_rad_s=arm_rate,
+        force_ext_world_n=force,
+    )

@@ -32,7 +32,17 @@ def law(config: FlightConfig) -> AdaptiveConfig:
 
 def reference(position: Vec3 = (0.0, 0.0, 1.0), arm: Vec2 = FOLD) -> Reference:
     zero: Vec3 = (0.0, 0.0, 0.0)
-    return Reference(position, zero, zero, 0.0, 0.0, arm, (0.0, 0.0), (0.0, 0.0))
+    return Reference(
+        position_world_m=position,
+        velocity_world_m_s=zero,
+        acceleration_world_m_s2=zero,
+        yaw_rad=0.0,
+        yaw_rate_rad_s=0.0,
+        arm_rad=arm,
+        arm_rate_rad_s=(0.0, 0.0),
+        arm_acceleration_rad_s2=(0.0, 0.0),
+        jerk_world_m_s3=(0.0, 0.0, 0.0),
+    )
 
 
 def state(
@@ -43,7 +53,16 @@ def state(
     force: Vec3 | None = (0.0, 0.0, 0.0),
 ) -> PlantState:
     zero: Vec3 = (0.0, 0.0, 0.0)
-    return PlantState(position, velocity, zero, IDENTITY_QUAT, zero, arm, arm_rate, force)
+    return PlantState(
+        position_world_m=position,
+        velocity_world_m_s=velocity,
+        acceleration_world_m_s2=zero,
+        attitude_wxyz=IDENTITY_QUAT,
+        angular_rate_body_rad_s=zero,
+        arm_rad=arm,
+        arm_rate_rad_s=arm_rate,
+        force_ext_world_n=force,
+    )
 
 
 def settled(config: FlightConfig, plant: PlantState, ticks: int = 400) -> Wrench:

@@ -42,7 +42,17 @@ def flown(*overrides: str) -> FastResult:
 
 def stepped(config: SitlConfig, state: PlantState, acceleration: Vec3 = ZERO, vertical_scale: float = 1.0) -> Wrench:
     """The first tick: level, and nothing filtered yet."""
-    reference = Reference((0.0, 0.0, 1.0), ZERO, acceleration, 0.0, 0.0, POSE, (0.0, 0.0), (0.0, 0.0))
+    reference = Reference(
+        position_world_m=(0.0, 0.0, 1.0),
+        velocity_world_m_s=ZERO,
+        acceleration_world_m_s2=acceleration,
+        yaw_rad=0.0,
+        yaw_rate_rad_s=0.0,
+        arm_rad=POSE,
+        arm_rate_rad_s=(0.0, 0.0),
+        arm_acceleration_rad_s2=(0.0, 0.0),
+        jerk_world_m_s3=(0.0, 0.0, 0.0),
+    )
     return CscController(law(config), config.vehicle, 0.49).step(0.005, state, reference, vertical_scale)
 
 
@@ -167,7 +177,14 @@ def test_the_net_force_is_felt_in_the_body_frame() -> None:
     config = configured()
     c = CscController(law(config), config.vehicle, 0.49)
     tilted = PlantState(
-        (0.0, 0.0, 1.0), ZERO, ZERO, (math.cos(0.1), math.sin(0.1), 0.0, 0.0), ZERO, POSE, (0.0, 0.0), ZERO
+        position_world_m=(0.0, 0.0, 1.0),
+        velocity_world_m_s=ZERO,
+        acceleration_world_m_s2=ZERO,
+        attitude_wxyz=(math.cos(0.1), math.sin(0.1), 0.0, 0.0),
+        angular_rate_body_rad_s=ZERO,
+        arm_rad=POSE,
+        arm_rate_rad_s=(0.0, 0.0),
+        force_ext_world_n=ZERO,
     )
     sideways = quat_rotate(tilted.attitude_wxyz, (0.0, 2.0, 0.0))
     tau_ext, _ = c._external(tilted, sideways)

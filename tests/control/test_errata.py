@@ -75,8 +75,15 @@ class Machine:
         vx, vy, vz, w1, w2 = self.rate.tolist()
         zero: Vec3 = (0.0, 0.0, 0.0)
         return PlantState(
-            (x, y, z), (vx, vy, vz), zero, IDENTITY_QUAT, zero, (a1, a2), (w1, w2), self.force_world_n
-        )  # fmt: skip
+            position_world_m=(x, y, z),
+            velocity_world_m_s=(vx, vy, vz),
+            acceleration_world_m_s2=zero,
+            attitude_wxyz=IDENTITY_QUAT,
+            angular_rate_body_rad_s=zero,
+            arm_rad=(a1, a2),
+            arm_rate_rad_s=(w1, w2),
+            force_ext_world_n=self.force_world_n,
+        )
 
     def tau_ext(self) -> Array:
         a1, a2 = self.chi[3:5].tolist()
@@ -104,7 +111,15 @@ class Machine:
 
 
 TARGET = Reference(
-    (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0), 0.0, 0.0, POSE, (0.0, 0.0), (0.2, -0.1), (0.3, -0.2, 0.0)
+    position_world_m=(0.0, 0.0, 1.0),
+    velocity_world_m_s=(0.0, 0.0, 0.0),
+    acceleration_world_m_s2=(0.1, 0.0, 0.0),
+    yaw_rad=0.0,
+    yaw_rate_rad_s=0.0,
+    arm_rad=POSE,
+    arm_rate_rad_s=(0.0, 0.0),
+    arm_acceleration_rad_s2=(0.2, -0.1),
+    jerk_world_m_s3=(0.3, -0.2, 0.0),
 )
 OPTIONS_OFF = {
     "disturbance_time_xyz_s": (0.0, 0.0, 0.0),
@@ -156,7 +171,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
     controller = AdaptiveController(law, config.vehicle, HOVER)
     # The same law with the options beyond the paper off: what they add to tau is the difference, and belongs to E.
     plain = AdaptiveController(law.model_copy(update=OPTIONS_OFF), config.vehicle, HOVER)
-    machine = Machine(config)
+    machine = Machine(config=config)
     m_d, weight = (np.array(gain)[ROWS] for gain in (law.inertia_md, law.row_weights_s))
     share = np.array([*law.base_compliance_xyz, 1.0, 1.0])
     fed = np.array([*law.force_feedforward_xyz, 0.0, 0.0])
@@ -181,8 +196,12 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
             return impedance.gamma
 
         def s_after(
-            h: float, e: Array = e, v: Array = e_rate, a: Array = e_acceleration, after: Callable[[float], list[float]] = gamma_after
-        ) -> Array:  # fmt: skip
+            h: float,
+            e: Array = e,
+            v: Array = e_rate,
+            a: Array = e_acceleration,
+            after: Callable[[float], list[float]] = gamma_after,
+        ) -> Array:
             impedance = Impedance(law)
             impedance.gamma = after(h)
             return np.array(impedance.sliding(wide(e + h * v + 0.5 * h * h * a), wide(v + h * a)))[ROWS]

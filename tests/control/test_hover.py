@@ -24,7 +24,16 @@ def state(
     acceleration: Vec3 = (0.0, 0.0, 0.0), attitude: Quat = IDENTITY_QUAT, force: Vec3 | None = (0.0, 0.0, 0.0)
 ) -> PlantState:
     zero: Vec3 = (0.0, 0.0, 0.0)
-    return PlantState(zero, zero, acceleration, attitude, zero, (1.7, 1.0), (0.0, 0.0), force)
+    return PlantState(
+        position_world_m=zero,
+        velocity_world_m_s=zero,
+        acceleration_world_m_s2=acceleration,
+        attitude_wxyz=attitude,
+        angular_rate_body_rad_s=zero,
+        arm_rad=(1.7, 1.0),
+        arm_rate_rad_s=(0.0, 0.0),
+        force_ext_world_n=force,
+    )
 
 
 def learnt(

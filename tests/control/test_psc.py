@@ -48,7 +48,17 @@ def flown(*overrides: str) -> FastResult:
     return FastFlight(configured(*overrides)).run()
 
 
-REFERENCE = Reference((0.0, 0.0, 1.0), ZERO, (0.2, 0.0, 0.1), 0.0, 0.0, POSE, (0.0, 0.0), (0.3, -0.2))
+REFERENCE = Reference(
+    position_world_m=(0.0, 0.0, 1.0),
+    velocity_world_m_s=ZERO,
+    acceleration_world_m_s2=(0.2, 0.0, 0.1),
+    yaw_rad=0.0,
+    yaw_rate_rad_s=0.0,
+    arm_rad=POSE,
+    arm_rate_rad_s=(0.0, 0.0),
+    arm_acceleration_rad_s2=(0.3, -0.2),
+    jerk_world_m_s3=(0.0, 0.0, 0.0),
+)
 
 
 def stepped(config: SitlConfig, state: PlantState) -> Wrench:

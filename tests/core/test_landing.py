@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from companion.model.types import (
@@ -27,7 +27,7 @@ from sitl.fast.loop import FastFlight, FastResult
 from tests.safety.healthy import put
 from tests.support import CATCH, SHORT_CATCH
 
-replace = dataclasses.replace
+replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
 STANDS_M = load_sitl("configs/missions/catch.yaml").vehicle.airframe.ground_clearance_m
 
@@ -180,7 +180,15 @@ def test_nobody_takes_thrust_back_from_what_sinks() -> None:
         t_s = 1.0 + 0.005 * k
         sink_m_s = max(0.0, sink_m_s + 0.005 * 9.81 * (1.0 - detector.relief) - 0.01 * (detector.relief == 1.0))
         z -= 0.005 * sink_m_s
-        pose = MocapPose(t_s, None, k, (0.0, 0.0, z), (1.0, 0.0, 0.0, 0.0), True, 0.0)
+        pose = MocapPose(
+            stamp_s=t_s,
+            latency_s=None,
+            frame_number=k,
+            position_world_m=(0.0, 0.0, z),
+            attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+            tracking_valid=True,
+            marker_error_m=0.0,
+        )
         detector = detector.update(t_s, frozen, pose, 0.2, 0.9, landed=False)
         assert not detector.certain
         reliefs.append(detector.relief)
@@ -197,7 +205,15 @@ def test_hanging_on_the_tether_is_no_touchdown() -> None:
     hangs = replace(vehicle, position_world_m=(0.0, 0.0, 1.2), velocity_world_m_s=(0.0, 0.0, 0.0))
     for k in range(1000):
         t_s = 1.0 + 0.005 * k
-        pose = MocapPose(t_s, None, k, (0.0, 0.0, 1.2), (1.0, 0.0, 0.0, 0.0), True, 0.0)
+        pose = MocapPose(
+            stamp_s=t_s,
+            latency_s=None,
+            frame_number=k,
+            position_world_m=(0.0, 0.0, 1.2),
+            attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+            tracking_valid=True,
+            marker_error_m=0.0,
+        )
         detector = detector.update(t_s, hangs, pose, 0.0, 0.1, landed=True)
         assert not detector.certain
         assert detector.relief == 1.0

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from companion.core.flight_core import FlightCore
@@ -27,7 +27,7 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.safety.healthy import healthy, put
 
-replace = dataclasses.replace
+replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
 
 

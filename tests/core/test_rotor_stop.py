@@ -6,6 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
@@ -42,7 +43,7 @@ def machine_from(phase: str, ticks: int | None = None, **changes: Any) -> tuple[
     # What stands still is watched from its first tick on.
     start = begun(phase, ticks if ticks is not None else 0 if phase in ("arm", "disarm") else 20)
     core, i = start.fork()
-    return core, dataclasses.replace(Machine(i, start.standing_m), **changes), Account(start.standing_m)
+    return core, dataclasses.replace(Machine(i=i, floor_m=start.standing_m), **changes), Account(start.standing_m)
 
 
 def requests(outputs: list[Outputs]) -> set[AutopilotRequest]:
@@ -155,7 +156,10 @@ def test_a_pilot_who_takes_over_between_arming_and_take_off_is_not_disarmed(mode
 def test_landed_just_after_arming_it_ends_only_once_px4_shows_that_it_is_not_armed() -> None:
     """PX4's HEARTBEAT comes once a second: LAND 20 ms after ARM meets a status from before the arming."""
     core, machine, _ = machine_from("arm", 1, landed=LandedState.ON_GROUND, armed=False)
-    begun = [core.step(dataclasses.replace(machine.tick(), command=OperatorCommand.LAND)), *walked(core, machine, 40)]
+    begun = [
+        core.step(msgspec.structs.replace(machine.tick(), command=OperatorCommand.LAND)),
+        *walked(core, machine, 40),
+    ]
     assert all(o.outcome is None for o in begun), "over while the rotors spool up"
     machine.armed = True
     outputs = walked(core, machine, 100)
@@ -347,7 +351,7 @@ def test_in_manual_a_pilot_flies_whatever_failsafe_acts() -> None:
 def test_in_every_stage_a_pilot_who_takes_over_is_in_the_heartbeat_to_the_guardian(
     phase: str, mode: FlightMode
 ) -> None:
-    heartbeats = Heartbeats(LinkIdentity(1, 1, 195, 0), 0.0)
+    heartbeats = Heartbeats(LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
 
     def pilot_in(ticks: int) -> bool:
         for _ in range(ticks):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from companion.core.flight_core import FlightCore
@@ -16,7 +16,7 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from tests.safety.healthy import put
 
-replace = dataclasses.replace
+replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
 
 

@@ -11,6 +11,8 @@ import math
 from collections import deque
 from functools import cache
 
+import msgspec
+
 from companion.core.flight_core import FlightCore
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
@@ -37,7 +39,7 @@ ON_ITS_ROTORS = quat_from_euler_zyx(math.radians(-55.0), 0.0, 0.0)
 """Tipped over: it rests on two feet and a rotor."""
 STOPS = (AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM)
 LOW_HOVER = ("mission.phases[0].height_m=0.5", "mission.phases[0].duration_s=2.0", "mission.phases[1].duration_s=1.0")
-replace = dataclasses.replace
+replace = msgspec.structs.replace
 
 
 class Deaf:
@@ -117,16 +119,39 @@ class Machine:
         pose = before.mocap
         if self.seen:
             number = 0 if pose is None else pose.frame_number + 1
-            pose = MocapPose(t_s, 0.005, number, self.position, self.mocap_attitude or self.attitude, True, 0.0002)
+            pose = MocapPose(
+                stamp_s=t_s,
+                latency_s=0.005,
+                frame_number=number,
+                position_world_m=self.position,
+                attitude_wxyz=self.mocap_attitude or self.attitude,
+                tracking_valid=True,
+                marker_error_m=0.0002,
+            )
         old = before.vehicle
         assert old is not None and before.arm is not None and before.force is not None
         # Nothing repeats itself to the last bit: that is a fault of its own.
         jitter = 1e-5 * ((before.tick * 7) % 11 - 5)
         vehicle = VehicleState(
-            t_s, t_s, t_s, (self.position[0] + jitter, *self.position[1:]), velocity, self.attitude,
-            (jitter, jitter, jitter), (jitter, jitter, self.feels_m_s2), None,
-        )  # fmt: skip
-        status = AutopilotStatus(t_s, self.armed, self.mode, self.landed, 15.8, 0.9, self.system_status)
+            position_stamp_s=t_s,
+            attitude_stamp_s=t_s,
+            imu_stamp_s=t_s,
+            position_world_m=(self.position[0] + jitter, *self.position[1:]),
+            velocity_world_m_s=velocity,
+            attitude_wxyz=self.attitude,
+            angular_rate_body_rad_s=(jitter, jitter, jitter),
+            specific_force_body_m_s2=(jitter, jitter, self.feels_m_s2),
+            boot_s=None,
+        )
+        status = AutopilotStatus(
+            heartbeat_stamp_s=t_s,
+            armed=self.armed,
+            mode=self.mode,
+            landed=self.landed,
+            battery_voltage_v=15.8,
+            battery_remaining=0.9,
+            system_status=self.system_status,
+        )
         self.i = replace(
             before,
             tick=before.tick + 1,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
+import msgspec
 import pytest
 
 from companion.core.flight_core import FlightCore
@@ -67,7 +67,7 @@ class _Asking(FastFlight):
     def _inputs(self, tick: int) -> Inputs:
         i = self._change(super()._inputs(tick))
         if self._script and i.t_s >= self._script[0][0]:
-            return dataclasses.replace(i, command=self._script.pop(0)[1])
+            return msgspec.structs.replace(i, command=self._script.pop(0)[1])
         return i
 
 

@@ -32,7 +32,10 @@ def launcher_and_operator() -> Iterator[tuple[socket.socket, Operator]]:
 
 
 def asked(*commands: OperatorCommand) -> list[GroundCommand]:
-    return [GroundCommand(command, "anna", f"{number:032x}") for number, command in enumerate(commands)]
+    return [
+        GroundCommand(command=command, operator="anna", nonce=f"{number:032x}", hold=0)
+        for number, command in enumerate(commands)
+    ]
 
 
 def given(operator: Operator, ticks: int) -> list[OperatorCommand]:
@@ -64,12 +67,27 @@ def test_a_stop_drops_every_resume_and_start_that_was_given_before_it(
 
 def in_tick(action: SafetyAction) -> Outputs:
     return Outputs(
-        0, 0.0, 0.0, "hold", PhaseKind.FLIGHT, 0.0, None, None, None, AutopilotRequest.NONE, action, (), None, None
+        tick=0,
+        t_s=0.0,
+        mission_t_s=0.0,
+        phase="hold",
+        phase_kind=PhaseKind.FLIGHT,
+        progress=0.0,
+        reference=None,
+        attitude=None,
+        arm_torque_nm=None,
+        request=AutopilotRequest.NONE,
+        action=action,
+        events=(),
+        control=None,
+        outcome=None,
+        mocap_trusted=True,
+        bent_by=(),
     )
 
 
 def resume(hold: int) -> GroundCommand:
-    return GroundCommand(RESUME, "anna", "0" * 32, hold)
+    return GroundCommand(command=RESUME, operator="anna", nonce="0" * 32, hold=hold)
 
 
 def test_a_resume_ends_the_hold_that_it_names_and_no_other(

@@ -194,7 +194,12 @@ class OtherForceTorque(Standing):
 
     def latest(self) -> ForceSample | None:
         self.sample += 1
-        return ForceSample(self.clock(), (0.01 * (self.sample % 5), 0.0, 0.0), ZERO, False)
+        return ForceSample(
+            stamp_s=self.clock(),
+            force_sensor_n=(0.01 * (self.sample % 5), 0.0, 0.0),
+            torque_sensor_nm=ZERO,
+            overload=False,
+        )
 
 
 def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) -> None:

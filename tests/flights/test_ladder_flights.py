@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 
+import msgspec
 import pytest
 
 from companion.core.flight_core import FlightCore
@@ -27,7 +27,7 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import SHORT_CATCH
 
-replace = dataclasses.replace
+replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
 
 

@@ -37,7 +37,7 @@ class TippedOver(FastFlight):
                 torque_nm = (
                     STIFFNESS_NM * (LIES_AT_RAD - euler_zyx_from_quat((w, x, y, z))[0]) - DAMPING_NMS * world.v[3]
                 )
-                world.hold(Wrench((0.0, 0.0, 0.0), (torque_nm, 0.0, 0.0)))
+                world.hold(Wrench(force_n=(0.0, 0.0, 0.0), torque_nm=(torque_nm, 0.0, 0.0)))
                 if not armed:
                     self.stopped_s = min(self.stopped_s, world.t_s)
             step(armed)

@@ -10,12 +10,13 @@ import asyncio
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from types import TracebackType
 from typing import Any, Self
 
 from aiohttp import WSMsgType, web
+from msgspec.structs import replace
 
 from companion.ground.protocol.messages import (
     VERSION,
@@ -77,12 +78,33 @@ def flown() -> Flown:
 
 def sent_at(tick: int, t_s: float) -> Sent:
     """The fast loop has no wires: times as they are over a good one."""
-    return Sent(tick, True, None, t_s - 0.0008, 0.0003, t_s, t_s + 0.0002, t_s + 0.0004, t_s + 0.0003)
+    return Sent(
+        tick=tick,
+        attitude_sent=True,
+        arm_torque_sent_nm=None,
+        start_s=t_s - 0.0008,
+        lateness_s=0.0003,
+        joint_read_s=t_s,
+        core_s=t_s + 0.0002,
+        setpoint_sent_s=t_s + 0.0004,
+        current_sent_s=t_s + 0.0003,
+    )
 
 
 def state(presence: Presence = Presence.FLYING, **changes: Any) -> State:
     """What is said of the vehicle."""
-    usual = State(VERSION, NAME, SESSION, presence, True, "catch", "adaptive", "recommended", 1.7e9, True)
+    usual = State(
+        v=VERSION,
+        vehicle=NAME,
+        session=SESSION,
+        presence=presence,
+        simulated=True,
+        mission="catch",
+        law="adaptive",
+        preset="recommended",
+        wall_s=1.7e9,
+        commands=True,
+    )
     return replace(usual, **changes)
 
 
@@ -97,12 +119,24 @@ def preflight() -> Preflight:
 
 def event(number: int, text: str, *, id_: str = "hold", severity: str = "warning", action: str = "hold") -> EventLine:
     """One line."""
-    return EventLine(20.0 + number, 8.0 + number, id_, severity, action, text)
+    return EventLine(t_s=20.0 + number, mission_t_s=8.0 + number, id=id_, severity=severity, action=action, text=text)
 
 
 def ack(command: str, nonce: str, text: str, *, accepted: bool = True, operator: str = "anna") -> Ack:
     """The vehicle's answer to a command."""
-    return Ack(VERSION, SESSION, nonce, operator, CommandName(command), accepted, text, 21.0, "catch", "hold")
+    return Ack(
+        v=VERSION,
+        session=SESSION,
+        nonce=nonce,
+        operator=operator,
+        command=CommandName(command),
+        accepted=accepted,
+        text=text,
+        t_s=21.0,
+        phase="catch",
+        action="hold",
+        proof="",
+    )
 
 
 def told(record: object, vehicle: str = NAME, **more: Any) -> Message:

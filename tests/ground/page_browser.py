@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
+from msgspec.structs import replace
 from playwright.sync_api import sync_playwright
 
 from companion.ground.protocol.messages import VERSION, Events, Preflight, PreflightRow, Stream
@@ -173,4 +173,4 @@ def playing(stream: Stream, **changes: Any) -> Callable[[], Message]:
 
 
 def events_of(*lines: Any, vehicle: str = NAME) -> Message:
-    return told(Events(VERSION, SESSION, len(lines), tuple(lines)), vehicle)
+    return told(Events(v=VERSION, session=SESSION, count=len(lines), lines=tuple(lines)), vehicle)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import aiomqtt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from rich.console import Console
 
 from companion.ground.protocol.access import broker_access
@@ -142,7 +142,19 @@ def test_without_a_key_everything_is_shown() -> None:
 
 def test_an_answer_that_the_vehicle_did_not_prove_is_none() -> None:
     """Else whoever reads the nonce on the way says "landing" and ends the tries."""
-    ack = Ack(VERSION, "s1", "0" * 32, "anna", CommandName.LAND, True, "landing", 1.0, "catch", "land")
+    ack = Ack(
+        v=VERSION,
+        session="s1",
+        nonce="0" * 32,
+        operator="anna",
+        command=CommandName.LAND,
+        accepted=True,
+        text="landing",
+        t_s=1.0,
+        phase="catch",
+        action="land",
+        proof="",
+    )
     watch, topic = VehicleTracker(signer=SIGNER), "companion/rig/ack"
     assert watch.receive(topic, encode(ack), False, 50.0) is None
     assert watch.receive(topic, encode(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
@@ -174,7 +186,19 @@ def genuine() -> dict[Topic, dict[str, Any]]:
     """One good message of each topic, as data."""
     config, _, events = flight()
     scene = scene_of(config, "s1", [(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], mission_s=21.0)
-    ack = Ack(VERSION, "s1", "0" * 32, "bert", CommandName.HOLD, True, "holding", 1.0, "catch", "hold")
+    ack = Ack(
+        v=VERSION,
+        session="s1",
+        nonce="0" * 32,
+        operator="bert",
+        command=CommandName.HOLD,
+        accepted=True,
+        text="holding",
+        t_s=1.0,
+        phase="catch",
+        action="hold",
+        proof="",
+    )
     records = {
         Topic.STATE: state_of("rig", "s1"),
         Topic.SCENE: scene,

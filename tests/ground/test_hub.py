@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
@@ -27,7 +27,19 @@ def stream_of(session: str = SESSION, t_s: float = 1.0, **values: Any) -> bytes:
 
 
 def ack_of(nonce: str) -> Ack:
-    return Ack(VERSION, SESSION, nonce, "anna", CommandName.HOLD, True, "holding", 1.0, "catch", "hold")
+    return Ack(
+        v=VERSION,
+        session=SESSION,
+        nonce=nonce,
+        operator="anna",
+        command=CommandName.HOLD,
+        accepted=True,
+        text="holding",
+        t_s=1.0,
+        phase="catch",
+        action="hold",
+        proof="",
+    )
 
 
 def took(outbox: Outbox) -> list[Any]:
@@ -159,7 +171,7 @@ def test_who_comes_late_is_told_what_is_known_but_no_old_stream() -> None:
     watch = VehicleTracker()
     hub = Hub(watch, "no broker yet")
     watch.receive("companion/rig/state", encode(state_of("rig", SESSION)), True, 0.0)
-    watch.receive("companion/rig/events", encode(Events(VERSION, SESSION, 0, ())), True, 0.0)
+    watch.receive("companion/rig/events", encode(Events(v=VERSION, session=SESSION, count=0, lines=())), True, 0.0)
     watch.receive("companion/rig/stream", stream_of(), False, 10.0)
     soon, late = Outbox(), Outbox()
     hub.add(soon, 10.0 + 0.9 * FRESH_S)

@@ -20,7 +20,7 @@ from companion.config.loader import load_flight
 from companion.ground.protocol.keys import operators_text, write_private
 from companion.ground.protocol.messages import Events, Preflight, Scene, State, Stream, decode
 from companion.ground.station.replay_log import read_for_page
-from companion.model.codec import json_text
+from companion.model.codec import to_json
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.analysis.synthetic_flight import record_flight
 from tests.broker import Broker, free_port, loopback_broker
@@ -149,7 +149,7 @@ def test_a_log_is_the_records_that_the_vehicle_would_have_sent(log: Path) -> Non
     data: dict[str, Any] = json.loads(gzip.decompress(replayed.gzip_json))
 
     def record(cls: type[Any], part: Any) -> Any:
-        return decode(cls, json_text(part).encode())
+        return decode(cls, to_json(part))
 
     state = record(State, data["state"])
     assert (state.presence.value, state.mission, state.law, state.commands) == ("ended", "catch", "adaptive", False)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
 import math
@@ -8,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jsonschema
+import msgspec
 import pytest
 
 from companion.analysis import log
@@ -27,6 +27,7 @@ from companion.ground.protocol.messages import (
 from companion.ground.telemetry import stream as snapshot
 from companion.ground.telemetry.health import DEVICE_NAMES
 from companion.ground.telemetry.stream import TEXT_MAX, StreamBuilder, replay
+from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import (
     AttitudeSetpoint,
@@ -56,7 +57,7 @@ def changed(row: Row, **values: Any) -> Row:
     def put(record: Any, path: list[str], value: Any) -> Any:
         if not path:
             return value
-        return dataclasses.replace(record, **{path[0]: put(getattr(record, path[0]), path[1:], value)})
+        return msgspec.structs.replace(record, **{path[0]: put(getattr(record, path[0]), path[1:], value)})
 
     parts: dict[str, Any] = {"inputs": row[0], "outputs": row[1], "sent": row[2]}
     for name, value in values.items():
@@ -130,7 +131,7 @@ def test_the_attitude_error_is_the_angle_to_the_setpoint(axis: tuple[float, floa
 def _states(t_s: float) -> VehicleState:
     state = IN_FLIGHT[0].vehicle
     assert state is not None
-    return dataclasses.replace(state, position_world_m=(0.5, 0.5, 0.5), position_stamp_s=t_s)
+    return msgspec.structs.replace(state, position_world_m=(0.5, 0.5, 0.5), position_stamp_s=t_s)
 
 
 @pytest.mark.parametrize(
@@ -173,14 +174,24 @@ def test_numbers_that_are_none_make_a_message_that_every_parser_reads(bad: float
             return bad
         if isinstance(value, tuple):
             return tuple(map(spoilt, value))
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            return dataclasses.replace(
-                value, **{f.name: spoilt(getattr(value, f.name)) for f in dataclasses.fields(value)}
-            )
+        if isinstance(value, Record):
+            return type(value)(**{name: spoilt(getattr(value, name)) for name in value.__struct_fields__})
         return value
 
-    event = Event(1.0, "e", Severity.INFO, SafetyAction.NOMINAL, "text")
-    tether = TetherState(1.0, 1.0, 1.0, 0.1, 0.5, 0.0, 0.0, False, False, False)
+    event = Event(t_s=1.0, id="e", severity=Severity.INFO, action=SafetyAction.NOMINAL, text="text")
+    tether = TetherState(
+        range_m=1.0,
+        slack_m=1.0,
+        stop_slack_m=1.0,
+        elevation_rad=0.1,
+        clearance_m=0.5,
+        turns=0.0,
+        pull_n=0.0,
+        taut=False,
+        snagged=False,
+        separated=False,
+        vehicle_turns=0.0,
+    )
     row = changed(IN_FLIGHT, outputs__events=(event,), outputs__tether=tether)
     maker = StreamBuilder(CONFIG, "s")
     maker.add_tick(*IN_FLIGHT)
@@ -240,7 +251,7 @@ def test_late_ticks_and_lost_records_are_counted() -> None:
 def test_the_newest_events_are_kept_and_all_are_counted() -> None:
     maker = StreamBuilder(CONFIG, "s")
     for k in range(EVENTS_KEPT + 30):
-        event = Event(0.1 * k, f"e{k}", Severity.WARNING, SafetyAction.HOLD, f"text {k}")
+        event = Event(t_s=0.1 * k, id=f"e{k}", severity=Severity.WARNING, action=SafetyAction.HOLD, text=f"text {k}")
         maker.add_tick(*changed(ROWS[k], outputs__events=(event,), outputs__mission_t_s=0.05 * k))
     record = maker.events_message()
     assert record.count == EVENTS_KEPT + 30
@@ -267,8 +278,20 @@ def test_the_longest_events_fit_into_a_message() -> None:
 
 
 def tether(**values: Any) -> dict[str, Any]:
-    state = TetherState(2.0, 1.0, 0.9, 0.1, 0.5, 0.0, 0.0, False, False, False)
-    return {"outputs__tether": dataclasses.replace(state, **values)}
+    state = TetherState(
+        range_m=2.0,
+        slack_m=1.0,
+        stop_slack_m=0.9,
+        elevation_rad=0.1,
+        clearance_m=0.5,
+        turns=0.0,
+        pull_n=0.0,
+        taut=False,
+        snagged=False,
+        separated=False,
+        vehicle_turns=0.0,
+    )
+    return {"outputs__tether": msgspec.structs.replace(state, **values)}
 
 
 def old(device: str, limit_s: float) -> Callable[[float], dict[str, Any]]:

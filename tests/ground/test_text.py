@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import os
 import pty
 import re
@@ -13,11 +14,11 @@ import sys
 import termios
 import time
 from collections.abc import AsyncIterator, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from rich.console import Console
 
 from companion.ground.protocol.access import broker_access
@@ -115,7 +116,9 @@ def test_a_taut_tether_is_loud() -> None:
 def test_who_may_not_command_is_told_why_and_shown_no_keys() -> None:
     text = plain(
         drawn(
-            known(), 0.0, replace(AROUND, operator=None, view_only_reason="nobody shall", notices=(Notice("a note"),))
+            known(),
+            0.0,
+            dataclasses.replace(AROUND, operator=None, view_only_reason="nobody shall", notices=(Notice("a note"),)),
         )
     )
     assert "view only: nobody shall" in text and "ABORT" not in text and "a note" in text

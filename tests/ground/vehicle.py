@@ -6,11 +6,11 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import aiomqtt
+from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.ground.protocol.commands import Accepted, Refused, Verifier
@@ -47,7 +47,16 @@ def flight() -> tuple[FlightConfig, tuple[Stream, ...], Events]:
 
 def state_of(name: str, session: str, **values: Any) -> State:
     state = State(
-        VERSION, name, session, Presence.FLYING, True, "catch", "adaptive", "recommended", 1.7e9, commands=True
+        v=VERSION,
+        vehicle=name,
+        session=session,
+        presence=Presence.FLYING,
+        simulated=True,
+        mission="catch",
+        law="adaptive",
+        preset="recommended",
+        wall_s=1.7e9,
+        commands=True,
     )
     return replace(state, **values)
 
@@ -102,7 +111,9 @@ class PlayedVehicle:
     async def say_events(self, *texts: str) -> None:
         line = flight()[2].lines[0]
         lines = tuple(replace(line, text=text) for text in texts)
-        await self.say(Topic.EVENTS, Events(VERSION, self.session, len(lines), lines), retain=True)
+        await self.say(
+            Topic.EVENTS, Events(v=VERSION, session=self.session, count=len(lines), lines=lines), retain=True
+        )
 
     async def say_stream(self, **values: Any) -> Stream:
         _, streams, _ = flight()
@@ -141,9 +152,18 @@ class PlayedVehicle:
                 command, accepted, text = verdict.command, False, verdict.text
             if self.answers:
                 ack = Ack(
-                    VERSION, self.session, command.nonce, command.operator, command.command, accepted, text, self.t_s,
-                    "catch", "nominal",
-                )  # fmt: skip
+                    v=VERSION,
+                    session=self.session,
+                    nonce=command.nonce,
+                    operator=command.operator,
+                    command=command.command,
+                    accepted=accepted,
+                    text=text,
+                    t_s=self.t_s,
+                    phase="catch",
+                    action="nominal",
+                    proof="",
+                )
                 await self.say(Topic.ACK, with_proof(ack, self.name, self._operators.key(command.operator)))
 
 

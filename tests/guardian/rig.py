@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import socket
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,10 +22,9 @@ from companion.config.loader import load_flight
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
 from companion.launcher.launcher import replace_device_settings
-from companion.model.codec import unpack_plain
+from companion.model.packets import LogLine, Packet, read_packet
 from companion.model.types import Quat, Vec3
 from companion.runtime import ipc
-from companion.runtime.packets import TEXT
 from sitl.natnet import BodyPose, NatNetServer
 from tests.io.px4_peer import Px4Peer, free_udp_port
 from tests.support import DEADLINE_S, HOVER, wait_until
@@ -102,7 +103,7 @@ class Rig:
         self.tick = 0
         self.messages: list[ipc.Message] = []
         self._disk_full = disk_full
-        self.logged: list[tuple[Any, ...]] = []
+        self.logged: list[Packet] = []
 
     def __enter__(self) -> Self:
         config = load_flight(HOVER)
@@ -216,15 +217,13 @@ class Rig:
 
     def listen(self) -> None:
         """Take in what went to launcher and recorder."""
-        for into, opened in ((self.messages, self.channel), (self.logged, self.recorder)):
-            while True:
-                try:
-                    data = opened.recv(65536)
-                except (BlockingIOError, ConnectionResetError):
-                    break
-                if not data:
-                    break
-                into.append(json.loads(data) if opened is self.channel else unpack_plain(data))
+        self.messages += map(json.loads, self._arrived(self.channel))
+        self.logged += map(read_packet, self._arrived(self.recorder))
+
+    def _arrived(self, opened: socket.socket) -> Iterator[bytes]:
+        with contextlib.suppress(BlockingIOError, ConnectionResetError):
+            while data := opened.recv(65536):
+                yield data
 
     @property
     def events(self) -> list[str]:
@@ -236,7 +235,7 @@ class Rig:
     def log_ids(self) -> list[str]:
         """Ids of the lines that the recorder got."""
         self.listen()
-        return [packet[4] for packet in self.logged if packet[0] == TEXT]
+        return [packet.source for packet in self.logged if isinstance(packet, LogLine)]
 
     @property
     def result(self) -> ipc.Message | None:

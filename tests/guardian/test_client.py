@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import socket
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 
 from companion.config.loader import load_flight
@@ -100,9 +100,34 @@ def _beat() -> heartbeat.Heartbeat:
 
 
 def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
-    status = AutopilotStatus(5.0, armed, FlightMode.OFFBOARD, LandedState.IN_AIR, None, None)
-    mocap = MocapPose(4.9, None, 1, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), tracking, 0.0)
-    return Inputs(9, 5.0, None, status, mocap, None, None, OperatorCommand.NONE, 0)
+    status = AutopilotStatus(
+        heartbeat_stamp_s=5.0,
+        armed=armed,
+        mode=FlightMode.OFFBOARD,
+        landed=LandedState.IN_AIR,
+        battery_voltage_v=None,
+        battery_remaining=None,
+    )
+    mocap = MocapPose(
+        stamp_s=4.9,
+        latency_s=None,
+        frame_number=1,
+        position_world_m=(1.0, 2.0, 3.0),
+        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+        tracking_valid=tracking,
+        marker_error_m=0.0,
+    )
+    return Inputs(
+        tick=9,
+        t_s=5.0,
+        vehicle=None,
+        status=status,
+        mocap=mocap,
+        arm=None,
+        force=None,
+        command=OperatorCommand.NONE,
+        recorder_dropped=0,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +156,12 @@ def test_when_the_rotors_may_turn(
     pair: Pair, waiting: Outputs, armed: bool, request_: AutopilotRequest, kind: PhaseKind, lifting: bool
 ) -> None:
     client, guardian = pair
-    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 14540, ("10.0.0.7", 14580)), 77.0)
-    guard.tick(inputs(armed=armed), dataclasses.replace(waiting, request=request_, phase_kind=kind))
+    guard = FlightGuard(
+        client,
+        LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=14540, peer=("10.0.0.7", 14580)),
+        77.0,
+    )
+    guard.tick(inputs(armed=armed), msgspec.structs.replace(waiting, request=request_, phase_kind=kind))
     beat = heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES))
     assert beat is not None
     assert beat.lifting is lifting
@@ -144,10 +173,12 @@ def test_when_the_rotors_may_turn(
 
 def test_a_pilot_stays_one_and_a_pose_that_is_not_believed_is_not_passed_on(pair: Pair, waiting: Outputs) -> None:
     client, guardian = pair
-    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 0), 0.0)
-    event = Event(5.0, "pilot_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "a pilot")
-    guard.tick(inputs(tracking=False), dataclasses.replace(waiting, events=(event,)))
-    guard.tick(inputs(), dataclasses.replace(waiting, mocap_trusted=False))
+    guard = FlightGuard(client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    event = Event(
+        t_s=5.0, id="pilot_took_over", severity=Severity.CRITICAL, action=SafetyAction.AUTOPILOT_LAND, text="a pilot"
+    )
+    guard.tick(inputs(tracking=False), msgspec.structs.replace(waiting, events=(event,)))
+    guard.tick(inputs(), msgspec.structs.replace(waiting, mocap_trusted=False))
     guard.goodbye(inputs().status)
     beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(3)]
     assert [beat is not None and (beat.pilot, beat.goodbye, beat.pose_stamp_s) for beat in beats] == [
@@ -160,8 +191,8 @@ def test_a_pilot_stays_one_and_a_pose_that_is_not_believed_is_not_passed_on(pair
 def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiting: Outputs) -> None:
     """Whatever the outcome: rotors that turn are for the guardian to stop once this process is gone."""
     client, guardian = pair
-    guard = FlightGuard(client, LinkIdentity(1, 1, 195, 0), 0.0)
-    guard.tick(inputs(armed=True), dataclasses.replace(waiting, phase_kind=PhaseKind.DONE))
+    guard = FlightGuard(client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    guard.tick(inputs(armed=True), msgspec.structs.replace(waiting, phase_kind=PhaseKind.DONE))
     guard.goodbye(inputs(armed=True).status)
     guard.goodbye(inputs(armed=False).status)
     beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(2)]
@@ -172,10 +203,12 @@ def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiti
 def test_motion_capture_is_refused_from_the_landing_for_it_until_it_is_believed_again(
     waiting: Outputs, event_id: str
 ) -> None:
-    heartbeats = Heartbeats(LinkIdentity(1, 1, 195, 0), 0.0)
-    bad = dataclasses.replace(waiting, mocap_trusted=False)
-    landing = Event(5.0, event_id, Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, "not believed")
-    walk = [bad, waiting, dataclasses.replace(bad, events=(landing,)), bad, waiting, bad]
+    heartbeats = Heartbeats(LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    bad = msgspec.structs.replace(waiting, mocap_trusted=False)
+    landing = Event(
+        t_s=5.0, id=event_id, severity=Severity.CRITICAL, action=SafetyAction.AUTOPILOT_LAND, text="not believed"
+    )
+    walk = [bad, waiting, msgspec.structs.replace(bad, events=(landing,)), bad, waiting, bad]
     assert [heartbeats.of(inputs(armed=True), outputs).mocap_refused for outputs in walk] == [
         False,  # a single pose that jumps or repeats itself
         False,

@@ -25,7 +25,15 @@ from companion.model.types import MocapPose
 from tests.io.px4_peer import Px4Peer, free_udp_port
 from tests.support import DEADLINE_S, wait_until
 
-POSE = MocapPose(12.345678, None, 7, (1.25, -2.5, 0.75), quat_from_euler_zyx(0.1, -0.2, 2.3), True, 0.0002)
+POSE = MocapPose(
+    stamp_s=12.345678,
+    latency_s=None,
+    frame_number=7,
+    position_world_m=(1.25, -2.5, 0.75),
+    attitude_wxyz=quat_from_euler_zyx(0.1, -0.2, 2.3),
+    tracking_valid=True,
+    marker_error_m=0.0002,
+)
 
 
 def heartbeat(system: int = 1, component: int = 1) -> bytes:

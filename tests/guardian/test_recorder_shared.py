@@ -8,10 +8,12 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from companion.model.codec import pack_plain
+from companion.model.codec import to_packet
+from companion.model.packets import LogLine
 from companion.model.types import Severity
 from companion.recorder.client import RecorderProcess
-from companion.runtime.packets import TEXT, UNNUMBERED
+
+GUARDIANS_LINE = to_packet(LogLine(t_s=1.5, severity=Severity.WARNING, source="guardian_land", text="of the guardian"))
 
 
 def lines_of(path: Path) -> bytes:
@@ -28,7 +30,7 @@ def test_the_flight_closes_the_log_though_the_guardian_holds_the_channel(tmp_pat
     recorder, guardian = shared(tmp_path / "flight.mcap")
     with guardian:
         recorder.client.text(1.0, Severity.INFO, "flight", "of the flight")
-        guardian.send(pack_plain((TEXT, UNNUMBERED, 1.5, "warning", "guardian_land", "of the guardian")))
+        guardian.send(GUARDIANS_LINE)
         recorder.client.text(2.0, Severity.INFO, "flight", "of the flight again")
         report = recorder.finish()
     assert (report.error, report.dropped) == (None, 0)
@@ -39,7 +41,7 @@ def test_the_log_ends_with_the_guardian_when_the_flight_is_dead(tmp_path: Path) 
     recorder, guardian = shared(tmp_path / "flight.mcap")
     with guardian:
         recorder.client._socket.close()  # as the kernel does it for a process that was killed
-        guardian.send(pack_plain((TEXT, UNNUMBERED, 1.5, "warning", "guardian_land", "of the guardian")))
+        guardian.send(GUARDIANS_LINE)
         assert recorder.process.poll() is None
     assert recorder.process.wait(20.0) == 0
     assert recorder.process.stdout is not None

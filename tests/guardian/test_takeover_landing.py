@@ -110,7 +110,19 @@ class Landing:
             if mocap:
                 number = round(self.t_s / STEP_S)
                 position: Vec3 = (0.0, 0.0, height_m)
-                self.takeover.take_poses([MocapPose(self.t_s, None, number, position, attitude, True, 0.0)])
+                self.takeover.take_poses(
+                    [
+                        MocapPose(
+                            stamp_s=self.t_s,
+                            latency_s=None,
+                            frame_number=number,
+                            position_world_m=position,
+                            attitude_wxyz=attitude,
+                            tracking_valid=True,
+                            marker_error_m=0.0,
+                        )
+                    ]
+                )
             self.takeover.take_messages(self.t_s, [heartbeat, *said])
             if self.takeover.landed is None:
                 self.takeover.step(self.t_s)

@@ -24,11 +24,17 @@ from sitl.force_torque import ForceTorqueServer
 
 WAIT_S = 20.0
 # 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
-AWKWARD = Wrench((0x55AA / 50, -0x55AB / 50, 0x5555 / 50), (-0x5556 / 2000, 0x55AA / 2000, 0x55AA / 2000), 0)
+AWKWARD = Wrench(
+    force_n=(0x55AA / 50, -0x55AB / 50, 0x5555 / 50),
+    torque_nm=(-0x5556 / 2000, 0x55AA / 2000, 0x55AA / 2000),
+    overload_bits=0,
+)
 
 counts = st.integers(-32768, 32767) | st.sampled_from([0x55AA, -0x55AB, 0x5555, -0x5556, 0x0055, 0x00AA])
 wrenches = st.tuples(*[counts] * 6, st.integers(0, 255)).map(
-    lambda c: Wrench((c[0] / 50, c[1] / 50, c[2] / 50), (c[3] / 2000, c[4] / 2000, c[5] / 2000), c[6])
+    lambda c: Wrench(
+        force_n=(c[0] / 50, c[1] / 50, c[2] / 50), torque_nm=(c[3] / 2000, c[4] / 2000, c[5] / 2000), overload_bits=c[6]
+    )
 )
 
 
@@ -39,14 +45,16 @@ def test_golden_packets() -> None:
     assert rft.encode_command(Command.START).hex() == "550b000000000000000baa"
     assert rft.encode_command(Command.SET_RATE, 6).hex() == "550f0600000000000015aa"
     assert rft.encode_command(Command.SET_BIAS, 1).hex() == "5511010000000000" + "0012aa"
-    wrench = Wrench((1.0, -1.0, 200.0), (0.5, -0.0005, 4.0), 0x20)
+    wrench = Wrench(force_n=(1.0, -1.0, 200.0), torque_nm=(0.5, -0.0005, 4.0), overload_bits=0x20)
     packet = rft.encode_wrench(Command.START, wrench)
     assert packet.hex() == "55" + "0b" + "0032" + "ffce" + "2710" + "03e8" + "ffff" + "1f40" + "20" + "0000" + "a9aa"
     assert rft.decode_wrench(packet[1:-2]) == wrench
 
 
 def test_counts_saturate() -> None:
-    packet = rft.encode_wrench(Command.START, Wrench((1e6, -1e6, 0.0), (1e6, -1e6, 0.0), 0))
+    packet = rft.encode_wrench(
+        Command.START, Wrench(force_n=(1e6, -1e6, 0.0), torque_nm=(1e6, -1e6, 0.0), overload_bits=0)
+    )
     assert rft.decode_wrench(packet[1:-2]).force_n == (655.34, -655.36, 0.0)
 
 
@@ -391,7 +399,9 @@ def test_sensor_once_bias_and_refused_rate() -> None:
                 assert rft.decode_text((await line.receive(1))[0]) == "RFT60HA-0001"
                 await line.send(Command.SET_BIAS, 1)
                 await line.send(Command.READ_ONCE)
-                assert rft.decode_wrench((await line.receive(1))[0]) == Wrench((0.0,) * 3, (0.0,) * 3, 0)
+                assert rft.decode_wrench((await line.receive(1))[0]) == Wrench(
+                    force_n=(0.0,) * 3, torque_nm=(0.0,) * 3, overload_bits=0
+                )
                 await line.send(Command.SET_BIAS, 0)
                 await line.send(Command.READ_ONCE)
                 assert rft.decode_wrench((await line.receive(1))[0]).force_n == (2.0, 0.0, 0.0)

@@ -531,7 +531,15 @@ def test_estimator_status_is_asked_for_and_told() -> None:
                 report = autopilot.estimator()
                 assert report is not None
                 # PX4 says NaN of a velocity that it does not fuse, and of what it does not know.
-                assert report == EstimatorReport(report.stamp_s, 0x33F, 0.0, 0.25, 0.125, 0.0625, math.inf)
+                assert report == EstimatorReport(
+                    stamp_s=report.stamp_s,
+                    flags=0x33F,
+                    velocity_ratio=0.0,
+                    position_horizontal_ratio=0.25,
+                    position_vertical_ratio=0.125,
+                    position_horizontal_accuracy_m=0.0625,
+                    position_vertical_accuracy_m=math.inf,
+                )
                 assert peer.asked_interval_us[mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS] == pytest.approx(200_000.0)
                 await eventually(lambda: autopilot.estimator() != report, "a newer one")
 

@@ -285,7 +285,17 @@ def test_px4_that_restarts_at_the_same_address_is_heard_again() -> None:
             async with edge(port) as autopilot:
                 px4.__exit__(None, None, None)
                 for tick in range(20):  # what is sent now comes back as ICMP errors
-                    autopilot.send_vision(MocapPose(1.0 + tick, None, tick, (0.0, 0.0, 0.0), LEVEL, True, 0.0))
+                    autopilot.send_vision(
+                        MocapPose(
+                            stamp_s=1.0 + tick,
+                            latency_s=None,
+                            frame_number=tick,
+                            position_world_m=(0.0, 0.0, 0.0),
+                            attitude_wxyz=LEVEL,
+                            tracking_valid=True,
+                            marker_error_m=0.0,
+                        )
+                    )
                     await asyncio.sleep(0.005)
                 with Px4Peer(port, at=where) as again:
                     again.base_mode = ARMED

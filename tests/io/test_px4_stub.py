@@ -42,7 +42,15 @@ class Companion:
         number = 0
         attitude = quat_from_euler_zyx(0.0, 0.0, YAW_RAD)
         while True:
-            pose = MocapPose(self._clock(), 0.003, number, POSITION_WORLD_M, attitude, True, 0.0)
+            pose = MocapPose(
+                stamp_s=self._clock(),
+                latency_s=0.003,
+                frame_number=number,
+                position_world_m=POSITION_WORLD_M,
+                attitude_wxyz=attitude,
+                tracking_valid=True,
+                marker_error_m=0.0,
+            )
             assert self.autopilot.send_vision(pose)
             assert self.autopilot.send_attitude(AttitudeSetpoint(attitude, 0.1))
             self.autopilot.request(self.request)

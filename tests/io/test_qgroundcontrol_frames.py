@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import random
 import struct
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
@@ -370,7 +370,7 @@ def test_texts_are_bounded_gravest_first_and_what_was_left_out_is_said() -> None
 
 def test_events_say_what_is_done_and_characters_that_mavlink_lacks_do_not_hurt() -> None:
     def event(severity: Severity, action: SafetyAction) -> Event:
-        return Event(1.0, "some", severity, action, "tilt 35°")
+        return Event(t_s=1.0, id="some", severity=severity, action=action, text="tilt 35°")
 
     assert event_text(event(Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND)) == (2, "AUTOPILOT LAND: tilt 35°")
     assert event_text(event(Severity.WARNING, SafetyAction.WARN)) == (4, "tilt 35°")

@@ -56,16 +56,47 @@ PILOT_MODE = 3 << 16
 
 
 def inputs(tick: int = 0) -> Inputs:
-    return Inputs(tick, tick * 0.005, None, None, None, None, None, OperatorCommand.NONE, 0)
+    return Inputs(
+        tick=tick,
+        t_s=tick * 0.005,
+        vehicle=None,
+        status=None,
+        mocap=None,
+        arm=None,
+        force=None,
+        command=OperatorCommand.NONE,
+        recorder_dropped=0,
+    )
 
 
 def outputs(tick: int = 0, phase: str = "approach", events: tuple[Event, ...] = ()) -> Outputs:
-    tether = TetherState(1.5, 0.75, 0.5, 0.0, 1.0, 0.0, 0.0, False, False, False)
-    none = AutopilotRequest.NONE
+    tether = TetherState(
+        range_m=1.5,
+        slack_m=0.75,
+        stop_slack_m=0.5,
+        elevation_rad=0.0,
+        clearance_m=1.0,
+        turns=0.0,
+        pull_n=0.0,
+        taut=False,
+        snagged=False,
+        separated=False,
+        vehicle_turns=0.0,
+    )
     return Outputs(
-        *(tick, tick * 0.005, 0.0, phase, PhaseKind.FLIGHT, 0.25, None, LEVEL, None, none),
-        *(SafetyAction.NOMINAL, events, None, None),
+        tick=tick,
+        t_s=tick * 0.005,
+        mission_t_s=0.0,
+        phase=phase,
+        phase_kind=PhaseKind.FLIGHT,
+        progress=0.25,
+        attitude=LEVEL,
+        request=AutopilotRequest.NONE,
+        action=SafetyAction.NOMINAL,
+        events=events,
+        mocap_trusted=True,
         tether=tether,
+        bent_by=(),
     )
 
 
@@ -110,7 +141,13 @@ def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() ->
                 ours = await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
                 assert (ours.type, ours.autopilot) == (18, 8)  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID
 
-                event = Event(1.0, "tether_short", Severity.CRITICAL, SafetyAction.RETRACT, "slack 0.1 m: going back")
+                event = Event(
+                    t_s=1.0,
+                    id="tether_short",
+                    severity=Severity.CRITICAL,
+                    action=SafetyAction.RETRACT,
+                    text="slack 0.1 m: going back",
+                )
                 station.tell(inputs(), outputs(events=(event,)))
                 said = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase approach")
                 assert said.severity == mavlink.MAV_SEVERITY_INFO

@@ -55,7 +55,15 @@ class Standing:
                 self.plant.step(False)
                 for frame in self.plant.take_mocap():
                     t_s, p, q = self.plant.t_s, frame.position_world_m, frame.attitude_wxyz
-                    self._pose = MocapPose(t_s, t_s - frame.exposure_t_s, frame.number, p, q, frame.valid, 0.0002)
+                    self._pose = MocapPose(
+                        stamp_s=t_s,
+                        latency_s=t_s - frame.exposure_t_s,
+                        frame_number=frame.number,
+                        position_world_m=p,
+                        attitude_wxyz=q,
+                        tracking_valid=frame.valid,
+                        marker_error_m=0.0002,
+                    )
                     self.px4.on_vision(t_s, ned_from_enu(p), attitude_ned_frd_from_enu_flu(q))
             yield HandSample(self.plant.t_s, self._pose, self._vehicle(), False)
 
@@ -64,12 +72,12 @@ class Standing:
         if estimate is None:
             return None
         return VehicleState(
-            t_s,
-            t_s,
-            t_s,
-            enu_from_ned(estimate.position_ned_m),
-            enu_from_ned(estimate.velocity_ned_m_s),
-            attitude_enu_flu_from_ned_frd(estimate.attitude_ned_frd),
-            flu_from_frd(estimate.rates_frd_rad_s),
-            flu_from_frd(estimate.accel_frd_m_s2),
+            position_stamp_s=t_s,
+            attitude_stamp_s=t_s,
+            imu_stamp_s=t_s,
+            position_world_m=enu_from_ned(estimate.position_ned_m),
+            velocity_world_m_s=enu_from_ned(estimate.velocity_ned_m_s),
+            attitude_wxyz=attitude_enu_flu_from_ned_frd(estimate.attitude_ned_frd),
+            angular_rate_body_rad_s=flu_from_frd(estimate.rates_frd_rad_s),
+            specific_force_body_m_s2=flu_from_frd(estimate.accel_frd_m_s2),
         )

@@ -57,7 +57,15 @@ def vehicle(count: int = 620) -> tuple[VehicleState, ...]:
         force = (wave(i, 0.05), wave(i + 1, 0.05), 9.81 + wave(i + 2, 0.05))
         states.append(
             VehicleState(
-                t_s, t_s, t_s, position, (0.0, 0.0, 0.0), attitude, (0.0, 0.0, wave(i, 0.01)), force, t_s + 40.0
+                position_stamp_s=t_s,
+                attitude_stamp_s=t_s,
+                imu_stamp_s=t_s,
+                position_world_m=position,
+                velocity_world_m_s=(0.0, 0.0, 0.0),
+                attitude_wxyz=attitude,
+                angular_rate_body_rad_s=(0.0, 0.0, wave(i, 0.01)),
+                specific_force_body_m_s2=force,
+                boot_s=t_s + 40.0,
             )
         )
     return tuple(states)
@@ -73,7 +81,7 @@ def estimator(**changes: float) -> tuple[EstimatorReport, ...]:
         "position_vertical_accuracy_m": 0.005,
         **changes,
     }
-    return tuple(EstimatorReport(START_S + 0.2 * i, **values) for i in range(1, 26))  # type: ignore[arg-type]
+    return tuple(EstimatorReport(stamp_s=START_S + 0.2 * i, **values) for i in range(1, 26))  # type: ignore[arg-type]
 
 
 def mocap(count: int = 1000, **changes: object) -> tuple[MocapPose, ...]:
@@ -129,10 +137,10 @@ def force(
 ) -> tuple[ForceSample, ...]:
     return tuple(
         ForceSample(
-            START_S + (i + 1) * SPAN_S / 1000,
-            (bias_n + wave(i, noise_n) + drift_n * i / 1000, wave(i + 1, noise_n), 0.7),
-            (0.0, 0.0, 0.0),
-            overload and i == 500,
+            stamp_s=START_S + (i + 1) * SPAN_S / 1000,
+            force_sensor_n=(bias_n + wave(i, noise_n) + drift_n * i / 1000, wave(i + 1, noise_n), 0.7),
+            torque_sensor_nm=(0.0, 0.0, 0.0),
+            overload=overload and i == 500,
         )
         for i in range(1000)
     )
@@ -174,8 +182,8 @@ def stream(**changes: object) -> MocapStream:
 def sound() -> Observations:
     """A machine in SITL: no hand test is asked for."""
     return Observations(
-        START_S,
-        SPAN_S,
+        start_s=START_S,
+        duration_s=SPAN_S,
         firmware="PX4 1.16.1 release (git 94cb2012)",
         params=PARAMS,
         vehicle=vehicle(),
@@ -188,7 +196,7 @@ def sound() -> Observations:
         force=force(),
         machine=machine(),
         state_counts=StateCounts(620, 1060, 1130),
-        force_stream=ForceStream(1000, 0, "RFT60-HA01, firmware V1.2.0"),
+        force_stream=ForceStream(samples=1000, bad_sums=0, product="RFT60-HA01, firmware V1.2.0"),
         arm_reads=(700, 0),
         mission_s=21.0,
         plan=(),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.observations import Observations
@@ -32,7 +32,7 @@ def observed(rig: Standing, until_s: float) -> Observations:
     seen = [sample for sample in rig.samples(until_s) if sample.t_s > 2.0]
     poses = {sample.pose.frame_number: sample.pose for sample in seen if sample.pose is not None}
     states = tuple(sample.vehicle for sample in seen if sample.vehicle is not None)
-    return Observations(2.0, until_s - 2.0, vehicle=states, mocap=tuple(poses.values()))
+    return Observations(start_s=2.0, duration_s=until_s - 2.0, vehicle=states, mocap=tuple(poses.values()))
 
 
 def failed(rows: list[Row]) -> dict[str, str]:
@@ -124,7 +124,7 @@ def test_a_machine_that_is_carried_is_not_judged() -> None:
 
 def test_too_few_samples_are_not_judged() -> None:
     config = world()
-    (row,) = frames.rows(Observations(0.0, 5.0), config.mission, config.vehicle)
+    (row,) = frames.rows(Observations(start_s=0.0, duration_s=5.0), config.mission, config.vehicle)
     assert row.refuses
     assert "0 tracked poses" in row.read
 
@@ -170,7 +170,7 @@ def test_the_hand_test_on_record_is_told_on_hardware_only() -> None:
     seen = observed(Standing(config), WATCH_S)
 
     def row(**known: str) -> Row | None:
-        rows = frames.rows(replace(seen, **known), config.mission, config.vehicle)  # type: ignore[arg-type]
+        rows = frames.rows(replace(seen, **known), config.mission, config.vehicle)
         return next((row for row in rows if row.id == "frames.hand_test"), None)
 
     assert row() is None

@@ -25,7 +25,7 @@ from tests.support import CATCH
 
 SETUP = Setup("tarot650-2r", "192.168.1.10", 1, "z", "4.1")
 AT = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
-ROWS = [Row("hand.forward", "hand test: forward", True, "felt 0.29 m forward")]
+ROWS = [Row(id="hand.forward", title="hand test: forward", ok=True, read="felt 0.29 m forward")]
 
 
 def one() -> list[Passed]:

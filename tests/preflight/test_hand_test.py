@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from functools import cache
 
 import pytest
+from msgspec.structs import replace
 
 from companion.model.frames import quat_rotate
 from companion.model.rows import Row, refusals
@@ -77,7 +78,7 @@ def felt_otherwise(course: Iterable[HandSample], turn: Callable[[Vec3], Vec3]) -
                 specific_force_body_m_s2=turn(vehicle.specific_force_body_m_s2),
                 angular_rate_body_rad_s=turn(vehicle.angular_rate_body_rad_s),
             )
-        turned.append(replace(sample, vehicle=vehicle))
+        turned.append(dataclasses.replace(sample, vehicle=vehicle))
     return turned
 
 
@@ -100,7 +101,7 @@ def test_a_biased_imu_and_slow_motion_capture_pass(seed: int) -> None:
             (fx, fy, fz), (wx, wy, wz) = vehicle.specific_force_body_m_s2, vehicle.angular_rate_body_rad_s
             force, rate = (fx + 0.3, fy - 0.2, fz + 0.2), (wx + 0.02, wy - 0.02, wz + 0.03)
             vehicle = replace(vehicle, specific_force_body_m_s2=force, angular_rate_body_rad_s=rate)
-        course.append(replace(sample, vehicle=vehicle))
+        course.append(dataclasses.replace(sample, vehicle=vehicle))
     assert not failed(hand_test_evaluation.rows(result(course), "z"))
 
 
@@ -152,7 +153,7 @@ def test_a_z_up_stream_that_is_taken_for_y_up_is_named() -> None:
 def test_each_of_the_48_body_frames_is_told_from_the_others(axes: AxisMap) -> None:
     """Without the rule of how people make a rigid body: every exchange of its axes."""
     measured = result(
-        replace(sample, pose=exchanged(sample.pose, axes)) if sample.pose is not None else sample
+        dataclasses.replace(sample, pose=exchanged(sample.pose, axes)) if sample.pose is not None else sample
         for sample in samples()
     )
     assert hand_test_evaluation.best_axes(measured) == axes
@@ -190,7 +191,7 @@ def doubled(pose: MocapPose) -> MocapPose:
 
 
 def test_wrong_distances_are_told() -> None:
-    course = [replace(s, pose=doubled(s.pose)) if s.pose is not None else s for s in samples()]
+    course = [dataclasses.replace(s, pose=doubled(s.pose)) if s.pose is not None else s for s in samples()]
     assert set(failed(hand_test_evaluation.rows(result(course), "z"))) == {"hand.scale"}
 
 
@@ -198,19 +199,19 @@ def test_wrong_distances_are_told() -> None:
 
 
 def test_it_ends_at_once_when_px4_is_armed() -> None:
-    view = ran(replace(sample, armed=sample.t_s > 6.0) for sample in samples())
+    view = ran(dataclasses.replace(sample, armed=sample.t_s > 6.0) for sample in samples())
     assert view.ended.startswith("PX4 reports that it is armed")
     assert view.step is Step.LIFT
     assert view.result is None
 
 
 def test_it_does_not_begin_when_px4_is_armed() -> None:
-    view = HandTest().update(replace(samples()[0], armed=True))
+    view = HandTest().update(dataclasses.replace(samples()[0], armed=True))
     assert view.ended.startswith("PX4 reports that it is armed")
 
 
 def test_it_ends_when_px4_does_not_say_whether_it_is_armed() -> None:
-    view = ran(replace(sample, armed=None if sample.t_s > 3.0 else False) for sample in samples())
+    view = ran(dataclasses.replace(sample, armed=None if sample.t_s > 3.0 else False) for sample in samples())
     assert view.ended.startswith(f"no report for {SILENCE_MAX_S:g} s on whether PX4 is armed")
 
 
@@ -231,10 +232,10 @@ def test_a_machine_that_nobody_lifts_is_told_after_the_time_limit() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda sample: replace(sample, pose=None), "motion capture does not track the rigid body"),
-        (lambda sample: replace(sample, vehicle=None), "no state from PX4"),
+        (lambda sample: dataclasses.replace(sample, pose=None), "motion capture does not track the rigid body"),
+        (lambda sample: dataclasses.replace(sample, vehicle=None), "no state from PX4"),
         (
-            lambda sample: replace(sample, pose=sample.pose and replace(sample.pose, tracking_valid=False)),
+            lambda sample: dataclasses.replace(sample, pose=sample.pose and replace(sample.pose, tracking_valid=False)),
             "motion capture does not track the rigid body",
         ),
     ],
@@ -251,7 +252,7 @@ def test_markers_that_are_covered_during_a_move_make_it_count_not() -> None:
     for sample in samples():
         covered = 5.0 < sample.t_s < 5.7
         pose = replace(sample.pose, tracking_valid=False) if sample.pose and covered else sample.pose
-        view = test.update(replace(sample, pose=pose))
+        view = test.update(dataclasses.replace(sample, pose=pose))
         notices.add(view.notice)
         assert view.result is None or view.step is Step.DONE
     assert any("motion capture lost the rigid body" in notice for notice in notices)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
 from companion.model.observations import ForceStream, Observations, StateCounts
@@ -35,6 +36,10 @@ class Case:
     """`airframe.thrust_max_n`: changed in the vehicle file."""
     also: tuple[str, ...] = ()
     """Rows that must fail with it."""
+
+
+def force_stream(samples: int = 1000, bad_sums: int = 0, lost: str | None = None) -> dict[str, Any]:
+    return {"force_stream": ForceStream(samples=samples, bad_sums=bad_sums, product="RFT60", lost=lost)}
 
 
 def moved(x_m: float = 0.0, yaw_rad: float = 0.0, until: int = 620) -> tuple[VehicleState, ...]:
@@ -165,10 +170,10 @@ CASES = {
     "dead bus": Case("arm.reads", "0 of 0", "loose cable", {"arm_reads": (0, 0)}),
     "arm's latency timer": Case("arm.usb_latency", "16 ms", "udev", {"machine": r.machine(arm_latency_ms=16)}, WARN),
     "no force sensor": Case("force.device", "expected it", "", failure("force")),
-    "force port lost": Case("force.device", "was lost", "plug", {"force_stream": ForceStream(9, 0, "RFT60", "was lost")}),
-    "slow force": Case("force.rate", "150 Hz", "cable", {"force_stream": ForceStream(750, 0, "RFT60")}, WARN),
-    "very slow force": Case("force.rate", "50 Hz", "cable", {"force_stream": ForceStream(250, 0, "RFT60")}),
-    "disturbed": Case("force.checksums", "3 wrong", "shielded", {"force_stream": ForceStream(1000, 3, "RFT60")}, WARN),
+    "force port lost": Case("force.device", "was lost", "plug", force_stream(samples=9, lost="was lost")),
+    "slow force": Case("force.rate", "150 Hz", "cable", force_stream(samples=750), WARN),
+    "very slow force": Case("force.rate", "50 Hz", "cable", force_stream(samples=250)),
+    "disturbed": Case("force.checksums", "3 wrong", "shielded", force_stream(bad_sums=3), WARN),
     "noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=0.7)}, WARN),
     "very noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=5.0)}),
     "overloaded": Case("force.overload", "1 of 1000", "remove the load", {"force": r.force(overload=True)}),
@@ -314,7 +319,7 @@ def test_a_row_is_one_line_with_read_wanted_and_fix() -> None:
 
 
 def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:
-    rows = evaluation.rows(Observations(0.0, 5.0), r.config())
+    rows = evaluation.rows(Observations(start_s=0.0, duration_s=5.0), r.config())
     assert {"px4.heartbeat", "px4.vision", "mocap.device", "force.device"} <= {row.id for row in rows if row.refuses}
 
 

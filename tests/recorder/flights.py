@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import select
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from companion.config.loader import load_flight
 from companion.model.types import Inputs, Outputs, Sent, TetherState
@@ -32,8 +33,15 @@ def flight_of(result: FastResult) -> Iterator[Row]:
             i,
             o,
             Sent(
-                *(i.tick, o.attitude is not None, o.arm_torque_nm, t_s - 0.0008, 0.0003),
-                *(t_s, t_s + 0.0002, t_s + 0.0004, t_s + 0.0003),
+                tick=i.tick,
+                attitude_sent=o.attitude is not None,
+                arm_torque_sent_nm=o.arm_torque_nm,
+                start_s=t_s - 0.0008,
+                lateness_s=0.0003,
+                joint_read_s=t_s,
+                core_s=t_s + 0.0002,
+                setpoint_sent_s=t_s + 0.0004,
+                current_sent_s=t_s + 0.0003,
             ),
         )
 
@@ -42,7 +50,19 @@ def tethered(end_s: float) -> Iterator[Row]:
     """The synthetic flight up to this mission time, with a tether that comes near to its end."""
     for inputs, outputs, sent in synthetic_flight(end_s=end_s):
         slack_m = 0.8 + 0.7 * math.cos(outputs.mission_t_s)
-        state = TetherState(3.0 - slack_m, slack_m, slack_m - 0.05, 0.3, 0.5, 0.0, 0.0, slack_m < 0.15, False, False)
+        state = TetherState(
+            range_m=3.0 - slack_m,
+            slack_m=slack_m,
+            stop_slack_m=slack_m - 0.05,
+            elevation_rad=0.3,
+            clearance_m=0.5,
+            turns=0.0,
+            pull_n=0.0,
+            taut=slack_m < 0.15,
+            snagged=False,
+            separated=False,
+            vehicle_turns=0.0,
+        )
         yield inputs, replace(outputs, tether=state), sent
 
 

@@ -18,7 +18,8 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 
 from companion.io.protocols import DeviceError
-from companion.model.codec import differences, from_jsonable, unpack_plain
+from companion.model.codec import differences, from_json
+from companion.model.packets import CommandAnswer, read_packet
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -33,7 +34,6 @@ from companion.model.types import (
     Severity,
 )
 from companion.recorder.client import RecorderClient, RecorderProcess, epoch_offset_ns
-from companion.runtime.packets import ACK
 
 EPOCH_NS = 1_700_000_000_000_000_000
 DEADLINE_S = 60.0
@@ -41,15 +41,54 @@ DEADLINE_S = 60.0
 
 def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
     t_s = k * 0.005
-    pose = MocapPose(t_s, 0.002, k, (0.1 * k, 1 / 3, 1.0), (1.0, 0.0, 0.0, 0.0), True, 1e-4)
-    events = (Event(t_s, "note", Severity.WARNING, SafetyAction.WARN, text),) if text else ()
+    pose = MocapPose(
+        stamp_s=t_s,
+        latency_s=0.002,
+        frame_number=k,
+        position_world_m=(0.1 * k, 1 / 3, 1.0),
+        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+        tracking_valid=True,
+        marker_error_m=1e-4,
+    )
+    events = (
+        (Event(t_s=t_s, id="note", severity=Severity.WARNING, action=SafetyAction.WARN, text=text),) if text else ()
+    )
     return (
-        Inputs(k, t_s, None, None, pose, None, None, OperatorCommand.NONE, 0),
-        Outputs(
-            *(k, t_s, 0.0, "ground", PhaseKind.GROUND, 0.0, None, None, None, AutopilotRequest.NONE),
-            *(SafetyAction.NOMINAL, events, None, None),
+        Inputs(
+            tick=k,
+            t_s=t_s,
+            vehicle=None,
+            status=None,
+            mocap=pose,
+            arm=None,
+            force=None,
+            command=OperatorCommand.NONE,
+            recorder_dropped=0,
         ),
-        Sent(k, False, None, t_s, 1e-4, t_s, t_s, t_s, t_s),
+        Outputs(
+            tick=k,
+            t_s=t_s,
+            mission_t_s=0.0,
+            phase="ground",
+            phase_kind=PhaseKind.GROUND,
+            progress=0.0,
+            request=AutopilotRequest.NONE,
+            action=SafetyAction.NOMINAL,
+            events=events,
+            mocap_trusted=True,
+            bent_by=(),
+        ),
+        Sent(
+            tick=k,
+            attitude_sent=False,
+            arm_torque_sent_nm=None,
+            start_s=t_s,
+            lateness_s=1e-4,
+            joint_read_s=t_s,
+            core_s=t_s,
+            setpoint_sent_s=t_s,
+            current_sent_s=t_s,
+        ),
     )
 
 
@@ -105,7 +144,7 @@ def test_every_tick_is_in_the_log_with_its_stamp_schema_and_metadata(recorder: R
         assert len(found) == 500
         for k, (log_time, data) in enumerate(found):
             assert log_time == EPOCH_NS + k * 5_000_000
-            assert differences(from_jsonable(cls, data), tick(k)[part]) is None
+            assert differences(from_json(cls, json.dumps(data).encode()), tick(k)[part]) is None
     with recorder.path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -264,7 +303,7 @@ def test_an_impossible_path_is_refused_in_one_line_before_the_flight(tmp_path: P
 
 def test_a_record_that_cannot_be_written_is_counted_and_named(recorder: RecorderProcess) -> None:
     inputs, outputs, sent = tick(0)
-    broken = Outputs(**{**{f: getattr(outputs, f) for f in Outputs.__slots__}, "events": None})
+    broken = Outputs(**{**{f: getattr(outputs, f) for f in Outputs.__struct_fields__}, "events": None})
     recorder.client.record(inputs, broken, sent)
     offer(recorder, range(1, 3))
     report = recorder.finish(DEADLINE_S)
@@ -302,8 +341,8 @@ def test_commands_are_heard_in_the_tick_in_which_they_are_there(channel: tuple[R
     say(recorder, command="resume", operator="bob", nonce="b2", hold=3)
     client.record(*tick(0))
     assert client.take_commands() == [
-        GroundCommand(OperatorCommand.HOLD, "anna", "a1"),
-        GroundCommand(OperatorCommand.RESUME, "bob", "b2", 3),
+        GroundCommand(command=OperatorCommand.HOLD, operator="anna", nonce="a1", hold=0),
+        GroundCommand(command=OperatorCommand.RESUME, operator="bob", nonce="b2", hold=3),
     ]
     client.record(*tick(1))
     assert client.take_commands() == []
@@ -364,8 +403,16 @@ def test_an_answer_is_a_packet_in_its_turn(channel: tuple[RecorderClient, socket
     client.record(*tick(0))
     client.ack("a1", "anna", OperatorCommand.HOLD, True, "holding", 1.25, "hold", SafetyAction.HOLD)
     recorder.recv(2**20)
-    assert unpack_plain(recorder.recv(2**20)) == (
-        *(ACK, 1, "a1", "anna", "hold", True, "holding", 1.25, "hold", "hold"),
+    assert read_packet(recorder.recv(2**20)) == CommandAnswer(
+        number=1,
+        nonce="a1",
+        operator="anna",
+        command=OperatorCommand.HOLD,
+        accepted=True,
+        text="holding",
+        t_s=1.25,
+        phase="hold",
+        action=SafetyAction.HOLD,
     )
 
 

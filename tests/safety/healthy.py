@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable
 
+import msgspec
+
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
@@ -29,7 +31,19 @@ TICK_S = 0.005
 START_S = 10.0
 ZERO3 = (0.0, 0.0, 0.0)
 ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-SLOW = TetherState(1.8, 1.2, 1.2, 0.5, 0.3, 0.0, 0.0, False, False, False)
+SLOW = TetherState(
+    range_m=1.8,
+    slack_m=1.2,
+    stop_slack_m=1.2,
+    elevation_rad=0.5,
+    clearance_m=0.3,
+    turns=0.0,
+    pull_n=0.0,
+    taut=False,
+    snagged=False,
+    separated=False,
+    vehicle_turns=0.0,
+)
 Change = Callable[[Inputs], Inputs]
 
 
@@ -43,22 +57,46 @@ def healthy(tick: int = 0, t_s: float | None = None) -> Inputs:
         tick=tick,
         t_s=t_s,
         vehicle=VehicleState(
-            t_s,
-            t_s,
-            t_s,
-            position,
-            (0.05, d, d),
-            attitude,
-            (0.06, d, d),
-            (d, d, 9.81 + d),
-            t_s,
-            t_s,
-            (0.0, 0.0, 9.81 * t_s),
+            position_stamp_s=t_s,
+            attitude_stamp_s=t_s,
+            imu_stamp_s=t_s,
+            position_world_m=position,
+            velocity_world_m_s=(0.05, d, d),
+            attitude_wxyz=attitude,
+            angular_rate_body_rad_s=(0.06, d, d),
+            specific_force_body_m_s2=(d, d, 9.81 + d),
+            boot_s=t_s,
+            imu_boot_s=t_s,
+            delta_velocity_body_m_s=(0.0, 0.0, 9.81 * t_s),
         ),
-        status=AutopilotStatus(t_s, True, FlightMode.OFFBOARD, LandedState.IN_AIR, 15.8, 0.9),
-        mocap=MocapPose(t_s, 0.005, tick, position, attitude, True, 0.0002, t_s - 0.005),
-        arm=ArmState(t_s, (2.0 + d, 1.0 - d), (d, d), (0.5 + d, 0.2 - d), (0, 0), (35.0, 35.0), 0),
-        force=ForceSample(t_s, (1.0 + d, -1.0, 0.5), (d, d, d), False),
+        status=AutopilotStatus(
+            heartbeat_stamp_s=t_s,
+            armed=True,
+            mode=FlightMode.OFFBOARD,
+            landed=LandedState.IN_AIR,
+            battery_voltage_v=15.8,
+            battery_remaining=0.9,
+        ),
+        mocap=MocapPose(
+            stamp_s=t_s,
+            latency_s=0.005,
+            frame_number=tick,
+            position_world_m=position,
+            attitude_wxyz=attitude,
+            tracking_valid=True,
+            marker_error_m=0.0002,
+            exposure_server_s=t_s - 0.005,
+        ),
+        arm=ArmState(
+            stamp_s=t_s,
+            angle_rad=(2.0 + d, 1.0 - d),
+            velocity_rad_s=(d, d),
+            torque_nm=(0.5 + d, 0.2 - d),
+            hardware_error=(0, 0),
+            temperature_c=(35.0, 35.0),
+            read_failures=0,
+        ),
+        force=ForceSample(stamp_s=t_s, force_sensor_n=(1.0 + d, -1.0, 0.5), torque_sensor_nm=(d, d, d), overload=False),
         command=OperatorCommand.NONE,
         recorder_dropped=0,
     )
@@ -75,28 +113,28 @@ def standing(**changes: object) -> Situation:
 
 def control(**changes: object) -> ControlLog:
     log = ControlLog(
-        ZERO8,
-        ZERO8,
-        ZERO8,
-        ZERO8,
-        ZERO8,
-        ZERO8,
-        (0.0, 0.0, 0.0, 0.0),
-        0.0,
-        0.0,
-        ZERO3,
-        ZERO3,
-        0.5,
-        (False, False, False),
+        error=ZERO8,
+        error_rate=ZERO8,
+        sliding=ZERO8,
+        gamma=ZERO8,
+        tau=ZERO8,
+        e_tau=ZERO8,
+        h_hat=(0.0, 0.0, 0.0, 0.0),
+        zeta=0.0,
+        rho=0.0,
+        force_ext_world_n=ZERO3,
+        attitude_desired_rad=ZERO3,
+        hover_thrust=0.5,
+        saturated=(False, False, False),
     )
-    return dataclasses.replace(log, **changes)  # type: ignore[arg-type]
+    return msgspec.structs.replace(log, **changes)
 
 
 def put(part: str, **fields: object) -> Change:
     """Replace fields of one part of the inputs: put("arm", read_failures=9)."""
 
     def change(i: Inputs) -> Inputs:
-        return dataclasses.replace(i, **{part: dataclasses.replace(getattr(i, part), **fields)})
+        return msgspec.structs.replace(i, **{part: msgspec.structs.replace(getattr(i, part), **fields)})
 
     return change
 
@@ -104,7 +142,7 @@ def put(part: str, **fields: object) -> Change:
 def stopped(*parts: str) -> Change:
     """These parts stay as they were at the start, stamps and all."""
     frozen = healthy()
-    return lambda i: dataclasses.replace(i, **{part: getattr(frozen, part) for part in parts})
+    return lambda i: msgspec.structs.replace(i, **{part: getattr(frozen, part) for part in parts})
 
 
 def watched(

@@ -32,11 +32,33 @@ def governor(*overrides: str) -> Governor:
 
 
 def asked(p: Vec3, v: Vec3 = (0.0, 0.0, 0.0), a: Vec3 = (0.0, 0.0, 0.0)) -> Reference:
-    return Reference(p, v, a, 0.3, 0.0, ARM, (0.0, 0.0), (0.0, 0.0))
+    return Reference(
+        position_world_m=p,
+        velocity_world_m_s=v,
+        acceleration_world_m_s2=a,
+        yaw_rad=0.3,
+        yaw_rate_rad_s=0.0,
+        arm_rad=ARM,
+        arm_rate_rad_s=(0.0, 0.0),
+        arm_acceleration_rad_s2=(0.0, 0.0),
+        jerk_world_m_s3=(0.0, 0.0, 0.0),
+    )
 
 
 def tether(*, taut: bool = False, snagged: bool = False) -> TetherState:
-    return TetherState(2.0, 0.0, 0.0, 0.5, 0.1, 0.0, 0.0, taut, snagged, False)
+    return TetherState(
+        range_m=2.0,
+        slack_m=0.0,
+        stop_slack_m=0.0,
+        elevation_rad=0.5,
+        clearance_m=0.1,
+        turns=0.0,
+        pull_n=0.0,
+        taut=taut,
+        snagged=snagged,
+        separated=False,
+        vehicle_turns=0.0,
+    )
 
 
 def stop_of(g: Governor, reference: Reference) -> Vec3:

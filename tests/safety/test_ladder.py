@@ -23,7 +23,7 @@ EVENTS = [(rule.id, rule.air) for rule in RULES if rule.air is not None]
 
 
 def event(id_: str, asks: SafetyAction, t_s: float = 2.0) -> Event:
-    return Event(t_s, id_, Severity.CRITICAL, asks, "")
+    return Event(t_s=t_s, id=id_, severity=Severity.CRITICAL, action=asks, text="")
 
 
 @pytest.mark.parametrize(("now", "asked"), list(itertools.product(SafetyAction, EVENTS)))

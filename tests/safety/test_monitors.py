@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import msgspec
 import pytest
 
 from companion.config.loader import load_vehicle
@@ -34,7 +34,7 @@ from tests.safety.healthy import (
 )
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
-replace = dataclasses.replace
+replace = msgspec.structs.replace
 NAN = math.nan
 RULE = {rule.id: rule for rule in RULES}
 
@@ -286,12 +286,12 @@ def broken_fields() -> list[tuple[str, str, int | None]]:
     found: list[tuple[str, str, int | None]] = []
     for part in ("vehicle", "status", "mocap", "arm", "force"):
         record = getattr(healthy(), part)
-        for one in dataclasses.fields(record):
-            value = getattr(record, one.name)
-            if isinstance(value, float) and one.name not in ("marker_error_m", "written_s", "asked_s"):
-                found.append((part, one.name, None))
+        for name in record.__struct_fields__:
+            value = getattr(record, name)
+            if isinstance(value, float) and name not in ("marker_error_m", "written_s", "asked_s"):
+                found.append((part, name, None))
             elif isinstance(value, tuple) and isinstance(value[0], float):
-                found += [(part, one.name, index) for index in range(len(value))]
+                found += [(part, name, index) for index in range(len(value))]
     return found
 
 

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from companion.analysis import metrics
@@ -121,7 +122,7 @@ def test_a_catch_that_nobody_noticed_still_parts_before_from_after(seen: Seen) -
     blind = FastResult(
         inputs=flown.inputs,
         outputs=[
-            dataclasses.replace(o, events=tuple(event for event in o.events if event.id != "catch"))
+            msgspec.structs.replace(o, events=tuple(event for event in o.events if event.id != "catch"))
             for o in flown.outputs
         ],
     )

@@ -8,10 +8,10 @@ import subprocess
 import sys
 import termios
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from companion.model.types import AutopilotStatus, FlightMode, LandedState, VehicleState
 from companion.sitl_config.faults import Fault
@@ -91,8 +91,25 @@ def flight() -> FastFlight:
 def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
     level = (1.0, 0.0, 0.0, 0.0)
     nothing = (0.0, 0.0, 0.0)
-    state = VehicleState(t_s, t_s, t_s, (t_s, 0.0, 0.0), nothing, level, nothing, (0.0, 0.0, 9.81), t_s)
-    return state, AutopilotStatus(t_s, True, FlightMode.OFFBOARD, LandedState.IN_AIR, 16.0, 1.0)
+    state = VehicleState(
+        position_stamp_s=t_s,
+        attitude_stamp_s=t_s,
+        imu_stamp_s=t_s,
+        position_world_m=(t_s, 0.0, 0.0),
+        velocity_world_m_s=nothing,
+        attitude_wxyz=level,
+        angular_rate_body_rad_s=nothing,
+        specific_force_body_m_s2=(0.0, 0.0, 9.81),
+        boot_s=t_s,
+    )
+    return state, AutopilotStatus(
+        heartbeat_stamp_s=t_s,
+        armed=True,
+        mode=FlightMode.OFFBOARD,
+        landed=LandedState.IN_AIR,
+        battery_voltage_v=16.0,
+        battery_remaining=1.0,
+    )
 
 
 def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: FastFlight) -> None:

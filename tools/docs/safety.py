@@ -68,7 +68,7 @@ def monitors_table() -> str:
 
 def after(state: SafetyAction, event_id: str, asks: SafetyAction) -> SafetyAction:
     """Where the ladder stands after an event, by the ladder itself."""
-    event = Event(0.0, event_id, Severity.INFO, asks, "")
+    event = Event(t_s=0.0, id=event_id, severity=Severity.INFO, action=asks, text="")
     return update(SupervisorState(state, "before", 0.0), [event], 0.0, _TIMES).action
 
 

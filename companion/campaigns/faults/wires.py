@@ -172,7 +172,7 @@ def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:
     for event in summary["events"]:
         if event["id"] not in known:
             severity, action = Severity(event["severity"]), SafetyAction(event["action"])
-            found.append(Event(event["t_s"], event["id"], severity, action, ""))
+            found.append(Event(t_s=event["t_s"], id=event["id"], severity=severity, action=action, text=""))
     return sorted(found, key=lambda event: event.t_s)
 
 

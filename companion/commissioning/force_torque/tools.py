@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Final
 
+import msgspec
+
 from companion.commissioning.force_torque import fit as ft_fit
 from companion.commissioning.force_torque.watch import FtSensor, arm_angles, pose_rad, until_loaded
 from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
@@ -67,7 +69,7 @@ async def watch(session: Session) -> Watched:
         empty = await sensor.tare_samples(WATCH_S)
         health = sensor.counts()
         product = f"{sensor.product_name}, firmware {sensor.firmware}" if sensor.firmware else sensor.product_name
-        stream = ForceStream(len(empty) - 1, health.bad_sums, product, health.lost)
+        stream = ForceStream(samples=len(empty) - 1, bad_sums=health.bad_sums, product=product, lost=health.lost)
         seen = Watched(empty, await angles_rad(), stream, usb_latency_ms(device.port), weight_kg)
         if weight_kg is None:
             return seen
@@ -123,13 +125,30 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     """Return the preflight's rows of what was watched, and whether the readings change."""
     samples = seen.empty
     still = VehicleState(
-        0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), IDENTITY_QUAT, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY_M_S2)
+        position_stamp_s=0.0,
+        attitude_stamp_s=0.0,
+        imu_stamp_s=0.0,
+        position_world_m=(0.0, 0.0, 0.0),
+        velocity_world_m_s=(0.0, 0.0, 0.0),
+        attitude_wxyz=IDENTITY_QUAT,
+        angular_rate_body_rad_s=(0.0, 0.0, 0.0),
+        specific_force_body_m_s2=(0.0, 0.0, GRAVITY_M_S2),
     )
     observed = Observations(
-        samples[0].stamp_s,
-        samples[-1].stamp_s - samples[0].stamp_s,
+        start_s=samples[0].stamp_s,
+        duration_s=samples[-1].stamp_s - samples[0].stamp_s,
         vehicle=(still,),
-        arm=(ArmState(0.0, seen.arm_rad, (0.0, 0.0), (0.0, 0.0), (0, 0), (0.0, 0.0), 0),),
+        arm=(
+            ArmState(
+                stamp_s=0.0,
+                angle_rad=seen.arm_rad,
+                velocity_rad_s=(0.0, 0.0),
+                torque_nm=(0.0, 0.0),
+                hardware_error=(0, 0),
+                temperature_c=(0.0, 0.0),
+                read_failures=0,
+            ),
+        ),
         force=tuple(samples),
         force_stream=seen.stream,
     )
@@ -139,7 +158,7 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     )
     return [
         *(
-            replace(row, fix=bias_fix) if row.id == preflight.TARE.id and not row.ok else row
+            msgspec.structs.replace(row, fix=bias_fix) if row.id == preflight.TARE.id and not row.ok else row
             for row in preflight.rows(observed, vehicle)
         ),
         ft_fit.stuck_row(samples, vehicle),

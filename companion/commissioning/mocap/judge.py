@@ -194,8 +194,14 @@ def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location,
         return rows, changes
     poses = _poses(frames, device.rigid_body_id, device.up_axis)
     others = tuple(body.id for body in seen if body.id != device.rigid_body_id and body.frames)
-    stream = MocapStream(len(frames), t.lost, info.application, others, watched.names.get(device.rigid_body_id, ""))
-    observed = Observations(0.0, watched.duration_s, mocap=tuple(poses), mocap_stream=stream)
+    stream = MocapStream(
+        frames=len(frames),
+        lost=t.lost,
+        application=info.application,
+        other_bodies=others,
+        body_name=watched.names.get(device.rigid_body_id, ""),
+    )
+    observed = Observations(start_s=0.0, duration_s=watched.duration_s, mocap=tuple(poses), mocap_stream=stream)
     rate = _rate(t, device.rate_hz, changes)
     # The preflight's device row is the server's here, and the rate is reported with its cause.
     rows += [
@@ -216,7 +222,15 @@ def _poses(frames: Sequence[FrameSeen], own_id: int, up_axis: str) -> list[Mocap
             if up_axis == "y":
                 p, q = z_up_from_y_up(p, q)
             poses.append(
-                MocapPose(frame.arrived_s, frame.latency_s, frame.number, p, q, body.tracking_valid, body.error_m)
+                MocapPose(
+                    stamp_s=frame.arrived_s,
+                    latency_s=frame.latency_s,
+                    frame_number=frame.number,
+                    position_world_m=p,
+                    attitude_wxyz=q,
+                    tracking_valid=body.tracking_valid,
+                    marker_error_m=body.error_m,
+                )
             )
     return poses
 

@@ -17,9 +17,11 @@ import hmac
 import re
 import secrets
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple, TypeAlias
+
+from msgspec.structs import replace
 
 from companion.config.ground import VEHICLE_NAME
 from companion.ground.protocol.keys import OPERATOR_NAME, SAFER_COMMANDS, Operators
@@ -149,7 +151,17 @@ def make_command(
     Raises:
         ValueError: a field is out of range; the message names it.
     """
-    unsigned = Command(VERSION, vehicle, session, operator, name, t_ms, hold, secrets.token_hex(16), "")
+    unsigned = Command(
+        v=VERSION,
+        vehicle=vehicle,
+        session=session,
+        operator=operator,
+        command=name,
+        t_ms=t_ms,
+        hold=hold,
+        nonce=secrets.token_hex(16),
+        mac="",
+    )
     return sign(unsigned, key)
 
 

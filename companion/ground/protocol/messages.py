@@ -20,13 +20,11 @@ World ENU, body FLU, SI units, quaternions (w, x, y, z), as in `companion.model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 from typing import TypeVar
 
-from companion.ground.protocol.strict_json import StrictJsonError, check_finite, parse
-from companion.model.codec import RecordError, from_jsonable, json_text, to_jsonable
-from companion.model.frozen import quick
+from companion.ground.protocol.strict_json import StrictJsonError, parse
+from companion.model.codec import Record, RecordError, from_jsonable, to_json
 from companion.model.types import Quat, Vec2, Vec3, Vec4
 
 VERSION = 2
@@ -77,9 +75,7 @@ class HealthLevel(Enum):
     OFF = "off"  # not present, or not known yet
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class State:
+class State(Record, frozen=True, kw_only=True):
     """``state``, retained; also the last will."""
 
     v: int
@@ -101,9 +97,7 @@ class State:
     """For display: why the vehicle is silent, why it accepts no commands, ..."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(Record, frozen=True, kw_only=True):
     """``scene``, retained: geometry and limits for drawing the machine in its room."""
 
     v: int
@@ -132,9 +126,7 @@ class Scene:
     phases: tuple[str, ...]
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class PreflightRow:
+class PreflightRow(Record, frozen=True):
     """One row of the preflight."""
 
     id: str
@@ -143,9 +135,7 @@ class PreflightRow:
     text: str
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Preflight:
+class Preflight(Record, frozen=True):
     """``preflight``, retained."""
 
     v: int
@@ -153,9 +143,7 @@ class Preflight:
     rows: tuple[PreflightRow, ...]
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class EventLine:
+class EventLine(Record, frozen=True, kw_only=True):
     """One event for display."""
 
     t_s: float
@@ -171,9 +159,7 @@ class EventLine:
 EVENTS_KEPT = 100
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Events:
+class Events(Record, frozen=True, kw_only=True):
     """``events``, retained: the newest `EVENTS_KEPT`, oldest first."""
 
     v: int
@@ -183,9 +169,7 @@ class Events:
     lines: tuple[EventLine, ...]
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class DeviceHealth:
+class DeviceHealth(Record, frozen=True):
     """Health of one device."""
 
     name: str
@@ -194,9 +178,7 @@ class DeviceHealth:
     """Measured values, such as ``3 ms old`` or ``15.9 V, 82 %``."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class TetherView:
+class TetherView(Record, frozen=True, kw_only=True):
     """State of the tether for display; see `companion.model.types.TetherState`."""
 
     slack_m: float
@@ -207,9 +189,7 @@ class TetherView:
     snagged: bool
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class ControlView:
+class ControlView(Record, frozen=True, kw_only=True):
     """Internal values of the controller; see `companion.model.types.ControlLog`."""
 
     rho: float
@@ -223,15 +203,13 @@ class ControlView:
     payload_estimate_kg: float | None = None
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Timing:
+class Timing(Record, frozen=True, kw_only=True):
     """Durations of the loop and the links: the worst of the ticks since the previous message."""
 
     lateness_ms: float
-    mocap_age_ms: float | None
-    mocap_to_setpoint_ms: float | None
-    joint_read_to_write_ms: float | None
+    mocap_age_ms: float | None = None
+    mocap_to_setpoint_ms: float | None = None
+    joint_read_to_write_ms: float | None = None
     core_ms: float
     """From inputs read to decision made, `Sent.core_s - Sent.joint_read_s`."""
     missed: int
@@ -244,9 +222,7 @@ class Timing:
     """One read of all servos, by the bus thread."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Stream:
+class Stream(Record, frozen=True, kw_only=True):
     """``stream``, 20 Hz. Position and attitude are motion capture's, or PX4's while that is lost."""
 
     v: int
@@ -261,35 +237,35 @@ class Stream:
     progress: float
     action: str
     """`companion.model.types.SafetyAction`."""
-    hold: int | None
+    hold: int | None = None
     """Number of the current hold, `companion.model.types.Sent.hold`, which `resume` names; None if the vehicle does not hold."""
-    armed: bool | None
-    mode: str | None
-    landed: str | None
-    pose_from: str | None
+    armed: bool | None = None
+    mode: str | None = None
+    landed: str | None = None
+    pose_from: str | None = None
     """``mocap`` or ``px4``."""
-    position_world_m: Vec3 | None
-    attitude_wxyz: Quat | None
-    velocity_world_m_s: Vec3 | None
-    arm_rad: Vec2 | None
-    reference_world_m: Vec3 | None
-    reference_yaw_rad: float | None
-    reference_arm_rad: Vec2 | None
-    e_p_m: float | None
-    e_q_deg: float | None
+    position_world_m: Vec3 | None = None
+    attitude_wxyz: Quat | None = None
+    velocity_world_m_s: Vec3 | None = None
+    arm_rad: Vec2 | None = None
+    reference_world_m: Vec3 | None = None
+    reference_yaw_rad: float | None = None
+    reference_arm_rad: Vec2 | None = None
+    e_p_m: float | None = None
+    e_q_deg: float | None = None
     """Angle between attitude and setpoint."""
-    thrust: float | None
+    thrust: float | None = None
     """Normalised thrust as sent."""
-    battery_v: float | None
-    battery_remaining: float | None
-    tether: TetherView | None
-    control: ControlView | None
+    battery_v: float | None = None
+    battery_remaining: float | None = None
+    tether: TetherView | None = None
+    control: ControlView | None = None
     timing: Timing
     lights: tuple[DeviceHealth, ...]
     bent_by: tuple[str, ...]
     waits_for_start: bool
     """The vehicle is ready on the ground and waits for `start`."""
-    proofs: tuple[str, ...] = ()
+    proofs: tuple[str, ...]
     """One proof per operator whose key the vehicle holds (`companion.ground.protocol.proof`); empty if it accepts no commands."""
 
 
@@ -303,9 +279,7 @@ class CommandName(Enum):
     START = "start"  # take off; for flights that wait for START
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(Record, frozen=True, kw_only=True):
     """``command``: signed with the operator's key over every other field (`companion.ground.protocol.commands`)."""
 
     v: int
@@ -325,9 +299,7 @@ class Command:
     """HMAC-SHA256, hexadecimal."""
 
 
-@quick
-@dataclass(frozen=True, slots=True)
-class Ack:
+class Ack(Record, frozen=True, kw_only=True):
     """``ack``: one for every well-signed command, and for no other."""
 
     v: int
@@ -342,7 +314,7 @@ class Ack:
     t_s: float
     phase: str
     action: str
-    proof: str = ""
+    proof: str
     """Proof for the operator who sent the command (`companion.ground.protocol.proof`)."""
 
 
@@ -360,7 +332,7 @@ RETAINED = frozenset({Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS})
 
 def encode(message: object) -> bytes:
     """Return a record as a payload."""
-    return json_text(to_jsonable(message)).encode()
+    return to_json(message)
 
 
 def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) -> M:
@@ -368,7 +340,7 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
 
     Raises:
         MessageError: the payload is too large, is not strict JSON (`companion.ground.protocol.strict_json`), has another version,
-            does not fit the record, or holds a number that is not finite.
+            or does not fit the record.
     """
     if len(payload) > max_bytes:
         raise MessageError(f"{len(payload)} bytes, at most {max_bytes} expected")
@@ -377,13 +349,11 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
         if not isinstance(data, dict) or data.get("v") != VERSION:
             version = data.get("v") if isinstance(data, dict) else None
             raise MessageError(f"version {version!r:.20}, expected {VERSION}")
-        record = from_jsonable(cls, data)
-        check_finite(record)
+        return from_jsonable(cls, data)
     except (RecordError, StrictJsonError) as error:
         raise MessageError(str(error)) from None
     except RecursionError:  # nested too deeply to be quoted
         raise MessageError("nested too deeply") from None
-    return record
 
 
 def vehicle_of(topic: str) -> tuple[str, Topic] | None:

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import json
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from companion.ground.protocol.messages import Ack, Stream
-from companion.model.codec import json_text, to_jsonable
+from companion.model.codec import to_jsonable
 
 _STREAM_DOMAIN = "companion stream 2"
 _ACK_DOMAIN = "companion ack 2"
@@ -53,7 +56,9 @@ def ack_proven(ack: Ack, vehicle: str, key: bytes) -> bool:
 
 
 def _text(domain: str, vehicle: str, record: Stream | Ack) -> bytes:
-    return f"{domain}\n{vehicle}\n{json_text(to_jsonable(record))}\n".encode()
+    """The text under a proof. It is part of the protocol: the JSON is what `json.dumps` writes, whatever codec carries the message."""
+    message = json.dumps(to_jsonable(record), allow_nan=False, separators=(",", ":"))
+    return f"{domain}\n{vehicle}\n{message}\n".encode()
 
 
 def _proof(text: bytes, key: bytes) -> str:

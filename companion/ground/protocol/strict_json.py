@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from typing import Any
-
-from companion.model.codec import plain
 
 NUMBER_MAX = 1e12
 """Largest magnitude of a number in a message, far above wall clocks in seconds and flight clocks in milliseconds."""
@@ -36,26 +33,6 @@ def parse(payload: bytes) -> Any:
         raise StrictJsonError("not JSON") from None
     except RecursionError:
         raise StrictJsonError("nested too deeply") from None
-
-
-def check_finite(record: object) -> None:
-    """Reject a record with a number that is not finite: the log codec accepts the text "nan" as one.
-
-    Raises:
-        StrictJsonError: a number is not finite.
-    """
-    if not _finite(plain(record)):
-        raise StrictJsonError("a number is not finite")
-
-
-def _finite(values: Sequence[Any]) -> bool:
-    for value in values:
-        if isinstance(value, float):
-            if not math.isfinite(value):
-                return False
-        elif isinstance(value, (list, tuple)) and not _finite(value):
-            return False
-    return True
 
 
 def _int(text: str) -> int:

@@ -14,7 +14,7 @@ from typing import Any
 
 from companion.ground.protocol.messages import Topic
 from companion.ground.station.vehicles import VEHICLES_MAX, ReceivedRecord, VehicleTracker
-from companion.model.codec import json_text, to_jsonable
+from companion.model.codec import to_json
 
 OUTBOX_MAX = 1000
 """Limit of waiting messages per viewer, not counting the stream."""
@@ -157,5 +157,5 @@ def envelope(received: ReceivedRecord) -> str:
     data: dict[str, Any] = {"kind": received.topic.value, "vehicle": received.vehicle}
     if received.age_s is not None:
         data["age_s"] = round(received.age_s, 3)
-    data["data"] = to_jsonable(received.record)
-    return json_text(data)
+    data["data"] = received.record
+    return to_json(data).decode()

@@ -15,7 +15,7 @@ from companion.config.loader import FlightConfig, logged_flight
 from companion.ground.protocol.messages import VERSION, Preflight, PreflightRow, Presence, State
 from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.ground.telemetry.stream import replay
-from companion.model.codec import json_text, to_jsonable
+from companion.model.codec import to_json
 from companion.model.types import Vec3
 
 STREAMS_MAX = 12_000
@@ -60,14 +60,13 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
     session = f"log-{number}"
     streams, events = replay(log.rows(), config, session, _epoch_offset_s(log), max_records=STREAMS_MAX)
     parts = {
-        "state": to_jsonable(_state(log, config, session)),
-        "scene": to_jsonable(scene_of(config, session, _reference_path(log), mission_s=log.outputs[-1].mission_t_s)),
-        "preflight": to_jsonable(Preflight(VERSION, session, _preflight(log))),
-        "events": to_jsonable(events),
+        "state": _state(log, config, session),
+        "scene": scene_of(config, session, _reference_path(log), mission_s=log.outputs[-1].mission_t_s),
+        "preflight": Preflight(VERSION, session, _preflight(log)),
+        "events": events,
+        "streams": list(streams),
     }
-    texts = [f'"{name}":{json_text(part)}' for name, part in parts.items()]
-    texts.append(f'"streams":[{",".join(json_text(to_jsonable(stream)) for stream in streams)}]')
-    body = gzip.compress(f"{{{','.join(texts)}}}".encode(), _GZIP_LEVEL, mtime=0)
+    body = gzip.compress(to_json(parts), _GZIP_LEVEL, mtime=0)
     return ReplayLog(str(path), body)
 
 

@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections import deque
 from collections.abc import Iterable
 from typing import TypeVar
+
+import msgspec
 
 from companion.config.loader import FlightConfig
 from companion.ground.protocol.messages import (
@@ -104,12 +105,12 @@ class StreamBuilder:
         for event in outputs.events:
             self._append(
                 EventLine(
-                    event.t_s,
-                    outputs.mission_t_s,
-                    event.id,
-                    event.severity.value,
-                    event.action.value,
-                    truncated(event.text),
+                    t_s=event.t_s,
+                    mission_t_s=outputs.mission_t_s,
+                    id=event.id,
+                    severity=event.severity.value,
+                    action=event.action.value,
+                    text=truncated(event.text),
                 )
             )
 
@@ -128,11 +129,20 @@ class StreamBuilder:
             kept = [line for line in self.events if line.id != source]
             self.events.clear()
             self.events.extend(kept)
-        self._append(EventLine(t_s, mission_t_s, source, severity, SafetyAction.NOMINAL.value, truncated(text)))
+        self._append(
+            EventLine(
+                t_s=t_s,
+                mission_t_s=mission_t_s,
+                id=source,
+                severity=severity,
+                action=SafetyAction.NOMINAL.value,
+                text=truncated(text),
+            )
+        )
 
     def events_message(self) -> Events:
         """Return the events that are kept."""
-        return Events(VERSION, self._session, self.count, tuple(map(_finite_line, self.events)))
+        return Events(v=VERSION, session=self._session, count=self.count, lines=tuple(map(_finite_line, self.events)))
 
     def build(self, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Stream:
         """Return the current stream message, with the worst timings since the previous one.
@@ -190,6 +200,7 @@ class StreamBuilder:
             timing=timing,
             lights=self._health.evaluate(snapshot),
             bent_by=o.bent_by,
+            proofs=(),
             waits_for_start=o.phase == WAITS_FOR_START,
         )
 
@@ -267,7 +278,7 @@ def _every_second(records: list[Stream]) -> list[Stream]:
         if index % 2 and index != len(records) - 1:
             between.append(record.timing)
             continue
-        kept.append(dataclasses.replace(record, timing=merge_timings([*between, record.timing])))
+        kept.append(msgspec.structs.replace(record, timing=merge_timings([*between, record.timing])))
         between = []
     return kept
 
@@ -302,7 +313,17 @@ def _tether(state: TetherState | None) -> TetherView | None:
     if state is None:
         return None
     numbers = _rounded((state.slack_m, state.stop_slack_m, state.pull_n, state.turns), 4)
-    return None if numbers is None else TetherView(*numbers, state.taut, state.snagged)
+    if numbers is None:
+        return None
+    slack_m, stop_slack_m, pull_n, turns = numbers
+    return TetherView(
+        slack_m=slack_m,
+        stop_slack_m=stop_slack_m,
+        pull_n=pull_n,
+        turns=turns,
+        taut=state.taut,
+        snagged=state.snagged,
+    )
 
 
 def _control(control: ControlLog | None) -> ControlView | None:
@@ -334,7 +355,9 @@ def truncated(text: str) -> str:
 def _finite_line(line: EventLine) -> EventLine:
     if _fits(line.t_s) and _fits(line.mission_t_s):
         return line
-    return dataclasses.replace(line, t_s=_number(line.t_s, 4) or 0.0, mission_t_s=_number(line.mission_t_s, 4) or 0.0)
+    return msgspec.structs.replace(
+        line, t_s=_number(line.t_s, 4) or 0.0, mission_t_s=_number(line.mission_t_s, 4) or 0.0
+    )
 
 
 def _fits(value: float) -> bool:

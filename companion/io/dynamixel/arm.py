@@ -10,9 +10,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Self, TypeVar
+
+from msgspec.structs import replace
 
 from companion.config.vehicle import Arm, ArmDevice
 from companion.io.dynamixel.bus import ArmBus, Pair

@@ -63,7 +63,12 @@ class RobotousForceTorque:
 
     def counts(self) -> ForceCounts:
         """Return the counters, for logs and preflight."""
-        return ForceCounts(self._samples, self._scanner.skipped_bytes, self._scanner.bad_sums, self._lost)
+        return ForceCounts(
+            samples=self._samples,
+            skipped_bytes=self._scanner.skipped_bytes,
+            bad_sums=self._scanner.bad_sums,
+            lost=self._lost,
+        )
 
     async def tare_samples(self, duration_s: float) -> list[ForceSample]:
         """Return the samples of the next `duration_s` (counted at the configured rate), for the caller to average.

@@ -108,9 +108,9 @@ def decode_wrench(data: bytes) -> Wrench:
     """Return N and N m from the 16 data bytes of a READ_ONCE or START response."""
     fx, fy, fz, tx, ty, tz, bits = _WRENCH.unpack_from(data, 1)
     return Wrench(
-        (fx / FORCE_PER_N, fy / FORCE_PER_N, fz / FORCE_PER_N),
-        (tx / TORQUE_PER_NM, ty / TORQUE_PER_NM, tz / TORQUE_PER_NM),
-        bits,
+        force_n=(fx / FORCE_PER_N, fy / FORCE_PER_N, fz / FORCE_PER_N),
+        torque_nm=(tx / TORQUE_PER_NM, ty / TORQUE_PER_NM, tz / TORQUE_PER_NM),
+        overload_bits=bits,
     )
 
 

@@ -107,13 +107,13 @@ class NatNetMocap:
     def counts(self) -> MocapCounts:
         """Return the counts since the driver was opened."""
         return MocapCounts(
-            self._frames,
-            self._superseded,
-            self._out_of_order,
-            self._malformed,
-            self._foreign,
-            self._last_malformed,
-            self._callback_error,
+            frames=self._frames,
+            superseded=self._superseded,
+            out_of_order=self._out_of_order,
+            malformed=self._malformed,
+            foreign=self._foreign,
+            last_malformed=self._last_malformed,
+            callback_error=self._callback_error,
         )
 
     async def __aenter__(self) -> Self:

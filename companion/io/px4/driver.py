@@ -147,7 +147,14 @@ class MavsdkAutopilot:
     def identity(self) -> LinkIdentity:
         """Return the ids of both ends of the open link."""
         peer = self._claim.peer if self._claim is not None else None
-        return LinkIdentity(self._system_id, *self._own_ids, self._local_port, peer)
+        own_system, own_component = self._own_ids
+        return LinkIdentity(
+            autopilot_system=self._system_id,
+            own_system=own_system,
+            own_component=own_component,
+            local_port=self._local_port,
+            peer=peer,
+        )
 
     async def forward_to(self, port: int) -> int:
         """Forward between PX4 and a UDP port of 127.0.0.1; returns the port of 127.0.0.1 from which MAVSDK sends to it.

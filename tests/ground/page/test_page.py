@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from companion.ground.protocol.messages import Presence, Stream
 from tests.ground.monitor_stub import BROKER, NAME, Message, Stand, ack, event, flown, hello, retained, state, told

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
 import pytest
 
 from companion.config.loader import load_flight
@@ -81,9 +81,9 @@ def test_every_control_of_a_tablet_is_large_enough(touched: tuple[Page, Stand]) 
 @pytest.mark.parametrize("size", SIZES)
 def test_every_plots_values_stand_beside_its_title(shared: Page, stand: Stand, size: str) -> None:
     """Its head has room for one line; a second one is cut off."""
-    late = dataclasses.replace(flown().at(8.5).timing, lateness_ms=12.3, mocap_age_ms=16.5, whole_ms=10.4)
+    late = msgspec.structs.replace(flown().at(8.5).timing, lateness_ms=12.3, mocap_age_ms=16.5, whole_ms=10.4)
     shared.open_anew(stand, size=size)
-    shared.tell(told(dataclasses.replace(flown().at(8.5), timing=late)))
+    shared.tell(told(msgspec.structs.replace(flown().at(8.5), timing=late)))
     cut = shared.tab.evaluate(
         "[...document.querySelectorAll('.plot header')].filter((h) => h.scrollHeight > h.clientHeight).map((h) => h.innerText)"
     )
