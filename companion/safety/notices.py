@@ -17,9 +17,9 @@ class Notice:
     id: str
     severity: Severity
     action: SafetyAction
-    """What the supervisor is asked for; the state machine has done all else."""
+    """Action requested from the supervisor; the state machine does everything else."""
     when: str
-    """When it is reported, and what follows."""
+    """When the event is reported, and what follows."""
 
 
 _INFO, _WARNING, _CRITICAL = Severity.INFO, Severity.WARNING, Severity.CRITICAL
@@ -40,47 +40,44 @@ ESTIMATE_UNSTEADY = Notice(
     "PX4's estimate has not been near motion capture and steady for 1 s (0.05 m, 5 deg in the mean; 0.02 m, 2 deg of wandering): "
     "refused",
 )  # fmt: skip
-START_REFUSED = Notice(
-    "start_refused", _CRITICAL, _NOMINAL, "the machine does not stand where and as the mission says: refused"
-)
+START_REFUSED = Notice("start_refused", _CRITICAL, _NOMINAL, "the vehicle's pose is not the mission's start: refused")
 OFFBOARD_REFUSED = Notice("offboard_refused", _CRITICAL, _NOMINAL, "PX4 did not enter OFFBOARD within 8 s: refused")
 ARMING_REFUSED = Notice("arming_refused", _CRITICAL, _NOMINAL, "PX4 did not arm within 10 s: refused")
 NOT_READY = Notice(
     "not_ready", _WARNING, _NOMINAL,
-    "a flight that waits for its start has lost what it had: inputs, an estimate that is steady and agrees, its place. "
-    "It waits for it to come back, as long as that takes",
+    "a flight that waits for its start has lost its inputs, its estimate or its place; it waits until they are back",
 )  # fmt: skip
 START_DECLINED = Notice(
-    "start_declined", _WARNING, _NOMINAL, "`start` was commanded, and it is not ready; the text says why"
+    "start_declined", _WARNING, _NOMINAL, "`start` was commanded before the flight was ready; the text gives the reason"
 )
 CALLED_OFF = Notice(
     "called_off", _INFO, _LAND,
-    "HOLD was commanded before the rotors lift: stand down, aborted. One that waits for its start just goes on waiting",
+    "HOLD was commanded before take-off: aborted. A flight that waits for its start continues to wait",
 )  # fmt: skip
 RESUME_REFUSED = Notice(
     "resume_refused", _WARNING, _NOMINAL,
-    "going on was asked for while something stands that it must hold for; the text says what",
+    "RESUME was commanded while the cause of the hold persists; the text names it",
 )  # fmt: skip
 TAKEOFF = Notice("takeoff", _INFO, _NOMINAL, "the plan begins")
 CATCH = Notice("catch", _INFO, _NOMINAL, "a payload was caught")
 PAYLOAD_LEFT = Notice(
     "payload_left", _INFO, _NOMINAL,
-    "nothing has pulled on the net for 0.5 s, though the machine does not fall: it is empty, and ready for the next catch",
+    "no pull on the net for 0.5 s without free fall: the net is empty and ready for the next catch",
 )  # fmt: skip
 TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle stands")
-NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "5 s after the plan's end nothing was felt: PX4 lands")
+NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "no touch-down 5 s after the plan's end: PX4 lands")
 DISARM_REFUSED = Notice(
     "disarm_refused", _CRITICAL, _NOMINAL,
-    "PX4 did not disarm within 8 s, or left OFFBOARD before: PX4 lands; if nothing had lifted: people are told to disarm it, "
-    "and the guardian takes over",
+    "PX4 did not disarm within 8 s, or left OFFBOARD before: PX4 lands; if the vehicle had not lifted: the crew is asked to "
+    "disarm it, and the guardian takes over",
 )  # fmt: skip
-AUTOPILOT_LANDING = Notice("autopilot_landing", _CRITICAL, _PX4_LANDS, "what the landing by PX4 has to tell")
-GATE = Notice("gate", _WARNING, _WARN, "the gate held a command back, or cut it")
+AUTOPILOT_LANDING = Notice("autopilot_landing", _CRITICAL, _PX4_LANDS, "reports of the landing by PX4")
+GATE = Notice("gate", _WARNING, _WARN, "the gate rejected or limited a command")
 HOLD_EXPIRED = Notice("hold_expired", _CRITICAL, _LAND, "a HOLD lasted longer than `hold_max_s`: it lands")
 RETRACT_EXPIRED = Notice(
     "retract_expired", _CRITICAL, _LAND, "a RETRACT lasted longer than `retract_max_s`: it lands where it is"
 )
-RETRACT_DONE = Notice("retract_done", _INFO, _LAND, "a RETRACT has arrived: it lands")
+RETRACT_DONE = Notice("retract_done", _INFO, _LAND, "a RETRACT is complete: it lands")
 NO_ROOM_TO_STAY = Notice(
     "no_room_to_stay", _CRITICAL, _LAND, "a HOLD lower than 0.3 m above standing, or a RETRACT in a landing: it lands"
 )
