@@ -1,6 +1,6 @@
 """`python -m sitl`: the simulated world as a process.
 
-Started by `companion fly --sitl` (with --for-launcher: talks JSON lines on stdout, ends when stdin does) or by `companion sitl`.
+`companion sitl` and `companion fly --sitl` start it; with --for-launcher it writes JSON lines to stdout and ends when stdin ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.runtime.event_loop import run
 from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime
 from companion.sitl_config.loader import SitlConfig
 from sitl.autopilot.mavlink import LinkError
-from sitl.faults.timing import FaultError, in_time
+from sitl.faults.timing import FaultError, with_fault_times
 from sitl.px4.backend import RealPx4
 from sitl.px4.hil_link import Px4Error
 from sitl.server import Ports, Sitl, start_of
@@ -31,7 +31,7 @@ TRUTH_FILE = "world.json"
 
 
 def _say(message: dict[str, Any]) -> None:
-    with contextlib.suppress(OSError):  # the launcher is gone; standard input will say so
+    with contextlib.suppress(OSError):  # the launcher is gone; standard input ends too
         os.write(
             1, json.dumps(message).encode() + b"\n"
         )  # unbuffered: nothing is left to be flushed into a closed pipe
@@ -74,7 +74,7 @@ def _say_last(sitl: Sitl, truth_file: Path | None) -> None:
 
 
 def _leave_with_launcher(sitl: Sitl) -> None:
-    """Standard input names the flight process, and ends when the launcher does; a vehicle that still flies then may land first."""
+    """Read the flight process's pid from standard input; when the launcher ends, end as soon as the vehicle has landed."""
     loop = asyncio.get_running_loop()
     descriptor = sys.stdin.fileno()
 
@@ -106,7 +106,7 @@ def _introduce(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) -> None:
     print(
         "companion sitl is running; Ctrl-C ends it\n"
         f"  {name:<13} MAVLink 2 on UDP 127.0.0.1:{port} (MAVSDK: udpin://0.0.0.0:{port}), from port {port + 40};\n"
-        "                ground stations on 14550; it arms once somebody forwards mocap as VISION_POSITION_ESTIMATE\n"
+        "                ground stations on 14550; it arms once motion capture arrives as VISION_POSITION_ESTIMATE\n"
         f"  mocap         NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port "
         f"{mocap.get('data_port')}\n"
         f"  arm bus       {devices['arm']['port']}\n"
@@ -116,16 +116,18 @@ def _introduce(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the world."""
+    """Run the world until it is asked to end; return 0, or 3 if it cannot start or PX4 fails."""
     parser = argparse.ArgumentParser(prog="python -m sitl")
-    parser.add_argument("--config", type=Path, required=True, help="effective configuration, JSON")
+    parser.add_argument("--config", type=Path, required=True, help="effective configuration, a JSON file")
     parser.add_argument("--for-launcher", action="store_true")
-    parser.add_argument("--px4", type=Path, metavar="DIR", help="fly a real PX4, which lives in this folder")
+    parser.add_argument(
+        "--px4", type=Path, metavar="DIR", help="fly a real PX4; this folder keeps its parameters and logs"
+    )
     arguments = parser.parse_args(argv)
     config = SitlConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     try:
         truth_file = arguments.config.with_name(TRUTH_FILE)
-        run(_serve(in_time(config), arguments.for_launcher, truth_file, arguments.px4))
+        run(_serve(with_fault_times(config), arguments.for_launcher, truth_file, arguments.px4))
     except (OSError, LinkError, FaultError, Px4Error) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:

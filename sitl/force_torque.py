@@ -1,8 +1,8 @@
-"""A Robotous RFT60-HA01 on a pty: the sensor's end of the serial line.
+"""An emulated Robotous RFT60-HA01 force-torque sensor on a pty.
 
-Answers as the sensor does (see `companion.io.force_torque.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17; while it streams
-only STOP and SET_BIAS are executed, and those two have no answer. Readings are quantised to 1/50 N and 1/2000 N m. The caller adds
-noise and latency.
+It answers as the sensor does (see `companion.io.force_torque.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17. While it streams it
+executes only STOP and SET_BIAS, which have no answer. Readings are quantised to 1/50 N and 1/2000 N m. The caller adds noise and
+latency.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ TORQUE_CAPACITY_NM: Final = 4.0
 _ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
 _FORCE_BITS = (Overload.FX, Overload.FY, Overload.FZ)
 _TORQUE_BITS = (Overload.TX, Overload.TY, Overload.TZ)
-_MAX_CATCH_UP = 8  # frames; a world that jumped further is not paid back in a burst
+_MAX_CATCH_UP = 8  # packets; after a longer jump of the world's time the rest is skipped
 
 
 class ForceTorqueServer:
     """The emulated sensor; an async context manager on the running event loop.
 
     Args:
-        product_name: what it answers to PRODUCT_NAME.
-        serial_number: to SERIAL_NUMBER.
-        firmware: to FIRMWARE_VERSION.
+        product_name: answer to PRODUCT_NAME.
+        serial_number: answer to SERIAL_NUMBER.
+        firmware: answer to FIRMWARE_VERSION.
 
     Attributes:
-        silent: the sensor neither answers nor streams (cable cut).
-        stuck: it streams its last reading for ever.
-        dropped: packets that the pty would not take whole, because nobody reads it.
+        silent: fault: the sensor neither answers nor streams, as with a cut cable.
+        stuck: fault: it repeats its last reading for ever.
+        dropped: number of packets that were dropped because nobody reads the pty.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class ForceTorqueServer:
 
     @property
     def rate_hz(self) -> int:
-        """Output rate in force."""
+        """Present output rate."""
         return rft.RATE_CODES[self._rate_code]
 
     @property
@@ -84,7 +84,7 @@ class ForceTorqueServer:
         self._pty.close()
 
     def set_wrench(self, force_n: Vec3, torque_nm: Vec3) -> None:
-        """What the sensor feels from now on, in its own frame, N and N m; any rate."""
+        """Set the wrench on the sensor, in the sensor frame, N and N m."""
         self._force_n = force_n
         self._torque_nm = torque_nm
 
@@ -100,7 +100,7 @@ class ForceTorqueServer:
             self._send_reading(Command.START)
 
     def inject(self, noise: bytes) -> None:
-        """Put bytes on the line as they are (line noise, half a packet)."""
+        """Put bytes on the line as they are, such as noise or half a packet."""
         self._write(noise)
 
     def _measure(self) -> Wrench:

@@ -1,7 +1,7 @@
-"""A NatNet server: the Motive end of the wire, multicast and unicast, bitstream 3.0 and 4.1.
+"""An emulated NatNet server (Motive): multicast and unicast, bitstream 3.0 and 4.1.
 
-Layouts as in the NatNet SDK (`NatNetTypes.h`, packet client). Written apart from the companion's parser on purpose: only message
-ids are shared. Latency and noise are made by the caller.
+Layouts as in the NatNet SDK (`NatNetTypes.h`, packet client). It shares only the message ids with the companion's parser, so that an
+error in one of the two shows. The caller adds latency and noise.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
 )
 _STRAY_MARKER_M: Final[Vec3] = (2.5, -2.0, 0.03)  # a reflection on the floor, as every lab has one
 LOOPBACK, LOOPBACK_BROADCAST = "127.0.0.1", "127.255.255.255"
-"""A server on a network hears broadcasts; one that is bound to the loopback address has to listen for them beside it."""
+"""A socket on the loopback address receives no broadcasts, so a second socket listens for them."""
 OTHER_BODY: Final = "wand"
 OTHER_PLACE_M: Final[Vec3] = (1.9, -1.5, 0.04)
-"""A rigid body that somebody left on the floor."""
+"""Position of another rigid body, left on the floor."""
 _MARKER_SIZE_M: Final = 0.014
 _MARKER_OCCLUDED = 0x01
 _MARKER_POINT_CLOUD_SOLVED = 0x02
@@ -47,7 +47,7 @@ _END_OF_DATA = bytes(4)
 
 @dataclass(frozen=True, slots=True)
 class BodyPose:
-    """One rigid body of one frame, in the axes that the server is to stream."""
+    """One rigid body of one frame, in the axes of the stream."""
 
     id: int
     position_m: Vec3
@@ -59,15 +59,15 @@ class BodyPose:
 class NatNetServer:
     """Streams frames of data and answers clients; an async context manager on the running event loop.
 
-    Unicast clients are those that asked to be connected; with a multicast group, those that sent a keep-alive. A unicast client of a
-    4.1 server may choose its bitstream ("Bitstream,3.0").
+    A client becomes a unicast client when it connects or, with a multicast group, when it sends a keep-alive. A unicast client of a 4.1
+    server may choose its bitstream ("Bitstream,3.0").
 
     Args:
         version: NatNet bitstream version.
         interface: local address of both sockets, and the multicast interface.
-        command_port: 0 takes a free one, see the property.
-        data_port: source of all frames, destination of multicast ones; 0 takes a free one.
-        multicast_group: None streams to unicast clients only.
+        command_port: command port; 0 takes any free one.
+        data_port: source port of every frame and destination of multicast frames; 0 takes any free one.
+        multicast_group: multicast address, or None to stream to unicast clients only.
         bodies: id and name of each rigid body.
         rate_hz: answer to the FrameRate request.
     """
@@ -88,9 +88,9 @@ class NatNetServer:
         self.bodies = tuple(bodies)
         self.rate_hz = rate_hz
         self.dropped = 0
-        """Datagrams that the network would not take."""
+        """Number of datagrams that could not be sent."""
         self.requests = 0
-        """Datagrams received from clients."""
+        """Number of datagrams received from clients."""
         self._ports = (command_port, data_port)
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
@@ -111,12 +111,12 @@ class NatNetServer:
 
     @property
     def frame_number(self) -> int:
-        """Number of the frame that was published last; 0 before the first."""
+        """Number of the newest frame; 0 before the first."""
         return self._number
 
     @property
     def unicast_clients(self) -> tuple[tuple[str, int], ...]:
-        """Addresses that frames are sent to."""
+        """Addresses of the unicast clients."""
         return tuple(self._clients)
 
     async def __aenter__(self) -> Self:
@@ -151,12 +151,12 @@ class NatNetServer:
         return [opened for opened in (self._command, self._broadcast) if opened is not None]
 
     def publish(self, t_s: float, poses: Sequence[BodyPose], exposure_t_s: float | None) -> None:
-        """Send one frame to everybody; never blocks.
+        """Send one frame to every client; never blocks.
 
         Args:
             t_s: time of transmission on the world's clock.
-            poses: bodies of this frame; one that is left out is not streamed.
-            exposure_t_s: middle of the cameras' exposure on the same clock; None: not known (as with some cameras).
+            poses: rigid bodies of this frame.
+            exposure_t_s: middle of the cameras' exposure on the same clock, or None if the cameras do not report it.
         """
         self._number += 1
         self._last = (t_s, tuple(poses), exposure_t_s)
@@ -239,7 +239,7 @@ class NatNetServer:
             self._reply(Message.UNRECOGNIZED_REQUEST, b"", address)
 
     def _answer_request(self, request: str, address: tuple[str, int]) -> None:
-        """NAT_REQUEST: a value for a question, an int32 return code (0 success) for an order."""
+        """Answer NAT_REQUEST: a query with its value, a command with an int32 return code (0 means success)."""
         name, _, argument = request.partition(",")
         known = self._clients.get(address)
         if name == "FrameRate":
@@ -279,7 +279,7 @@ def encode_frame(
     exposure_t_s: float | None,
     names: dict[int, str],
 ) -> bytes:
-    """One NAT_FRAMEOFDATA datagram with every section of the version; arguments as of `NatNetServer.publish`."""
+    """Return one NAT_FRAMEOFDATA datagram with every section of the version; arguments as for `NatNetServer.publish`."""
     markers = {
         pose.id: [_add(pose.position_m, quat_rotate(pose.quat_wxyz, offset)) for offset in _MARKERS_BODY_M]
         for pose in poses
@@ -331,7 +331,7 @@ def encode_frame(
 
 
 def encode_model_definitions(version: NatNetVersion, bodies: Sequence[tuple[int, str]]) -> bytes:
-    """Payload of NAT_MODELDEF: the marker sets, the rigid bodies and one camera."""
+    """Return the payload of NAT_MODELDEF: marker sets, rigid bodies and one camera."""
     descriptions: list[tuple[Descriptor, bytes]] = []
     count = len(_MARKERS_BODY_M)
     labels = [f"Marker{k}".encode() + b"\0" for k in range(1, count + 1)]

@@ -1,7 +1,7 @@
-"""The SITL process: the plant in real time, every device behind its real wire.
+"""The simulated world in real time: the plant, with every device behind its real wire.
 
-The world's clock follows the wall clock. When this process is held up for longer than `_CATCH_UP_S` the world pauses instead of
-racing: the time lost is counted (`slipped_s`) and reported.
+The world's clock follows the wall clock. If the process falls behind by more than `_CATCH_UP_S`, the world pauses instead of catching
+up; `slipped_s` counts the lost time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import AutopilotBackend, StubBackend
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.faults.injector import Faults, Sample, sample
-from sitl.faults.processes import SIGNALS, ProcessFaults, environment, strike
+from sitl.faults.processes import SIGNALS, ProcessFaults, environment, inject_process_fault
 from sitl.force_torque import ForceTorqueServer
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
 from sitl.px4.hil_link import Px4Error
@@ -35,9 +35,9 @@ from sitl.world.world import PHYSICS_DT_S
 
 _CATCH_UP_S = 0.03
 COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
-STRIKE_AGAIN_S = 0.2
-"""To look for a process takes a moment; one that is not there yet is looked for again."""
-OF_OTHERS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
+INJECT_RETRY_S = 0.2
+"""Time between two searches for the process that a fault is meant for."""
+OTHER_PROCESS_FAULTS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
 _LEAVE_S = 30.0
 
 OnMessage = Callable[[dict[str, Any]], None]
@@ -45,11 +45,11 @@ OnMessage = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """UDP ports of the standalone simulator; 0 takes a free one."""
+    """UDP ports of the standalone simulator; 0 takes any free port."""
 
     autopilot_local: int = 0
     autopilot_remote: int = 0
-    """Where PX4 sends first; 0: it waits for a partner to speak."""
+    """Port that PX4 sends to from the start; with 0 it waits until a partner sends something."""
     mocap_command: int = 0
     mocap_data: int = 0
     multicast: bool = False
@@ -57,7 +57,7 @@ class Ports:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where the machine stands."""
+    """Pose of the vehicle at the start, on the floor."""
 
     position_m: Vec2
     yaw_rad: float
@@ -68,12 +68,12 @@ class Sitl:
     """The plant and its wires.
 
     Args:
-        vehicle: the machine.
-        config: of the world.
-        start: where the machine stands.
-        ports: of the wires.
-        on_message: takes what happens.
-        autopilot: a real PX4; None: the stub.
+        vehicle: vehicle file.
+        config: configuration of the world.
+        start: pose of the vehicle at the start.
+        ports: UDP ports.
+        on_message: called with every event, as a message for the launcher.
+        autopilot: a real PX4, or None for the stub.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Sitl:
         self.faults = Faults(
             config,
             self.plant.world,
-            self.autopilot.faulty,
+            self.autopilot.fault_target,
             [servo.drive for servo in self.servos],
             vehicle.tether.anchor_world_m,
             self.servos,
@@ -107,23 +107,23 @@ class Sitl:
             self.plant.faults = self.faults
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
-        self._arm_hand = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand else None
+        self._arm_handling = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand else None
         self.flight = ProcessFaults()
         self.course: list[Sample] = []
-        """Where the machine truly was, from the first fault on."""
+        """True position, tilt and tether of the vehicle, sampled from the first fault on."""
         self._course_due_s = 0.0
         self.frames: list[tuple[int, float]] = []
-        """Numbers of motion-capture frames that had just been sent, and when: by them a log's clock is told from the world's."""
+        """(number, world time) of some motion-capture frames as they were sent; they relate a log's clock to the world's."""
         self.modes: list[tuple[float, str | None, bool]] = []
-        """Every change of what the autopilot does: world time, mode, armed."""
-        self._struck: set[FaultKind] = set()
-        self._strike_due_s = 0.0
+        """(world time, mode, armed) at every change of the autopilot's state."""
+        self._injected: set[FaultKind] = set()
+        self._inject_due_s = 0.0
         self._ports = ports
         self.slipped_s = 0.0
         self._origin_s = 0.0
-        """Of the world's clock, on the event loop's."""
+        """World time 0 on the event loop's clock."""
         self._next_frame: asyncio.TimerHandle | None = None
-        """Leaves before the next step."""
+        """Sends a frame that leaves between two steps."""
         self._at_rest = False
         self._leaving = False
         self._end_s = math.inf
@@ -131,7 +131,7 @@ class Sitl:
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[dict[str, dict[str, Any]]]:
-        """Open every wire; yields the addresses as settings of the vehicle file's devices."""
+        """Open every wire and yield the addresses, as `devices` settings of a vehicle file."""
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
             self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
@@ -165,24 +165,24 @@ class Sitl:
             }
 
     def flight_environment(self) -> dict[str, str]:
-        """What the flight process's environment needs for the faults of its own."""
+        """Return the environment variables that the flight process needs for faults that hang it."""
         stalls = [fault.duration_s for fault in self._config.faults if fault.kind == "stall_loop"]
         return environment({fault.kind for fault in self._config.faults}, stalls[0] if stalls else None)
 
     def stop(self) -> None:
-        """End now."""
+        """End at the next step."""
         self._end_s = -math.inf
 
     def leave(self) -> None:
-        """End as soon as the rotors stand, `_LEAVE_S` from now at the latest."""
+        """End as soon as the vehicle is disarmed, `_LEAVE_S` from now at the latest."""
         self._leaving = True
         self._end_s = min(self._end_s, self.plant.t_s + _LEAVE_S)
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Follow the wall clock until asked to stop; `on_ready` is called when the autopilot can be flown.
+        """Follow the wall clock until asked to stop; call `on_ready` once the autopilot is ready to fly.
 
         Raises:
-            Px4Error: a real PX4 is not to be had, has ended or hangs.
+            Px4Error: a real PX4 cannot be started, has ended or hangs.
         """
         try:
             async with asyncio.TaskGroup() as group:
@@ -220,10 +220,10 @@ class Sitl:
     def _step(self) -> None:
         plant = self.plant
         if plant.faults is not None:
-            self._plant_faults()
+            self._apply_faults()
         autopilot = self.autopilot
-        if self._arm_hand is not None and not autopilot.armed:
-            self._hold_arm(self._arm_hand)
+        if self._arm_handling is not None and not autopilot.armed:
+            self._hold_arm(self._arm_handling)
         plant.step(autopilot.armed)
         if autopilot.lockstep and plant.imu_due:
             autopilot.sense(plant.sample_imu())
@@ -270,14 +270,14 @@ class Sitl:
         clock, ahead_s = self.faults.server_clock_s, 0.0 if self.autopilot.lockstep else self.slipped_s
         self.mocap.publish(clock(t_s) + ahead_s, (*others, pose), clock(frame.exposure_t_s) + ahead_s)
 
-    def _plant_faults(self) -> None:
+    def _apply_faults(self) -> None:
         plant = self.plant
         for kind in SIGNALS:
             if plant.fault(kind) is not None:
                 seen = self.autopilot.observe()
-                self.flight.plant(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
-        self._strike()
-        self._note_course()
+                self.flight.inject(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
+        self._inject_process_faults()
+        self._record_course()
         down = plant.fault("link_loss") is not None or self.autopilot.down
         self.autopilot.set_link(down, self.faults.size("link_delay"))
         self.bus.damaged = self.faults.packet_lost
@@ -290,18 +290,18 @@ class Sitl:
             self._lost_servo.fail_silent(False)
             self._lost_servo = None
 
-    def _strike(self) -> None:
-        """Faults of other processes, once each."""
+    def _inject_process_faults(self) -> None:
+        """Inject faults of the recorder and the guardian, once each, and end a SIGSTOP that is over."""
         active, plant = self.faults.active, self.plant
-        due = [kind for kind in OF_OTHERS if kind in active and kind not in self._struck]
-        if due and self.flight.pid is not None and plant.t_s >= self._strike_due_s:
-            self._strike_due_s = plant.t_s + STRIKE_AGAIN_S
-            self._struck.update(kind for kind in due if strike(kind, self.flight.pid))
-        if self.flight.kind == "stop_flight" and "stop_flight" not in active and "stop_flight" not in self._struck:
-            self._struck.add("stop_flight")
-            self.flight.let_go()
+        due = [kind for kind in OTHER_PROCESS_FAULTS if kind in active and kind not in self._injected]
+        if due and self.flight.pid is not None and plant.t_s >= self._inject_due_s:
+            self._inject_due_s = plant.t_s + INJECT_RETRY_S
+            self._injected.update(kind for kind in due if inject_process_fault(kind, self.flight.pid))
+        if self.flight.kind == "stop_flight" and "stop_flight" not in active and "stop_flight" not in self._injected:
+            self._injected.add("stop_flight")
+            self.flight.resume()
 
-    def _note_course(self) -> None:
+    def _record_course(self) -> None:
         plant, frame = self.plant, self.mocap.frame_number
         if not self.frames or (frame > self.frames[-1][0] and plant.t_s >= self.frames[-1][1] + FRAMES_PERIOD_S):
             self.frames.append((frame, plant.t_s))
@@ -311,7 +311,7 @@ class Sitl:
         self.course.append(sample(plant.world, self._vehicle.tether.anchor_world_m))
 
     def ground_truth(self) -> dict[str, Any]:
-        """What a campaign wants to know of a flight with faults."""
+        """Return what really happened in a flight with faults, for the table of a campaign (`world.json`)."""
         return {
             **self.final(),
             "armed": self.autopilot.armed,
@@ -322,7 +322,7 @@ class Sitl:
         }
 
     def final(self) -> dict[str, Any]:
-        """What the world knows at its end."""
+        """Return what the world reports at the end of a flight, for `summary.json`."""
         world, armed = self.plant.world, self.plant.armed_t_s
         caught = world.caught_t_s
 
@@ -346,5 +346,5 @@ class Sitl:
 
 
 def start_of(position_m: Vec2, yaw_deg: float, arm_deg: Vec2) -> Start:
-    """A start pose from a mission's degrees."""
+    """Return a start pose, given a mission's angles in degrees."""
     return Start(position_m, math.radians(yaw_deg), (math.radians(arm_deg[0]), math.radians(arm_deg[1])))

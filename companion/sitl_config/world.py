@@ -153,7 +153,7 @@ class World(Model):
         """The servo of joint 0 or 1."""
         return Servo() if self.servos is None else self.servos[joint]
 
-    def spoiled_px4_params(self) -> dict[str, float | int]:
+    def overridden_px4_params(self) -> dict[str, float | int]:
         """`px4_params` in PX4's types."""
         return {
             name: int(value) if isinstance(PX4_DEFAULTS[name], int) else value

@@ -1,7 +1,7 @@
-"""The PX4 stub without its wire: commander, navigator, estimator and cascade stepped on world time. No I/O, no clock.
+"""The PX4 stub without I/O and clock: commander, navigator, estimator and cascade, stepped on world time.
 
-Frames are PX4's: local NED, body FRD. Everything that arrives carries the world time of its arrival; nothing in here knows sockets,
-so the same object flies behind MAVLink in real time and inside a faster-than-real-time loop.
+Frames are PX4's: local NED, body FRD. Every input carries the world time of its arrival, so the same object flies behind MAVLink in
+real time and inside the fast closed loop.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ _COMMANDER_PERIOD_S = 0.01
 _POSITION_PERIOD_S = 0.004
 _EARTH_RADIUS_M = 6371000.0
 _EV_POSITION_AND_YAW = 1 | 2 | 8
-"""EKF2_EV_CTRL: horizontal position, vertical position, yaw. Without magnetometer, barometer and GPS PX4 needs all of them."""
+"""Bits of EKF2_EV_CTRL for horizontal position, vertical position and yaw. Without magnetometer, barometer and GPS PX4 needs all."""
 _TIME_EPSILON_S = 1e-9
-# A member asked of its Enum takes as long as ten comparisons; these are asked for at 250 Hz.
+# Looking up an Enum member costs as much as ten comparisons; these two are used at 250 Hz.
 _OFFBOARD, _TERMINATION = NavState.OFFBOARD, NavState.TERMINATION
 
 
 @dataclass(frozen=True, slots=True)
 class Battery:
-    """What the power module measures."""
+    """Measurement of the power module."""
 
     voltage_v: float = 16.2
     current_a: float = 0.5
     remaining: float = 1.0
-    """0 to 1."""
+    """State of charge, 0 to 1."""
     consumed_mah: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where local (0, 0, 0) lies on earth (SET_GPS_GLOBAL_ORIGIN)."""
+    """Global position of the local origin (SET_GPS_GLOBAL_ORIGIN)."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
 
     def local_ned_m(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-        """Local position of a point nearby (equirectangular)."""
+        """Return the local position of a nearby point (equirectangular projection)."""
         north = math.radians(latitude_deg - self.latitude_deg) * _EARTH_RADIUS_M
         east = math.radians(longitude_deg - self.longitude_deg) * _EARTH_RADIUS_M * self._shrink()
         return (north, east, self.altitude_m - altitude_m)
 
     def global_deg_m(self, position_ned_m: Vec3) -> Vec3:
-        """Latitude and longitude in degrees, altitude in m."""
+        """Return latitude and longitude in degrees and altitude in m."""
         north, east, down = position_ned_m
         latitude = self.latitude_deg + math.degrees(north / _EARTH_RADIUS_M)
         longitude = self.longitude_deg + math.degrees(east / (_EARTH_RADIUS_M * self._shrink()))
@@ -76,7 +76,7 @@ _SOMEWHERE = Origin(47.4, 8.5, 480.0)
 
 
 def gains_from_params(params: Params) -> CascadeGains:
-    """Gains of the attitude and rate loops as MC_* say."""
+    """Return the gains of the attitude and rate loops, given by the MC_* parameters."""
     real = params.real
 
     def axes(pattern: str) -> Vec3:
@@ -98,10 +98,10 @@ class Px4Stub:
     """A PX4-like autopilot.
 
     Args:
-        params: the parameter store; read live.
-        estimator: stands for EKF2.
-        cascade: attitude and rate loops and mixer.
-        setpoint_delay_s: world time from the arrival of a setpoint to its effect in the attitude loop.
+        params: parameter store; changes take effect at once.
+        estimator: substitute for EKF2.
+        cascade: attitude loop, rate loop and mixer.
+        setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop.
     """
 
     def __init__(
@@ -115,29 +115,29 @@ class Px4Stub:
         self.origin: Origin | None = None
         self.home_ned_m: Vec3 | None = None
         self.notices: deque[Notice] = deque(maxlen=64)
-        """STATUSTEXTs not yet sent; oldest are dropped when nobody sends them."""
+        """STATUSTEXTs that wait to be sent; the oldest are dropped if the queue is full."""
         self.t_s = 0.0
         self.imu: ImuSample | None = None
         self.estimate: Estimate | None = None
         self.target = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0)
-        """What the attitude loop follows: ATTITUDE_TARGET."""
+        """Setpoint of the attitude loop (ATTITUDE_TARGET)."""
         self.rotors: RotorCommands = _STOPPED
         self.vision_received = 0
         self.vision_passed_on = 0
-        """Vision poses that arrived, and those among them that EKF2_EV_CTRL let through to the estimator."""
+        """Numbers of vision poses that arrived, and of those that EKF2_EV_CTRL admitted to the estimator."""
         self._estimator = estimator
         self._cascade = cascade
         self._setpoint_delay_s = setpoint_delay_s
         self.refuses_offboard = False
-        """Fault: the mode is not to be had, and is left."""
+        """Fault: PX4 refuses OFFBOARD, and leaves it."""
         self.refuses_arming = False
-        """Fault."""
+        """Fault: PX4 refuses to arm."""
         self.booted_at_s = 0.0
-        """World time at zero of PX4's own clock; before it nothing runs."""
+        """World time of the last boot: zero of PX4's own clock; before it nothing runs."""
         self.clock_ahead_s = 0.0
-        """PX4's own clock goes on while the world is held up."""
+        """Sum of the pauses of the world, during which PX4's own clock goes on."""
         self.since_sample_s = 0.0
-        """From its last IMU sample to the message that it answers; PX4's clock does not stand still between two. Set by its links."""
+        """Time from the last IMU sample to the message that is being answered, for PX4's clock; set by the links."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
         self._offboard: OffboardTarget | None = None
         self._setpoint_at_s: float | None = None
@@ -149,41 +149,41 @@ class Px4Stub:
 
     @property
     def armed(self) -> bool:
-        """Rotors may turn."""
+        """Whether the vehicle is armed."""
         return self.commander.armed
 
     @property
     def nav_state(self) -> NavState:
-        """The mode that flies."""
+        """Active mode."""
         return self.commander.nav_state
 
     @property
     def setpoint_at_s(self) -> float | None:
-        """World time at which the last offboard setpoint arrived; None: none ever did."""
+        """World time at which the newest offboard setpoint arrived, or None."""
         return self._setpoint_at_s
 
     @property
     def fusion(self) -> Fusion:
-        """How well vision fits the estimate."""
+        """Innovation test ratios and accuracy of vision."""
         return self._estimator.fusion()
 
     @property
     def landed(self) -> bool:
-        """Land detector."""
+        """Whether the land detector reports landed."""
         return self.land.landed
 
     @property
     def position_controlled(self) -> bool:
-        """The position controller makes the attitude target."""
+        """Whether the position controller computes the attitude target."""
         return self._climb_rate_controlled
 
     @property
     def home_set(self) -> bool:
-        """Home is known, locally and globally."""
+        """Whether the home position is known, locally and globally."""
         return self.home_ned_m is not None and self.origin is not None
 
     def step(self, imu: ImuSample) -> RotorCommands:
-        """Advance to the sample's world time; returns normalised rotor commands, all zero while disarmed."""
+        """Advance to the sample's world time and return normalised rotor commands; all are zero while disarmed."""
         t_s = imu.t_s
         dt_s = t_s - self.imu.t_s if self.imu is not None else 0.0
         self.imu = imu
@@ -209,17 +209,17 @@ class Px4Stub:
         return self.rotors
 
     def on_setpoint(self, t_s: float, target: OffboardTarget) -> None:
-        """An offboard setpoint arrived at world time `t_s`."""
+        """Take an offboard setpoint that arrived at world time `t_s`."""
         self._setpoint_at_s = t_s
         self._setpoint_kind = target.kind if isinstance(target, PositionTarget) else OffboardKind.ATTITUDE
         self._queue.append((t_s + self._setpoint_delay_s, target))
 
     def on_attitude_target(self, t_s: float, target: AttitudeTarget) -> None:
-        """SET_ATTITUDE_TARGET arrived at world time `t_s`."""
+        """Take SET_ATTITUDE_TARGET that arrived at world time `t_s`."""
         self.on_setpoint(t_s, target)
 
     def on_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> bool:
-        """A vision pose of a kind that EKF2 fuses arrived at world time `t_s`. False: EKF2_EV_CTRL keeps it out."""
+        """Take a vision pose that arrived at world time `t_s`; return whether EKF2_EV_CTRL admits it."""
         self.vision_received += 1
         if self.params.integer("EKF2_EV_CTRL") & _EV_POSITION_AND_YAW != _EV_POSITION_AND_YAW:
             return False
@@ -229,7 +229,7 @@ class Px4Stub:
         return True
 
     def on_command(self, t_s: float, command: int, params: Command7) -> Result:
-        """A MAV_CMD with param1 to param7 arrived at world time `t_s`; positions in degrees and m."""
+        """Execute a MAV_CMD with param1 to param7 that arrived at world time `t_s`; positions are in degrees and m."""
         refusal = self._refusal(command, params)
         if refusal is not None:
             self.notices.append(Notice(Severity.CRITICAL, refusal))
@@ -245,7 +245,7 @@ class Px4Stub:
         return result
 
     def _refusal(self, command: int, params: Command7) -> str | None:
-        """What a fault makes PX4 say to a command; None: nothing."""
+        """Return the text with which a fault refuses a command, or None."""
         if self.refuses_offboard and command == Command.DO_SET_MODE and params[1] == NavState.OFFBOARD.value[0]:
             return "Switching to Offboard is currently not available"
         if self.refuses_arming and command == Command.COMPONENT_ARM_DISARM and params[0] == 1.0:
@@ -253,7 +253,7 @@ class Px4Stub:
         return None
 
     def reboot(self, for_s: float) -> None:
-        """Everything but the parameters is forgotten; `for_s` from now PX4 runs again."""
+        """Restart: everything but the parameters is lost, and PX4 runs again `for_s` later."""
         self.booted_at_s = self.t_s + for_s
         self.commander, self.navigator = Commander(self.params), Navigator(self.params)
         self.land, self._estimator = LandDetector(self.params), Estimator()
@@ -265,7 +265,7 @@ class Px4Stub:
         self._climb_rate_controlled = False
 
     def pilot_chooses(self, state: NavState) -> None:
-        """A mode by the switch of a pilot's radio; where home is, somebody has told PX4 before."""
+        """Change the mode by the switch of a pilot's radio, with a home position set before."""
         estimate = self.estimate
         if estimate is None:
             return
@@ -276,11 +276,11 @@ class Px4Stub:
         self.commander.change_mode(state, self._health(self.t_s))
 
     def set_origin(self, origin: Origin) -> None:
-        """SET_GPS_GLOBAL_ORIGIN: from now on the local position is a global one too."""
+        """Set the global origin (SET_GPS_GLOBAL_ORIGIN), which makes the local position a global one too."""
         self.origin = origin
 
     def arming_problem(self) -> str | None:
-        """Why arming would be refused now; None: it would not."""
+        """Return why arming would be refused now, or None."""
         return self.commander.arming_problem(self._health(self.t_s))
 
     def _command_cycle(self, t_s: float, estimate: Estimate) -> None:
@@ -342,7 +342,7 @@ class Px4Stub:
         )
 
     def _attitude_for_rates(self, estimate: Estimate, rates: RateTarget) -> AttitudeTarget:
-        """The attitude whose P loop asks for exactly these rates: the cascade has one entrance only."""
+        """Return the attitude whose P loop commands exactly these rates, because the cascade takes only attitudes."""
         gains = (self.params.real("MC_ROLL_P"), self.params.real("MC_PITCH_P"), self.params.real("MC_YAW_P"))
         x, y, z = (rate / (2.0 * gain) for rate, gain in zip(rates.rates_frd_rad_s, gains, strict=True))
         size = math.sqrt(x * x + y * y + z * z)
@@ -387,5 +387,5 @@ class Px4Stub:
 
     @property
     def heading_rad(self) -> float:
-        """Yaw of the estimate, rad."""
+        """Estimated yaw, rad."""
         return heading_rad(self.estimate.attitude_ned_frd) if self.estimate is not None else 0.0

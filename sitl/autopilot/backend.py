@@ -1,7 +1,4 @@
-"""The autopilot's end of the simulated world: what the world's server needs of it, and the stub's way of giving it.
-
-The other way is a real PX4: `sitl.px4.backend`.
-"""
+"""The interface between the simulated world and its autopilot, and the stub behind it. A real PX4 is in `sitl.px4.backend`."""
 
 from __future__ import annotations
 
@@ -27,65 +24,65 @@ STUB_VERSION = "1.16"
 
 
 class Observation(NamedTuple):
-    """What can be seen of an autopilot from where the world is; None: not to be seen from there."""
+    """What the world can observe of an autopilot; a field is None if this autopilot does not show it."""
 
     setpoint_at_s: float | None
-    """World time at which the last setpoint arrived."""
+    """World time at which the newest setpoint arrived."""
     vision_received: int | None
-    """Vision poses that arrived so far."""
+    """Number of vision poses that arrived so far."""
     nav_state: NavState | None
 
 
 class AutopilotBackend(Protocol):
-    """An autopilot as the world's server sees it. The plant steps it by its IMU."""
+    """An autopilot of the simulated world. The plant steps it with IMU samples."""
 
     lockstep: bool
-    """It answers on a wire: `sense` and `answered` come before each `step`."""
+    """Whether it answers over a wire, so that the world calls `sense` and awaits `answered` before each `step`."""
 
     @property
     def armed(self) -> bool:
         """Rotors may turn."""
 
     @property
-    def faulty(self) -> FaultyAutopilot:
-        """For the faults of this world."""
+    def fault_target(self) -> FaultyAutopilot:
+        """Where faults of the autopilot are injected."""
 
     @property
     def down(self) -> bool:
-        """Nobody is there to speak with: it boots."""
+        """Whether it is booting and does not communicate."""
 
     def attach(self, world: World) -> None:
-        """The world that it flies in; before anything else."""
+        """Set the world that it flies in; call it before everything else."""
 
     def wires(self) -> AbstractAsyncContextManager[str]:
-        """Open what it speaks on; the value is the companion's `devices.autopilot.address`."""
+        """Open its links and yield the companion's `devices.autopilot.address`."""
 
     async def prepare(self) -> None:
-        """Make it ready to fly, while the world is being stepped."""
+        """Make it ready to fly; the world is stepped meanwhile."""
 
     def sense(self, imu: ImuSample) -> None:
-        """The sample of the next `step`, as early as it is known."""
+        """Send the IMU sample of the next `step` as soon as it is known."""
 
     async def answered(self) -> None:
-        """Until it has made something of that sample."""
+        """Wait until it has answered that sample."""
 
     def step(self, imu: ImuSample) -> Vec4:
-        """One IMU sample in, normalised rotor commands out; all zero while disarmed."""
+        """Take one IMU sample and return normalised rotor commands; all are zero while disarmed."""
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """After every step."""
+        """Stream telemetry; called after every step of the physics."""
 
     def set_link(self, down: bool, delay_s: float) -> None:
-        """Faults of the link to the companion: dead, or slow both ways."""
+        """Inject link faults: nothing arrives, or everything arrives `delay_s` late, in both directions."""
 
     def skip(self, paused_s: float) -> None:
-        """The world has stood still for so long while the wall clock went on: so does the autopilot's own clock, as a real one's."""
+        """Advance the autopilot's own clock by a pause of the world, because a real autopilot's clock does not pause."""
 
     def observe(self) -> Observation:
-        """What can be seen of it now."""
+        """Return its observable state."""
 
     def about(self) -> dict[str, Any]:
-        """kind (stub, px4) and version."""
+        """Return kind (stub or px4) and version, for `summary.json`."""
 
 
 def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
@@ -96,14 +93,14 @@ def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
         link_delay_s: added to the setpoint delay, for a loop without a wire that takes this time.
     """
     params = Params()
-    for name, value in config.spoiled_px4_params().items():
+    for name, value in config.overridden_px4_params().items():
         params.set(name, value)
     cascade = Cascade(gains_from_params(params))
     return Px4Stub(params, Estimator(), cascade, setpoint_delay_s=config.setpoint_delay_s + link_delay_s)
 
 
 def set_hover_thrust(px4: Px4Stub, config: WorldConfig, world: World) -> float:
-    """Set MPC_THR_HOVER to this machine's hover thrust times 1 + `hover_thrust_error`, unless `px4_params` overrides it.
+    """Set MPC_THR_HOVER to this vehicle's hover thrust times 1 + `hover_thrust_error`, unless `px4_params` overrides it.
 
     Returns:
         The hover thrust before the override.
@@ -115,7 +112,7 @@ def set_hover_thrust(px4: Px4Stub, config: WorldConfig, world: World) -> float:
 
 
 class StubBackend:
-    """The stub, in this process."""
+    """The PX4 stub, in this process."""
 
     lockstep = False
 
@@ -130,60 +127,60 @@ class StubBackend:
         return self.px4.commander.armed
 
     @property
-    def faulty(self) -> FaultyAutopilot:
+    def fault_target(self) -> FaultyAutopilot:
         """The stub itself."""
         return self.px4
 
     @property
     def down(self) -> bool:
-        """It boots after a restart."""
+        """Whether it is booting after a restart."""
         return self.px4.t_s < self.px4.booted_at_s
 
     def attach(self, world: World) -> None:
-        """Its hover thrust is that of this world's machine."""
+        """Set MPC_THR_HOVER to the hover thrust of this world's vehicle."""
         set_hover_thrust(self.px4, self._config, world)
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:
-        """MAVLink on UDP."""
+        """Open MAVLink over UDP and yield the companion's address."""
         ground = GROUND_PORTS if self._ports.remote else None
         async with MavlinkServer(self.px4, self._ports, ground) as self._mavlink:
             yield f"udpout://127.0.0.1:{self._mavlink.onboard_port}"
 
     async def prepare(self) -> None:
-        """There is nothing to prepare."""
+        """Do nothing: the stub is ready at once."""
 
     def sense(self, imu: ImuSample) -> None:
-        """It senses when it is stepped."""
+        """Do nothing: the stub takes the sample in `step`."""
 
     async def answered(self) -> None:
-        """It answers at once."""
+        """Return at once: the stub answers within `step`."""
 
     def step(self, imu: ImuSample) -> Vec4:
-        """One control period."""
+        """Run one control period."""
         return self.px4.step(imu)
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """What it measures and what it streams."""
+        """Update the battery and stream telemetry."""
         self.px4.battery = battery
         if not self.down:  # its clock would be negative
             self._mavlink.pump(t_s)
 
     def set_link(self, down: bool, delay_s: float) -> None:
-        """Both of its links."""
+        """Apply link faults to both of its links."""
         if down is not self._mavlink.link_down:
             self._mavlink.link_down = down
         self._mavlink.delay_s = delay_s
 
     def skip(self, paused_s: float) -> None:
-        """The clock that its messages carry."""
+        """Advance the clock of its messages."""
         self.px4.clock_ahead_s += paused_s
 
     def observe(self) -> Observation:
-        """Everything: it is ours."""
+        """Return the stub's state; every field is known."""
         px4 = self.px4
         return Observation(px4.setpoint_at_s, px4.vision_received, px4.nav_state)
 
     def about(self) -> dict[str, Any]:
-        """A stub, and what it behaves like."""
+        """Return the kind "stub" and the PX4 version that it imitates."""
         return {"kind": "stub", "version": STUB_VERSION}

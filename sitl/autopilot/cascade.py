@@ -19,7 +19,7 @@ MIX_YAW = (1.0, 1.0, -1.0, -1.0)
 
 @dataclass(frozen=True, slots=True)
 class CascadeGains:
-    """Gains in the meaning of MC_ROLL_P, MC_ROLLRATE_P/I/D and so on; roll, pitch, yaw."""
+    """Gains for roll, pitch and yaw, defined as MC_ROLL_P, MC_ROLLRATE_P/I/D and so on."""
 
     attitude_p: Vec3 = (6.5, 6.5, 2.8)
     rate_p: Vec3 = (0.15, 0.15, 0.2)
@@ -41,20 +41,20 @@ class Cascade:
         self.reset()
 
     def reset(self) -> None:
-        """Forget integrators (on arming)."""
+        """Reset integrators and filters, on arming."""
         self._integral: Vec3 = (0.0, 0.0, 0.0)
         self._rate_previous: Vec3 | None = None
         self._d_filtered: Vec3 = (0.0, 0.0, 0.0)
         self._unsaturated = True
 
     def step(self, dt_s: float, estimate: Estimate, target: AttitudeTarget) -> RotorCommands:
-        """One control period."""
+        """Run one control period and return normalised rotor commands."""
         rate_sp = self._rate_setpoint(estimate.attitude_ned_frd, target)
         torque = self._rate_loop(dt_s, estimate.rates_frd_rad_s, rate_sp, target.thrust)
         return self._mix(torque, target.thrust)
 
     def _rate_setpoint(self, q: Quat, target: AttitudeTarget) -> Vec3:
-        """Quaternion P control with reduced yaw priority (Brescianini et al., as in mc_att_control)."""
+        """Compute the rate setpoint: quaternion P control with reduced yaw priority (Brescianini et al., as mc_att_control)."""
         w, x, y, z = q
         wd, xd, yd, zd = target.attitude_ned_frd
         # z axes of both attitudes and the shortest rotation between them.
@@ -72,7 +72,7 @@ class Cascade:
             ax = rw * x + rx * w + ry * z - rz * y
             ay = rw * y - rx * z + ry * w + rz * x
             az = rw * z + rx * y - ry * x + rz * w
-        # What is left is a turn about the body's z axis, of which a share is asked for: a* (.) = target.
+        # The rest is a turn about the body's z axis, of which a share is commanded: a* (.) = target.
         left_w = aw * wd + ax * xd + ay * yd + az * zd
         left_z = aw * zd - ax * yd + ay * xd - az * wd
         (p_roll, p_pitch, p_yaw), (most_roll, most_pitch, most_yaw) = self._gains.attitude_p, self._gains.rate_max_rad_s
@@ -121,7 +121,7 @@ class Cascade:
         return (kx * error_x + ix - lx * dx, ky * error_y + iy - ly * dy, kz * error_z + iz - lz * dz)
 
     def _mix(self, torque: Vec3, thrust: float) -> RotorCommands:
-        """Collective + torques to rotor commands; yaw gives way first, then the collective (airmode off for yaw)."""
+        """Mix collective thrust and torques into rotor commands; on saturation yaw is reduced first, then the collective."""
         roll, pitch, yaw = torque
         # MIX_ROLL and MIX_PITCH: the rotors get -across, +across, +along, -along.
         across, along = roll - pitch, roll + pitch

@@ -1,8 +1,8 @@
-"""PX4's commander, pure: arming state, mode wishes, failsafe ladder, automatic disarm. Time and health are arguments.
+"""PX4's commander without I/O and clock: arming state, user intention, failsafe fallbacks, automatic disarm.
 
-Sources: PX4 1.16 Commander.cpp, UserModeIntention.cpp, failsafe.cpp, HealthAndArmingChecks. A mode wish is always taken while
-disarmed; arming is what gets refused. In flight a wish is refused when its mode cannot run. `nav_state` is what really flies: the wish,
-or what the failsafe makes of it as long as the wish cannot run.
+Sources: PX4 1.16 Commander.cpp, UserModeIntention.cpp, failsafe.cpp, HealthAndArmingChecks. While disarmed any mode can be chosen, and
+arming may be refused instead. In flight a mode is refused if it cannot run. `nav_state` is the active mode: the user intention, or a
+failsafe mode while the intended one cannot run.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Result(IntEnum):
 
 
 class Command(IntEnum):
-    """MAV_CMD numbers that the commander answers."""
+    """MAV_CMD numbers that the commander handles."""
 
     NAV_RETURN_TO_LAUNCH = 20
     NAV_LAND = 21
@@ -62,45 +62,45 @@ class Notice:
 
 
 class Commander:
-    """Arming and mode logic. `notices` collects what a ground station would be told; the caller empties it."""
+    """Arming and mode logic. `notices` collects STATUSTEXTs for ground stations; the caller empties it."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
         self.armed = False
-        self.wish = NavState.LOITER
+        self.user_intention = NavState.LOITER
         """vehicle_status.nav_state_user_intention; PX4 boots into Hold."""
         self.nav_state = NavState.LOITER
         self.failsafe = False
         self.armed_at_s: float | None = None
         self.taken_off = False
-        """Since arming."""
+        """Whether the vehicle has taken off since arming."""
         self.notices: list[Notice] = []
-        self._wish_after_disarm = NavState.LOITER
+        self._intention_after_disarm = NavState.LOITER
         self._disarm_since_s: float | None = None
 
     def command(
         self, t_s: float, command: int, params: tuple[float, float, float, float, float, float, float], health: Health
     ) -> Result:
-        """Answer COMMAND_LONG or COMMAND_INT as `Commander::handle_command` does. `params` are param1 to param7."""
+        """Handle COMMAND_LONG or COMMAND_INT as `Commander::handle_command` does; `params` are param1 to param7."""
         match command:
             case Command.COMPONENT_ARM_DISARM:
                 return self._arm_disarm(t_s, params[0], params[1], health)
             case Command.DO_SET_MODE:
                 return self._set_mode(params[0], params[1], params[2], health)
             case Command.NAV_TAKEOFF:
-                return self._wish_or_reject(NavState.TAKEOFF, health)
+                return self._intend_or_reject(NavState.TAKEOFF, health)
             case Command.NAV_LAND:
-                return self._wish_or_reject(NavState.LAND, health)
+                return self._intend_or_reject(NavState.LAND, health)
             case Command.NAV_RETURN_TO_LAUNCH:
-                return self._wish_or_reject(NavState.RTL, health)
+                return self._intend_or_reject(NavState.RTL, health)
             case Command.DO_REPOSITION:
                 if not math.isfinite(params[1]) or int(params[1]) != 1:
                     return Result.UNSUPPORTED
-                return self._wish_or_reject(NavState.LOITER, health)
+                return self._intend_or_reject(NavState.LOITER, health)
             case Command.DO_FLIGHTTERMINATION:
                 if not params[0] > 0.5 or not self.armed:
                     return Result.DENIED
-                return self._wish_or_reject(NavState.TERMINATION, health)
+                return self._intend_or_reject(NavState.TERMINATION, health)
             case Command.RUN_PREARM_CHECKS:
                 return Result.ACCEPTED
             case Command.PREFLIGHT_REBOOT_SHUTDOWN:
@@ -109,66 +109,66 @@ class Commander:
                 return Result.UNSUPPORTED
 
     def change_mode(self, state: NavState, health: Health) -> bool:
-        """UserModeIntention::change: wish for a mode. False: refused, nothing changed."""
+        """Set the user intention (UserModeIntention::change); return False if it is refused and nothing changed."""
         if self.nav_state is NavState.TERMINATION:
             return False
         if self.armed and health.missing(state, self._offboard_timeout_s()) is not None:
             return False
-        self.wish = state
+        self.user_intention = state
         if state not in PREVENT_ARMING:
-            self._wish_after_disarm = state
+            self._intention_after_disarm = state
         if not self.armed:
             self.nav_state = state
         return True
 
     def arm(self, t_s: float, health: Health) -> bool:
-        """Arm on an external command. False: refused; `arming_problem` knows why."""
+        """Arm on an external command; return False if it is refused (see `arming_problem`)."""
         if self.armed:
             return True
         if self.arming_problem(health) is not None:
-            # What a mode requires and lacks PX4 tells by event only; texts of its own have the health checks alone.
-            self._say(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
+            # PX4 reports an unmet mode requirement as an event only; STATUSTEXT carries this general text.
+            self._notify(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
             return False
         self.armed = True
         self.armed_at_s = t_s
         self.taken_off = False
         self._disarm_since_s = None
-        self._say(Severity.INFO, "Armed by external command")
+        self._notify(Severity.INFO, "Armed by external command")
         return True
 
     def arming_problem(self, health: Health) -> str | None:
-        """Why arming would be refused in the present mode; None: it would not."""
-        if self.wish in PREVENT_ARMING:
+        """Return why arming would be refused in the present mode, or None."""
+        if self.user_intention in PREVENT_ARMING:
             return "Mode not suitable for arming"
-        missing = health.missing(self.wish, self._offboard_timeout_s())
+        missing = health.missing(self.user_intention, self._offboard_timeout_s())
         return missing.value if missing else None
 
     def disarm(self, landed: bool, forced: bool, reason: str) -> bool:
-        """Disarm. False: refused because the vehicle is in the air and `forced` is not set."""
+        """Disarm; return False if it is refused because the vehicle is in the air and `forced` is not set."""
         if not self.armed:
             return True
         if not forced and not landed:
-            self._say(Severity.CRITICAL, "Disarming denied: not landed")
+            self._notify(Severity.CRITICAL, "Disarming denied: not landed")
             return False
         self.armed = False
         self.armed_at_s = None
         self.taken_off = False
         self._disarm_since_s = None
         if self.nav_state is not NavState.TERMINATION:
-            self.wish = self._wish_after_disarm
-            self.nav_state = self.wish
+            self.user_intention = self._intention_after_disarm
+            self.nav_state = self.user_intention
         self.failsafe = False
-        self._say(Severity.INFO, f"Disarmed by {reason}")
+        self._notify(Severity.INFO, f"Disarmed by {reason}")
         return True
 
     def update(self, t_s: float, health: Health) -> None:
-        """One cycle of the commander's loop: failsafe, take-off bookkeeping, automatic disarm."""
+        """Run one cycle of the commander: take-off detection, failsafe, automatic disarm."""
         if not self.armed:
-            self.nav_state = self.wish if self.nav_state is not NavState.TERMINATION else self.nav_state
+            self.nav_state = self.user_intention if self.nav_state is not NavState.TERMINATION else self.nav_state
             return
         if not health.landed and not self.taken_off:
             self.taken_off = True
-            self._say(Severity.INFO, "Takeoff detected")
+            self._notify(Severity.INFO, "Takeoff detected")
         self._fail_safe(health)
         self._auto_disarm(t_s, health)
 
@@ -179,26 +179,28 @@ class Commander:
             self.disarm(landed=True, forced=True, reason="failsafe")
             return
         self.nav_state = state
-        self.failsafe = state is not self.wish
+        self.failsafe = state is not self.user_intention
         if self.failsafe and state is not previous:
-            self._say(Severity.CRITICAL, f"Failsafe activated: {_FAILSAFE_NAMES.get(state, state.name)}")
+            self._notify(Severity.CRITICAL, f"Failsafe activated: {_FAILSAFE_NAMES.get(state, state.name)}")
 
     def _select(self, health: Health) -> NavState | None:
-        """checkModeFallback and getSelectedAction; None: disarm at once."""
+        """Return the mode to fly (checkModeFallback and getSelectedAction), or None to disarm at once."""
         if self.nav_state is NavState.TERMINATION:
             return NavState.TERMINATION
         timeout_s = self._offboard_timeout_s() + OFFBOARD_LOSS_EXTRA_S
-        if health.missing(self.wish, timeout_s) is None:
-            return self.wish
+        if health.missing(self.user_intention, timeout_s) is None:
+            return self.user_intention
         first = NavState.RTL
-        if self.wish is NavState.OFFBOARD and not health.offboard_available(timeout_s):
+        if self.user_intention is NavState.OFFBOARD and not health.offboard_available(timeout_s):
             action = self._params.integer("COM_OBL_RC_ACT")
             if action == 7:
                 return None
-            # 0 to 2 hand over to a pilot; without a radio PX4 returns.
+            # 0 to 2 are manual modes; without a radio PX4 returns to launch.
             first = {3: NavState.RTL, 4: NavState.LAND, 5: NavState.LOITER, 6: NavState.TERMINATION}.get(action, first)
-        ladder = (first, NavState.RTL, NavState.LAND, NavState.DESCEND) if first is NavState.LOITER else _LADDERS[first]
-        for state in ladder:
+        fallbacks = (
+            (first, NavState.RTL, NavState.LAND, NavState.DESCEND) if first is NavState.LOITER else _FALLBACKS[first]
+        )
+        for state in fallbacks:
             if health.missing(state, timeout_s) is None:
                 return state
         return NavState.TERMINATION
@@ -211,14 +213,14 @@ class Commander:
         if self._disarm_since_s is None:
             self._disarm_since_s = t_s
             if self.taken_off:
-                self._say(Severity.INFO, "Landing detected")
+                self._notify(Severity.INFO, "Landing detected")
         if t_s - self._disarm_since_s >= delay_s:
             self.disarm(landed=True, forced=False, reason="landing" if self.taken_off else "auto preflight disarming")
 
     def _arm_disarm(self, t_s: float, action: float, magic: float, health: Health) -> Result:
         forced = math.isfinite(magic) and round(magic) == FORCE_MAGIC
         if not math.isfinite(action) or round(action) not in (0, 1):
-            self._say(Severity.CRITICAL, f"Unsupported ARM_DISARM param: {action:.3f}")
+            self._notify(Severity.CRITICAL, f"Unsupported ARM_DISARM param: {action:.3f}")
             return Result.UNSUPPORTED
         if round(action) == 1:  # an external command runs the checks even when it is forced
             done = self.arm(t_s, health)
@@ -233,24 +235,24 @@ class Commander:
             return Result.TEMPORARILY_REJECTED
         state = nav_state_from_custom(int(main_mode), int(sub_mode) if math.isfinite(sub_mode) else 0)
         if state is None:
-            self._say(Severity.CRITICAL, "Unsupported auto mode")
+            self._notify(Severity.CRITICAL, "Unsupported auto mode")
             return Result.TEMPORARILY_REJECTED
         return Result.ACCEPTED if self.change_mode(state, health) else Result.TEMPORARILY_REJECTED
 
-    def _wish_or_reject(self, state: NavState, health: Health) -> Result:
+    def _intend_or_reject(self, state: NavState, health: Health) -> Result:
         if self.change_mode(state, health):
             return Result.ACCEPTED
-        self._say(Severity.CRITICAL, f"Switching to {_MODE_NAMES[state]} is currently not available")
+        self._notify(Severity.CRITICAL, f"Switching to {_MODE_NAMES[state]} is currently not available")
         return Result.TEMPORARILY_REJECTED
 
     def _offboard_timeout_s(self) -> float:
         return self._params.real("COM_OF_LOSS_T")
 
-    def _say(self, severity: Severity, text: str) -> None:
+    def _notify(self, severity: Severity, text: str) -> None:
         self.notices.append(Notice(severity, text))
 
 
-_LADDERS = {
+_FALLBACKS = {
     NavState.RTL: (NavState.RTL, NavState.LAND, NavState.DESCEND),
     NavState.LAND: (NavState.LAND, NavState.DESCEND),
     NavState.TERMINATION: (NavState.TERMINATION,),

@@ -1,8 +1,8 @@
-"""EKF-like estimator of the PX4 stub: IMU prediction, delayed vision fusion.
+"""The PX4 stub's substitute for EKF2: IMU prediction and delayed vision fusion.
 
 A fixed-gain observer with the couplings that matter in EKF2: position innovations correct velocity and, through gravity, tilt; vision
-corrects yaw; without vision the state dead-reckons on the IMU and drifts. Vision is fused at the time it was taken, against the state
-the filter had then, as EKF2 does on its delayed horizon; the output is predicted to now.
+corrects yaw; without vision the state is dead reckoning on the IMU and drifts. Vision is fused at the time of its exposure, against the
+state of that time, as EKF2 does on its delayed horizon; the output is predicted to the present.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _FAKE_POSITION_SIGMA_M = 0.015
 
 
 class Estimator:
-    """Fixed-gain observer that behaves as EKF2 with external vision does."""
+    """A fixed-gain observer that behaves like EKF2 with external vision."""
 
     def __init__(self) -> None:
         self._t_s: float | None = None
@@ -56,11 +56,11 @@ class Estimator:
         self._arrived_t_s: float | None = None
         self._tilt_aligned = False
         self._test = (_TEST_MAX, _TEST_MAX)
-        """Squared innovations over their gates, filtered: horizontal, vertical."""
+        """Filtered squared innovations divided by their squared gates: horizontal, vertical."""
         self._variance_m2 = _FAKE_POSITION_SIGMA_M**2
 
     def predict(self, imu: ImuSample) -> None:
-        """Advance to the sample's time."""
+        """Predict the state to the sample's time."""
         if self._t_s is None or not self._tilt_aligned:
             self._align_tilt(imu)
             return
@@ -103,7 +103,7 @@ class Estimator:
             history.popleft()
 
     def _align_tilt(self, imu: ImuSample) -> None:
-        """Roll and pitch from the accelerometer at rest, yaw 0 until vision says more."""
+        """Initialise roll and pitch from the accelerometer at rest; yaw is 0 until vision corrects it."""
         fx, fy, fz = imu.accel_frd_m_s2
         if fx * fx + fy * fy + fz * fz < 1.0:
             return
@@ -117,7 +117,7 @@ class Estimator:
     def fuse_vision(
         self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat, noise_m: float = _VISION_NOISE_M
     ) -> None:
-        """Fuse a vision pose that was taken at world time `t_s` (arrival minus EKF2_EV_DELAY); `noise_m` is EKF2_EVP_NOISE."""
+        """Fuse a vision pose of world time `t_s` (arrival minus EKF2_EV_DELAY); `noise_m` is EKF2_EVP_NOISE."""
         # A sum is finite only if everything in it is.
         if self._t_s is None or not math.isfinite(sum(position_ned_m) + sum(attitude_ned_frd)):
             return
@@ -177,7 +177,7 @@ class Estimator:
         self._q = quat_normalize(quat_multiply((math.cos(norm), k * x, k * y, k * z), self._q))
 
     def fusion(self) -> Fusion:
-        """How well vision fits, now."""
+        """Return innovation test ratios and accuracy of vision."""
         since_s = (self._t_s or 0.0) - self._fused_t_s if self._fused_t_s is not None else math.inf
         if since_s == math.inf:
             return Fusion(math.nan, math.nan, _FAKE_POSITION_SIGMA_M, _FAKE_POSITION_SIGMA_M)
@@ -186,7 +186,7 @@ class Estimator:
         return Fusion(h, v, sigma_m, sigma_m)
 
     def estimate(self) -> Estimate:
-        """Newest output."""
+        """Return the newest estimate."""
         t_s = self._t_s or 0.0
         since = t_s - self._fused_t_s if self._fused_t_s is not None else math.inf
         return Estimate(
@@ -203,5 +203,5 @@ class Estimator:
 
 
 def _growth_m2(since_s: float) -> float:
-    """Of the position's variance, that long without vision."""
+    """Return the growth of the position variance after `since_s` without vision."""
     return _DIFFUSION_M2_S * since_s + _ACCEL_NOISE_M_S2**2 * since_s**3 / 3.0

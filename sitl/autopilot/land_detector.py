@@ -1,4 +1,4 @@
-"""Landed detection, pure, after PX4's MulticopterLandDetector: ground contact, then maybe landed, then landed."""
+"""Land detection as in PX4's MulticopterLandDetector: ground contact, then maybe landed, then landed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sitl.autopilot.types import Estimate
 
 _DESCENT_THRESHOLD_M_S = 0.3
 _BLIND_S = 8.0
-"""Without vertical velocity: this long at minimum thrust and without rotation counts as landed."""
+"""Without a velocity estimate, this time at minimum thrust and without rotation counts as landed."""
 
 
 class _Settings(NamedTuple):
@@ -25,7 +25,7 @@ class _Settings(NamedTuple):
 
 
 class LandDetector:
-    """Three conditions in a row, each held for a third of LNDMC_TRIG_TIME; each is lost at once."""
+    """Three conditions in sequence, each held for a third of LNDMC_TRIG_TIME; each is lost at once."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -48,7 +48,7 @@ class LandDetector:
         climb_rate_controlled: bool,
         descend_m_s: float,
     ) -> None:
-        """One cycle. `thrust` is the collective that the attitude loop got, `descend_m_s` the commanded speed down."""
+        """Run one cycle; `thrust` is the collective setpoint, `descend_m_s` the commanded speed downwards."""
         if not armed:
             self.ground_contact = self.maybe_landed = self.landed = True
             self._contact_since_s = self._maybe_since_s = self._landed_since_s = -math.inf
@@ -68,7 +68,7 @@ class LandDetector:
         if not estimate.position_valid:
             return False
         settings = self._settings
-        # The hover thrust estimator runs in climb-rate-controlled modes only; where it does, PX4 trusts the hover thrust more.
+        # The hover thrust estimator runs only in climb-rate-controlled modes; there PX4 trusts the hover thrust more.
         share = 0.6 if climb_rate_controlled and settings.hover_estimated else 0.3
         if thrust > settings.thrust_min + share * (settings.thrust_hover - settings.thrust_min):
             return False
@@ -111,7 +111,7 @@ class LandDetector:
 
 
 def _held(t_s: float, now: bool, since_s: float | None, hold_s: float) -> tuple[float | None, bool]:
-    """Start of a condition and whether it has lasted `hold_s`."""
+    """Return since when a condition holds, and whether it has held for `hold_s`."""
     if not now:
         return None, False
     if since_s is None:

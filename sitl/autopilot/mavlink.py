@@ -1,8 +1,8 @@
-"""The PX4 stub's wire: MAVLink 2 over UDP on 127.0.0.1, an onboard link and optionally one to a ground station.
+"""The PX4 stub's MAVLink 2 over UDP on 127.0.0.1: an onboard link and optionally one to a ground station.
 
-As PX4 SITL does, a link sends to its remote port from the start, and from then on to whoever spoke first, for as long as PX4 runs;
-what others say is handled, too. A link without a remote port is a wire to be plugged in: it sends to whoever spoke last. Streams run
-on world time, driven by `pump`; what arrives is handled when it arrives.
+As in PX4 SITL, a link sends to its remote port from the start, then to the first sender, for as long as PX4 runs; messages of other
+senders are handled too. A link without a remote port sends to the newest sender. Streams run on world time, driven by `pump`; messages
+are handled when they arrive.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _GROUND_STATION_TIMEOUT_S = 2.5
 """telemetry_status HEARTBEAT_TIMEOUT_US."""
 _STATUS_TEXT_BYTES = 50
 _TEXTS_KEPT, _TEXT_STALE_S = 8, 5.0
-"""Of the mavlink_log queue; the stream passes over what is older."""
+"""Length of the mavlink_log queue, and age after which the stream skips a text."""
 
 
 _STEP_MAX_S = 0.03
 
 
 class LinkError(Exception):
-    """A UDP port cannot be had: one line for the user."""
+    """A UDP port cannot be opened; the text is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +42,9 @@ class Ports:
     """UDP ports of one link."""
 
     local: int
-    """0: any free one."""
+    """Local port; 0 takes any free port."""
     remote: int
-    """0: silent until somebody speaks to `local`."""
+    """Port to send to; with 0 the link is silent until a datagram arrives."""
 
 
 ONBOARD_PORTS = Ports(14580, 14540)
@@ -52,14 +52,14 @@ GROUND_PORTS = Ports(18570, 14550)
 
 
 class Link(UdpEndpoint):
-    """One MAVLink channel: own sequence numbers, own streams, own partner."""
+    """One MAVLink channel with its own sequence numbers, streams and partner."""
 
     def __init__(self, stub: Px4Stub, receiver: Receiver, partner: Address | None, ground: bool) -> None:
         super().__init__()
         self.schedule = Schedule(ground)
         self.down = False
         self.delay_s = 0.0
-        """Fault: everything takes so long, each way."""
+        """Fault: delay in each direction."""
         self.messages_in = 0
         self._stub = stub
         self._receiver = receiver
@@ -74,10 +74,10 @@ class Link(UdpEndpoint):
         self._texts: deque[tuple[float, int, bytes]] = deque(maxlen=_TEXTS_KEPT)
         self._text_id = 0
         self._pumped: tuple[float, float] | None = None
-        """Wall clock and world time."""
+        """(wall clock, world time) of the last `pump`."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        """Decode and handle at once, or as late as the link is slow."""
+        """Decode and handle a datagram, after `delay_s`."""
         if self.delay_s:
             asyncio.get_running_loop().call_later(self.delay_s, self._take, data, addr)
         else:
@@ -88,7 +88,7 @@ class Link(UdpEndpoint):
             return
         messages = self._decoder.parse_buffer(data)
         if self._decoder.buf_len():
-            self._decoder = _new_decoder()  # a cut message must not swallow the datagrams after it
+            self._decoder = _new_decoder()  # a truncated message must not consume the next datagrams
         for message in messages or ():
             if message.get_type() == "BAD_DATA":
                 continue
@@ -103,10 +103,10 @@ class Link(UdpEndpoint):
             return 0.0
         wall_s, t_s = self._pumped
         since_s = t_s - self._stub.t_s + asyncio.get_running_loop().time() - wall_s
-        return min(_STEP_MAX_S, max(0.0, since_s))  # longer: the world is held up
+        return min(_STEP_MAX_S, max(0.0, since_s))  # after a longer time the world is paused
 
     def send(self, message: Message) -> None:
-        """Send one message to the partner, if there is one."""
+        """Send one message to the partner, if one is known."""
         if self.down or self._transport is None or self._partner is None:
             return
         data = message.pack(self._encoder)
@@ -121,21 +121,21 @@ class Link(UdpEndpoint):
             self.send_to(data, partner)
 
     def send_all_params(self) -> None:
-        """Queue _HASH_CHECK and every parameter; `pump` sends them in portions."""
+        """Queue _HASH_CHECK and every parameter; `pump` sends a few at a time."""
         self._params_to_send = deque([None, *self._stub.params])
 
     def saw_ground_station(self) -> None:
-        """PX4 sends STATUSTEXT only on links where a ground station is alive, then also what it has said a moment ago."""
+        """Note a ground station: PX4 sends STATUSTEXT only on links with one, and then also recent texts."""
         self._ground_station_at_s = self._stub.t_s
         self._send_texts()
 
     def status_text(self, severity: int, text: str) -> None:
-        """STATUSTEXT, in chunks when it is long; once a ground station is there."""
+        """Queue a STATUSTEXT; it is sent in chunks if it is long, once a ground station is known."""
         self._texts.append((self._stub.t_s, severity, text.encode()))
         self._send_texts()
 
     def _send_texts(self) -> None:
-        """MavlinkStreamStatustext::send: every text counts, from id 0 on, one that needs no chunks too."""
+        """Send queued texts as MavlinkStreamStatustext::send does: ids count from 0, for texts of one chunk too."""
         seen_s, now_s = self._ground_station_at_s, self._stub.t_s
         if seen_s is None or now_s - seen_s > _GROUND_STATION_TIMEOUT_S:
             return
@@ -149,7 +149,7 @@ class Link(UdpEndpoint):
             self._text_id = (self._text_id + 1) % 65536
 
     def pump(self, t_s: float) -> None:
-        """Send the streams that are due at world time `t_s` and a portion of the parameter list."""
+        """Send the streams that are due at world time `t_s` and a few queued parameters."""
         self._pumped = (asyncio.get_running_loop().time(), t_s)
         if self.down or self._partner is None:
             return
@@ -167,10 +167,10 @@ def _new_decoder() -> Any:
 
 
 class MavlinkServer:
-    """Owns the links of one stub. `async with` opens and closes the sockets.
+    """The links of one stub, an async context manager.
 
     Raises (on entering):
-        LinkError: a port is in use or may not be had.
+        LinkError: a port is in use or cannot be opened.
     """
 
     def __init__(
@@ -184,17 +184,17 @@ class MavlinkServer:
 
     @property
     def onboard_port(self) -> int:
-        """Local port of the onboard link (while open)."""
+        """Local port of the onboard link, while it is open."""
         return self._links[0].port
 
     @property
     def ground_port(self) -> int | None:
-        """Local port of the link to the ground station; None: there is none."""
+        """Local port of the ground station link, or None if there is none."""
         return self._links[1].port if len(self._links) > 1 else None
 
     @property
     def link_down(self) -> bool:
-        """Fault: nothing goes in or out on any link."""
+        """Fault: every link is down."""
         return self._down
 
     @link_down.setter
@@ -205,7 +205,7 @@ class MavlinkServer:
 
     @property
     def delay_s(self) -> float:
-        """Fault: everything on every link takes so long, each way."""
+        """Fault: delay of every link in each direction."""
         return self._links[0].delay_s if self._links else 0.0
 
     @delay_s.setter
@@ -215,7 +215,7 @@ class MavlinkServer:
 
     @property
     def messages_in(self) -> int:
-        """Messages decoded on all links."""
+        """Number of messages decoded on all links."""
         return sum(link.messages_in for link in self._links)
 
     async def __aenter__(self) -> Self:
@@ -240,12 +240,12 @@ class MavlinkServer:
         await self._close()
 
     def pump(self, t_s: float) -> None:
-        """Send what is due at world time `t_s`; call it every 2 to 4 ms."""
+        """Send everything that is due at world time `t_s`; call it every 2 to 4 ms."""
         notices = self._stub.notices
         while notices:
             notice = notices.popleft()
             for link in self._links:
-                # The tab tells ground stations that the same comes as an event too, which the stub does not send.
+                # As in PX4, the tab marks a text that is also sent as an event; the stub does not send events.
                 link.status_text(int(notice.severity), f"{notice.text}\t")
         for link in self._links:
             link.pump(t_s)

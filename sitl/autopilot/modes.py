@@ -1,4 +1,4 @@
-"""PX4's navigation states: their place in HEARTBEAT.custom_mode and what each of them needs to run (ModeUtil/mode_requirements)."""
+"""PX4's navigation states: their code in HEARTBEAT.custom_mode and their requirements (ModeUtil/mode_requirements)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class NavState(Enum):
     ACRO = (5, 0)
     OFFBOARD = (6, 0)
     STABILIZED = (7, 0)
-    # PX4 shows both of these as AUTO LAND / MANUAL; a third number keeps them apart in here.
+    # PX4 reports these two as AUTO LAND and MANUAL; a third number distinguishes them here.
     DESCEND = (4, 6, 1)
     TERMINATION = (1, 0, 1)
 
@@ -32,7 +32,7 @@ class NavState(Enum):
 
     @property
     def auto(self) -> bool:
-        """PX4 flies by itself (MAV_MODE_FLAG_AUTO_ENABLED)."""
+        """Whether it is an automatic mode (MAV_MODE_FLAG_AUTO_ENABLED)."""
         numbers: tuple[int, ...] = self.value
         return numbers[0] == 4
 
@@ -41,14 +41,14 @@ _BY_CUSTOM = {state.value: state for state in NavState if len(state.value) == 2}
 
 
 def nav_state_from_custom(main_mode: int, sub_mode: int) -> NavState | None:
-    """Navigation state asked for by DO_SET_MODE param2 and param3; AUTO without a sub mode is MISSION. None: there is none."""
+    """Return the navigation state of DO_SET_MODE param2 and param3, or None; AUTO without a sub mode is MISSION."""
     if main_mode == 4 and sub_mode == 0:
         return NavState.MISSION
     return _BY_CUSTOM.get((main_mode, sub_mode if main_mode == 4 else 0))
 
 
 class Need(Enum):
-    """What a mode may require; the value is PX4's text when it is missing."""
+    """A requirement of a mode; the value is PX4's text if it is not met."""
 
     ATTITUDE = "No valid attitude estimate"
     LOCAL_ALTITUDE = "No valid altitude estimate"
@@ -79,7 +79,7 @@ REQUIREMENTS: dict[NavState, tuple[Need, ...]] = {
 }
 
 PREVENT_ARMING = frozenset({NavState.RTL, NavState.LAND, NavState.DESCEND, NavState.TERMINATION})
-"""Modes in which PX4 does not arm (mode_req_prevent_arming); it is not in them after a disarm either."""
+"""Modes in which PX4 does not arm (mode_req_prevent_arming); it leaves them on disarming."""
 
 
 class OffboardKind(Enum):
@@ -93,28 +93,28 @@ class OffboardKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What the commander looks at, sampled from the rest of the autopilot at one instant."""
+    """State of the rest of the autopilot that the commander checks, at one moment."""
 
     attitude_valid: bool
     position_valid: bool
     origin_set: bool
-    """SET_GPS_GLOBAL_ORIGIN was received, so the local position is a global one too."""
+    """Whether SET_GPS_GLOBAL_ORIGIN was received, so that the local position is a global one too."""
     home_set: bool
     landed: bool
     maybe_landed: bool
-    """The land detector's last stage before `landed`; enough for a disarm command."""
+    """Last stage of the land detector before `landed`; it suffices for a disarm command."""
     setpoint_age_s: float | None
-    """World time since the last offboard setpoint arrived; None: never."""
+    """Time since the newest offboard setpoint arrived, or None."""
     setpoint_kind: OffboardKind = OffboardKind.ATTITUDE
 
     def offboard_available(self, timeout_s: float) -> bool:
-        """offboardCheck: fresh, and what the setpoint needs is valid. `timeout_s` is COM_OF_LOSS_T."""
+        """Return whether setpoints are fresh and the estimate they need is valid (offboardCheck); `timeout_s` is COM_OF_LOSS_T."""
         if self.setpoint_age_s is None or self.setpoint_age_s > timeout_s:
             return False
         return self.setpoint_kind is OffboardKind.ATTITUDE or self.position_valid
 
     def missing(self, state: NavState, offboard_timeout_s: float) -> Need | None:
-        """First requirement of a mode that is not met; None: the mode can run."""
+        """Return the first requirement of a mode that is not met, or None if the mode can run."""
         for need in REQUIREMENTS[state]:
             if not self._met(need, offboard_timeout_s):
                 return need

@@ -1,6 +1,6 @@
-"""PX4's own modes, pure: Hold, Takeoff, Land, Descend, Return, position setpoints in OFFBOARD, and the take-off ramp.
+"""PX4's own modes: Hold, Takeoff, Land, Descend, Return, position setpoints in OFFBOARD, and the take-off ramp.
 
-Every mode is reduced to a `PositionTarget`; `PositionControl` turns it into attitude and thrust.
+Every mode produces a `PositionTarget`, and `PositionControl` converts it to attitude and thrust.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from sitl.autopilot.smoothing import Smoothing
 from sitl.autopilot.types import AttitudeTarget, Estimate
 
 _STOP_AHEAD_S = 0.6
-"""Constant of Navigator::preproject_stop_point (PX4 1.16): the delay until the full deceleration acts."""
+"""Delay until full deceleration (constant of Navigator::preproject_stop_point, PX4 1.16)."""
 _BLIND_DESCENT_M_S2 = 0.3
-"""FlightTaskDescend without vertical velocity: this much less than 1 g of thrust."""
+"""Thrust deficit of FlightTaskDescend without a vertical velocity estimate."""
 _DESCENT_SLEW_M_S2 = 1.0
 _REACHED_M = 0.1
 _HOME_RADIUS_M = 0.3
@@ -35,7 +35,7 @@ class Phase(Enum):
 
 
 class Navigator:
-    """Turns the navigation state into an attitude target."""
+    """Computes the attitude target of the active mode."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -43,23 +43,23 @@ class Navigator:
         self.phase = Phase.GROUND
         self.takeoff_done = False
         self.target = _LEVEL_IDLE
-        """What the position controller follows: POSITION_TARGET_LOCAL_NED."""
+        """Setpoint of the position controller (POSITION_TARGET_LOCAL_NED)."""
         self._state: NavState | None = None
         self._ramp_since_s = 0.0
         self._hold_ned_m: Vec3 = (0.0, 0.0, 0.0)
         self._way = Smoothing((0.0, 0.0), (0.0, 0.0))
-        """To the point that the mode holds."""
+        """Trajectory to the point that the mode holds."""
         self._yaw_rad = 0.0
         self._descent_m_s = 0.0
         self._descending = False
 
     @property
     def descend_m_s(self) -> float:
-        """trajectory_setpoint.velocity[2], for the land detector: a position setpoint below the floor is no commanded descent."""
+        """Commanded descent speed for the land detector (trajectory_setpoint.velocity[2]); a position setpoint does not count."""
         return self.target.velocity_ned_m_s[2] or 0.0
 
     def enter(self, state: NavState, estimate: Estimate, home_ned_m: Vec3 | None, landed: bool) -> None:
-        """Take up a mode: fix the point that it holds."""
+        """Enter a mode and set the point that it holds."""
         previous, self._state = self._state, state
         came_from_takeoff = previous is NavState.TAKEOFF and self.takeoff_done
         self.takeoff_done = False
@@ -81,15 +81,15 @@ class Navigator:
             self._hold_ned_m = self._stopping_point(estimate)
 
     def leave(self) -> None:
-        """Disarmed: no mode flies."""
+        """Leave the mode, on disarming."""
         self._state = None
 
     def settle(self, landed: bool) -> None:
-        """The position loop does not fly now (disarmed, or attitude setpoints): it will start from where the vehicle is."""
+        """Reset the take-off phase while the position loop is inactive (disarmed, or attitude setpoints)."""
         self.phase = Phase.GROUND if landed else Phase.FLIGHT
 
     def reposition(self, position_ned_m: Vec3, yaw_rad: float | None) -> None:
-        """MAV_CMD_DO_REPOSITION: move the point that Hold holds."""
+        """Move the point that Hold holds (MAV_CMD_DO_REPOSITION)."""
         self._hold_ned_m = position_ned_m
         if yaw_rad is not None:
             self._yaw_rad = yaw_rad
@@ -106,7 +106,18 @@ class Navigator:
         landed: bool,
         touching: bool,
     ) -> AttitudeTarget:
-        """One period of the position loop. `armed_s` is the time since arming, `touching` the land detector's first stage."""
+        """Run one period of the position loop.
+
+        Args:
+            t_s: world time.
+            dt_s: time since the last period.
+            estimate: state of the vehicle.
+            home_ned_m: home position, or None.
+            offboard: position setpoint in OFFBOARD, or None.
+            armed_s: time since arming.
+            landed: whether the land detector reports landed.
+            touching: whether it reports ground contact.
+        """
         self.target = target = self._mode_target(dt_s, estimate, home_ned_m, offboard)
         self._advance(t_s, estimate, target, armed_s, landed)
         if self.phase is Phase.GROUND or (self.phase is Phase.FLIGHT and touching):
@@ -137,7 +148,7 @@ class Navigator:
         return PositionTarget((x, y, self._hold_ned_m[2]), (vx, vy, None), (ax, ay, None), yaw_rad=self._yaw_rad)
 
     def _descent(self, dt_s: float, estimate: Estimate, home_ned_m: Vec3 | None) -> float:
-        """Landing speed by height above home (MPC_LAND_ALT1/2), approached smoothly."""
+        """Return the landing speed at this height above home (MPC_LAND_ALT1/2), limited in its rate of change."""
         real = self._params.real
         height = (home_ned_m[2] if home_ned_m else 0.0) - estimate.position_ned_m[2]
         low, high = real("MPC_LAND_ALT2"), max(real("MPC_LAND_ALT1"), real("MPC_LAND_ALT2") + 1e-3)
@@ -169,7 +180,7 @@ class Navigator:
         return (vz is not None and vz < 0.0) or (az is not None and az < 0.0)
 
     def _climb_limit(self, t_s: float) -> float | None:
-        """Upward speed limit: in the ramp it rises from the one that gives no thrust at all (Takeoff::updateRamp)."""
+        """Return the upward speed limit; in the take-off ramp it rises from the value that gives no thrust (Takeoff::updateRamp)."""
         real = self._params.real
         speed = real("MPC_TKO_SPEED")
         if self.phase is Phase.RAMPUP:

@@ -1,7 +1,7 @@
 """Parameter store of the PX4 stub: PX4's names, types, order, wire encoding and defaults for this vehicle.
 
-Values are stored as PX4 stores them: INT32, or REAL32 rounded to single precision. The defaults are PX4 1.16's own, except for the
-ones in `VEHICLE_DEFAULTS`: what this project wants for flying indoors on motion capture alone, and the slower pace of a small room.
+Values are stored as in PX4: INT32, or REAL32 in single precision. The defaults are those of PX4 1.16, except for
+`VEHICLE_DEFAULTS`: settings for flying indoors on motion capture alone, and lower speeds for a small room.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAV_PARAM_TYPE_INT32 = 6
 MAV_PARAM_TYPE_REAL32 = 9
 HASH_CHECK = "_HASH_CHECK"
 VERSION = "1.16"
-"""Whose names and defaults these are."""
+"""PX4 version of the names and defaults."""
 
 Value = int | float
 
@@ -31,17 +31,17 @@ VEHICLE_DEFAULTS: Mapping[str, Value] = {
 
 
 class Params:
-    """The autopilot's parameters; index on the wire is the alphabetic one, as in PX4."""
+    """The autopilot's parameters; as in PX4, their index is alphabetic."""
 
     def __init__(self, overrides: Mapping[str, Value] | None = None) -> None:
-        """Defaults of this vehicle, then `overrides`.
+        """Set the defaults of this vehicle, then `overrides`.
 
         Raises:
             KeyError: if an override names no known parameter.
             ValueError: if an override is not finite, or not whole where PX4 has an INT32.
         """
         self.revision = 0
-        """Grows with every change; whoever caches values compares it."""
+        """Grows with every change, so that a cache of values can compare it."""
         self._integer = {name: isinstance(default, int) for name, default in PX4_DEFAULTS.items()}
         self._values: dict[str, Value] = {name: PX4_DEFAULTS[name] for name in sorted(PX4_DEFAULTS)}
         self._names = tuple(self._values)
@@ -62,7 +62,7 @@ class Params:
         return self._values[name]
 
     def real(self, name: str) -> float:
-        """Value as float.
+        """Return a value as float.
 
         Raises:
             KeyError: unknown name.
@@ -70,7 +70,7 @@ class Params:
         return float(self._values[name])
 
     def integer(self, name: str) -> int:
-        """Value as int.
+        """Return a value as int.
 
         Raises:
             KeyError: unknown name.
@@ -78,7 +78,7 @@ class Params:
         return int(self._values[name])
 
     def set(self, name: str, value: Value) -> Value:
-        """Store a value; returns what was stored.
+        """Store a value and return what was stored.
 
         Raises:
             KeyError: unknown name.
@@ -97,7 +97,7 @@ class Params:
         return stored
 
     def index(self, name: str) -> int:
-        """Index on the wire.
+        """Return the index of a parameter in the protocol.
 
         Raises:
             KeyError: unknown name.
@@ -105,11 +105,11 @@ class Params:
         return self._index[name]
 
     def name_at(self, index: int) -> str | None:
-        """Name at a wire index, or None."""
+        """Return the name at an index of the protocol, or None."""
         return self._names[index] if 0 <= index < len(self._names) else None
 
     def mav_type(self, name: str) -> int:
-        """MAV_PARAM_TYPE of a parameter.
+        """Return the MAV_PARAM_TYPE of a parameter.
 
         Raises:
             KeyError: unknown name.
@@ -117,7 +117,7 @@ class Params:
         return MAV_PARAM_TYPE_INT32 if self._integer[name] else MAV_PARAM_TYPE_REAL32
 
     def wire_value(self, name: str) -> float:
-        """PARAM_VALUE.param_value: integers are bit-cast into the float (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE).
+        """Return PARAM_VALUE.param_value; integers are bit-cast into the float (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE).
 
         Raises:
             KeyError: unknown name.
@@ -125,18 +125,18 @@ class Params:
         return encode_bytewise(self._values[name])
 
     def set_from_wire(self, name: str, wire: float, mav_type: int) -> Value:
-        """PARAM_SET: PX4 takes the type from its own table and ignores a message whose type disagrees.
+        """Store the value of PARAM_SET; PX4 rejects a message whose type differs from its own table.
 
         Raises:
             KeyError: unknown name.
-            ValueError: the type disagrees or the value is not finite.
+            ValueError: the type differs or the value is not finite.
         """
         if mav_type != self.mav_type(name):
             raise ValueError(f"{name}: MAV_PARAM_TYPE {mav_type} sent, {self.mav_type(name)} expected")
         return self.set(name, decode_bytewise(wire, mav_type))
 
     def hash_check(self) -> float:
-        """Value of the _HASH_CHECK pseudo parameter, a bit-cast CRC over names and values."""
+        """Return the value of the pseudo parameter _HASH_CHECK, a bit-cast CRC over names and values."""
         crc = 0
         for name, value in self._values.items():
             crc = zlib.crc32(name.encode(), crc)
@@ -145,14 +145,14 @@ class Params:
 
 
 def encode_bytewise(value: Value) -> float:
-    """The float whose bytes are those of an int32, or the value itself."""
+    """Return the float with the bytes of an int32, or a float unchanged."""
     if isinstance(value, int):
         return float(struct.unpack("<f", struct.pack("<i", value))[0])
     return value
 
 
 def decode_bytewise(wire: float, mav_type: int) -> Value:
-    """Inverse of `encode_bytewise`."""
+    """Undo `encode_bytewise`."""
     if mav_type == MAV_PARAM_TYPE_INT32:
         return int(struct.unpack("<i", struct.pack("<f", wire))[0])
     return wire

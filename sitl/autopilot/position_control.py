@@ -1,4 +1,4 @@
-"""PX4's position controller, pure: position P, velocity PID, thrust vector and yaw to attitude. Frames: local NED, body FRD."""
+"""PX4's position controller: position P, velocity PID, then thrust vector and yaw to attitude. Frames: local NED, body FRD."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Gains:
 
 
 class PositionControl:
-    """mc_pos_control: one controller for PX4's own modes and for position setpoints in OFFBOARD."""
+    """The controller of PX4's own modes and of position setpoints in OFFBOARD (mc_pos_control)."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -45,7 +45,7 @@ class PositionControl:
         self._yaw_rad: float | None = None
 
     def reset(self) -> None:
-        """Forget the integrators and the yaw setpoint."""
+        """Reset integrators and yaw setpoint."""
         self._integral = [0.0, 0.0, 0.0]
         self._velocity_previous = None
         self._yaw_rad = None
@@ -53,7 +53,7 @@ class PositionControl:
     def step(
         self, dt_s: float, estimate: Estimate, target: PositionTarget, climb_limit_m_s: float | None = None
     ) -> AttitudeTarget:
-        """One control period. `climb_limit_m_s` lowers the upward speed limit (negative: only downward), for the take-off ramp."""
+        """Run one control period; `climb_limit_m_s` lowers the upward speed limit in the take-off ramp (negative: only descent)."""
         if self._revision != self._params.revision:
             self._gains = self._read()
         gains = self._gains
@@ -66,7 +66,7 @@ class PositionControl:
         return AttitudeTarget(attitude, thrust, yaw_rate)
 
     def idle(self, estimate: Estimate) -> AttitudeTarget:
-        """On the ground: no thrust, level, present heading, integrators at zero."""
+        """Return the setpoint on the ground: level, present heading, no thrust; reset the integrators."""
         self.reset()
         yaw = heading_rad(estimate.attitude_ned_frd)
         return AttitudeTarget((math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)), 0.0)
@@ -110,12 +110,12 @@ class PositionControl:
         return out
 
     def _thrust_attitude(self, push: list[float], yaw_rad: float) -> tuple[Quat, float]:
-        """Acceleration setpoint to thrust vector: hover thrust is what makes 1 g; vertical goes before horizontal."""
+        """Convert an acceleration setpoint to attitude and thrust: hover thrust gives 1 g, vertical has priority over horizontal."""
         gains = self._gains
         up = max(GRAVITY_M_S2 - push[2], 1e-3)
-        lean = math.hypot(push[0], push[1])
+        horizontal = math.hypot(push[0], push[1])
         limit = up * math.tan(gains.tilt_rad)
-        scale = limit / lean if lean > limit else 1.0
+        scale = limit / horizontal if horizontal > limit else 1.0
         ax, ay = push[0] * scale, push[1] * scale
         norm = math.sqrt(ax * ax + ay * ay + up * up)
         thrust = gains.hover * norm / GRAVITY_M_S2
@@ -165,12 +165,12 @@ class PositionControl:
 
 
 def heading_rad(attitude_ned_frd: Quat) -> float:
-    """Yaw of an attitude, rad."""
+    """Return the yaw of an attitude, rad."""
     return euler_zyx_from_quat(attitude_ned_frd)[2]
 
 
 def attitude_from_up(thrust_direction_ned: Vec3, yaw_rad: float) -> Quat:
-    """Attitude whose -z axis (the thrust) points along a unit vector and whose x axis heads to `yaw_rad`."""
+    """Return the attitude whose -z axis (the thrust) points along a unit vector, with heading `yaw_rad`."""
     zx, zy, zz = -thrust_direction_ned[0], -thrust_direction_ned[1], -thrust_direction_ned[2]
     # x axis: the heading turned into the plane normal to z.
     xx, xy, xz = zz * math.cos(yaw_rad), zz * math.sin(yaw_rad), -(zx * math.cos(yaw_rad) + zy * math.sin(yaw_rad))

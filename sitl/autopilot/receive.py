@@ -1,4 +1,4 @@
-"""What the PX4 stub does with each MAVLink message that arrives: parameters, commands, setpoints, vision. No sockets, no clock."""
+"""Handlers of the MAVLink messages that the PX4 stub receives: parameters, commands, setpoints, vision. No sockets, no clock."""
 
 from __future__ import annotations
 
@@ -71,11 +71,11 @@ class Receiver:
         }
 
     def handle(self, link: Reply, message: Message) -> None:
-        """Handle one decoded message that is meant for this autopilot or for everybody."""
+        """Handle one decoded message if it is addressed to this autopilot or to all systems."""
         handler = self._handlers.get(message.get_msgId())
         if handler is None:
             return
-        # A companion computer may share the system id; only an echo of the stub's own messages is not for it.
+        # A companion computer may share the system id, so only an echo of the stub's own messages is ignored.
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._system, self._component):
             return
         if getattr(message, "target_system", 0) not in (0, self._system):
@@ -149,7 +149,7 @@ class Receiver:
         )
 
     def _link_command(self, link: Reply, command: int, params: Command7) -> Result | None:
-        """Commands that PX4's mavlink module answers itself; None: the commander's business."""
+        """Handle a command that PX4's mavlink module answers itself; return None if the commander handles it."""
         number = int(params[0]) if math.isfinite(params[0]) else -1
         match command:
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -208,7 +208,7 @@ class Receiver:
         self._vision((m.x, m.y, m.z), quat_from_euler_zyx(m.roll, m.pitch, m.yaw))
 
     def _odometry(self, _link: Reply, message: Message) -> None:
-        """Only external vision is fused: MOCAP_NED, unset and naive estimators end in other topics or in an error, silently."""
+        """Take ODOMETRY only if it is external vision; PX4 silently does not fuse MOCAP_NED, unset and naive estimators."""
         m = message
         if m.estimator_type in _FUSED_ESTIMATORS and m.frame_id in _FUSED_FRAMES:
             self._vision((m.x, m.y, m.z), (m.q[0], m.q[1], m.q[2], m.q[3]))
@@ -229,7 +229,7 @@ class Receiver:
         )
 
     def _ftp(self, link: Reply, message: Message) -> None:
-        """No files here: every request is refused at once, so that nobody waits."""
+        """Refuse every file request at once, so that a ground station does not wait."""
         sequence, session, opcode = struct.unpack_from("<HBB", bytes(message.payload))
         if opcode >= 128:
             return
@@ -245,7 +245,7 @@ class Receiver:
 
 
 def param_value_message(stub: Px4Stub, name: str) -> Message:
-    """PARAM_VALUE of one parameter."""
+    """Return PARAM_VALUE of one parameter."""
     params = stub.params
     return mavlink.MAVLink_param_value_message(
         name.encode(), params.wire_value(name), params.mav_type(name), len(params), params.index(name)
@@ -253,7 +253,7 @@ def param_value_message(stub: Px4Stub, name: str) -> Message:
 
 
 def hash_check_message(stub: Px4Stub) -> Message:
-    """PARAM_VALUE of _HASH_CHECK: outside the count, with index -1."""
+    """Return PARAM_VALUE of _HASH_CHECK, which has index -1 and is not counted."""
     return mavlink.MAVLink_param_value_message(
         HASH_CHECK.encode(), stub.params.hash_check(), MAV_PARAM_TYPE_INT32, len(stub.params), 65535
     )

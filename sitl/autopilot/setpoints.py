@@ -1,4 +1,4 @@
-"""Offboard setpoints after decoding: what SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED ask for, in PX4's frames."""
+"""Decoding of the offboard setpoints SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED, in PX4's frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class RateTarget:
 
 @dataclass(frozen=True, slots=True)
 class PositionTarget:
-    """trajectory_setpoint: None per axis means that this quantity does not command the axis."""
+    """Position setpoint (trajectory_setpoint); None means that this quantity does not command the axis."""
 
     position_ned_m: Axis3 = NOTHING
     velocity_ned_m_s: Axis3 = NOTHING
@@ -34,7 +34,7 @@ class PositionTarget:
 
     @property
     def kind(self) -> OffboardKind:
-        """What offboard_control_mode would say."""
+        """Kind of setpoint, as in offboard_control_mode."""
         if any(value is not None for value in self.position_ned_m):
             return OffboardKind.POSITION
         if any(value is not None for value in self.velocity_ned_m_s):
@@ -43,7 +43,7 @@ class PositionTarget:
 
     @property
     def empty(self) -> bool:
-        """Commands nothing at all."""
+        """Whether it commands nothing."""
         axes = (*self.position_ned_m, *self.velocity_ned_m_s, *self.acceleration_ned_m_s2)
         return all(value is None for value in axes)
 
@@ -57,10 +57,11 @@ _THROTTLE_IGNORE, _ATTITUDE_IGNORE = 64, 128
 def decode_attitude_target(
     type_mask: int, q_wxyz: Quat, rates_frd_rad_s: Vec3, thrust: float
 ) -> AttitudeTarget | RateTarget | None:
-    """SET_ATTITUDE_TARGET as PX4 reads it.
+    """Decode SET_ATTITUDE_TARGET as PX4 does, with thrust limited to 0 .. 1.
 
-    A quaternion without direction, a thrust that is not finite or is to be ignored, and rates that are not finite give None: the
-    stub keeps flying what it has, and the message does not count as a setpoint. Thrust is limited to 0 .. 1.
+    Returns:
+        The setpoint, or None if the message does not count as one: its quaternion has no direction, its thrust is not finite or
+        masked out, or its rates are not finite.
     """
     if type_mask & _THROTTLE_IGNORE or not math.isfinite(thrust):
         return None
@@ -93,9 +94,9 @@ def decode_position_target(
     yaw_rate_rad_s: float,
     heading_rad: float,
 ) -> PositionTarget | None:
-    """SET_POSITION_TARGET_LOCAL_NED as PX4 reads it; None: nothing usable is in it.
+    """Decode SET_POSITION_TARGET_LOCAL_NED as PX4 does; return None if it commands nothing.
 
-    PX4 takes MAV_FRAME_LOCAL_NED in full and, in MAV_FRAME_BODY_NED, velocity and acceleration turned by the heading.
+    PX4 uses every field in MAV_FRAME_LOCAL_NED; in MAV_FRAME_BODY_NED it uses velocity and acceleration, rotated by the heading.
     """
     if frame not in (MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_NED) or type_mask & _FORCE_SET:
         return None

@@ -1,7 +1,7 @@
-"""Jerk-limited motion to a point in the horizontal plane, pure, after PX4's PositionSmoothing and VelocitySmoothing.
+"""Jerk-limited motion to a point in the horizontal plane, after PX4's PositionSmoothing and VelocitySmoothing.
 
 The speed towards the point is what TrajMath's computeMaxSpeedFromDistance allows, at most MPC_XY_CRUISE; the velocity follows it within
-MPC_ACC_HOR and MPC_JERK_AUTO. Near the point that is a creep with a time constant of 2 MPC_ACC_HOR / MPC_JERK_AUTO.
+MPC_ACC_HOR and MPC_JERK_AUTO. Near the point the approach is exponential, with a time constant of 2 MPC_ACC_HOR / MPC_JERK_AUTO.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ class Smoothing:
     """The trajectory's position, velocity and acceleration, local NED.
 
     Args:
-        position_ned_m, velocity_ned_m_s: where it starts, horizontally, at no acceleration.
+        position_ned_m: horizontal position at the start.
+        velocity_ned_m_s: horizontal velocity at the start; the acceleration there is zero.
     """
 
     __slots__ = ("acceleration_m_s2", "position_m", "velocity_m_s")

@@ -1,4 +1,4 @@
-"""Which messages the PX4 stub streams and how often: PX4's rates and ceilings, and a schedule on world time. No I/O, no clock."""
+"""Telemetry streams of the PX4 stub: PX4's default and maximum rates, and a schedule on world time. No I/O, no clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Builder = Callable[[Px4Stub], Message | None]
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """One message type. Rates in Hz: default on the onboard link, default on the ground link, the most PX4 delivers."""
+    """One message type with its rates in Hz: default on the onboard link, default on the ground station link, maximum."""
 
     build: Builder
     onboard_hz: float
@@ -85,7 +85,7 @@ STREAMS: dict[int, Stream] = {
 
 
 class Schedule:
-    """When each stream of one link is due, on world time."""
+    """Schedule of the streams of one link, on world time."""
 
     def __init__(self, ground: bool) -> None:
         self._default_hz = {key: stream.ground_hz if ground else stream.onboard_hz for key, stream in STREAMS.items()}
@@ -95,7 +95,7 @@ class Schedule:
             self.set_rate(key, rate_hz)
 
     def set_rate(self, message_id: int, rate_hz: float) -> bool:
-        """Ask for a rate; 0 stops the stream, PX4's ceiling bounds it. False: no such stream."""
+        """Set the rate of a stream, limited by PX4's maximum; 0 stops it. Return False if there is no such stream."""
         stream = STREAMS.get(message_id)
         if stream is None:
             return False
@@ -106,7 +106,7 @@ class Schedule:
         return True
 
     def set_interval_us(self, message_id: int, interval_us: float) -> bool:
-        """MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 is the default rate. False: no such stream."""
+        """Handle MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 is the default rate. Return False if there is no such stream."""
         if message_id not in STREAMS or not math.isfinite(interval_us):
             return False
         if interval_us == 0:
@@ -114,14 +114,14 @@ class Schedule:
         return self.set_rate(message_id, 1e6 / interval_us if interval_us > 0 else 0.0)
 
     def interval_us(self, message_id: int) -> int:
-        """MESSAGE_INTERVAL: -1 stopped, 0 unknown."""
+        """Return the interval for MESSAGE_INTERVAL: -1 if stopped, 0 if unknown."""
         if message_id not in STREAMS:
             return 0
         period_s = self._period_s.get(message_id)
         return -1 if period_s is None else round(period_s * 1e6)
 
     def due(self, t_s: float) -> list[int]:
-        """Streams to send now. A stream that fell behind is sent once, not in a burst."""
+        """Return the ids of the streams to send now; a stream that fell behind is sent once, not in a burst."""
         ids = []
         for key, period_s in self._period_s.items():
             at_s = self._due_s[key]

@@ -29,7 +29,7 @@ def _ms(stub: Px4Stub) -> int:
 
 
 def clock_us(stub: Px4Stub) -> int:
-    """PX4's own clock, since it booted: of every message that tells microseconds."""
+    """Return PX4's own clock: microseconds since it booted."""
     return int((stub.t_s - stub.booted_at_s + stub.clock_ahead_s) * 1e6)
 
 
@@ -58,7 +58,7 @@ def system_status(stub: Px4Stub) -> int:
 
 
 def sys_status(stub: Px4Stub) -> Message:
-    """SYS_STATUS. As measured, PREARM_CHECK is never healthy with SYS_HAS_MAG = 0; position sources are not reported at all."""
+    """SYS_STATUS. As measured, PREARM_CHECK is never healthy with SYS_HAS_MAG = 0, and position sources are not reported."""
     present = (
         mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
         | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -127,7 +127,7 @@ def attitude_quaternion(stub: Px4Stub) -> Message | None:
 
 
 def local_position_ned(stub: Px4Stub) -> Message | None:
-    """LOCAL_POSITION_NED; whether the position is valid or not, as PX4 sends it: (0, 0, 0) before vision, dead reckoning after it."""
+    """LOCAL_POSITION_NED. PX4 sends it even if the position is invalid: (0, 0, 0) before vision, dead reckoning after its loss."""
     estimate = _attitude(stub)
     if estimate is None:
         return None
@@ -178,8 +178,8 @@ def scaled_imu(stub: Px4Stub) -> Message | None:
 
 
 def estimator_status(stub: Px4Stub) -> Message | None:
-    """ESTIMATOR_STATUS as EKF2 1.16 makes it: a ratio is NaN while nothing of its kind is fused, the absolute position needs an origin,
-    and "constant position" is said at rest too.
+    """ESTIMATOR_STATUS as EKF2 1.16 sends it: a ratio is NaN while nothing of its kind is fused, the absolute position needs an origin,
+    and the flag for constant position is also set at rest.
     """
     estimate = stub.estimate
     if estimate is None:
@@ -227,7 +227,7 @@ def altitude(stub: Px4Stub) -> Message | None:
 
 
 def attitude_target(stub: Px4Stub) -> Message | None:
-    """ATTITUDE_TARGET: what the attitude loop follows."""
+    """ATTITUDE_TARGET: setpoint of the attitude loop."""
     if not stub.armed:
         return None
     target = stub.target
@@ -237,7 +237,7 @@ def attitude_target(stub: Px4Stub) -> Message | None:
 
 
 def position_target_local_ned(stub: Px4Stub) -> Message | None:
-    """POSITION_TARGET_LOCAL_NED: what the position controller follows."""
+    """POSITION_TARGET_LOCAL_NED: setpoint of the position controller."""
     if not stub.armed or not stub.position_controlled:
         return None
     target = stub.navigator.target
@@ -301,17 +301,17 @@ def actuator_output_status(stub: Px4Stub) -> Message:
 
 
 def system_time(stub: Px4Stub) -> Message:
-    """SYSTEM_TIME; no wall clock without GPS."""
+    """SYSTEM_TIME; the wall clock is 0 without GPS."""
     return mavlink.MAVLink_system_time_message(0, _ms(stub))
 
 
 def timesync_request(stub: Px4Stub) -> Message:
-    """TIMESYNC as PX4 asks for it."""
+    """TIMESYNC request of PX4."""
     return mavlink.MAVLink_timesync_message(0, clock_us(stub) * 1000)
 
 
 def ping(stub: Px4Stub) -> Message:
-    """PING request to everybody."""
+    """PING request to all systems."""
     return mavlink.MAVLink_ping_message(clock_us(stub), int(stub.t_s) & 0xFFFFFFFF, 0, 0)
 
 

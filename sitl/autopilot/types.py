@@ -1,6 +1,6 @@
 """Records inside the PX4 stub; frames are PX4's own: local NED, body FRD.
 
-Named tuples: they are made at 250 Hz, and one costs a quarter of a frozen dataclass.
+They are named tuples because they are created at 250 Hz, at a quarter of the cost of a frozen dataclass.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from companion.model.types import Quat, Vec3, Vec4
 
 
 class ImuSample(NamedTuple):
-    """One IMU sample, noise and bias included."""
+    """One IMU sample, with noise and bias."""
 
     t_s: float
     gyro_frd_rad_s: Vec3
@@ -20,7 +20,7 @@ class ImuSample(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Output of the EKF-like estimator."""
+    """Output of the estimator."""
 
     t_s: float
     position_ned_m: Vec3
@@ -29,24 +29,24 @@ class Estimate(NamedTuple):
     rates_frd_rad_s: Vec3
     accel_frd_m_s2: Vec3
     vision_fused: bool
-    """Vision arrived and was accepted within the last 0.55 s (as PX4's EV flags)."""
+    """Whether vision was fused within the last 0.55 s (as PX4's EV flags)."""
     position_valid: bool
-    """xy_valid and z_valid of VEHICLE_LOCAL_POSITION: holds up to 4.5 s after the last fused vision."""
+    """xy_valid and z_valid of VEHICLE_LOCAL_POSITION: true up to 4.5 s after vision was last fused."""
     attitude_valid: bool
 
 
 class Fusion(NamedTuple):
-    """How well the estimator's vision fits: ratios of ESTIMATOR_STATUS, square roots of filtered test ratios, and one sigma in m."""
+    """Vision innovation test ratios as in ESTIMATOR_STATUS (square roots of filtered test ratios), and accuracy (one sigma)."""
 
     horizontal_ratio: float
-    """NaN: not fused."""
+    """NaN if vision is not fused."""
     vertical_ratio: float
     horizontal_accuracy_m: float
     vertical_accuracy_m: float
 
 
 class AttitudeTarget(NamedTuple):
-    """What the attitude loop follows."""
+    """Setpoint of the attitude loop."""
 
     attitude_ned_frd: Quat
     thrust: float

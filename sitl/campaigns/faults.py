@@ -14,7 +14,7 @@ from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, with_world
 from sitl.campaigns.runner import CampaignError, Data
 from sitl.fast.loop import FastResult
-from sitl.faults.timing import FaultError, in_time
+from sitl.faults.timing import FaultError, with_fault_times
 from sitl.world.world import Snapshot
 
 
@@ -28,7 +28,7 @@ def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
     flights: list[Data] = job["flights"]
     for phase in {flight["phase"] for flight in flights}:
         try:
-            in_time(with_world(config, {"faults": [{"kind": "mocap_loss", "phase": phase}]}))
+            with_fault_times(with_world(config, {"faults": [{"kind": "mocap_loss", "phase": phase}]}))
         except FaultError as error:
             raise CampaignError(str(error), bad_input=True) from None
     return flights

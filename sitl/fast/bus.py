@@ -1,4 +1,4 @@
-"""The servo bus of the fast closed loop: what the companion's set-up of the bus finds, without a pty."""
+"""The servo bus of the fast closed loop: the outcome of the companion's bus set-up, computed without a pty."""
 
 from __future__ import annotations
 

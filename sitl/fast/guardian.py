@@ -1,6 +1,6 @@
-"""The guardian in the fast closed loop: its own watch and its own landing, on simulated time, over a wire that is only memory.
+"""The guardian in the fast closed loop: its own monitoring and landing code on simulated time, over a link in memory.
 
-What its process does beside that (kill, take the port) is told here by how long it takes.
+Killing the flight process and taking over its port are modelled by the time they take.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from sitl.autopilot.receive import Receiver
 from sitl.autopilot.streams import Schedule
 
 TAKE_OVER_S = 0.03
-"""From the decision to the first message: the flight process is killed, its port opened."""
+"""Time from the decision to the first message: killing the flight process and opening its port."""
 _OWN = (1, 191)
 
 
 class MemoryWire:
-    """The guardian's wire to the stub."""
+    """The guardian's MAVLink connection to the stub, in memory."""
 
     lost = False
 
@@ -47,42 +47,42 @@ class MemoryWire:
     # -- the guardian's end ----------------------------------------------------------------------------------------
 
     def fileno(self) -> int:
-        """Nothing to wait on."""
+        """Return -1: there is no socket to wait for."""
         return -1
 
     @property
     def ready(self) -> bool:
-        """There is nobody to look for."""
+        """Whether PX4 was found; always true."""
         return True
 
     def send(self, data: bytes) -> None:
-        """Handled at once."""
+        """Deliver MAVLink bytes to the stub at once."""
         for message in self._decoder.parse_buffer(data) or ():
             self._receiver.handle(self._end, message)
 
     def receive(self) -> list[bytes]:
-        """What the stub has sent."""
+        """Return and clear the packets that the stub has sent."""
         waiting = list(self._waiting)
         self._waiting.clear()
         return waiting
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: there is no socket."""
 
     # -- the stub's end --------------------------------------------------------------------------------------------
 
     def pump(self, t_s: float) -> None:
-        """Streams that are due."""
+        """Send the stub's telemetry streams that are due."""
         for message in self.schedule.messages(self._px4, t_s):
             self.post(message)
 
     def post(self, message: Any) -> None:
-        """One message of the stub."""
+        """Queue one message of the stub."""
         self._waiting.append(message.pack(self._encoder))
 
 
 class _StubEnd:
-    """What the receiver answers through."""
+    """Where the stub's receiver sends its answers."""
 
     def __init__(self, wire: MemoryWire) -> None:
         self._wire = wire
@@ -92,21 +92,21 @@ class _StubEnd:
         self._wire.post(message)
 
     def send_all_params(self) -> None:
-        """Nobody here asks for them."""
+        """Do nothing: the guardian does not ask for parameters."""
 
     def saw_ground_station(self) -> None:
-        """There is none."""
+        """Do nothing: there is no ground station."""
 
     def status_text(self, severity: int, text: str) -> None:
-        """Nobody reads it."""
+        """Drop the text: the guardian does not read it."""
 
 
 class FastGuardian:
     """The guardian of one fast flight.
 
     Args:
-        vehicle: for the timeout and the height of a vehicle that stands.
-        px4: the other end of its wire.
+        vehicle: vehicle file; it has the timeout and the height of the vehicle on the floor.
+        px4: the stub that it connects to.
     """
 
     def __init__(self, vehicle: Vehicle, px4: Px4Stub) -> None:
@@ -123,11 +123,17 @@ class FastGuardian:
         self.alive = True
 
     def beat(self, inputs: Inputs, outputs: Outputs) -> None:
-        """A control tick of the flight process."""
+        """Take the heartbeat of one control tick of the flight process."""
         self._beat = self._heartbeats.of(inputs, outputs)
 
-    def must_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
-        """One look at the flight process; to be asked in every tick."""
+    def decides_to_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
+        """Check the flight process; call it in every tick.
+
+        Args:
+            t_s: world time.
+            heard: a heartbeat arrived in this tick.
+            dead: the flight process has ended.
+        """
         if not self.alive or self._beat is None or not self._beat.lifting or t_s - self._round_s < PERIOD_S - 1e-9:
             return False
         self._round_s = t_s
@@ -144,7 +150,7 @@ class FastGuardian:
         return True
 
     def take_over(self, t_s: float) -> Landing:
-        """In charge from now on."""
+        """Take control and return the landing."""
         assert self._beat is not None
         return Landing(self._beat, self._vehicle, self._px4, t_s, self._notify)
 
@@ -155,7 +161,7 @@ class FastGuardian:
 
 
 class Landing:
-    """The guardian in charge."""
+    """A landing that the guardian controls."""
 
     def __init__(self, beat: Heartbeat, vehicle: Vehicle, px4: Px4Stub, t_s: float, notify: Notify) -> None:
         self._wire = MemoryWire(px4)
@@ -170,7 +176,7 @@ class Landing:
         return self._landing.landed
 
     def step(self, t_s: float, poses: list[MocapPose]) -> None:
-        """To be called in every step of the physics."""
+        """Advance the landing; call it in every step of the physics."""
         self._landing.take_poses(poses)
         if t_s - self._round_s >= PERIOD_S - 1e-9:
             self._round_s = t_s

@@ -1,4 +1,4 @@
-"""The MAVLink link of the fast closed loop when it is faulty: dead, or slow both ways."""
+"""The MAVLink link of the fast closed loop with its faults: lost, or delayed in both directions."""
 
 from __future__ import annotations
 
@@ -13,60 +13,62 @@ from sitl.faults.injector import Faults
 from sitl.world.world import World
 
 MEMORY = 400
-"""Ticks that the link may hold back."""
+"""Longest delay of received states, in control ticks."""
 
 
 class FastLink:
-    """Between the core and the stub.
+    """The link between the flight core and the stub.
 
     Args:
-        faults: of the world.
-        world: for the time.
-        px4: the other end; while it boots there is none.
-        tick_s: from one control tick to the next.
+        faults: faults of the world.
+        world: the world, for its time.
+        px4: the stub; while it boots, the link is dead.
+        tick_s: period of the control tick.
     """
 
     def __init__(self, faults: Faults, world: World, px4: Px4Stub, tick_s: float) -> None:
         self._faults, self._world, self._px4, self._tick_s = faults, world, px4, tick_s
-        self._on_their_way: deque[tuple[float, Callable[[], None]]] = deque()
-        self._told: deque[tuple[VehicleState | None, AutopilotStatus]] = deque(maxlen=MEMORY)
-        """What PX4 said in the last ticks, the newest first."""
+        self._in_flight: deque[tuple[float, Callable[[], None]]] = deque()
+        self._received: deque[tuple[VehicleState | None, AutopilotStatus]] = deque(maxlen=MEMORY)
+        """What PX4 sent in the last ticks, newest first."""
 
     @property
     def alive(self) -> bool:
-        """What is sent arrives, sooner or later."""
+        """Whether messages arrive at all."""
         return "link_loss" not in self._faults.active and self._world.t_s >= self._px4.booted_at_s
 
     def send(self, deliver: Callable[[], None]) -> None:
-        """To PX4; `deliver` is called when it arrives."""
+        """Send something to PX4; `deliver` is called when it arrives."""
         if not self.alive:
             return
         delay_s = self._faults.size("link_delay")
-        if delay_s or self._on_their_way:
-            self._on_their_way.append((self._world.t_s + delay_s, deliver))
+        if delay_s or self._in_flight:
+            self._in_flight.append((self._world.t_s + delay_s, deliver))
         else:
             deliver()
 
-    def deliver_late(self) -> None:
-        """What arrives now. To be called in every tick."""
-        late, t_s = self._on_their_way, self._world.t_s
+    def deliver_due(self) -> None:
+        """Deliver delayed messages that are due; call it in every tick."""
+        late, t_s = self._in_flight, self._world.t_s
         while late and late[0][0] <= t_s + 1e-9:
             deliver = late.popleft()[1]
             if self.alive:
                 deliver()
 
-    def hear(self, state: VehicleState | None, status: AutopilotStatus) -> tuple[VehicleState | None, AutopilotStatus]:
-        """What the core hears in this tick, of what PX4 says now: late if the link is slow, the last of it if the link is dead."""
-        told = self._told
-        if not self.alive and told:
-            return told[0]
-        if state is None and told:
-            state = told[0][0]
-        told.appendleft((state, status))
+    def receive(
+        self, state: VehicleState | None, status: AutopilotStatus
+    ) -> tuple[VehicleState | None, AutopilotStatus]:
+        """Return the state that the core receives in this tick: delayed if the link is slow, the last one if the link is lost."""
+        received = self._received
+        if not self.alive and received:
+            return received[0]
+        if state is None and received:
+            state = received[0][0]
+        received.appendleft((state, status))
         delay_s = self._faults.size("link_delay")
         if not delay_s:
             return state, status
-        state, status = told[min(len(told) - 1, round(delay_s / self._tick_s))]
+        state, status = received[min(len(received) - 1, round(delay_s / self._tick_s))]
         if state is not None:  # stamps are of the arrival
             state = replace(
                 state,

@@ -1,6 +1,6 @@
-"""The fast closed loop: the same flight core, PX4 stub, servos and world, without sockets and on simulated time.
+"""The fast closed loop: flight core, PX4 stub, servos and world on simulated time, without sockets.
 
-What a wire would do is kept: sensor rates, quantisation, noise, delays; what is left out is only the bytes.
+It keeps the sensor rates, quantisation, noise and delays of the wires, and leaves out only their bytes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from sitl.fast.bus import scales_of
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
 from sitl.faults.injector import COOL_C, Faults
-from sitl.faults.timing import in_time
+from sitl.faults.timing import with_fault_times
 from sitl.server import start_of
 from sitl.servo.drive import MODE_CURRENT
 from sitl.servo.from_config import plugged_in, servos_of
@@ -61,18 +61,18 @@ from sitl.world.world import Layout, Snapshot, Truth
 
 TICK_S = 0.005
 LINK_DELAY_S = 0.002
-"""Time that a setpoint takes on the wire."""
+"""Time from sending a setpoint to its arrival at PX4."""
 POSITION_PERIOD_S = 1.0 / 124.0
-"""As PX4 streams at most; attitude and IMU come with every tick."""
+"""PX4's fastest position stream; attitude and IMU arrive with every tick."""
 _NO_COMMAND, _LAND = OperatorCommand.NONE, OperatorCommand.LAND
 _ON_GROUND, _IN_AIR = LandedState.ON_GROUND, LandedState.IN_AIR
 _NO_REQUEST = AutopilotRequest.NONE
 _HEALTHY = (0, 0)
 _COOL = (COOL_C, COOL_C)
 SETTLE_S = 30.0
-"""So long the world goes on after a flight that ends with rotors that turn."""
-HOLD_UP: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
-"""Faults of the flight process itself."""
+"""Longest time for which the world goes on after a flight that ends armed."""
+FLIGHT_PROCESS_FAULTS: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
+"""Faults that stop the flight process."""
 _MODES = {NavState.OFFBOARD: FlightMode.OFFBOARD, NavState.LAND: FlightMode.LAND, NavState.LOITER: FlightMode.HOLD}
 _OFFBOARD_MODE: Command7 = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NOTHING: Command7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -80,55 +80,55 @@ _NOTHING: Command7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass
 class FastResult:
-    """One flight."""
+    """Record of one flight."""
 
     inputs: list[Inputs] = field(default_factory=list)
     outputs: list[Outputs] = field(default_factory=list)
     crashed: bool = False
     caught: bool = False
     snapshots: list[Snapshot] = field(default_factory=list)
-    """The world after each tick, as it is."""
+    """State of the world after each tick."""
     layout: Layout | None = None
     after: list[Snapshot] = field(default_factory=list)
-    """The world after the last tick, while the guardian lands; every 5 ms."""
+    """State of the world after the last tick, every 5 ms, while the guardian or PX4 lands."""
     guardian_events: list[Event] = field(default_factory=list)
-    """What the guardian did; empty: it was not needed."""
+    """The guardian's events; empty if it did not act."""
     guardian_landed: bool | None = None
-    """None: it was not needed, or has not come to an end."""
+    """Whether the guardian landed the vehicle; None if it did not act or has not finished."""
     armed: bool = False
-    """The rotors still turn at the end."""
+    """Whether the vehicle is still armed at the end."""
 
     @cached_property
     def truth(self) -> list[Truth]:
-        """The world after each tick; made when somebody looks."""
+        """True state after each tick; computed at the first access."""
         layout = self.layout
         return [] if layout is None else [layout.truth(snapshot) for snapshot in self.snapshots]
 
 
 @contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
-    """A flight makes many records and no cycles: the collector would go through all of them again and again, for nothing."""
+def _garbage_collection_paused() -> Iterator[None]:
+    """Pause garbage collection: a flight creates many records and no reference cycles, so collecting only costs time."""
     was_on = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         if was_on:
-            # Not young any more: else the collector would at once go through all that the flight has made.
+            # Moves the records to the oldest generation, so that the next collection does not traverse all of them.
             gc.freeze()
             gc.unfreeze()
             gc.enable()
 
 
-class _Heard:
-    """PX4, and every IMU sample that it sends on."""
+class _RecordedImu:
+    """Steps PX4 and sums its IMU samples, as the companion does with the IMU stream."""
 
     def __init__(self, px4: Px4Stub) -> None:
         self._px4 = px4
         self.total = DeltaVelocity()
 
     def step(self, imu: ImuSample) -> Vec4:
-        """One sample; PX4's clock starts anew with PX4."""
+        """Step PX4 by one sample; the sum restarts when PX4 reboots."""
         boot_s = imu.t_s - self._px4.booted_at_s
         if boot_s >= 0.0:
             self.total.add(boot_s, imu.accel_frd_m_s2)
@@ -139,20 +139,20 @@ class FastFlight:
     """One flight in the fast closed loop.
 
     Args:
-        config: effective configuration; hover thrust is taken from the stub's MPC_THR_HOVER if absent.
-        command: what the operator asks for at a flight time, for tests.
+        config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none.
+        land_at_s: flight time at which the operator commands a landing; None means never.
     """
 
     def __init__(self, config: SitlConfig, land_at_s: float | None = None) -> None:
-        config = in_time(config)
+        config = with_fault_times(config)
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
         self.px4 = stub_of(world, LINK_DELAY_S)
         servos = servos_of(vehicle, world)
         self._drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-        self._heard = _Heard(self.px4)
-        self.plant = Plant(vehicle, world, self._heard, self._drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
+        self._imu = _RecordedImu(self.px4)
+        self.plant = Plant(vehicle, world, self._imu, self._drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
         self.faults = Faults(world, self.plant.world, self.px4, self._drives, vehicle.tether.anchor_world_m)
         if world.faults:
             self.plant.faults = self.faults
@@ -172,20 +172,20 @@ class FastFlight:
             drive.set_goal_current(0, at_once=True)
             drive.start_watchdog(self._watchdog_s)
         self._scales = scales_of(vehicle, plugged_in(servos, world))
-        """None if the set-up of the servo bus failed: the arm never answers."""
+        """Scale of each joint; None if the set-up of the servo bus failed, and then the arm never answers."""
         self._mocap: MocapPose | None = None
         self._force: ForceSample | None = None
         self._arm: ArmState | None = None
         self._position = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
         self._trusted = True
-        """What the core said of motion capture: only what it believes is passed on to PX4."""
+        """Whether the core trusts motion capture; only trusted poses are forwarded to PX4."""
         self._dropped = 0
 
     def run(self, limit_s: float = 90.0) -> FastResult:
-        """Fly to the end."""
+        """Fly until the mission ends, the vehicle crashes or world time reaches `limit_s`."""
         world = self.plant.world
         result = FastResult(layout=world.layout)
-        with _no_collection():
+        with _garbage_collection_paused():
             self._run(result, limit_s)
         result.crashed = world.crashed
         result.caught = world.caught_t_s is not None
@@ -202,8 +202,8 @@ class FastFlight:
                 plant.step(px4.armed)
                 for frame in plant.take_mocap():
                     self._deliver(frame)
-            if guardian is not None and self._held_up(guardian):
-                if guardian.must_take_over(world.t_s, False, plant.fault("kill_flight") is not None):
+            if guardian is not None and self._flight_process_stalled(guardian):
+                if guardian.decides_to_take_over(world.t_s, False, plant.fault("kill_flight") is not None):
                     self._guardian_lands(guardian, result, limit_s)
                     break
                 result.after.append(world.snapshot())
@@ -216,7 +216,7 @@ class FastFlight:
             self._carry_out(outputs)
             if guardian is not None:
                 guardian.beat(inputs, outputs)
-                guardian.must_take_over(world.t_s, True, False)
+                guardian.decides_to_take_over(world.t_s, True, False)
             result.inputs.append(inputs)
             result.outputs.append(outputs)
             result.snapshots.append(world.snapshot())
@@ -229,7 +229,7 @@ class FastFlight:
         result.armed = px4.armed
 
     def _settle(self, result: FastResult) -> None:
-        """A flight that was given up while PX4 still lands: what becomes of the vehicle."""
+        """Let PX4 finish the landing of a flight that has ended in the air."""
         world, px4 = self.plant.world, self.px4
         end_s = world.t_s + SETTLE_S
         period_s = world.t_s
@@ -239,16 +239,16 @@ class FastFlight:
                 period_s += TICK_S
                 result.after.append(world.snapshot())
 
-    def _held_up(self, guardian: FastGuardian) -> bool:
-        """A fault keeps the flight process from its tick; what then goes on is what other threads do."""
+    def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
+        """Return whether a fault keeps the flight process from its tick, and do what its bus thread still does."""
         active, t_s = self.faults.active, self.plant.world.t_s
         guardian.alive = "kill_guardian" not in active
-        if "stall_loop" in active:  # the bus thread lives: it feeds the watchdogs, and takes old currents back
+        if "stall_loop" in active:  # the bus thread runs on: it feeds the watchdogs and withdraws stale currents
             for drive in self._drives:
                 drive.heard_instruction()
                 if t_s - self._goal_s > self._watchdog_s:
                     drive.set_goal_current(0)
-        return not active.keys().isdisjoint(HOLD_UP)
+        return not active.keys().isdisjoint(FLIGHT_PROCESS_FAULTS)
 
     def _guardian_lands(self, guardian: FastGuardian, result: FastResult, limit_s: float) -> None:
         plant, px4 = self.plant, self.px4
@@ -274,7 +274,7 @@ class FastFlight:
             position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
             if self.plant.faults is None:
                 self.px4.on_vision(pose.stamp_s, position, attitude)
-            elif self.faults.active.keys().isdisjoint(HOLD_UP):
+            elif self.faults.active.keys().isdisjoint(FLIGHT_PROCESS_FAULTS):
                 self._link.send(lambda: self._see(position, attitude))
 
     def _see(self, position_ned_m: Vec3, attitude_ned_frd: Quat) -> None:
@@ -304,8 +304,8 @@ class FastFlight:
         if plant.faults is None:
             vehicle, status = self._vehicle(t_s), self._status(t_s)
         else:
-            self._link.deliver_late()
-            vehicle, status = self._link.hear(self._vehicle(t_s), self._status(t_s))
+            self._link.deliver_due()
+            vehicle, status = self._link.receive(self._vehicle(t_s), self._status(t_s))
             active = self.faults.active
             guardian_ready = "kill_guardian" not in active
             if "kill_recorder" in active or "disk_full" in active:
@@ -333,7 +333,7 @@ class FastFlight:
         )
 
     def _bus_fails(self) -> bool:
-        """A read that brings nothing; the servos that are not lost have heard it all the same, unless it was damaged."""
+        """Return whether this read fails. Servos that are not lost still receive the instruction, unless noise damaged it."""
         lost = self.faults.active.get("servo_loss")
         damaged = self.faults.packet_lost()
         if lost is None:
@@ -359,8 +359,8 @@ class FastFlight:
             angular_rate_body_rad_s=flu_from_frd(estimate.rates_frd_rad_s),
             specific_force_body_m_s2=flu_from_frd(estimate.accel_frd_m_s2),
             boot_s=None if self.plant.faults is None else t_s - self.px4.booted_at_s,
-            imu_boot_s=self._heard.total.boot_s,
-            delta_velocity_body_m_s=flu_from_frd(self._heard.total.sum_m_s),
+            imu_boot_s=self._imu.total.boot_s,
+            delta_velocity_body_m_s=flu_from_frd(self._imu.total.sum_m_s),
         )
 
     def _status(self, t_s: float) -> AutopilotStatus:
@@ -387,7 +387,7 @@ class FastFlight:
             (e1, e2), (c1, c2) = self.faults.errors, self.faults.temperatures_c
             errors, temperatures_c = (e1, e2), (c1, c2)
         if drive1.watchdog_tripped or drive2.watchdog_tripped:
-            # As the edge does: told in one state, and started again with no current.
+            # As the driver does: reported in one state, then restarted with zero current.
             tripped = (drive1.watchdog_tripped * WATCHDOG_ERROR, drive2.watchdog_tripped * WATCHDOG_ERROR)
             errors = (errors[0] | tripped[0], errors[1] | tripped[1])
             drive1.start_watchdog(self._watchdog_s)
@@ -406,10 +406,10 @@ class FastFlight:
 
     def _carry_out(self, outputs: Outputs) -> None:
         torque_nm, setpoint, request = outputs.arm_torque_nm, outputs.attitude, outputs.request
-        faulty = self.plant.faults is not None
+        with_faults = self.plant.faults is not None
         if setpoint is not None:
             target = AttitudeTarget(attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz), setpoint.thrust)
-            if faulty:
+            if with_faults:
                 self._link.send(lambda: self.px4.on_setpoint(self.plant.world.t_s, target))
             else:
                 self.px4.on_setpoint(self.plant.world.t_s, target)
@@ -417,7 +417,7 @@ class FastFlight:
             self._goal_s = self.plant.world.t_s
             (drive1, drive2), (scale1, scale2) = self._drives, self._scales
             counts = (scale1.current_counts(torque_nm[0]), scale2.current_counts(torque_nm[1]))
-            if not faulty:
+            if not with_faults:
                 drive1.set_goal_current(counts[0])
                 drive2.set_goal_current(counts[1])
             elif not self.faults.packet_lost():
@@ -425,14 +425,14 @@ class FastFlight:
                 for number, (drive, goal) in enumerate(zip(self._drives, counts, strict=True), start=1):
                     if lost is None or lost.servo != number:
                         drive.set_goal_current(goal)
-        elif faulty and self.plant.world.t_s - self._goal_s > self._watchdog_s and not self.faults.packet_lost():
-            # As the bus thread does with a goal that nobody renews; a servo that is lost has its own watchdog.
+        elif with_faults and self.plant.world.t_s - self._goal_s > self._watchdog_s and not self.faults.packet_lost():
+            # As the bus thread does with a stale goal; a servo that is lost has its own watchdog.
             lost = self.faults.active.get("servo_loss")
             for number, drive in enumerate(self._drives, start=1):
                 if lost is None or lost.servo != number:
                     drive.set_goal_current(0)
         if request is not _NO_REQUEST:
-            if faulty:
+            if with_faults:
                 self._link.send(lambda: self._request(request))
             else:
                 self._request(request)

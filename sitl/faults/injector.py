@@ -1,7 +1,7 @@
-"""Faults in the simulated world: which of them act now, and what they do to physics, sensors and PX4.
+"""Faults of the simulated world: which are active, and what they do to physics, sensors and PX4.
 
-The plant calls `Faults.step` in every step; the wires and the fast closed loop ask `active` for what is theirs: link, bus, processes.
-Without faults there is no `Faults`, and nothing is called.
+The plant calls `Faults.step` in every step. Faults of the link, the servo bus and the processes are in `active`, where the wires and
+the fast closed loop look them up.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ class Servo(Protocol):
     """A servo behind its control table (`sitl.servo.model.ServoModel`)."""
 
     def trip_overload(self) -> None:
-        """Overload error."""
+        """Raise the overload error."""
 
     def set_temperature_c(self, temperature_c: float) -> None:
-        """Motor temperature."""
+        """Set the motor temperature."""
 
 
 class Autopilot(Protocol):
-    """What faults do to an autopilot (`sitl.autopilot.autopilot.Px4Stub`)."""
+    """An autopilot that faults act on (`sitl.autopilot.autopilot.Px4Stub`)."""
 
     refuses_offboard: bool
     refuses_arming: bool
 
     def reboot(self, for_s: float) -> None:
-        """Restart; `for_s` from now it runs again."""
+        """Restart; it runs again `for_s` later."""
 
     def pilot_chooses(self, state: NavState) -> None:
-        """A mode by somebody else."""
+        """Change the mode as a pilot does by radio."""
 
 
 class Faults:
     """The faults of one world.
 
     Args:
-        config: of the world; every fault has a time.
-        world: physics.
+        config: configuration of the world; every fault has a time (`with_fault_times`).
+        world: the physics.
         px4: the autopilot.
         drives: motors of both servos.
-        anchor_world_m: of the tether.
-        servos: control tables of both servos, where there are any.
+        anchor_world_m: anchor of the tether.
+        servos: control tables of both servos; empty in the fast closed loop.
     """
 
     def __init__(
@@ -85,13 +85,13 @@ class Faults:
         self._tether_m = world.tether_length_m
         self._chance = np.random.default_rng([config.seed, len(config.faults)])
         self.active: dict[FaultKind, Fault] = {}
-        """Those that act now."""
+        """Active fault of each kind."""
         self.begun_s: float | None = None
-        """World time at which the first one began."""
+        """World time at which the first fault began, or None."""
         self.sag_v = 0.0
-        """Voltage that the battery has lost."""
+        """Voltage drop of the battery by a fault."""
         self.errors = [0, 0]
-        """Register 70 of each servo, where there is no control table."""
+        """Register 70 of each servo without a control table."""
         self.temperatures_c = [COOL_C, COOL_C]
         self._frozen: tuple[Vec3, Quat] | None = None
         self._other: tuple[Vec3, Quat] | None = None
@@ -104,7 +104,12 @@ class Faults:
     # -- when ------------------------------------------------------------------------------------------------------
 
     def step(self, t_s: float, armed_t_s: float | None) -> None:
-        """Before every step of the physics; `armed_t_s`: world time at which the rotors were armed."""
+        """Start and end faults that are due; call it before every step of the physics.
+
+        Args:
+            t_s: world time.
+            armed_t_s: world time of arming, or None.
+        """
         self._now_s = t_s
         origins = {"start": 0.0, "arming": armed_t_s, "catch": self._world.caught_t_s}
         for index, fault in enumerate(self._faults):
@@ -130,7 +135,7 @@ class Faults:
         else:
             others = [other for other, acts in zip(self._faults, self._on, strict=True) if acts]
             same = next((other for other in others if other.kind == fault.kind), None)
-            if same is not None:  # of two of a kind the other one goes on
+            if same is not None:  # another fault of this kind is still active
                 self.active[fault.kind] = same
                 return
             del self.active[fault.kind]
@@ -139,13 +144,13 @@ class Faults:
     # -- what ------------------------------------------------------------------------------------------------------
 
     def _act(self, fault: Fault, on: bool, t_s: float) -> None:
-        """The beginning or the end of a fault of the physics, of the servos or of PX4."""
+        """Apply the start (`on`) or the end of a fault of the physics, the servos or PX4."""
         world, px4, size = self._world, self._px4, fault.magnitude
         match fault.kind:
             case "motor_weak" | "battery_sag":
-                self._weaken()
+                self._set_rotor_share()
             case "gust":
-                self._blow(size if on else 0.0)
+                self._set_gust(size if on else 0.0)
             case "tether_taut":
                 away_m = math.dist(world.attachment_world_m, self._anchor_m)
                 world.tether_length_m = min(self._tether_m, away_m + size) if on else self._tether_m
@@ -162,7 +167,7 @@ class Faults:
             case "payload_dropped" if on:
                 world.drop()
             case "servo_overload" if on:
-                self._let_go(fault.servo - 1, OVERLOAD)
+                self._shut_down_servo(fault.servo - 1, OVERLOAD)
             case "servo_hot":
                 self._heat(fault.servo - 1, size if on else COOL_C)
             case "servo_angle":
@@ -191,7 +196,7 @@ class Faults:
             case _:
                 pass
 
-    def _weaken(self) -> None:
+    def _set_rotor_share(self) -> None:
         weak, sag = self.active.get("motor_weak"), self.active.get("battery_sag")
         self.sag_v = sag.magnitude if sag is not None else 0.0
         every = (1.0 - self.sag_v / FULL_V) ** 2
@@ -199,14 +204,14 @@ class Faults:
         share: Vec4 = (first, every, every, every)
         self._world.rotor_share = None if min(share) == 1.0 else share
 
-    def _blow(self, speed_m_s: float) -> None:
+    def _set_gust(self, speed_m_s: float) -> None:
         x, y = (p - a for p, a in zip(self._world.q[0:2], self._anchor_m[0:2], strict=True))
         away_m = math.hypot(x, y) or 1.0
         wx, wy, wz = self._wind_m_s
         self._world.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
 
-    def _let_go(self, index: int, error: int) -> None:
-        """A servo shuts down by itself."""
+    def _shut_down_servo(self, index: int, error: int) -> None:
+        """Shut a servo down, as its own protection does."""
         if self._servos and error == OVERLOAD:
             self._servos[index].trip_overload()
         elif not self._servos:
@@ -218,12 +223,12 @@ class Faults:
         if self._servos:
             self._servos[index].set_temperature_c(temperature_c)
         elif temperature_c > OVERHEATED_C:
-            self._let_go(index, OVERHEATING)
+            self._shut_down_servo(index, OVERHEATING)
 
     # -- sensors ---------------------------------------------------------------------------------------------------
 
     def pose(self, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat, bool]:
-        """What motion capture makes of the vehicle's pose at an exposure; the third: the body is seen."""
+        """Return the pose that motion capture measures instead of the true one, and whether it tracks the body."""
         active = self.active
         pose = (position_world_m, attitude_wxyz)
         if "mocap_freeze" in active:
@@ -239,21 +244,21 @@ class Faults:
         return (*pose, "mocap_occluded" not in active)
 
     def mocap_period_s(self, usual_s: float) -> float:
-        """From one exposure to the next."""
+        """Return the time from one exposure to the next."""
         slow = self.active.get("mocap_rate")
         return usual_s if slow is None else max(usual_s, 1.0 / slow.magnitude)
 
     def size(self, kind: FaultKind) -> float:
-        """Of the fault of that kind that acts now; 0: none does."""
+        """Return the size of the active fault of this kind, or 0 if none is active."""
         fault = self.active.get(kind)
         return 0.0 if fault is None else fault.magnitude
 
     def server_clock_s(self, t_s: float) -> float:
-        """What the motion-capture machine's clock showed at a world time."""
+        """Return the clock of the motion-capture server at a world time."""
         return t_s + self.size("clock_step") if t_s >= self._stepped_s else t_s
 
     def wrench(self, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
-        """What the force sensor reads instead."""
+        """Return what the force sensor measures instead of the true wrench."""
         bias_n = self.size("force_bias")
         if bias_n:
             x, y, z = force_n
@@ -265,25 +270,25 @@ class Faults:
         return force_n, torque_nm
 
     def packet_lost(self) -> bool:
-        """One more transaction on the servo bus, and this is its fate."""
+        """Decide at random whether noise destroys this transaction on the servo bus."""
         share = self.size("bus_noise")
         return share > 0.0 and float(self._chance.random()) < share
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Sample:
-    """Where the machine truly was, for a campaign's table."""
+    """True state of the vehicle at one moment, for the table of a campaign."""
 
     t_s: float
     position_world_m: Vec3
     tilt_rad: float
     slack_m: float
-    """Of the tether as long as it is now."""
+    """Slack of the tether at its present length."""
     tension_n: float
 
 
 def sample(world: World, anchor_world_m: Vec3) -> Sample:
-    """The world as it is now."""
+    """Return the present true state."""
     x, y, z, *attitude = world.q[0:7]
     slack_m = world.tether_length_m - math.dist(world.attachment_world_m, anchor_world_m)
     tension_n = world.sensors()[world.layout.tether]

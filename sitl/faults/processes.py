@@ -1,4 +1,4 @@
-"""Faults of the flight process itself, planted from outside, and what PX4 saw of them by the world's clock."""
+"""Faults of the flight, recorder and guardian processes, injected from outside, and what PX4 observes after them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,18 @@ SIGNALS: dict[FlightFaultKind, signal.Signals] = {
     "stall_loop": signal.SIGUSR2,
 }
 STALL_VARIABLE = "COMPANION_SITL_STALL_S"
-"""Of the environment, for sitl/faults/hang."""
+"""Environment variable for sitl/faults/hang: how long the event loop stalls."""
 _VISION_WINDOW_S = 2.0
 _SAMPLE_S = 0.01
 
 
 def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]:
-    """What the flight process's environment needs for these kinds of faults; `stall_s`: how long the loop stalls, None: for good."""
+    """Return the environment variables of the flight process for these kinds of faults.
+
+    Args:
+        kinds: fault kinds.
+        stall_s: how long the event loop stalls; None means for ever.
+    """
     if not kinds & {"hold_gil", "stall_loop"}:
         return {}
     hooks = str(Path(__file__).parent / "hang")
@@ -38,12 +43,12 @@ def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]
     return found if stall_s is None else {**found, STALL_VARIABLE: str(stall_s)}
 
 
-def strike(kind: FaultKind, flight_pid: int) -> bool:
-    """A fault of the recorder or of the guardian; False: there is no such process.
+def inject_process_fault(kind: FaultKind, flight_pid: int) -> bool:
+    """Inject a fault of the recorder or the guardian; return False if that process does not exist yet.
 
     Args:
         kind: kill_recorder, kill_guardian or disk_full.
-        flight_pid: of the flight process, whose child the recorder is, and whose sibling the guardian.
+        flight_pid: pid of the flight process, the recorder's parent and the guardian's sibling.
     """
     module = "companion.guardian" if kind == "kill_guardian" else "companion.recorder.main"
     parent = os.getppid() if kind == "kill_guardian" else flight_pid
@@ -52,7 +57,7 @@ def strike(kind: FaultKind, flight_pid: int) -> bool:
         return False
     with contextlib.suppress(ProcessLookupError):
         if kind == "disk_full":
-            # No file of it may grow any more: its writes fail as on a full disk, and nobody else's do.
+            # Its files cannot grow any more, so that its writes fail as on a full disk. Other processes are not affected.
             _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (1, hard))
         else:
@@ -75,13 +80,13 @@ def _command(pid: int) -> list[str]:
 
 
 class ProcessFaults:
-    """Plants a fault once, then watches what still reaches PX4 and what the vehicle does."""
+    """Injects one fault of the flight process, then records what still reaches PX4 and how the vehicle moves."""
 
     def __init__(self) -> None:
         self.pid: int | None = None
-        """Of the flight process; the launcher tells."""
+        """Pid of the flight process, as the launcher reported it, or None."""
         self.kind: FlightFaultKind | None = None
-        """What was planted."""
+        """Kind of the fault that was injected, or None."""
         self._t_s = 0.0
         self._start_m: Vec3 = (0.0, 0.0, 0.0)
         self._position_m: Vec3 = (0.0, 0.0, 0.0)
@@ -95,14 +100,14 @@ class ProcessFaults:
         self._worst_tilt_rad = 0.0
         self._due_s = -math.inf
 
-    def plant(self, kind: FlightFaultKind, t_s: float, position_m: Vec3, vision_count: int | None) -> bool:
-        """Do it to the flight process; False: done already, or there is no such process.
+    def inject(self, kind: FlightFaultKind, t_s: float, position_m: Vec3, vision_count: int | None) -> bool:
+        """Signal the flight process; return False if a fault was injected before or its pid is not known.
 
         Args:
-            kind: which.
+            kind: kind of the fault.
             t_s: world time.
-            position_m: of the vehicle, world.
-            vision_count: poses that PX4 has got so far; None: that is not to be seen from here.
+            position_m: position of the vehicle, world frame.
+            vision_count: vision poses that PX4 received so far, or None if that is not observable.
         """
         if self.kind is not None or self.pid is None:
             return False
@@ -114,8 +119,8 @@ class ProcessFaults:
         self._vision_count = vision_count
         return True
 
-    def let_go(self) -> None:
-        """The end of a SIGSTOP that had one."""
+    def resume(self) -> None:
+        """Continue a process that was stopped for a limited time."""
         if self.kind == "stop_flight" and self.pid is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGCONT)
@@ -128,7 +133,11 @@ class ProcessFaults:
         nav_state: NavState | None,
         armed: bool,
     ) -> bool:
-        """After every step; True: `sample` wants to be called. What is None is not to be seen from here."""
+        """Record the autopilot's state after a step; an argument is None if it is not observable.
+
+        Returns:
+            Whether `sample` is due.
+        """
         if self.kind is None or self._disarmed_s is not None:
             return False
         if setpoint_at_s is not None and setpoint_at_s > self._t_s and self._land_s is None:
@@ -150,12 +159,12 @@ class ProcessFaults:
         return True
 
     def sample(self, position_m: Vec3, attitude_wxyz: tuple[float, float, float, float]) -> None:
-        """Where the vehicle is."""
+        """Record position and attitude of the vehicle."""
         self._position_m = position_m
         self._worst_tilt_rad = max(self._worst_tilt_rad, tilt_rad(attitude_wxyz))
 
     def report(self) -> dict[str, Any] | None:
-        """Times in s since the fault, None for what never happened; None: no fault was planted."""
+        """Return times in s since the fault (None for what never happened), or None if no fault was injected."""
         if self.kind is None:
             return None
 

@@ -13,23 +13,23 @@ from companion.sitl_config.faults import Fault, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig
 
 AFTER_CATCH_S = 0.1
-"""Phase "catch"."""
+"""Start of a fault in phase "catch", after the catch."""
 REBOOT_ON_GROUND_S = 1.3
-"""Phase "ground": from the start on, but a restart only once there is something to restart."""
+"""Start of a PX4 restart in phase "ground": before it PX4 has not booted."""
 _ALONG_M = 0.3
 _EARLY_IN_LINE, _MIDDLE = 0.35, 0.5
 _FROM_START: frozenset[FaultKind] = frozenset({"payload_missed", "payload_heavy"})
 
 
 class FaultError(Exception):
-    """A fault that this mission has no place for; one line."""
+    """The mission lacks the phase that a fault names; the text is one line for the user."""
 
 
-def in_time(config: SitlConfig) -> SitlConfig:
-    """The configuration with every fault at a time instead of in a phase, and a heavy payload as the one that is thrown.
+def with_fault_times(config: SitlConfig) -> SitlConfig:
+    """Return the configuration with a time in place of each fault's phase, and with the heavy payload of a fault as the payload.
 
     Raises:
-        FaultError: the mission has no such phase.
+        FaultError: the mission lacks the phase.
     """
     faults = config.world.faults
     if not faults:
@@ -54,7 +54,7 @@ def _timed(fault: Fault, config: SitlConfig) -> Fault:
 
 
 def _plan_time_s(phase: FlightPhase, config: SitlConfig) -> float:
-    """Seconds since the plan's start. The line is the first way sideways, before its middle; the return is the last one."""
+    """Return the time since the start of the plan. "line" and "catch" lie in the first sideways segment, "return" in the last one."""
     plan = Plan.build(config.mission, config.vehicle)
 
     def way_m(segment: Segment) -> float:

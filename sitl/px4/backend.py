@@ -1,4 +1,4 @@
-"""A real PX4 as the autopilot of the simulated world: started, set up through MAVLink, restarted once, flown in lockstep, ended."""
+"""A real PX4 as the autopilot of the simulated world: started, configured over MAVLink, restarted once, flown in lockstep, ended."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sitl.faults.injector import Autopilot as FaultyAutopilot
 from sitl.px4.control_link import ControlLink, Version, same
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
 from sitl.px4.parameter_file import restore, stored
-from sitl.px4.parameters import BEFORE_BOOT, NOT_EVERYWHERE, parameters
+from sitl.px4.parameters import BEFORE_BOOT, VERSION_DEPENDENT, parameters
 from sitl.px4.process import HOW_TO_GET_IT, HOW_TO_START_IT, MODEL, Installation, Instance, Px4Process, find
 from sitl.px4.relay import Relay
 from sitl.world.world import World
@@ -30,32 +30,32 @@ from sitl.world.world import World
 BOOT_DEADLINE_S = 30.0
 END_DEADLINE_S = 6.0
 BY_HAND_DEADLINE_S = 10.0
-"""For a PX4 that somebody has started by hand: it asks for the world twice in a millisecond."""
+"""Deadline for a PX4 that was started by hand; it tries to connect twice per millisecond."""
 USER_DEADLINE_S = 300.0
-"""For somebody who is asked to start it once more."""
+"""Deadline for the user to restart PX4."""
 SAMPLE_S = 0.004
-OF_THE_STUB: Mapping[FaultKind, str] = {
+STUB_ONLY_FAULTS: Mapping[FaultKind, str] = {
     "autopilot_reboot": "restarts PX4 in the middle of a step",
     "offboard_refused": "makes PX4 refuse a mode",
     "arming_refused": "makes PX4 refuse to arm",
     "battery_sag": "changes what PX4's power module measures",
 }
-"""Faults that need an inside that a real PX4 does not show."""
+"""Faults that only the stub can have, and why."""
 _LINK_FAULTS: frozenset[FaultKind] = frozenset({"link_loss", "link_delay"})
 
 Tell = Callable[[str], None]
 
 
 def refuse_what_needs_the_stub(config: WorldConfig) -> None:
-    """Look at a world before a real PX4 is started for it.
+    """Reject a world that only the stub can simulate, before a real PX4 is started.
 
     Raises:
-        Px4Error: it has something that only the stub can do.
+        Px4Error: the world has such a fault, or a battery that does not start full.
     """
     for fault in config.faults:
-        if fault.kind in OF_THE_STUB:
+        if fault.kind in STUB_ONLY_FAULTS:
             raise Px4Error(
-                f"world.faults: {fault.kind} {OF_THE_STUB[fault.kind]}, which needs the stub's inside; fly it with --sitl"
+                f"world.faults: {fault.kind} {STUB_ONLY_FAULTS[fault.kind]}, which only the stub can simulate; fly it with --sitl"
             )
     if config.battery_start != 1.0:
         raise Px4Error(
@@ -67,13 +67,13 @@ class RealPx4:
     """One PX4 for one flight.
 
     Args:
-        airframe: of the vehicle file.
-        config: of the world.
-        folder: of PX4: parameters, logs, what it says.
-        tell: takes one line for the user.
+        airframe: airframe of the vehicle file.
+        config: configuration of the world.
+        folder: folder for PX4's parameters, logs and output.
+        tell: called with one line for the user.
 
     Raises:
-        Px4Error: the world needs the stub, PX4_SITL names nothing that can be started, or no instance is free.
+        Px4Error: the world needs the stub, PX4_SITL names no program, or no instance number is free.
     """
 
     lockstep = True
@@ -93,35 +93,35 @@ class RealPx4:
         self._version: Version | None = None
         self._imu: ImuSample | None = None
         self._flies = False
-        """From now on a PX4 that goes is an error."""
+        """Whether preparation is over, so that a PX4 that disconnects is an error."""
 
     @property
     def number(self) -> int:
-        """Of PX4's instance."""
+        """Instance number of PX4."""
         return self._instance.number
 
     @property
     def armed(self) -> bool:
-        """As every HIL_ACTUATOR_CONTROLS says."""
+        """Whether PX4 is armed, by the newest HIL_ACTUATOR_CONTROLS."""
         return self._link.armed
 
     @property
     def down(self) -> bool:
-        """It never is, in flight."""
+        """Whether PX4 is booting; always False in flight."""
         return False
 
     @property
-    def faulty(self) -> FaultyAutopilot:
-        """Those faults that a real PX4 can have."""
+    def fault_target(self) -> FaultyAutopilot:
+        """Where faults are injected that a real PX4 can have."""
         return _Faulty(self._control)
 
     def attach(self, world: World) -> None:
-        """The world that PX4's sensors sense."""
+        """Set the world that PX4's sensors measure."""
         self._world = world
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:
-        """TCP to PX4 and the world's own MAVLink link; PX4 itself, if there is one to be started, is ended at the end."""
+        """Open the simulator link and the control link, start PX4 if there is one to start, and end it on leaving."""
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._instance.close)
             await stack.enter_async_context(self._link)
@@ -139,10 +139,10 @@ class RealPx4:
         self._process = Px4Process(self._installation, self._instance, self._folder, settings)
 
     async def prepare(self) -> None:
-        """Boot, set the vehicle's parameters, restart for those that want it, look again.
+        """Wait for PX4 to boot, set the vehicle's parameters, restart PX4 if any changed, and check them again.
 
         Raises:
-            Px4Error: PX4 is not to be had, or does not become what it must be.
+            Px4Error: PX4 did not connect, or does not keep its parameters.
         """
         if self._process is None:
             self._tell(
@@ -162,20 +162,20 @@ class RealPx4:
                 raise Px4Error(
                     f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; {fix}"
                 )
-        await self._control.write(self._config.spoiled_px4_params())
+        await self._control.write(self._config.overridden_px4_params())
         await self._control.show_modes()
         self._flies = True
 
     async def _boot(self, deadline_s: float) -> None:
-        """Until PX4 computes; `deadline_s` is for its coming, `BOOT_DEADLINE_S` for its boot.
+        """Wait until PX4 answers sensor samples: `deadline_s` for its connection, then `BOOT_DEADLINE_S` for its boot.
 
         Raises:
-            Px4Error: it has ended, or one of the two has passed.
+            Px4Error: it has ended, or a deadline has passed.
         """
         found, end_s = "nobody there", time.monotonic() + deadline_s
         while not await self._link.until_in_step(0.2):
             if self._process is not None and not self._process.running:
-                raise Px4Error(self._process.epitaph())
+                raise Px4Error(self._process.exit_summary())
             if self._link.connected and found == "nobody there":
                 found, deadline_s = "no answer to the world's sensors", BOOT_DEADLINE_S
                 end_s = time.monotonic() + deadline_s
@@ -190,9 +190,9 @@ class RealPx4:
         return f"{HOW_TO_GET_IT}; or {HOW_TO_START_IT.format(model=MODEL, number=self.number)}"
 
     async def _settle(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
-        """Write what differs; what did, in PX4's types."""
+        """Write the parameters that differ and return them, in PX4's types."""
         have = await self._control.read(wanted)
-        absent = [name for name in wanted if name not in have and name not in NOT_EVERYWHERE]
+        absent = [name for name in wanted if name not in have and name not in VERSION_DEPENDENT]
         if absent:
             raise Px4Error(
                 f"PX4 {self._version}: expected the parameter {absent[0]}, found that it has none of this name"
@@ -206,7 +206,7 @@ class RealPx4:
         return different
 
     async def _restart(self, changed: Mapping[str, Value]) -> None:
-        """The same PX4 in the same folder, or somebody who starts it again."""
+        """Restart PX4 in the same folder, or ask the user to restart it."""
         if self._process is None:
             self._tell(
                 "the vehicle's parameters are set; PX4 must start again for them: end it and start it once more, in the same folder, "
@@ -225,13 +225,13 @@ class RealPx4:
         await self._boot(BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S)
 
     def sense(self, imu: ImuSample) -> None:
-        """HIL_SENSOR, with the truth of this moment behind it."""
+        """Send HIL_SENSOR, with the true height and attitude of this moment."""
         self._imu = imu
         q = self._world.q
         self._link.send(imu, q[2], (q[3], q[4], q[5], q[6]))
 
     async def answered(self) -> None:
-        """HIL_ACTUATOR_CONTROLS.
+        """Wait for HIL_ACTUATOR_CONTROLS.
 
         Raises:
             Px4Error: PX4 has ended, or has stopped answering.
@@ -239,36 +239,36 @@ class RealPx4:
         if self._link.pending:
             await self._link.answered()
         if self._flies and not self._link.connected:
-            raise Px4Error(await self._epitaph())
+            raise Px4Error(await self._exit_summary())
 
-    async def _epitaph(self) -> str:
+    async def _exit_summary(self) -> str:
         if self._process is None:
             return "PX4: expected it to stay until the flight is over, found that it has closed its simulator link"
         await self._process.until_ended(1.0)
-        return self._process.epitaph()
+        return self._process.exit_summary()
 
     def step(self, imu: ImuSample) -> Vec4:
-        """What PX4 answered."""
+        """Return the rotor commands of PX4's newest answer."""
         del imu
         return self._link.rotors
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """PX4 has a battery of its own, and streams by itself."""
+        """Do nothing: PX4 simulates its own battery and streams by itself."""
 
     def set_link(self, down: bool, delay_s: float) -> None:
-        """By way of the relay."""
+        """Apply link faults to the relay."""
         if self._relay is not None:
             self._relay.down, self._relay.delay_s = down, delay_s
 
     def skip(self, paused_s: float) -> None:
-        """It has no clock but the world's, and a gap in its samples would throw its estimate off: it falls behind, and is seen to."""
+        """Do nothing: PX4's only clock is the world's, and a gap in its samples would disturb its estimate."""
 
     def observe(self) -> Observation:
-        """What arrives at PX4 only its own log shows."""
+        """Return the mode; only PX4's own log shows what arrives there."""
         return Observation(None, None, self._control.nav_state)
 
     def about(self) -> dict[str, Any]:
-        """PX4, and which one."""
+        """Return kind, version, build, instance and clock of this PX4."""
         version = self._version
         return {
             "kind": "px4",
@@ -280,7 +280,7 @@ class RealPx4:
         }
 
     async def _end(self) -> None:
-        """End our own PX4. Its clock runs by our samples, and it needs the clock to end."""
+        """End the PX4 that was started here; it needs samples until its end, because they drive its clock."""
         self._flies = False
         process, imu = self._process, self._imu
         if process is None:
@@ -300,7 +300,7 @@ class RealPx4:
 
 
 class _Faulty:
-    """Faults of a real PX4: a pilot who chooses a mode."""
+    """Faults that a real PX4 can have: a pilot who changes the mode."""
 
     refuses_offboard = False
     refuses_arming = False
@@ -309,11 +309,15 @@ class _Faulty:
         self._control = control
 
     def reboot(self, for_s: float) -> None:
-        """Was refused before the flight."""
+        """Reject the fault; `refuse_what_needs_the_stub` has done so before the flight.
+
+        Raises:
+            Px4Error: always.
+        """
         raise Px4Error("world.faults: autopilot_reboot needs the stub; fly it with --sitl")
 
     def pilot_chooses(self, state: NavState) -> None:
-        """As a ground station does."""
+        """Change the mode as a ground station does."""
         self._control.choose_mode(state)
 
 

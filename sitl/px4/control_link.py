@@ -1,7 +1,7 @@
-"""The simulator's own MAVLink link to a real PX4, beside the companion's: parameters, version, mode.
+"""The simulated world's own MAVLink link to a real PX4, beside the companion's: parameters, version, mode.
 
-It is PX4's link to a camera (UDP 14280 plus instance). The onboard link stays untouched, because PX4 keeps the first partner that
-speaks to it.
+It uses PX4's camera link (UDP 14280 plus instance) and leaves the onboard link alone, because PX4 keeps sending to the first partner
+that contacts it.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ PARAMS_DEADLINE_S = 20.0
 COMMAND_DEADLINE_S = 5.0
 HEARTBEAT_DEADLINE_S = 20.0
 MODE_PERIOD_S = 0.02
-"""Between two CURRENT_MODE on this link, so that a change of mode is seen at once; the companion hears one heartbeat a second."""
+"""Period of CURRENT_MODE on this link; heartbeats come once a second, too rarely to time a change of mode."""
 _AT_ONCE = 20
-"""Parameters asked for together: PX4's receive buffer is finite."""
+"""Parameters requested at a time; more would overflow PX4's receive buffer."""
 _OWN_SYSTEM, _OWN_COMPONENT = 254, mavlink.MAV_COMP_ID_SYSTEM_CONTROL
 _AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 _FORCE_DISARM = 21196.0
@@ -36,24 +36,24 @@ _FORCE_DISARM = 21196.0
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """What flies."""
+    """Version of PX4."""
 
     release: str
-    """1.16.1"""
+    """Release, such as 1.16.1."""
     build: str
-    """The first eight digits of its commit; empty if it does not tell."""
+    """First eight digits of its commit, or empty if PX4 does not report it."""
 
     def __str__(self) -> str:
         return f"{self.release} ({self.build})" if self.build else self.release
 
 
 class ControlLink(UdpEndpoint):
-    """The link. An async context manager on the instance's own socket."""
+    """The link: an async context manager on the socket of the instance."""
 
     def __init__(self, instance: Instance) -> None:
         super().__init__()
         self.nav_state: NavState | None = None
-        """By the last HEARTBEAT or CURRENT_MODE."""
+        """Mode of the newest HEARTBEAT or CURRENT_MODE."""
         self._instance = instance
         self._system = instance.number + 1
         self._encoder = mavlink.MAVLink(None, srcSystem=_OWN_SYSTEM, srcComponent=_OWN_COMPONENT)
@@ -69,7 +69,7 @@ class ControlLink(UdpEndpoint):
         await self.close()
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        """PX4's messages."""
+        """Decode PX4's messages, note its mode and pass each message to the requests that wait."""
         for message in self._decoder.parse_buffer(data) or ():
             if message.get_srcSystem() != self._system or message.get_srcComponent() != _AUTOPILOT:
                 continue
@@ -80,10 +80,10 @@ class ControlLink(UdpEndpoint):
                 handler(message)
 
     async def until_heard(self) -> None:
-        """Until PX4's heartbeat has come.
+        """Wait for PX4's heartbeat.
 
         Raises:
-            Px4Error: not in time.
+            Px4Error: none came within HEARTBEAT_DEADLINE_S.
         """
         self.nav_state = None
         heard = await self._ask(
@@ -98,10 +98,10 @@ class ControlLink(UdpEndpoint):
             )
 
     async def version(self) -> Version:
-        """AUTOPILOT_VERSION.
+        """Request AUTOPILOT_VERSION.
 
         Raises:
-            Px4Error: PX4 does not tell.
+            Px4Error: PX4 did not answer.
         """
         message = await self._ask(
             lambda: self._command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION),
@@ -115,14 +115,14 @@ class ControlLink(UdpEndpoint):
         return Version(".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8)), build)
 
     async def read(self, names: Iterable[str]) -> dict[str, Value]:
-        """Values of parameters; what PX4 does not have is left out.
+        """Read parameters; names that PX4 does not have are left out.
 
         Raises:
             Px4Error: PX4 stopped answering.
         """
         wanted = list(dict.fromkeys(names))
         found: dict[str, Value] = {}
-        # A name that PX4 does not have is answered by nothing: asked for often enough it is absent.
+        # PX4 does not answer a request for an unknown name, so a name without an answer to four requests is absent.
         for _ in range(4):
             missing = [name for name in wanted if name not in found]
             for i in range(0, len(missing), _AT_ONCE):
@@ -149,13 +149,13 @@ class ControlLink(UdpEndpoint):
         return found
 
     async def write(self, values: Mapping[str, Value]) -> None:
-        """Set parameters, each confirmed by what PX4 reads back.
+        """Set parameters and wait until PX4 confirms each of them.
 
         Args:
             values: int for INT32, float for REAL32: PX4 ignores the other type.
 
         Raises:
-            Px4Error: PX4 did not take one.
+            Px4Error: PX4 did not accept one of them.
         """
         left = dict(values)
 
@@ -187,12 +187,12 @@ class ControlLink(UdpEndpoint):
         """Have PX4 store its parameters now instead of some seconds later.
 
         Raises:
-            Px4Error: it did not.
+            Px4Error: PX4 refused or did not answer.
         """
         await self.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1.0)
 
     async def show_modes(self) -> None:
-        """Have CURRENT_MODE come so often that it tells when a mode changed. PX4 forgets it when it restarts.
+        """Request CURRENT_MODE every MODE_PERIOD_S; PX4 forgets the request when it restarts.
 
         Raises:
             Px4Error: PX4 refused.
@@ -202,7 +202,7 @@ class ControlLink(UdpEndpoint):
         )
 
     def choose_mode(self, state: NavState) -> None:
-        """Ask for a mode as a ground station does; what comes of it, the heartbeats tell."""
+        """Request a mode as a ground station does, without waiting for an answer."""
         main, sub = state.value[0:2]
         self._command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main, sub)
 
@@ -211,10 +211,10 @@ class ControlLink(UdpEndpoint):
         self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, _FORCE_DISARM)
 
     async def command(self, command: int, *params: float) -> None:
-        """One MAV_CMD, accepted.
+        """Send one MAV_CMD and wait until PX4 accepts it.
 
         Raises:
-            Px4Error: it was refused, or not answered.
+            Px4Error: PX4 refused it or did not answer.
         """
 
         def result(message: Any) -> Any:
@@ -233,7 +233,7 @@ class ControlLink(UdpEndpoint):
         self._send(mavlink.MAVLink_command_long_message(self._system, _AUTOPILOT, command, 0, *numbers))
 
     async def _ask(self, send: Callable[[], None], answer: Callable[[Any], Any], deadline_s: float) -> Any:
-        """Send, and again as long as `answer` makes None of every message that comes; None: the deadline has passed."""
+        """Call `send` every ASK_AGAIN_S until `answer` returns something for a message; return that, or None at the deadline."""
         answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def handle(message: Any) -> None:
@@ -259,14 +259,14 @@ class ControlLink(UdpEndpoint):
 
 
 def _parameter(message: Any) -> tuple[str, Value | None]:
-    """Name and value of a PARAM_VALUE; ("", None) of anything else."""
+    """Return name and value of a PARAM_VALUE, or ("", None) for another message."""
     if message.get_type() != "PARAM_VALUE":
         return "", None
     return message.param_id, decode_bytewise(message.param_value, message.param_type)
 
 
 def same(a: Value, b: Value) -> bool:
-    """Both are the same to PX4, which keeps REAL32."""
+    """Return whether PX4 stores both as the same value; it stores numbers in single precision."""
     if isinstance(a, int) != isinstance(b, int):
         return False
     return a == b or math.isclose(_single(a), _single(b), rel_tol=1e-6, abs_tol=1e-9)

@@ -1,8 +1,7 @@
 """The world as PX4's external simulator: MAVLink 2 over TCP, HIL_SENSOR out, HIL_ACTUATOR_CONTROLS in, in lockstep.
 
-PX4 is the client. Its clock is the `time_usec` of the last HIL_SENSOR and nothing else, so that it computes exactly as long as the
-world lets it: a sample, then its answer, then the next sample. The clock begins anew with each PX4 that connects. Motion capture does
-not go this way.
+PX4 is the client. Its only clock is the `time_usec` of the newest HIL_SENSOR, so the two advance in turn: a sample, its answer, the
+next sample. The clock restarts with each PX4 that connects. Motion capture reaches PX4 over the companion's link instead.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from companion.model.types import Quat, Vec3
 from sitl.autopilot.types import ImuSample, RotorCommands
 
 CLOCK_ORIGIN_S = 1.0
-"""PX4's clock at its first sample, however old the world is: it must not begin at zero, and one that begins at some minutes keeps EKF2
-from its first estimate (PX4 1.16.1: at 300 s for some 10 s, at 1000 s for longer than the preflight waits)."""
+"""PX4's clock at its first sample, at any world time. It must not start at zero; if it starts at some minutes, EKF2's first estimate is
+late (PX4 1.16.1: by about 10 s at 300 s, by more than the preflight waits at 1000 s)."""
 ANSWER_PATIENCE_S = 2.0
-"""One sample without an answer: the next one is sent all the same."""
+"""Time to wait for the answer to one sample; then the next one is sent."""
 ANSWER_DEADLINE_S = 10.0
-"""No answer at all for so long: PX4 has stopped."""
+"""Time without any answer after which PX4 counts as hung."""
 FIELD_EVERY, BARO_OFFSET = 5, 2
-"""Samples between two of the magnetometer, and of the barometer: 50 Hz each, in turns."""
+"""Every fifth sample carries the magnetometer, and every fifth the barometer: 50 Hz each."""
 
 _STOPPED: RotorCommands = (0.0, 0.0, 0.0, 0.0)
 _ACCEL_AND_GYRO, _MAG, _BARO = 0x07 | 0x38, 0x1C0, 0x200 | 0x800 | 0x1000
@@ -39,25 +38,25 @@ _TEMPERATURE_C = 25.0
 
 
 class Px4Error(Exception):
-    """PX4 is not there, has ended, or has stopped answering; one line."""
+    """PX4 cannot be started, has ended or does not answer; the text is one line for the user."""
 
 
 def pressure_hpa(altitude_m: float) -> float:
-    """Of the standard atmosphere, at a height above the sea."""
+    """Return the pressure of the standard atmosphere at a height above sea level."""
     return 1013.25 * math.pow(1.0 - 2.25577e-5 * altitude_m, 5.25588)
 
 
 def field_frd_gauss(attitude_wxyz: Quat) -> Vec3:
-    """Magnetic field in the body (FRD) of a vehicle with this attitude (body FLU, world ENU)."""
+    """Return the magnetic field in the body frame (FRD), given the attitude (body FLU to world ENU)."""
     north, east, down = _FIELD_NED_GAUSS
     forward, left, up = quat_rotate(quat_conjugate(attitude_wxyz), (east, north, -down))
     return (forward, -left, -up)
 
 
 class HilSensors:
-    """HIL_SENSOR messages of one flight.
+    """Builds the HIL_SENSOR messages of one flight.
 
-    PX4 does not boot without magnetometer and barometer, whether it fuses them or not: their values are plausible and noisy.
+    PX4 does not boot without magnetometer and barometer, even if it does not fuse them, so both have plausible, noisy values.
     """
 
     def __init__(self, seed: int) -> None:
@@ -65,8 +64,12 @@ class HilSensors:
         self._number = 0
 
     def message(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> Any:
-        """HIL_SENSOR; the sample's time counts from PX4's first one, height above the floor and attitude (world ENU, body FLU) are
-        the true ones.
+        """Build HIL_SENSOR.
+
+        Args:
+            imu: IMU sample; its time counts from PX4's first sample.
+            height_m: true height above the floor.
+            attitude_wxyz: true attitude, body FLU to world ENU.
         """
         gauss = self._random.gauss
         fields = _ACCEL_AND_GYRO
@@ -91,40 +94,40 @@ class HilSensors:
 
 
 def clock_us(t_s: float) -> int:
-    """PX4's clock, by the world time since its first sample."""
+    """Return PX4's clock, given the world time since its first sample."""
     return round((t_s + CLOCK_ORIGIN_S) * 1e6)
 
 
 class SimulatorLink:
-    """The simulator's end of the TCP link; PX4 may connect, go, and connect again. An async context manager.
+    """The simulator's end of the TCP link, an async context manager. PX4 may disconnect and connect again.
 
     Args:
-        listener: bound to where PX4 connects, 127.0.0.1:4560 plus its instance; closed with the link.
-        sensors: what PX4 senses.
+        listener: listens where PX4 connects, 127.0.0.1:4560 plus its instance; closed with the link.
+        sensors: builds the sensor messages.
     """
 
     def __init__(self, listener: socket.socket, sensors: HilSensors) -> None:
         self.rotors: RotorCommands = _STOPPED
-        """Rotor commands of the last answer, 0 to 1, PX4's quad-x order; 0 while disarmed."""
+        """Rotor commands of the newest answer, 0 to 1, in PX4's quad-x order; 0 while disarmed."""
         self.armed = False
         self.answers = 0
-        """HIL_ACTUATOR_CONTROLS since PX4 connected."""
+        """Number of HIL_ACTUATOR_CONTROLS since PX4 connected."""
         self.unanswered = 0
-        """Samples that PX4 left without an answer, in all."""
+        """Number of samples that PX4 did not answer."""
         self.connections = 0
         self.clock_begun_s: float | None = None
-        """World time of the first sample of the PX4 that is there; None before it. PX4's clock counts from it, at `CLOCK_ORIGIN_S`."""
+        """World time of the first sample of the connected PX4, or None. PX4's clock is `CLOCK_ORIGIN_S` at it."""
         self._listener = listener
         self._sensors = sensors
         self._server: asyncio.Server | None = None
         self._peer: _Peer | None = None
         self._encoder = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_SYSTEM_CONTROL)
-        self._waits_for_us: int | None = None
+        self._awaited_us: int | None = None
         self._answer = asyncio.Event()
         self._change = asyncio.Event()
         self._silent_s = 0.0
-        self._rests = False
-        """Disarmed and without an answer: in OFFBOARD without setpoints, as after a flight, PX4 computes no controls."""
+        self._idle = False
+        """Whether PX4 is disarmed and does not answer: in OFFBOARD without setpoints, as after a flight, it computes no controls."""
 
     async def __aenter__(self) -> Self:
         self._server = await asyncio.get_running_loop().create_server(lambda: _Peer(self), sock=self._listener)
@@ -146,20 +149,20 @@ class SimulatorLink:
 
     @property
     def connected(self) -> bool:
-        """A PX4 is there."""
+        """Whether a PX4 is connected."""
         return self._peer is not None
 
     @property
     def in_step(self) -> bool:
-        """It answers: its modules run."""
+        """Whether it answers samples, so that its modules run."""
         return self._peer is not None and self.answers > 0
 
     async def until_in_step(self, deadline_s: float) -> bool:
-        """Wait for PX4's first answer, while somebody goes on sending samples; False: none came in time."""
+        """Wait for PX4's first answer while samples go on; return False if none came in time."""
         return await self._until(lambda: self.in_step, deadline_s)
 
     async def until_gone(self, deadline_s: float) -> bool:
-        """Wait until PX4 has closed its end; False: it has not in time."""
+        """Wait until PX4 has disconnected; return False if it has not in time."""
         return await self._until(lambda: not self.connected, deadline_s)
 
     async def _until(self, reached: Any, deadline_s: float) -> bool:
@@ -171,30 +174,30 @@ class SimulatorLink:
         return bool(reached())
 
     def send(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> None:
-        """One sample to PX4; nothing happens while there is none. `answered` waits for what it makes of it."""
+        """Send one sample to PX4, if one is connected; `answered` waits for the answer."""
         if self._peer is None:
             return
         if self.clock_begun_s is None:
             self.clock_begun_s = imu.t_s
         message = self._sensors.message(imu._replace(t_s=imu.t_s - self.clock_begun_s), height_m, attitude_wxyz)
-        # A PX4 that boots does not answer yet; one that rests does not answer for a while.
-        self._waits_for_us = int(message.time_usec) if self.answers and not self._rests else None
+        # A PX4 that is booting or idle does not answer.
+        self._awaited_us = int(message.time_usec) if self.answers and not self._idle else None
         self._peer.write(message.pack(self._encoder))
         self._encoder.seq = (self._encoder.seq + 1) % 256
 
     @property
     def pending(self) -> bool:
-        """The last sample has not been answered."""
-        return self._waits_for_us is not None
+        """Whether the newest sample waits for its answer."""
+        return self._awaited_us is not None
 
     async def answered(self) -> None:
-        """Until PX4 has answered the last sample, or is gone. After `ANSWER_PATIENCE_S` the sample is given up; a PX4 that is not armed
-        is then not waited for any more until it answers again.
+        """Wait until PX4 has answered the newest sample or has disconnected, `ANSWER_PATIENCE_S` at most. After that a PX4 that is not
+        armed is not waited for again until it answers.
 
         Raises:
             Px4Error: an armed PX4 has answered nothing for `ANSWER_DEADLINE_S`.
         """
-        while self._waits_for_us is not None:
+        while self._awaited_us is not None:
             self._answer.clear()
             try:
                 async with asyncio.timeout(ANSWER_PATIENCE_S):
@@ -202,8 +205,8 @@ class SimulatorLink:
             except TimeoutError:
                 self.unanswered += 1
                 self._silent_s += ANSWER_PATIENCE_S
-                self._waits_for_us = None
-                self._rests = not self.armed
+                self._awaited_us = None
+                self._idle = not self.armed
                 if self._silent_s >= ANSWER_DEADLINE_S:
                     raise Px4Error(
                         f"PX4: expected an answer to every HIL_SENSOR (lockstep), found none for {ANSWER_DEADLINE_S:g} s; "
@@ -213,7 +216,7 @@ class SimulatorLink:
     # -- called by the peer --------------------------------------------------------------------------------------
 
     def attach(self, peer: _Peer) -> bool:
-        """PX4 connects; False: there is one already."""
+        """Accept a connection of PX4; return False if another one is connected."""
         if self._peer is not None:
             return False
         self._peer = peer
@@ -221,39 +224,39 @@ class SimulatorLink:
         self.clock_begun_s = None
         self.answers = 0
         self._silent_s = 0.0
-        self._rests = False
+        self._idle = False
         self._change.set()
         return True
 
     def detach(self, peer: _Peer) -> None:
-        """PX4 is gone: its rotors stand."""
+        """Forget a PX4 that disconnected, and stop its rotors."""
         if self._peer is not peer:
             return
         self._peer = None
         self.rotors, self.armed, self.answers = _STOPPED, False, 0
-        self._waits_for_us = None
+        self._awaited_us = None
         self._answer.set()
         self._change.set()
 
     def take(self, message: Any) -> None:
-        """One message of PX4's."""
+        """Handle one message of PX4."""
         if message.get_type() != "HIL_ACTUATOR_CONTROLS":
             return
         self.answers += 1
-        self._rests = False
+        self._idle = False
         if self.answers == 1:
             self._change.set()
         self.armed = bool(message.mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         a, b, c, d = (min(1.0, max(0.0, value)) for value in message.controls[0:4])
         self.rotors = (a, b, c, d)
-        if self._waits_for_us is not None and message.time_usec >= self._waits_for_us:
-            self._waits_for_us = None
+        if self._awaited_us is not None and message.time_usec >= self._awaited_us:
+            self._awaited_us = None
             self._silent_s = 0.0
             self._answer.set()
 
 
 class _Peer(asyncio.Protocol):
-    """One TCP connection."""
+    """One TCP connection of PX4."""
 
     def __init__(self, link: SimulatorLink) -> None:
         self.closed = asyncio.Event()
@@ -263,7 +266,7 @@ class _Peer(asyncio.Protocol):
         self._decoder.robust_parsing = True
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Somebody connects."""
+        """A client connects."""
         self._transport = cast(asyncio.Transport, transport)
         connection = transport.get_extra_info("socket")
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -271,22 +274,22 @@ class _Peer(asyncio.Protocol):
             self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It is gone."""
+        """The client disconnected."""
         self._transport = None
         self._link.detach(self)
         self.closed.set()
 
     def data_received(self, data: bytes) -> None:
-        """Messages, whole or in parts."""
+        """Decode messages, which may arrive in parts."""
         for message in self._decoder.parse_buffer(data) or ():
             self._link.take(message)
 
     def write(self, data: bytes) -> None:
-        """Send."""
+        """Send bytes, if the connection is open."""
         if self._transport is not None:
             self._transport.write(data)
 
     def close(self) -> None:
-        """Close."""
+        """Close the connection at once."""
         if self._transport is not None:
             self._transport.abort()

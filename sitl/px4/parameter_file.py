@@ -1,6 +1,6 @@
-"""The file in which a simulated PX4 keeps its changed parameters: read while PX4 runs, and made whole again after its end.
+"""The file in which a simulated PX4 stores its changed parameters: read while PX4 runs, and restored after its end.
 
-PX4 writes the file from a thread of its own, some time after a change, and a SIGTERM cuts that short: what it leaves then is empty.
+PX4 writes the file some time after a change, in a separate thread. A SIGTERM during that time leaves an empty file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _DOUBLE, _INT32, _END = 0x01, 0x10, 0x00
 
 
 def decode(data: bytes) -> dict[str, Value] | None:
-    """Parameters of a BSON document of doubles and 32-bit integers; None: it is not whole.
+    """Return the parameters of a BSON document of doubles and 32-bit integers, or None if it is incomplete.
 
     Layout (bsonspec.org): int32 length of everything, then per element a type, a name that ends with 0 and the value, then 0.
     """
@@ -43,10 +43,10 @@ def decode(data: bytes) -> dict[str, Value] | None:
 
 
 async def stored(folder: Path, values: Mapping[str, Value]) -> bytes:
-    """The file, once these values are in it.
+    """Wait until the file holds these values, and return its bytes.
 
     Raises:
-        Px4Error: they do not come.
+        Px4Error: PX4 did not store them within STORED_DEADLINE_S.
     """
     file = folder / NAME
     loop = asyncio.get_running_loop()
@@ -58,12 +58,12 @@ async def stored(folder: Path, values: Mapping[str, Value]) -> bytes:
             return data
         await asyncio.sleep(_LOOK_AGAIN_S)
     raise Px4Error(
-        f"PX4: expected it to store its parameters in {file} within {STORED_DEADLINE_S:g} s, found them not there"
+        f"PX4: expected it to store its parameters in {file} within {STORED_DEADLINE_S:g} s, found other values"
     )
 
 
 def restore(folder: Path, data: bytes) -> None:
-    """After PX4's end: the file as it was when everything was in it."""
+    """Write the file again as it was when it was complete; call it after PX4 has ended."""
     file = folder / NAME
     if file.read_bytes() != data:
         file.write_bytes(data)

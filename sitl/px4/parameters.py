@@ -1,4 +1,4 @@
-"""What a real PX4 must know to fly the machine of the simulated world: parameters that the world tells, and the operator's own."""
+"""Parameters that a real PX4 needs to fly the simulated vehicle: those of the world, and the user's overrides."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ BEFORE_BOOT: Mapping[str, Value] = {
     "SENS_IMU_MODE": 1,
     "EKF2_MULTI_IMU": 0,
 }
-"""Log from boot until disarmed, with the estimator's inputs and at a high rate; there is one IMU."""
+"""Logging from boot until disarming, at a high rate and with the estimator's inputs; one IMU."""
 ROLL_PITCH_SHARE = 1.0 / math.sqrt(2.0)
-"""Of a roll or pitch command that reaches each rotor of a quad-x: PX4 scales its allocation matrix so
+"""Share of a roll or pitch command that reaches each rotor of a quad-x, by the scale of PX4's allocation matrix
 (ControlAllocationPseudoInverse::updateControlAllocationMatrixScale)."""
 
-OF_THIS_MOTION_CAPTURE: Mapping[str, Value] = {"EKF2_EV_DELAY": 10.0}
-"""ms, measured on 1.16.1: exposure to fusion takes 5 ms of latency, the wires, and half a period each of lockstep and of EKF2. The stub
-has the latency alone, for which the 5 of configs/px4/indoor_mocap.params are right."""
+SIMULATED_MOCAP: Mapping[str, Value] = {"EKF2_EV_DELAY": 10.0}
+"""In ms, measured on 1.16.1: from exposure to fusion it takes 5 ms of latency, the wires, and half a period each of lockstep and EKF2.
+The stub has the latency alone, for which the 5 ms of configs/px4/indoor_mocap.params are right."""
 
-NOT_EVERYWHERE = frozenset(wanted.name for wanted in WANTED if wanted.only)
-"""Versions of PX4 differ: not each has all of these."""
+VERSION_DEPENDENT = frozenset(wanted.name for wanted in WANTED if wanted.only)
+"""Parameters that not every PX4 version has."""
 
 _GAINS = (
     "MC_ROLL_P", "MC_PITCH_P", "MC_YAW_P", "MC_YAW_WEIGHT", "MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX", "MC_YAWRATE_P",
@@ -39,7 +39,7 @@ _MIXED_GAINS = (
 
 
 def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
-    """CA_ROTOR*: places in FRD (m) from the centre of mass, and the yaw reaction, positive for a rotor that turns counter-clockwise."""
+    """Return CA_ROTOR*: positions from the centre of mass (FRD, m) and yaw moment ratios, positive for counter-clockwise rotors."""
     found: dict[str, Value] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4}
     offset = rotor_offset_m(airframe)
     for i, (x, y, yaw) in enumerate(ROTORS):
@@ -50,19 +50,19 @@ def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
 
 
 def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) -> dict[str, Value]:
-    """Everything that is set on a real PX4 before it flies, by name.
+    """Return every parameter that is set on a real PX4 before it flies, by name.
 
     Args:
-        airframe: the rotors' geometry, of the vehicle file.
-        config: of the world.
-        hover_command: normalised thrust that truly holds the machine.
+        airframe: airframe of the vehicle file, for the rotor geometry.
+        config: configuration of the world.
+        hover_command: true normalised hover thrust.
     """
     gains = {name: PX4_DEFAULTS[name] for name in _GAINS}
     mixed = {name: PX4_DEFAULTS[name] / ROLL_PITCH_SHARE for name in _MIXED_GAINS}
     return {
         **simulated_values(),
         **VEHICLE_DEFAULTS,
-        **OF_THIS_MOTION_CAPTURE,
+        **SIMULATED_MOCAP,
         **BEFORE_BOOT,
         **gains,
         **mixed,
@@ -72,5 +72,5 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
         "SIM_BAT_DRAIN": config.battery_life_s,
         "SIM_BAT_MIN_PCT": 0.0,
         "BAT1_N_CELLS": 4,
-        **config.spoiled_px4_params(),
+        **config.overridden_px4_params(),
     }

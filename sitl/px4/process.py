@@ -1,7 +1,7 @@
-"""A real `px4` (SITL) as a child process: found, given an instance number that nobody uses, started in a folder of its own, ended.
+"""A real `px4` (SITL) as a child process: finding it, claiming a free instance number, starting it in its own folder, ending it.
 
-Everything that PX4 writes stays in that folder: parameters, logs (`log/*.ulg`), and what it says (`px4.log`). Outside of it PX4
-keeps `/tmp/px4_lock-N` and `/tmp/px4-sock-N` only.
+PX4 writes its parameters, its logs (`log/*.ulg`) and its output (`px4.log`) to that folder. Outside of it, it writes only
+`/tmp/px4_lock-N` and `/tmp/px4-sock-N`.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from companion.runtime.subprocesses import how_it_ended
 from sitl.px4.hil_link import Px4Error
 
 VARIABLE = "PX4_SITL"
-"""Of the environment: the px4 binary, or the folder that a build leaves (build/px4_sitl_default)."""
+"""Environment variable that names the px4 binary or its build folder (build/px4_sitl_default)."""
 MODEL = "none_iris"
-"""A quad-x whose simulator is somebody else; everything that matters is set by parameters."""
+"""A quad-x with an external simulator; parameters set everything that matters."""
 INSTANCES = range(10)
-"""From 10 on PX4 sends to UDP 14549 whatever its number is."""
+"""Usable instance numbers; from 10 on every PX4 sends to the same port, UDP 14549."""
 HOST = "127.0.0.1"
 HOW_TO_GET_IT = (
     "set PX4_SITL to its build folder (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
 )
 HOW_TO_START_IT = (
-    "start one by hand, which waits for the world, and then this again: PX4_SIM_MODEL={model} px4 -i {number}, always in the same "
-    "folder, where it keeps its parameters, or PX4_SIM_MODEL={model} make px4_sitl_default none"
+    "start PX4 by hand, then this command again: PX4_SIM_MODEL={model} px4 -i {number}, always in the same folder, where it keeps its "
+    "parameters, or PX4_SIM_MODEL={model} make px4_sitl_default none"
 )
 _SIMULATOR, _ONBOARD, _ONBOARD_OWN, _GROUND_OWN = 4560, 14540, 14580, 18570
 _CAMERA, _CAMERA_OWN, _GIMBAL_OWN = 14030, 14280, 13030
@@ -47,18 +47,18 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True, slots=True)
 class Installation:
-    """A px4 that can be started."""
+    """A PX4 that can be started."""
 
     binary: Path
     etc: Path
-    """Its start scripts (ROMFS)."""
+    """Folder of its start scripts (ROMFS)."""
 
 
 def find(environment: Mapping[str, str] | None = None) -> Installation | None:
-    """The px4 that PX4_SITL names, else the one on PATH; None: there is none.
+    """Return the PX4 that PX4_SITL names, else the one on PATH, else None.
 
     Raises:
-        Px4Error: PX4_SITL names something that is none, or a px4 without its start scripts.
+        Px4Error: PX4_SITL does not name a program, or the program has no start scripts.
     """
     environment = os.environ if environment is None else environment
     named = environment.get(VARIABLE, "")
@@ -87,17 +87,17 @@ def _with_etc(binary: Path, origin: str) -> Installation:
 
 
 class Instance:
-    """An instance number nobody else uses, and the sockets that keep it so. Closed with `close`, or as a context manager.
+    """A free instance number with the sockets that reserve it; a context manager, or closed with `close`.
 
-    The simulator's TCP port is the claim: whoever listens there owns the number.
+    The process that listens on the simulator's TCP port owns the number.
     """
 
     def __init__(self, number: int, simulator: socket.socket, control: socket.socket) -> None:
         self.number = number
         self.simulator = simulator
-        """TCP, listening; PX4 connects to it."""
+        """Listening TCP socket that PX4 connects to."""
         self.control = control
-        """UDP; what PX4 sends to its camera link arrives here."""
+        """UDP socket that receives what PX4 sends on its camera link."""
 
     @property
     def onboard_port(self) -> int:
@@ -106,25 +106,25 @@ class Instance:
 
     @property
     def ground_port(self) -> int:
-        """UDP port that PX4 sends its ground link from; it goes to 14550, whatever the instance."""
+        """UDP port that PX4's ground station link sends from; every instance sends to 14550."""
         return _GROUND_OWN + self.number
 
     @property
     def onboard_address(self) -> tuple[str, int]:
-        """Where PX4's onboard link listens."""
+        """Address on which PX4's onboard link listens."""
         return (HOST, _ONBOARD_OWN + self.number)
 
     @property
     def control_address(self) -> tuple[str, int]:
-        """Where PX4's camera link listens."""
+        """Address on which PX4's camera link listens."""
         return (HOST, _CAMERA_OWN + self.number)
 
     @classmethod
     def claim(cls, numbers: range = INSTANCES) -> Instance:
-        """The first free one.
+        """Return the first free instance.
 
         Raises:
-            Px4Error: all are taken.
+            Px4Error: every instance is in use.
         """
         for number in numbers:
             instance = cls._try(number)
@@ -158,7 +158,7 @@ class Instance:
         return cls(number, simulator, control)
 
     def close(self) -> None:
-        """Give the number back."""
+        """Release the number."""
         self.simulator.close()
         self.control.close()
 
@@ -170,16 +170,16 @@ class Instance:
 
 
 class Px4Process:
-    """One PX4, running.
+    """A running PX4.
 
     Args:
-        installation: what to start.
-        instance: its number, claimed.
-        folder: PX4's working folder; made if it is not there. Parameters of an earlier start in the same folder are still set.
-        settings: parameters that must hold before anything of PX4 starts (PX4_PARAM_* of its start script).
+        installation: the program to start.
+        instance: claimed instance.
+        folder: PX4's working folder, created if absent; PX4 keeps its parameters there from one start to the next.
+        settings: parameters to set before PX4's modules start (PX4_PARAM_* of its start script).
 
     Raises:
-        Px4Error: it cannot be started.
+        Px4Error: PX4 cannot be started.
     """
 
     def __init__(
@@ -209,33 +209,33 @@ class Px4Process:
 
     @property
     def pid(self) -> int:
-        """Of PX4."""
+        """Process id of PX4."""
         return self._process.pid
 
     @property
     def running(self) -> bool:
-        """It has not ended."""
+        """Whether PX4 is still running."""
         return self._process.poll() is None
 
-    def epitaph(self) -> str:
-        """One line on a PX4 that ended by itself."""
+    def exit_summary(self) -> str:
+        """Return one line on how PX4 ended."""
         code = self._process.poll()
         how = "is running" if code is None else how_it_ended(code)
-        return f"PX4: px4 -i {self._number} {how}{self._last_complaint()}; see {self.log}"
+        return f"PX4: px4 -i {self._number} {how}{self._last_error_line()}; see {self.log}"
 
     async def until_ended(self, deadline_s: float) -> bool:
-        """Wait for its end; False: it has not come in time."""
+        """Wait until PX4 has ended; return False if it has not in time."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             await asyncio.to_thread(self._process.wait, deadline_s)
         return not self.running
 
     def ask_to_end(self) -> None:
-        """SIGTERM. In lockstep PX4's clock must go on until it is gone, or it cannot end."""
+        """Send SIGTERM. In lockstep PX4 needs samples until it has ended, because they drive its clock."""
         if self.running:
             self._process.terminate()
 
     def kill(self) -> None:
-        """End it at once, and what it left behind in /tmp."""
+        """Kill PX4 and remove the files that it left in /tmp."""
         if self.running:
             self._process.kill()
         self._process.wait()
@@ -244,15 +244,15 @@ class Px4Process:
                 with contextlib.suppress(OSError):
                     os.unlink(name)
 
-    def _last_complaint(self) -> str:
+    def _last_error_line(self) -> str:
         said = _tail(self.log)
         complaints = [line.strip() for line in said if "ERROR" in line or "PANIC" in line or "No such" in line]
-        # Of one that a signal ended the last words are not the cause.
+        # If a signal ended PX4, its last error line is not the cause.
         return f" ({complaints[-1][:160]})" if complaints and self._process.returncode > 0 else ""
 
 
 def _before_exec() -> None:
-    """In the child: without a simulator PX4 would wait for ever, so it ends with the world; and it asks for its own priorities."""
+    """Runs in the child: end with the parent, as PX4 would wait for a simulator for ever, and drop real-time priority."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

@@ -1,4 +1,4 @@
-"""A UDP relay between the companion and a real PX4, only for faults of their link: dead, or slow both ways."""
+"""A UDP relay between the companion and a real PX4 that injects link faults: lost, or delayed in both directions."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from sitl.udp import Address, UdpEndpoint
 
 
 class Relay:
-    """Binds the port that PX4 sends to, and one for the companion.
+    """Relays between the port that PX4 sends to and one for the companion.
 
     Args:
-        instance: claimed.
+        instance: claimed instance.
     """
 
     def __init__(self, instance: Instance) -> None:
         self.down = False
         self.delay_s = 0.0
-        """One way."""
+        """Delay in each direction."""
         self.datagrams = 0
-        """Datagrams of both sides."""
+        """Datagrams received from both sides."""
         self._instance = instance
         self._px4 = _Side(self, instance.onboard_address)
         self._companion = _Side(self, None)
 
     @contextlib.asynccontextmanager
     async def opened(self) -> AsyncIterator[str]:
-        """Relay while inside; the value is the companion's address."""
+        """Relay inside the context, and yield the address for the companion."""
         loop = asyncio.get_running_loop()
         self._px4.other, self._companion.other = self._companion, self._px4
         await loop.create_datagram_endpoint(lambda: self._px4, local_addr=(HOST, self._instance.onboard_port))

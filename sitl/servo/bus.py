@@ -1,4 +1,4 @@
-"""A half-duplex bus of emulated XM430 servos: `ServoLine` is the pure protocol, `ServoBus` puts it behind a pty.
+"""A half-duplex bus of emulated XM430 servos: `ServoLine` is the protocol without I/O, `ServoBus` puts it behind a pty.
 
 Source: ROBOTIS e-manual, "DYNAMIXEL Protocol 2.0".
 """
@@ -29,12 +29,12 @@ from sitl.servo.registers import BAUDS
 _BITS_PER_BYTE = 10
 _CLEAR_TURNS = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 _PARTIAL_TIMEOUT_S = 0.02
-"""The servo's own byte-to-byte timeout is 1.5 ms; a pty under load may be slower."""
+"""Byte-to-byte timeout; the servo's own is 1.5 ms, but a pty under load may be slower."""
 _BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in BAUDS if hasattr(termios, f"B{baud}")}
 
 
 class ServoLine:
-    """What the servos on one wire answer. Two of them with the same id answer at the same time: nobody can read that."""
+    """The servos on one wire. Two servos with the same id answer at the same time and garble each other's packets."""
 
     def __init__(self, servos: Iterable[ServoModel]) -> None:
         self.servos = tuple(servos)
@@ -44,11 +44,11 @@ class ServoLine:
 
     @property
     def packet_pending(self) -> bool:
-        """A packet has begun and is not complete."""
+        """Whether a packet has begun and is incomplete."""
         return self._parser.pending
 
     def drop_partial(self) -> None:
-        """The line was idle in the middle of a packet."""
+        """Drop an incomplete packet, after the line was idle in the middle of it."""
         self._parser.drop_partial()
 
     def feed(self, data: bytes, baud_bps: int | None = None) -> bytes:
@@ -56,12 +56,12 @@ class ServoLine:
 
         Args:
             data: any bytes.
-            baud_bps: rate at which they were sent; None: the rate of every servo.
+            baud_bps: baud rate at which they were sent; with None every servo hears them.
         """
         return self.exchange(data, baud_bps)[0]
 
     def exchange(self, data: bytes, baud_bps: int | None = None) -> tuple[bytes, float]:
-        """As `feed`, with the return delay time in s that the answers add to the time of their bytes."""
+        """Do as `feed`, and also return the sum of the servos' return delay times in s."""
         self._delay_s = 0.0
         packets = self._parser.feed(data)
         if not packets:
@@ -213,7 +213,7 @@ class ServoLine:
 
     def _quiet_write(self, servo_id: int, address: int, data: bytes) -> None:
         for servo in self._having(servo_id):
-            with contextlib.suppress(ServoRefusal):  # writes to several servos have no status packet that could tell
+            with contextlib.suppress(ServoRefusal):  # a write to several servos has no status packet
                 servo.write(address, data)
 
     # --- helpers -----------------------------------------------------------------------------------------------------
@@ -227,7 +227,7 @@ class ServoLine:
 
 
 def _together(answers: list[bytes]) -> bytes:
-    """What is read when several drive the line at once, a moment apart: low wins."""
+    """Combine answers that overlap on the line: each starts a byte after the one before it, and a 0 bit wins."""
     line = answers[0] if answers else b""
     for late in answers[1:]:
         late = b"\xff" + late
@@ -241,7 +241,7 @@ def _word(data: bytes, offset: int) -> int:
 
 
 def _sync_read_items(parameters: bytes) -> list[tuple[int, int, int]]:
-    """(id, address, length) of each servo asked; empty if malformed."""
+    """Return (id, address, length) of each servo; empty if the request is malformed."""
     if len(parameters) < 5:
         return []
     address, length = _word(parameters, 0), _word(parameters, 2)
@@ -266,18 +266,18 @@ class ServoBus:
 
     Args:
         servos: the servos on the wire.
-        wire_time: hold every answer back for the time of its bytes at the line's baud rate and the return delays. The event
-            loop's own granularity of 1 ms stands for the latency timer of the USB adapter.
+        wire_time: delay every answer by the time of its bytes at the line's baud rate and by the return delays. The event
+            loop's granularity of 1 ms stands for the latency timer of the USB adapter.
 
-    The master's baud rate is read from the pty's line settings: servos at another rate stay silent, as on a real wire.
+    The companion's baud rate is read from the pty's line settings; servos at another baud rate stay silent, as on a real wire.
     """
 
     def __init__(self, servos: Iterable[ServoModel], *, wire_time: bool = True) -> None:
         self.line = ServoLine(servos)
         self.dropped_bytes = 0
-        """Bytes of answers that nobody took off the line in time."""
+        """Bytes of answers that were dropped because nobody read the line."""
         self.damaged: Callable[[], bool] = lambda: False
-        """Fault: asked at every instruction whether noise damages it."""
+        """Fault: called at every instruction; returns whether noise damages it."""
         self._wire_time = wire_time
         self._pty = PtyLine(self._on_bytes)
         self._last_byte_s = 0.0
@@ -286,7 +286,7 @@ class ServoBus:
 
     @property
     def path(self) -> str:
-        """Device that the master opens; valid while the bus is entered."""
+        """Device that the companion opens; valid while the bus is open."""
         return self._pty.path
 
     async def __aenter__(self) -> Self:

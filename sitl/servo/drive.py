@@ -1,7 +1,6 @@
-"""Motor and encoder of one XM430: the physics behind the control table. No I/O, no registers.
+"""Motor and encoder of one XM430, on world time, without I/O or control table.
 
-`sitl.servo.model.ServoModel` puts the control table in front of it, for the bus; the fast closed loop uses it as it is. Time is the
-world's.
+`sitl.servo.model.ServoModel` adds the control table for the bus; the fast closed loop uses the drive directly.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ _TIME_EPSILON_S = 1e-9
 
 
 class ServoDrive:
-    """What flows in the motor at every step of the world, and what the servo would report of the last one.
+    """Computes the motor current at every step of the world, and the present values that the servo reports.
 
     Args:
-        shaft_angle_rad: where the shaft is before the first `update`.
+        shaft_angle_rad: shaft angle before the first `update`.
     """
 
     def __init__(self, shaft_angle_rad: float = 0.0) -> None:
@@ -44,39 +43,39 @@ class ServoDrive:
         self.goal_position_counts = 0
         """Register 116."""
         self.position_gain = 1.0
-        """Register 84 as a share of its default."""
+        """Register 84 divided by its default."""
         self.watchdog_tripped = False
-        """It let go, and stays so until `start_watchdog`."""
+        """Whether the watchdog has switched the motor off; `start_watchdog` clears it."""
         self.goal_delay_s = 0.0
-        """Goal currents take effect that much later than they were set."""
+        """Delay from setting a goal current to its effect."""
         self.now_s = 0.0
         """Time of the last `update`."""
         self.angle_rad = shaft_angle_rad
         self.velocity_rad_s = 0.0
         self.slip_counts = 0
-        """Fault: the horn has slipped, the encoder shows so much more."""
+        """Fault: the horn has slipped, and the encoder reads this much more."""
         self.turn_counts = 0
-        """What the encoder does not know: whole turns, see `forget_turns`."""
+        """Whole turns that the encoder has lost, see `forget_turns`."""
         self._goal_current_counts = 0
-        self._goals_on_their_way: deque[tuple[float, int]] = deque()
+        self._pending_goals: deque[tuple[float, int]] = deque()
         self._watchdog_s = math.inf
         self._heard_s = 0.0
         self._silent_until_s = math.inf
-        """The watchdog trips when nothing was heard until then."""
+        """Time at which the watchdog trips unless an instruction arrives."""
         self._updated = False
         self._current_counts = 0
         self.forget_turns()
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
-        """Note what the encoder sees and return the motor's current.
+        """Take the shaft's state and return the motor current.
 
         Args:
-            t_s: the world's time; must not run backwards.
+            t_s: world time; must not run backwards.
             shaft_angle_rad: continuous shaft angle in the servo's own convention (counts = angle / 2 pi * 4096).
             shaft_velocity_rad_s: shaft velocity, same convention.
 
         Returns:
-            Current in A that flows now, positive towards positive angle; 0 whenever the motor lets go.
+            Motor current in A, positive towards positive angle; 0 while the motor is off.
         """
         self.now_s = t_s
         self.angle_rad = shaft_angle_rad
@@ -88,7 +87,7 @@ class ServoDrive:
         if t_s > self._silent_until_s and self.torque_on:
             self.watchdog_tripped = True
             self.set_goal_current(0, at_once=True)
-        if self._goals_on_their_way:
+        if self._pending_goals:
             self._receive(t_s)
         if not self.torque_on or self.watchdog_tripped:
             counts = 0
@@ -101,34 +100,33 @@ class ServoDrive:
         return counts * AMP_PER_COUNT * self.direction
 
     def set_goal_current(self, counts: int, *, at_once: bool = False) -> None:
-        """Goal current (register 102), in the servo's own direction; takes effect `goal_delay_s` later.
+        """Set the goal current (register 102), in the servo's own direction; it takes effect `goal_delay_s` later.
 
         Args:
-            counts: the goal.
-            at_once: no delay, and what is on its way is forgotten.
+            counts: goal current.
+            at_once: take effect at once, and drop pending goals.
         """
         if at_once or self.goal_delay_s == 0.0:
-            self._goals_on_their_way.clear()
+            self._pending_goals.clear()
             self._goal_current_counts = counts
         else:
-            self._goals_on_their_way.append((math.inf, counts))
+            self._pending_goals.append((math.inf, counts))
 
     def heard_instruction(self) -> None:
-        """A valid instruction packet was on the bus: feeds the watchdog."""
+        """Feed the watchdog: a valid instruction packet was on the bus."""
         self._heard_s = self.now_s
         self._silent_until_s = self.now_s + self._watchdog_s
 
     def start_watchdog(self, period_s: float | None) -> None:
-        """Register 98: without an instruction for `period_s` the motor lets go and the goal current is 0; None: never.
-
-        One that has tripped is cleared; what was heard last still counts.
+        """Set and clear the watchdog (register 98): without an instruction for `period_s` the motor is switched off and the goal
+        current becomes 0. None disables it. The time counts from the last instruction, not from this call.
         """
         self.watchdog_tripped = False
         self._watchdog_s = math.inf if period_s is None else period_s
         self._silent_until_s = self._heard_s + self._watchdog_s
 
     def present(self) -> tuple[int, int, int]:
-        """Current, velocity and position at the last `update`: registers 126, 128 and 132, of one and the same instant."""
+        """Return current, velocity and position in counts at the last `update` (registers 126, 128 and 132)."""
         direction = self.direction
         position = (
             direction * round(self.angle_rad / RAD_PER_COUNT) - self.turn_counts + self.homing_counts + self.slip_counts
@@ -141,18 +139,18 @@ class ServoDrive:
         return self._current_counts, velocity, position
 
     def forget_turns(self) -> None:
-        """The encoder is absolute within one turn only; which turn it was is lost here."""
+        """Reduce the position to one turn: the encoder is absolute within one turn only."""
         counts = self.direction * round(self.angle_rad / RAD_PER_COUNT)
         self.turn_counts = counts - counts % COUNTS_PER_TURN
         self.show_no_current()
 
     def show_no_current(self) -> None:
-        """The present current is 0 until the next `update`."""
+        """Report a present current of 0 until the next `update`."""
         self._current_counts = 0
 
     def _receive(self, t_s: float) -> None:
-        """Goals come into force; those set since the last step were set just now, which is when their delay begins."""
-        goals = self._goals_on_their_way
+        """Apply pending goals that are due; the delay of goals set since the last step begins now."""
+        goals = self._pending_goals
         for i, (due_s, counts) in enumerate(goals):
             if due_s == math.inf:
                 goals[i] = (t_s + self.goal_delay_s, counts)

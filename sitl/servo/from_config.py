@@ -1,4 +1,4 @@
-"""The servos as the world's settings want them, over wires as in the fast closed loop."""
+"""Servos as configured in `world.servos`, for the wires and the fast closed loop."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ def servos_of(vehicle: Vehicle, config: World) -> list[ServoModel]:
 
 
 def plugged_in(servos: Sequence[ServoModel], config: World) -> list[ServoModel]:
-    """Return the servos whose plug is in the bus."""
+    """Return the servos that are connected to the bus."""
     return [servo for index, servo in enumerate(servos) if config.servo(index).connected]
 
 
-def servo_of(joint: Joint, device: ArmDevice, knobs: Servo) -> ServoModel:
-    """The servo that is built into a joint.
+def servo_of(joint: Joint, device: ArmDevice, settings: Servo) -> ServoModel:
+    """Return the servo of a joint.
 
     Args:
-        joint: its id, unless the knobs say another.
-        device: the bus's baud rate, unless the knobs say another.
-        knobs: what is true of it.
+        joint: joint of the vehicle file; its id is the default.
+        device: arm device of the vehicle file; its baud rate is the default.
+        settings: true settings of this servo.
     """
     servo = ServoModel(
-        joint.servo_id if knobs.id is None else knobs.id,
-        baud_bps=device.baud if knobs.baud is None else knobs.baud,
-        firmware=knobs.firmware,
+        joint.servo_id if settings.id is None else settings.id,
+        baud_bps=device.baud if settings.baud is None else settings.baud,
+        firmware=settings.firmware,
     )
-    low, high = knobs.position_limit_counts
+    low, high = settings.position_limit_counts
     for register, value in (
-        (reg.RETURN_DELAY, knobs.return_delay_us // 2),
-        (reg.DRIVE_MODE, knobs.drive_mode),
-        (reg.OPERATING_MODE, knobs.operating_mode),
-        (reg.SECONDARY_ID, knobs.shadow_id),
-        (reg.CURRENT_LIMIT, knobs.current_limit_counts),
+        (reg.RETURN_DELAY, settings.return_delay_us // 2),
+        (reg.DRIVE_MODE, settings.drive_mode),
+        (reg.OPERATING_MODE, settings.operating_mode),
+        (reg.SECONDARY_ID, settings.shadow_id),
+        (reg.CURRENT_LIMIT, settings.current_limit_counts),
         (reg.MIN_POSITION_LIMIT, low),
         (reg.MAX_POSITION_LIMIT, high),
     ):

@@ -1,7 +1,7 @@
-"""One emulated XM430-W210-T: its control table on the side of the bus, its motor on the side of the world. No I/O.
+"""An emulated XM430-W210-T without I/O: control table towards the bus, motor towards the world.
 
-The motor is a `ServoDrive`; writes are carried over to it, and what it measures is carried into the table before somebody looks.
-Time is the world's: the watchdog runs on the `t_s` of `update`.
+The motor is a `ServoDrive`. Writes are copied to it, and its present values are copied into the table before each read. The watchdog
+runs on the world time of `update`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _PRESENT = struct.Struct("<hii")
 
 
 class ServoRefusal(Exception):
-    """An instruction that the servo answers with an error number."""
+    """An instruction that the servo refuses with an error number."""
 
     def __init__(self, error: StatusError) -> None:
         super().__init__(error.name)
@@ -48,13 +48,13 @@ class ServoModel:
 
     Args:
         servo_id: register 7.
-        baud_bps: register 8 as a rate; the servo hears only packets sent at it.
+        baud_bps: baud rate (register 8); the servo receives only packets sent at it.
         firmware: register 6.
-        model: register 0; another number makes it a servo of another kind to whom asks.
-        shaft_angle_rad: where the shaft is before the first `update`.
+        model: model number (register 0).
+        shaft_angle_rad: shaft angle before the first `update`.
 
     Raises:
-        ValueError: baud rate or id that the servo does not have.
+        ValueError: the servo does not support this baud rate or id.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class ServoModel:
         self.drive = ServoDrive(shaft_angle_rad)
         """The motor."""
         self.lights = 0
-        """How often its light went on."""
+        """How often its LED was switched on."""
         self._shutdown = False
         self._silent = False
         self._registered: tuple[int, bytes] | None = None
@@ -89,15 +89,15 @@ class ServoModel:
     # --- side of the world -------------------------------------------------------------------------------------------
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
-        """Latch what the encoder sees and return the motor's current.
+        """Take the shaft's state and return the motor current.
 
         Args:
-            t_s: the world's time; must not run backwards.
+            t_s: world time; must not run backwards.
             shaft_angle_rad: continuous shaft angle in the servo's own convention (counts = angle / 2 pi * 4096).
             shaft_velocity_rad_s: shaft velocity, same convention.
 
         Returns:
-            Current in A that flows now, positive towards positive angle; 0 whenever the motor lets go.
+            Motor current in A, positive towards positive angle; 0 while the motor is off.
         """
         drive, memory = self.drive, self._memory
         current_a = drive.update(t_s, shaft_angle_rad, shaft_velocity_rad_s)
@@ -109,7 +109,7 @@ class ServoModel:
 
     @property
     def goal_delay_s(self) -> float:
-        """Goal currents take effect that much later than they were written."""
+        """Delay from writing a goal current to its effect."""
         return self.drive.goal_delay_s
 
     @goal_delay_s.setter
@@ -117,20 +117,20 @@ class ServoModel:
         self.drive.goal_delay_s = delay_s
 
     def fail_silent(self, silent: bool) -> None:
-        """Break (or mend) the data wire: the servo neither hears nor answers, its motor goes on until its watchdog trips."""
+        """Break or restore the data wire: the servo receives and answers nothing, and its motor goes on until its watchdog trips."""
         self._silent = silent
 
     def trip_overload(self) -> None:
-        """Overload error, as after holding more than the motor can."""
+        """Raise the overload error, as after holding too large a load."""
         self._raise_error(ERROR_OVERLOAD)
 
     def set_temperature_c(self, temperature_c: float) -> None:
-        """Motor temperature; above register 31 it is an overheating error."""
+        """Set the motor temperature; above register 31 it raises the overheating error."""
         self._set(reg.PRESENT_TEMPERATURE, max(0, min(255, round(temperature_c))))
         self._check_environment()
 
     def set_voltage_v(self, voltage_v: float) -> None:
-        """Supply voltage; outside registers 34 to 32 it is an input voltage error."""
+        """Set the supply voltage; outside registers 34 to 32 it raises the input voltage error."""
         self._set(reg.PRESENT_VOLTAGE, max(0, round(voltage_v * 10.0)))
         self._check_environment()
 
@@ -143,12 +143,12 @@ class ServoModel:
 
     @property
     def secondary_id(self) -> int:
-        """Register 12; above 252 it is off."""
+        """Register 12; values above 252 disable it."""
         return self._memory[12]
 
     @property
     def baud_bps(self) -> int:
-        """Register 8 as a rate."""
+        """Baud rate (register 8)."""
         return reg.BAUDS[self._memory[8]]
 
     @property
@@ -163,12 +163,12 @@ class ServoModel:
 
     @property
     def return_delay_s(self) -> float:
-        """Register 9, 2 us each."""
+        """Return delay time (register 9, unit 2 us)."""
         return self._memory[9] * 2e-6
 
     @property
     def lit(self) -> bool:
-        """Register 65."""
+        """Whether the LED is on (register 65)."""
         return bool(self._memory[65])
 
     @property
@@ -178,7 +178,7 @@ class ServoModel:
 
     @property
     def silent(self) -> bool:
-        """The data wire is broken."""
+        """Whether the data wire is broken."""
         return self._silent
 
     @property
@@ -187,14 +187,14 @@ class ServoModel:
         return ALERT if self._memory[70] else 0
 
     def heard_instruction(self) -> None:
-        """A valid instruction packet for whomever was on the bus: feeds the watchdog."""
+        """Feed the watchdog: a valid instruction packet for any servo was on the bus."""
         self.drive.heard_instruction()
 
     def read(self, address: int, length: int) -> bytes:
-        """Bytes of the control table.
+        """Return bytes of the control table.
 
         Raises:
-            ServoRefusal: DATA_LENGTH for nothing, ACCESS for bytes that are not defined.
+            ServoRefusal: DATA_LENGTH for zero bytes, ACCESS for undefined addresses.
         """
         if length == 0:
             raise ServoRefusal(StatusError.DATA_LENGTH)
@@ -202,16 +202,16 @@ class ServoModel:
         return bytes(self._memory[self._resolve(a, StatusError.ACCESS)] for a in range(address, address + length))
 
     def write(self, address: int, data: bytes) -> None:
-        """Write whole registers; all of them or, on a refusal, none.
+        """Write whole registers: all of them or, on a refusal, none.
 
         Raises:
-            ServoRefusal: as the servo's status packet says.
+            ServoRefusal: with the error number of the status packet.
         """
         for register, value in self._checked(address, data):
             self._apply(register, value)
 
     def register_write(self, address: int, data: bytes) -> None:
-        """Keep a write for `action`.
+        """Store a write for `action`.
 
         Raises:
             ServoRefusal: as `write`.
@@ -234,7 +234,7 @@ class ServoModel:
         self.write(address, data)
 
     def reboot(self) -> None:
-        """Restart: RAM as new, EEPROM kept, errors cleared unless their cause is still there."""
+        """Restart: reset RAM, keep EEPROM, and clear errors unless their cause persists."""
         memory = self._memory
         environment = {r: self._get(r) for r in (reg.PRESENT_TEMPERATURE, reg.PRESENT_VOLTAGE)}
         for register in reg.REGISTERS:
@@ -249,7 +249,7 @@ class ServoModel:
         self._power_on()
 
     def clear_turns(self) -> None:
-        """CLEAR 0x01: present position back into one turn.
+        """Reduce the present position to one turn (CLEAR 0x01).
 
         Raises:
             ServoRefusal: RESULT_FAIL while the shaft moves.
@@ -268,7 +268,7 @@ class ServoModel:
         self._memory[register.address : register.address + register.size] = register.encode(value)
 
     def _resolve(self, address: int, refusal: StatusError) -> int:
-        """Address behind a window of indirect data; itself for everything else."""
+        """Return the address behind an indirect data byte, or the address itself."""
         pointer = reg.INDIRECT_POINTER.get(address)
         if pointer is not None:
             address = self._memory[pointer] | self._memory[pointer + 1] << 8
@@ -279,7 +279,7 @@ class ServoModel:
         return address
 
     def _checked(self, address: int, data: bytes) -> list[tuple[Register, int]]:
-        """The register writes that `data` means, every one of them allowed."""
+        """Split `data` into register writes and check that each of them is allowed."""
         if not data:
             raise ServoRefusal(StatusError.DATA_LENGTH)
         targets = [self._resolve(address + i, StatusError.ACCESS) for i in range(len(data))]
@@ -361,7 +361,7 @@ class ServoModel:
         self._set(reg.GOAL_VELOCITY, 0)
 
     def _settings_to_drive(self) -> None:
-        """Everything but the goal current, which takes its time."""
+        """Copy the table's settings to the drive, except the goal current, which has a delay."""
         drive, memory = self.drive, self._memory
         watchdog = memory[98]
         drive.torque_on = bool(memory[64])
@@ -375,9 +375,9 @@ class ServoModel:
             drive.start_watchdog(watchdog * WATCHDOG_UNIT_S if watchdog else None)
 
     def _show_present(self) -> None:
-        """Carry what the drive measured at its last update into the table."""
+        """Copy the drive's present values into the table."""
         memory = self._memory
-        # One slice assignment of one instant's values: a reader never sees a position of one with a velocity of another.
+        # One assignment, so that a read never mixes values of two moments.
         current, velocity, position = self.drive.present()
         memory[126:136] = _PRESENT.pack(current, velocity, position)
         memory[120:122] = (int(self.drive.now_s * 1e3) % 32768).to_bytes(2, "little")

@@ -1,4 +1,4 @@
-"""DYNAMIXEL Protocol 2.0 on the servo's side: CRC, byte stuffing, a parser that survives garbage. No I/O, no state but the buffer.
+"""DYNAMIXEL Protocol 2.0 on the servo's side, without I/O: CRC, byte stuffing, and a parser that recovers from noise.
 
 Source: ROBOTIS e-manual, "DYNAMIXEL Protocol 2.0".
 """
@@ -12,7 +12,7 @@ HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
 MAX_ID = 252
 MAX_LENGTH = 1024
-"""Largest length field that a servo takes for a packet; anything longer is noise that looks like a header."""
+"""Largest valid length field; a larger one is noise that looks like a header."""
 _PREFIX = 7  # header, id, length
 
 
@@ -67,41 +67,41 @@ _CRC_TABLE = _crc_table()
 
 
 def crc16(data: bytes | bytearray, crc: int = 0) -> int:
-    """CRC-16 of `data` (polynomial 0x8005, most significant bit first), continued from `crc`."""
+    """Return the CRC-16 of `data` (polynomial 0x8005, most significant bit first), continued from `crc`."""
     for byte in data:
         crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
     return crc
 
 
 def stuff(body: bytes) -> bytes:
-    """Instruction or status body with FD added after every FF FF FD."""
+    """Return a packet body with FD inserted after every FF FF FD."""
     return body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
 
 
 def unstuff(body: bytes) -> bytes:
-    """Inverse of `stuff`."""
+    """Undo `stuff`."""
     return body.replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
 
 
 def packet(packet_id: int, body: bytes) -> bytes:
-    """A whole packet around an unstuffed body (instruction byte and parameters)."""
+    """Return the packet of an unstuffed body (instruction byte and parameters)."""
     body = stuff(body)
     head = HEADER + bytes((packet_id,)) + (len(body) + 2).to_bytes(2, "little") + body
     return head + crc16(head).to_bytes(2, "little")
 
 
 def status(servo_id: int, error: int, data: bytes = b"") -> bytes:
-    """A status packet; `error` is the whole error byte, alert bit included."""
+    """Return a status packet; `error` is the whole error byte, alert bit included."""
     return packet(servo_id, bytes((Instruction.STATUS, error)) + data)
 
 
 def fast_status(blocks: list[tuple[int, int, bytes]], total_blocks_size: int) -> bytes:
-    """The one status packet of a fast sync or bulk read.
+    """Return the single status packet of a fast sync or bulk read.
 
     Args:
-        blocks: (servo id, error byte, data) of the servos that answered, in the order asked for.
-        total_blocks_size: data bytes of all servos asked plus 4 per servo; the first servo announces it whether or not the
-            others follow. The packet is not stuffed and each block ends with the CRC of everything before it.
+        blocks: (servo id, error byte, data) of the servos that answered, in the order of the request.
+        total_blocks_size: data bytes of all requested servos plus 4 per servo; the first servo announces it even if others do
+            not answer. The packet is not stuffed, and each block ends with the CRC of everything before it.
     """
     out = bytearray(HEADER)
     out.append(BROADCAST_ID)
@@ -115,32 +115,32 @@ def fast_status(blocks: list[tuple[int, int, bytes]], total_blocks_size: int) ->
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet that was found on the line."""
+    """One packet on the line."""
 
     packet_id: int
     instruction: int
     parameters: bytes
-    """Stuffing removed; empty when the CRC is wrong."""
+    """Parameters without stuffing; empty if the CRC is wrong."""
     crc_ok: bool
 
 
 class PacketParser:
-    """Finds packets in a byte stream. Never raises; noise is skipped and the next good header is found again."""
+    """Finds packets in a byte stream. It never raises; it skips noise up to the next valid header."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     @property
     def pending(self) -> bool:
-        """A packet has begun and is not complete."""
+        """Whether a packet has begun and is incomplete."""
         return bool(self._buffer)
 
     def drop_partial(self) -> None:
-        """Forget a packet that has begun (the servo's byte-to-byte timeout)."""
+        """Drop an incomplete packet (the servo's byte-to-byte timeout)."""
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[Packet]:
-        """Take bytes from the line; returns the packets that became complete."""
+        """Take bytes from the line and return the packets that they complete."""
         buffer = self._buffer
         buffer += data
         packets: list[Packet] = []
@@ -171,7 +171,7 @@ class PacketParser:
 
 
 def _header_prefix_size(buffer: bytearray) -> int:
-    """How many bytes at the end of the buffer may be the beginning of a header."""
+    """Return how many bytes at the end of the buffer may begin a header."""
     for size in (3, 2, 1):
         if buffer.endswith(HEADER[:size]):
             return size

@@ -12,7 +12,7 @@ BAUDS = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_
 """Baud rate by value of register 8."""
 TABLE_SIZE = 662
 EEPROM_END = 64
-"""Registers below are kept over a reboot and locked while torque is on."""
+"""Registers below this address survive a reboot and are locked while torque is on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,20 +29,20 @@ class Register:
 
     @property
     def signed(self) -> bool:
-        """Two's complement."""
+        """Whether the value is in two's complement."""
         return self.low < 0
 
     @property
     def eeprom(self) -> bool:
-        """Kept over a reboot, locked while torque is on."""
+        """Whether the register survives a reboot and is locked while torque is on."""
         return self.address < EEPROM_END
 
     def decode(self, raw: bytes | bytearray) -> int:
-        """Value of the register's bytes."""
+        """Return the value of the register's bytes."""
         return int.from_bytes(raw, "little", signed=self.signed)
 
     def encode(self, value: int) -> bytes:
-        """Bytes of a value; wraps at the register's size."""
+        """Return the bytes of a value, wrapped at the register's size."""
         return (value & ((1 << 8 * self.size) - 1)).to_bytes(self.size, "little")
 
 
@@ -95,10 +95,10 @@ PRESENT_VOLTAGE = _read_only(144, 2, "present input voltage", 120)
 PRESENT_TEMPERATURE = _read_only(146, 1, "present temperature", 30)
 
 GOALS = (GOAL_PWM, GOAL_CURRENT, GOAL_VELOCITY, GOAL_POSITION)
-"""Read-only after the bus watchdog has tripped."""
+"""Goal registers; read-only after the bus watchdog has tripped."""
 
 INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))
-"""(address of the first indirect address, address of the first indirect data, how many)."""
+"""(first indirect address register, first indirect data register, number of them)."""
 INDIRECT_TARGETS = range(64, 662)
 
 _PLAIN = (
@@ -162,14 +162,14 @@ _INDIRECT_ADDRESSES = tuple(
 )
 
 REGISTERS = _PLAIN + _INDIRECT_ADDRESSES
-"""Everything but indirect data, which are windows on other registers."""
+"""Every register except indirect data, which map to other registers."""
 
 REGISTER_AT: dict[int, Register] = {
     register.address + i: register for register in REGISTERS for i in range(register.size)
 }
-"""Register of a byte address."""
+"""Register at each byte address."""
 
 INDIRECT_POINTER: dict[int, int] = {
     data + i: first + 2 * i for first, data, count in INDIRECT_BLOCKS for i in range(count)
 }
-"""Address of the indirect address that belongs to a byte of indirect data."""
+"""Indirect address register of each byte of indirect data."""

@@ -1,4 +1,4 @@
-"""A hand that holds the arm whenever it is limp, and moves it through the poses that `companion arm zero` asks for."""
+"""A simulated person who holds the arm while it is limp, and moves it through the poses of `companion arm zero`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from companion.model.types import Vec2
 
 MOVE_S: Final = 2.0
 FORGET_S: Final = 1.5
-"""The lights dark for so long: whoever asked has gone, the next one begins anew."""
+"""Time without LED after which the next LED starts again with the first pose."""
 
 
 class ArmHandling:
-    """Where both joints are held.
+    """Computes the angles at which both joints are held.
 
     Args:
-        arm: of the vehicle file; its walls say which poses there are.
-        angle_rad: of the joints at first.
+        arm: arm of the vehicle file; its joint limits define the poses.
+        angle_rad: joint angles at the start.
     """
 
     def __init__(self, arm: Arm, angle_rad: Vec2) -> None:
@@ -30,14 +30,14 @@ class ArmHandling:
         self._limp = True
 
     def angles_rad(self, t_s: float, limp: bool, angle_rad: Vec2, lights: int, lit: bool) -> Vec2 | None:
-        """Joint angles to hold now; None: the servos do.
+        """Return the joint angles to hold now, or None while the servos hold the arm.
 
         Args:
             t_s: world time.
-            limp: no servo has torque on.
-            angle_rad: where the joints are.
-            lights: how often the lights went on so far; each time the arm is moved to the next pose.
-            lit: they are on.
+            limp: whether torque is off on both servos.
+            angle_rad: joint angles.
+            lights: how often an LED was switched on so far; each time the arm moves to the next pose.
+            lit: whether an LED is on.
         """
         if limp and not self._limp:
             self._from = self._to = self._at = angle_rad

@@ -1,8 +1,7 @@
-"""What people do to the machine with its rotors off: carry it through the guided frame test, tap it, hang a weight on its net.
+"""Handling of the vehicle on the ground: carrying it through the guided frame test, tapping it, hanging a weight on its net.
 
-A hand is a spring and a damper on the base. Lift, forward, turn left, and back onto its place, again and again with a rest between:
-whoever starts to watch finds a whole round. Or it lifts and holds the machine, and another hand taps it. It sways as a hand does, and
-knows where the machine stood at first. Nothing of it is there while the rotors are armed.
+The hand is a spring and a damper on the base. It repeats one round (lift, forward, turn left, back) with a rest in between, or it lifts
+and holds the vehicle while another hand taps it. It sways. It acts only while the vehicle is disarmed.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ STIFFNESS_N_M, DAMPING_NS_M = 900.0, 95.0
 TURN_STIFFNESS_NM, TURN_DAMPING_NMS = 40.0, 4.0
 LIFT_M, FORWARD_M, TURN_DEG = 0.30, 0.30, 45.0
 REST_S = 6.0
-"""On the floor between two rounds."""
+"""Rest on the floor between two rounds."""
 _GRIP_S = 0.4
-"""To take the weight, and to give it back."""
+"""Time to take the weight, and to release it."""
 SWAY_DEG, SWAY_M = 2.0, 0.004
 
 
@@ -37,7 +36,7 @@ class _Leg(NamedTuple):
     forward_m: float
     up_m: float
     turn_deg: float
-    """Of the goal, from where the round began."""
+    """Turn of the goal, from the yaw at the start of the round."""
 
 
 _LEGS: Final = (
@@ -55,10 +54,10 @@ _LEGS: Final = (
 )
 ROUND_S: Final = sum(leg.duration_s for leg in _LEGS)
 TAP_S: Final = 0.024
-"""A knock with the flat of the hand: half a period of a sine."""
+"""Duration of a tap with the flat hand: half a period of a sine."""
 TAP_EVERY_S: Final = 1.1
 _HELD_S: Final = _GRIP_S + 1.6
-"""From the grip until the machine is held still enough to be tapped."""
+"""Time from the grip until the vehicle is steady enough to be tapped."""
 _TAP_LEVER_BODY_M: Final[Vec3] = (0.06, 0.04, 0.02)
 _TAPS_WORLD: Final[tuple[Vec3, ...]] = (
     (1.0, 0.0, 0.0),
@@ -67,23 +66,23 @@ _TAPS_WORLD: Final[tuple[Vec3, ...]] = (
     (0.0, -0.8, 0.6),
     (-0.6, -0.6, 0.5),
 )
-"""Directions, in turn."""
+"""Directions of the taps, in turn."""
 GRAVITY_M_S2: Final = 9.81
 
 
 class Wrench(NamedTuple):
-    """On the base's centre of mass, world frame."""
+    """Force and torque on the centre of mass of the base, world frame."""
 
     force_n: Vec3
     torque_nm: Vec3
 
 
-class Hand:
-    """When it holds the machine, and with which force.
+class Handling:
+    """Computes the force and torque of the hand on the vehicle.
 
     Args:
-        config: `hand`, `hand_t_s`, `hand_taps`, `hand_tap_n` and the seed of its sway.
-        weight_n: of the whole machine.
+        config: `hand`, `hand_t_s`, `hand_taps`, `hand_tap_n`, and the seed of the sway.
+        weight_n: weight of the whole vehicle.
     """
 
     def __init__(self, config: WorldConfig, weight_n: float) -> None:
@@ -96,12 +95,12 @@ class Hand:
         self._phases: list[float] = np.random.default_rng((config.seed, 17)).uniform(0.0, 2.0 * math.pi, 5).tolist()
 
     def wrench(self, t_s: float, q: list[float], v: list[float]) -> Wrench | None:
-        """What the hand does now; None: nothing.
+        """Return force and torque of the hand now, or None while it does not hold the vehicle.
 
         Args:
             t_s: world time.
-            q: position, quaternion of the base (world), then whatever.
-            v: velocity (world), angular rate (body).
+            q: MuJoCo's qpos; it begins with position and quaternion of the base (world).
+            v: MuJoCo's qvel; it begins with velocity (world) and angular rate (body) of the base.
         """
         t_s -= self._from_s
         if t_s < 0.0:
@@ -115,7 +114,7 @@ class Hand:
         (x, y, z), yaw = self._origin
         forward, up, turn = self._goal(t_s)
         grip = min(1.0, t_s / _GRIP_S, (self._round_s - t_s) / _GRIP_S)
-        # As far as it is lifted: on the floor nobody's hand sways.
+        # The sway grows with the height: on the floor there is none.
         loose = min(1.0, up / LIFT_M)
         sway = [loose * math.sin(2.0 * math.pi * (0.35 + 0.07 * k) * t_s + p) for k, p in enumerate(self._phases)]
         goal = (
@@ -140,9 +139,9 @@ class Hand:
         return Wrench(force_n=(fx, fy, fz + grip * self._weight_n), torque_nm=torque)
 
     def _tap(self, t_s: float) -> Vec3:
-        """Force of the other hand, world frame."""
+        """Return the force of a tap, world frame."""
         count, since_s = divmod(t_s - _HELD_S - 0.5 * TAP_EVERY_S, TAP_EVERY_S)
-        # Nobody taps to a clock.
+        # A person's taps are irregular.
         since_s -= 0.13 * (1.0 + math.sin(5.1 * count + self._phases[0]))
         if not 0.0 <= count < self._taps or not 0.0 <= since_s < TAP_S:
             return (0.0, 0.0, 0.0)
@@ -151,7 +150,7 @@ class Hand:
         return (x * size_n, y * size_n, z * size_n)
 
     def _goal(self, t_s: float) -> tuple[float, float, float]:
-        """Forward and up in m, turned in rad."""
+        """Return the goal: forward and up in m, turn in rad."""
         before = _Leg(0.0, 0.0, 0.0, 0.0)
         for leg in self._legs:
             if t_s < leg.duration_s:
@@ -165,7 +164,7 @@ class Hand:
 
 
 class HungWeight:
-    """A known weight that somebody hangs on the net while the force sensor is being read.
+    """A known weight that is hung on the net while the force sensor is read.
 
     Args:
         config: `net_weight_kg`, `net_weight_t_s`.
@@ -176,11 +175,11 @@ class HungWeight:
         self._read_since_s: float | None = None
 
     def pull_n(self, t_s: float, read: bool) -> float:
-        """Force on the net's centre now, N, downwards.
+        """Return the force on the centre of the net, N, downwards.
 
         Args:
             t_s: world time.
-            read: somebody reads the force sensor.
+            read: whether the force sensor is read.
         """
         if not read:
             self._read_since_s = None
@@ -191,7 +190,7 @@ class HungWeight:
 
 
 def _holding(held_s: float) -> tuple[_Leg, ...]:
-    """Lift, hold it for so long, put it back."""
+    """Return the legs of a round that lifts the vehicle, holds it for `held_s` and puts it back."""
     up, held = _Leg(1.6, 0.0, LIFT_M, 0.0), _Leg(held_s, 0.0, LIFT_M, 0.0)
     return (_Leg(_GRIP_S, 0.0, 0.0, 0.0), up, held, _Leg(2.0, 0.0, 0.0, 0.0), _Leg(_GRIP_S, 0.0, 0.0, 0.0))
 

@@ -1,7 +1,7 @@
-"""What a wrongly set-up motion-capture server streams of a pose.
+"""Poses as a wrongly configured motion-capture server streams them.
 
-A rigid body's rotation is counted from how the machine stood when somebody made the body, and is told in the axes of the stream. Who
-makes the body turns the machine's nose along the stream's x axis, if that one is level; else along the true one.
+A rigid body's rotation is zero in the attitude that the vehicle had when the body was created, and it is streamed in the axes of the
+stream. It is assumed that the nose pointed along the stream's x axis then, if that axis is level, else along the true x axis.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _PLACE = {"x": 0, "y": 1, "z": 2}
 
 
 class MocapMisalignment:
-    """True poses to streamed ones: `p' = A p`, `R' = A R Z A'` with A of `world.mocap_axes` and Z the body's wrong zero."""
+    """Converts true poses to streamed ones: `p' = A p`, `R' = A R Z A'`, with A of `world.mocap_axes` and Z the body's wrong zero."""
 
     def __init__(self, config: World) -> None:
         names = config.mocap_axes
@@ -36,12 +36,12 @@ class MocapMisalignment:
 
     @classmethod
     def of(cls, config: World) -> MocapMisalignment | None:
-        """None: the server is set up as it should be."""
+        """Return the misalignment of this configuration, or None if there is none."""
         upright = (config.mocap_axes, config.mocap_body_yaw_deg, config.mocap_body_tilt_deg)
         return None if upright == (("x", "y", "z"), 0.0, (0.0, 0.0)) else cls(config)
 
     def pose(self, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat]:
-        """Position and attitude as streamed."""
+        """Return position and attitude as streamed."""
         w, x, y, z = quat_multiply(attitude_wxyz, self._zero)
         x, y, z = self._axes((x, y, z))
         m = self._mirror

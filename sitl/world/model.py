@@ -1,4 +1,4 @@
-"""The MuJoCo model of the machine, its tether and the thrown payload, built from the vehicle file."""
+"""The MuJoCo model of the vehicle, its tether and the thrown payload, built from the vehicle file."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from companion.sitl_config.world import World
 
 PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"
-"""What a fault throws after the payload."""
-# PX4's quad-x order with each rotor's place (body FLU, in units of arm/sqrt 2) and its yaw reaction about body z (up).
+"""Names of the second ball, which a fault throws after the payload, and of its constraint."""
+# In PX4's quad-x order: each rotor's position (body FLU, in units of arm/sqrt 2) and the sign of its reaction torque about z (up).
 ROTORS = ((1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1))
 
 
 def rotor_offset_m(airframe: Airframe) -> float:
-    """Distance of each rotor from the body's x-z plane and from its y-z plane."""
+    """Return the distance of each rotor from the x-z plane and the y-z plane of the body."""
     return airframe.rotor_arm_m / math.sqrt(2.0)
 
 
 def base_mass_kg(vehicle: Vehicle, world: World) -> float:
-    """True mass of the flying base without arm and tool."""
+    """Return the true mass of the flying base without arm and tool."""
     arm, tool = vehicle.arm, vehicle.tool
     rest = sum(arm.link_masses_kg) + tool.sensor_mass_kg + tool.net_mass_kg
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
 
 
 def link_masses_kg(vehicle: Vehicle, world: World) -> tuple[float, float]:
-    """True masses of the links; what hangs on the wrist is as the vehicle file says."""
+    """Return the true masses of the links; sensor and net have the masses of the vehicle file."""
     first, second = vehicle.arm.link_masses_kg
     return first * (1.0 + world.link_mass_error[0]), second * (1.0 + world.link_mass_error[1])
 
 
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
-    """The model as MJCF."""
+    """Return the model as MJCF."""
     airframe, arm, tool = vehicle.airframe, vehicle.arm, vehicle.tool
     l1, l2 = arm.link_lengths_m
     m1, m2 = link_masses_kg(vehicle, world)

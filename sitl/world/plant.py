@@ -1,6 +1,6 @@
-"""The machine as its devices see it: the world behind noisy sensors, motors and an autopilot, without any wire.
+"""The vehicle with its sensors, motors and autopilot, without wires.
 
-`Plant.step` advances everything by one physics step. The server puts real wires around it; the fast closed loop uses it as it is.
+`Plant.step` advances everything by one physics step. The server adds real wires; the fast closed loop uses the plant directly.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
 from sitl.faults.injector import Faults
-from sitl.world.handling import Hand, HungWeight
+from sitl.world.handling import Handling, HungWeight
 from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.world import PHYSICS_DT_S, Truth, World
 
 IMU_EVERY = 2
-"""Physics steps per IMU sample: 250 Hz, as PX4's rate loop is stepped."""
+"""Physics steps per IMU sample: 250 Hz, the rate of PX4's rate loop."""
 BATTERY_FULL_V, BATTERY_EMPTY_V = 16.6, 14.0
 _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 
 
 class Px4(Protocol):
-    """The autopilot, stepped by its IMU."""
+    """An autopilot that is stepped with IMU samples."""
 
     def step(self, imu: ImuSample) -> Vec4:
-        """One IMU sample in, rotor commands out."""
+        """Take one IMU sample and return normalised rotor commands."""
 
 
 class JointDrive(Protocol):
-    """One servo's motor, in the servo's own angle convention."""
+    """The motor of one servo, in the servo's own angle convention."""
 
     goal_delay_s: float
-    """Goal currents take effect that much later than they were written."""
+    """Delay from writing a goal current to its effect."""
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
-        """Latch what the servo measures; the current (A) that the motor gives now."""
+        """Take the shaft's state and return the motor current in A."""
 
 
 class MocapFrame(NamedTuple):
@@ -59,12 +59,12 @@ class MocapFrame(NamedTuple):
 
 
 def _zero_rad(joint: Joint, servo: Servo) -> float:
-    """Shaft angle at joint angle 0."""
+    """Return the shaft angle at joint angle 0."""
     return joint.zero_count / _COUNTS_PER_RAD + joint.sign * math.radians(servo.zero_error_deg)
 
 
 def battery_voltage_v(remaining: float) -> float:
-    """Voltage at a charge of 0 to 1."""
+    """Return the battery voltage at a state of charge of 0 to 1."""
     return BATTERY_EMPTY_V + (BATTERY_FULL_V - BATTERY_EMPTY_V) * remaining
 
 
@@ -76,7 +76,7 @@ _PHASES = (0.0, math.tau / 3.0, 2.0 * math.tau / 3.0)
 
 
 def noise(seed: int, sensor: int) -> Iterator[Vec3]:
-    """Standard normal numbers by threes, drawn in blocks: three cost well under a microsecond."""
+    """Yield triples of standard normal numbers, drawn in blocks for speed (well under a microsecond each)."""
     rng = np.random.default_rng((seed, sensor))
     while True:
         values = iter(rng.standard_normal(_NOISE_BLOCK).tolist()[::-1])
@@ -87,12 +87,12 @@ class Plant:
     """World, sensors and motors.
 
     Args:
-        vehicle: the machine.
-        config: of the world.
-        px4: what flies it.
-        drives: of the joints.
+        vehicle: vehicle file.
+        config: configuration of the world.
+        px4: the autopilot.
+        drives: motors of both joints.
         start: position, yaw and joint angles, m and rad.
-        between_steps: cameras expose when they are due, as they do, and not at the end of the physics step that they are due in.
+        between_steps: cameras expose at the exact time, not at the end of the physics step.
     """
 
     def __init__(
@@ -125,10 +125,10 @@ class Plant:
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
         self._spoiled = MocapMisalignment.of(config)
-        self._hand = Hand(config, self.world.weight_n) if config.hand else None
+        self._handling = Handling(config, self.world.weight_n) if config.hand else None
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
-        """Whether the force sensor streams; the fast closed loop reads it from the start."""
+        """Whether the force sensor is read; in the fast closed loop it always is."""
         self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self._tick = 0
         self._imu_sample: ImuSample | None = None
@@ -137,11 +137,11 @@ class Plant:
         self._mocap_number = 0
         self.armed_t_s: float | None = None
         self.faults: Faults | None = None
-        """Set by whoever has faults; None: nothing goes wrong."""
+        """Faults of this world; None if there are none."""
 
     def _seed_noise(self) -> None:
-        """A stream per sensor, from the start again at arming: one seed is the same noise in flight, however long the machine stood
-        before and however often each sensor is asked, over wires as in the fast loop."""
+        """Start one noise sequence per sensor. It restarts at arming, so that the noise in flight depends only on the seed: not on the
+        time before arming, nor on how often another sensor is read."""
         self._mocap_noise, self._imu_noise, self._force_noise = (
             noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
         )
@@ -153,19 +153,19 @@ class Plant:
 
     @property
     def truth(self) -> Truth:
-        """The world's state after the last step."""
+        """True state after the last step."""
         return self.world.truth()
 
     def mission_t_s(self) -> float | None:
-        """Seconds since the rotors were armed."""
+        """Return the time since arming, or None before it."""
         return None if self.armed_t_s is None else self.t_s - self.armed_t_s
 
     def fault(self, kind: FaultKind) -> Fault | None:
-        """The fault of that kind that is active now."""
+        """Return the active fault of this kind, or None."""
         return None if self.faults is None else self.faults.active.get(kind)
 
     def _load_on_net(self, push: Push | None, weight: HungWeight | None) -> Vec3:
-        """Force on the net's centre of the push and of the hung weight, N, world frame."""
+        """Return the force of the push and the hung weight on the centre of the net, N, world frame."""
         now, force = self.mission_t_s(), (0.0, 0.0, 0.0)
         if push is not None and now is not None and push.t_s <= now < push.t_s + push.duration_s:
             force = push.force_world_n
@@ -196,19 +196,19 @@ class Plant:
         self._tick += 1
         if config.push is not None or self._weight is not None:
             world.push(self._load_on_net(config.push, self._weight))
-        if self._hand is not None:
-            world.hold(None if armed else self._hand.wrench(t_s, q, v))
+        if self._handling is not None:
+            world.hold(None if armed else self._handling.wrench(t_s, q, v))
         world.step(self._rotors, (torque1, torque2), armed)
         if world.t_s >= self._mocap_next_s - 1e-9:
             self._expose_mocap(min(world.t_s, self._mocap_next_s) if self._between_steps else world.t_s)
 
     @property
     def imu_due(self) -> bool:
-        """The next step begins with an IMU sample."""
+        """Whether the next step begins with an IMU sample."""
         return self._tick % IMU_EVERY == 0
 
     def sample_imu(self) -> ImuSample:
-        """That sample, before the step: for an autopilot that needs time to answer."""
+        """Return that sample before the step, for an autopilot that needs time to answer."""
         if self._imu_sample is None:
             self._imu_sample = self._imu()
         return self._imu_sample
@@ -228,7 +228,7 @@ class Plant:
         )
 
     def _vibration(self, t_s: float) -> Vec3:
-        """Mean of the vibration over the sample's interval, as PX4 integrates its raw samples; a third of a turn apart on the axes."""
+        """Return the mean vibration over the sample's interval, as PX4 integrates raw samples; the axes are 120 deg apart in phase."""
         interval_s = IMU_EVERY * PHYSICS_DT_S
         turns = math.tau * self._config.accel_vibration_hz
         k = self._config.accel_vibration_m_s2 / (turns * interval_s)
@@ -265,11 +265,11 @@ class Plant:
         self._mocap_queue.append((t_s + latency_s, MocapFrame(self._mocap_number, t_s, position, attitude, valid)))
 
     def take_mocap(self) -> list[MocapFrame]:
-        """Frames that leave the motion-capture machine now."""
+        """Return and remove the frames that the motion-capture server has sent by now."""
         return [frame for _, frame in self.mocap_until(self.world.t_s)]
 
     def mocap_until(self, until_s: float) -> list[tuple[float, MocapFrame]]:
-        """Frames that leave the motion-capture machine up to `until_s`, and when each does."""
+        """Return and remove the frames that the motion-capture server sends up to `until_s`, each with its time."""
         queue, until_s = self._mocap_queue, until_s + 1e-9
         if not queue or queue[0][0] > until_s:
             return []
@@ -279,22 +279,22 @@ class Plant:
         return [] if self.fault("mocap_loss") else frames
 
     def battery(self) -> Battery:
-        """What the power module measures: emptied by time in the air."""
+        """Return what the power module measures; the charge falls with the time since arming."""
         remaining = self.battery_remaining()
         return Battery(voltage_v=battery_voltage_v(remaining) - self.battery_sag_v(), remaining=remaining)
 
     def battery_sag_v(self) -> float:
-        """Voltage lost to a fault."""
+        """Return the voltage drop by a fault."""
         return 0.0 if self.faults is None else self.faults.sag_v
 
     def battery_remaining(self) -> float:
-        """Charge, 0 to 1."""
+        """Return the state of charge, 0 to 1."""
         flown_s = 0.0 if self.armed_t_s is None else self.world.t_s - self.armed_t_s
         remaining = self._config.battery_start - flown_s / self._config.battery_life_s
         return remaining if remaining > 0.0 else 0.0
 
     def force_torque(self) -> tuple[Vec3, Vec3]:
-        """Reading of the force-torque sensor in N and N m, sensor frame: noise, bias, faults and scale error included."""
+        """Return a reading of the force-torque sensor in N and N m, sensor frame, with noise, bias, faults and scale error."""
         s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
         bx, by, bz = self._config.force_bias_n
         noise_n = self._config.force_noise_n

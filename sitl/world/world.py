@@ -1,4 +1,4 @@
-"""One MuJoCo world: quadrotor, 2R arm, net, tether, floor and a thrown payload. Truth only; sensors add noise elsewhere."""
+"""The physics in MuJoCo: quadrotor, 2R arm, net, tether, floor and a thrown payload. Sensor noise is added in `plant`."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from sitl.world.model import mjcf
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
-"""Of a tether that is caught."""
+"""Stiffness and damping of a snagged tether."""
 _THROW_LEAD_S = 0.45
 _THROW_BESIDE_M = 0.5
-"""The vehicle passes `catch_at_m` at most this far to the left or right of it, else nothing is thrown."""
+"""Nothing is thrown if the vehicle passes `catch_at_m` farther to the side than this."""
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The world's true state; world ENU, body FLU."""
+    """True state of the vehicle; world ENU, body FLU."""
 
     t_s: float
     position_world_m: Vec3
@@ -37,13 +37,13 @@ class Truth:
     joint_angle_rad: Vec2
     joint_velocity_rad_s: Vec2
     force_sensor_n: Vec3
-    """Force of the surroundings on the tool side of the sensor, net's weight and inertia included, sensor frame."""
+    """Force on the tool side of the sensor, with weight and inertia of the net, sensor frame."""
     torque_sensor_nm: Vec3
     tether_tension_n: float
 
 
 class Snapshot(NamedTuple):
-    """MuJoCo's own numbers after one step: qpos, qvel, sensordata. `Layout.truth` tells what they mean."""
+    """MuJoCo's qpos, qvel and sensordata after one step; `Layout.truth` decodes them."""
 
     t_s: float
     q: list[float]
@@ -53,7 +53,7 @@ class Snapshot(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where things are in a `Snapshot`; the base is first in q and v, the sensors are three numbers each."""
+    """Indices into a `Snapshot`. The base comes first in q and v; each sensor has three numbers."""
 
     joint_q: tuple[int, int]
     joint_v: tuple[int, int]
@@ -64,7 +64,7 @@ class Layout:
     tether: int
 
     def truth(self, snapshot: Snapshot) -> Truth:
-        """The snapshot as a record."""
+        """Decode a snapshot."""
         t_s, q, v, s = snapshot
         (q1, q2), (v1, v2) = self.joint_q, self.joint_v
         a, g, f, tq = self.accel, self.gyro, self.force, self.torque
@@ -85,15 +85,15 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class WorldEvent:
-    """Something that happened in the world."""
+    """An event of the world."""
 
     t_s: float
     kind: str
-    """thrown, caught, taken (out of the net), missed, crashed."""
+    """thrown, caught, taken (out of the net), missed or crashed."""
 
 
 class Ball(NamedTuple):
-    """Something that is thrown: body, places in qpos and qvel, and the constraint that holds it in the net."""
+    """Indices of a ball: body, first place in qpos and in qvel, and the constraint that holds it in the net."""
 
     body: int
     q: int
@@ -102,7 +102,7 @@ class Ball(NamedTuple):
 
     @classmethod
     def of(cls, model: mujoco.MjModel, name: str, catch: str) -> Ball:
-        """By its names in the model."""
+        """Look up a ball by the names of its body and its constraint."""
         joint = model.joint(name).id
         return cls(
             model.body(name).id, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]), model.equality(catch).id
@@ -110,7 +110,7 @@ class Ball(NamedTuple):
 
 
 class World:
-    """The physics. `step` advances by `PHYSICS_DT_S`."""
+    """The physics; `step` advances it by `PHYSICS_DT_S`."""
 
     def __init__(
         self, vehicle: Vehicle, config: WorldConfig, start_position_m: Vec2, start_yaw_rad: float, arm_rad: Vec2
@@ -138,11 +138,11 @@ class World:
         self._crash_m = 0.6 * vehicle.airframe.ground_clearance_m
         self.wind_m_s = config.wind_m_s
         self.rotor_share: Vec4 | None = None
-        """Of each rotor's thrust that is really there; None: all of it."""
+        """Share of each rotor's thrust that a fault leaves; None without a fault."""
         self.snag: tuple[Vec3, float] | None = None
-        """Where the tether is caught, and how much of it is left from there."""
+        """Point where the tether is snagged, and its free length from there; None if it is free."""
         self.throw_aside_m = 0.0
-        """The throw goes so far beside the net."""
+        """Distance by which the throw misses the net."""
         self._held: Wrench | None = None
         self._tether = m.tendon("tether").id
         self._attachment = m.site("tether").id
@@ -150,20 +150,20 @@ class World:
         self.thrown_t_s: float | None = None
         self.caught_t_s: float | None = None
         self.missed = False
-        """The first throw."""
+        """Whether the first throw missed the net."""
         self.throws = self.catches = 0
-        """Throws so far, and how many of them were caught."""
+        """Number of throws and of catches so far."""
         self._flies_since_s: float | None = None
-        """The throw that has not ended in the net yet; one that missed it still may."""
+        """Time of the throw that is in flight; a throw that missed the net may still be caught."""
         self._kept_since_s: float | None = None
-        """The catch that has not been taken out of the net yet."""
+        """Time of the catch of the payload that is in the net."""
         self._missed = False
-        """What flies since then has missed the net."""
+        """Whether the throw in flight has missed the net."""
         self.crashed = False
         self._events: list[WorldEvent] = []
         self._last_x = start_position_m[0]
         d = self.data
-        # Views: to ask MuJoCo for its arrays anew in every step costs more than to read them.
+        # Views: looking up MuJoCo's arrays in every step costs more than reading them.
         self._ctrl, self._qpos, self._qvel, self._sensordata = d.ctrl, d.qpos, d.qvel, d.sensordata
         self._drag_force, self._push_force = d.xfrc_applied[self._base, 0:3], d.xfrc_applied[self._net, 0:3]
         self._hold_torque = d.xfrc_applied[self._base, 3:6]
@@ -173,7 +173,7 @@ class World:
         self.v: list[float] = []
         """qpos and qvel after the last step; see `layout`."""
         self._sensors: list[float] | None = None
-        """Read when asked for."""
+        """Sensor values of the last step; read from MuJoCo at the first access."""
         self._place(start_position_m, start_yaw_rad, arm_rad)
 
     def _place(self, position_m: Vec2, yaw_rad: float, arm_rad: Vec2) -> None:
@@ -187,32 +187,39 @@ class World:
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()
 
     def sensors(self) -> list[float]:
-        """sensordata after the last step; see `layout`."""
+        """Return sensordata after the last step; see `layout`."""
         if self._sensors is None:
             self._sensors = self._sensordata.tolist()
         return self._sensors
 
     def push(self, force_world_n: Vec3) -> None:
-        """Force on the net's centre from now on."""
+        """Set the external force on the centre of the net, N."""
         self._push_force[:] = force_world_n
 
     def hold(self, wrench: Wrench | None) -> None:
-        """A hand on the base from now on; None: it lets go."""
+        """Set force and torque of a hand on the base; None releases it."""
         self._held = wrench
         self._hold_torque[:] = (0.0, 0.0, 0.0) if wrench is None else wrench.torque_nm
 
     @property
     def weight_n(self) -> float:
-        """Of the machine without payload."""
+        """Weight of the vehicle without payload."""
         return 9.81 * float(self.model.body_subtreemass[self._base])
 
     @property
     def hover_command(self) -> float:
-        """True normalised thrust that holds the machine without payload."""
+        """True normalised hover thrust without payload."""
         return self.weight_n / self._vehicle.airframe.thrust_max_n
 
     def step(self, rotor_commands: Vec4, joint_torque_nm: Vec2, airborne: bool = True, *, drag: bool = True) -> None:
-        """Advance by one physics step; `airborne`: the throw may happen."""
+        """Advance by one physics step.
+
+        Args:
+            rotor_commands: normalised, 0 to 1, in PX4's quad-x order.
+            joint_torque_nm: motor torque of both joints.
+            airborne: whether a payload may be thrown.
+            drag: whether aerodynamic drag and wind act.
+        """
         k, most = self._gain, self._rotor_max_n
         a, b, c, d = self._thrust
         to_a, to_b, to_c, to_d = rotor_commands
@@ -248,12 +255,12 @@ class World:
         self._watch_crash()
 
     def release_arm(self) -> None:
-        """The arm leaves the stand that carries it before its servos do: at the first torque of both joints."""
+        """Release the arm from the stand that holds it until both servos give torque."""
         self._parked = False
         self.data.eq_active[self._park] = 0
 
     def hold_arm(self, angle_rad: Vec2) -> None:
-        """A hand holds both joints from now on, where the stand did, until `release_arm`."""
+        """Hold both joints at these angles until `release_arm`."""
         self._parked = True
         self.data.eq_active[self._park] = 1
         for park, angle in zip(self._park, angle_rad, strict=True):
@@ -287,7 +294,7 @@ class World:
                 self._await_pass()
 
     def _throw(self) -> None:
-        """Launch the payload so that it meets the net where the vehicle will be, at the velocity asked."""
+        """Launch the payload so that it meets the net with the configured velocity."""
         if self.throws == 0:
             self.thrown_t_s = self.t_s
         self.throws += 1
@@ -296,7 +303,7 @@ class World:
         self._events.append(WorldEvent(self.t_s, "thrown"))
 
     def _take_out(self) -> None:
-        """Somebody takes the payload out of the net, to throw it again."""
+        """Take the payload out of the net, so that it can be thrown again."""
         ball, d = self._payload, self.data
         self._kept_since_s = None
         d.eq_active[ball.catch] = 0
@@ -306,11 +313,11 @@ class World:
         self._events.append(WorldEvent(self.t_s, "taken"))
 
     def _await_pass(self) -> None:
-        """The next throw is on a pass that is still to come."""
+        """Wait with the next throw until the vehicle passes `catch_at_m` again."""
         self._last_x = self.q[0] + self.v[0] * _THROW_LEAD_S
 
     def throw(self, ball: Ball, aside_m: float = 0.0) -> None:
-        """The same with any ball, `aside_m` to the left (world y) of the net."""
+        """Launch a ball so that it meets a point `aside_m` to the left (world y) of the net."""
         d = self.data
         target = d.xpos[self._net] + d.qvel[0:3] * _THROW_LEAD_S + np.array([0.0, aside_m, 0.0])
         arrival = np.array(self._config.throw_velocity_m_s)
@@ -323,7 +330,7 @@ class World:
         d.qvel[v + 3 : v + 6] = 0.0
 
     def catch(self, ball: Ball) -> bool:
-        """Whether the ball is in the net, where it stays from then on."""
+        """Attach the ball to the net if it touches it; return whether it does."""
         d = self.data
         gap = d.xpos[ball.body] - d.xpos[self._net]
         if float(gap @ gap) > self._vehicle.tool.net_radius_m**2:
@@ -335,19 +342,19 @@ class World:
         return True
 
     def drop(self) -> None:
-        """The payload falls out of the net, if it is in there."""
+        """Let the payload fall out of the net, if it is in there."""
         if self._kept_since_s is not None:
             self.data.eq_active[self._payload.catch] = 0
 
     @property
     def attachment_world_m(self) -> Vec3:
-        """Where the tether is tied to the vehicle."""
+        """Point where the tether is attached to the vehicle."""
         x, y, z = self.data.site_xpos[self._attachment].tolist()
         return (x, y, z)
 
     @property
     def tether_length_m(self) -> float:
-        """Of the tether as it is now."""
+        """Present length of the tether."""
         return float(self.model.tendon_range[self._tether, 1])
 
     @tether_length_m.setter
@@ -355,7 +362,7 @@ class World:
         self.model.tendon_range[self._tether, 1] = length_m
 
     def _snag_pull_n(self, point_m: Vec3, length_m: float) -> Vec3:
-        """A stiff line from the point to the vehicle."""
+        """Return the force of a stiff, damped line from the point to the vehicle."""
         x, y, z = (p - a for p, a in zip(point_m, self.attachment_world_m, strict=True))
         distance_m = math.sqrt(x * x + y * y + z * z)
         if distance_m <= length_m or distance_m == 0.0:
@@ -367,7 +374,7 @@ class World:
         return (pull_n * x, pull_n * y, pull_n * z)
 
     def _watch_crash(self) -> None:
-        """Rotors or hull in the floor: far below standing height or upside down."""
+        """Detect a crash: the vehicle is far below its standing height or upside down."""
         if self.crashed:
             return
         q = self.q
@@ -378,14 +385,14 @@ class World:
             self._events.append(WorldEvent(self.t_s, "crashed"))
 
     def take_events(self) -> list[WorldEvent]:
-        """Events since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def snapshot(self) -> Snapshot:
-        """The state after the last step, as it is; nobody changes the lists afterwards."""
+        """Return MuJoCo's state after the last step; its lists are never changed afterwards."""
         return Snapshot(self.t_s, self.q, self.v, self.sensors())
 
     def truth(self) -> Truth:
-        """The state after the last step."""
+        """Return the true state after the last step."""
         return self.layout.truth(self.snapshot())

@@ -171,7 +171,7 @@ def test_spoiled_over_real_mavlink_the_row_is_there() -> None:
         port = free_udp_port()
         device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
         async with (
-            standing_stub(port, {HOVER: 0.49, **world.spoiled_px4_params()}),
+            standing_stub(port, {HOVER: 0.49, **world.overridden_px4_params()}),
             MavsdkAutopilot(device, flight_clock()) as autopilot,
         ):
             return rows(await autopilot.firmware(), await autopilot.read_params(names()), vehicle())
@@ -195,5 +195,5 @@ def test_a_spoiled_parameter_that_px4_cannot_have_is_refused(override: str, said
 
 def test_spoiled_parameters_come_in_px4s_types() -> None:
     world = World(px4_params={"EKF2_EV_CTRL": 3.0, "COM_OF_LOSS_T": 1.0})
-    assert world.spoiled_px4_params() == {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 1.0}
-    assert [type(value) for value in world.spoiled_px4_params().values()] == [int, float]
+    assert world.overridden_px4_params() == {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 1.0}
+    assert [type(value) for value in world.overridden_px4_params().values()] == [int, float]

@@ -29,7 +29,7 @@ from sitl.autopilot.backend import StubBackend
 from sitl.autopilot.commander import Command
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.autopilot.types import AttitudeTarget
-from sitl.faults.timing import in_time
+from sitl.faults.timing import with_fault_times
 from sitl.server import Ports, Sitl, start_of
 from sitl.servo import registers as reg
 from sitl.servo.protocol import Instruction, packet
@@ -78,7 +78,7 @@ def emitted(config: SitlConfig, end: int, usual: Emitted | None = None) -> Emitt
     The flight ends at the first step in which that is not what they emit in `usual`.
     """
     with asyncio.Runner(loop_factory=WorldLoop) as runner:
-        return runner.run(_emitted(in_time(config), end, usual))
+        return runner.run(_emitted(with_fault_times(config), end, usual))
 
 
 async def _emitted(config: SitlConfig, end: int, usual: Emitted | None) -> Emitted:
@@ -101,7 +101,7 @@ async def _emitted(config: SitlConfig, end: int, usual: Emitted | None) -> Emitt
                     sitl._step()
                     for _ in range(3):
                         await asyncio.sleep(0)
-                    fate = (sitl.flight.kind, sorted(sitl._struck), tuple(map(str, events)))
+                    fate = (sitl.flight.kind, sorted(sitl._injected), tuple(map(str, events)))
                     steps.append((*partner.heard(), fate))
                     if usual is not None and not usual.goes_on_as(steps, partner.force):
                         break

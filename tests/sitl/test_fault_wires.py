@@ -18,7 +18,7 @@ from companion.sitl_config.faults import Fault
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.link import FastLink
 from sitl.fast.loop import TICK_S, FastFlight
-from sitl.faults.processes import strike
+from sitl.faults.processes import inject_process_fault
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import packet, status
@@ -118,9 +118,9 @@ def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: 
     flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
     for tick in range(40):
         world.t_s = t_s = round(tick * TICK_S, 4)
-        link.deliver_late()
+        link.deliver_due()
         link.send(lambda sent_s=t_s: arrived.append((sent_s, world.t_s)))  # type: ignore[misc]
-        state, heard = link.hear(*at_rest(t_s))
+        state, heard = link.receive(*at_rest(t_s))
         assert state is not None
         if tick >= 10:
             assert state.position_world_m[0] == pytest.approx(t_s - 0.05), "what was said then"
@@ -133,14 +133,14 @@ def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: 
 
 def test_over_a_dead_link_nothing_comes_and_the_last_word_stays(flight: FastFlight) -> None:
     world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_S)
-    last = link.hear(*at_rest(0.0))
+    last = link.receive(*at_rest(0.0))
     flight.faults.active["link_loss"] = Fault(kind="link_loss", t_s=0.0)
     world.t_s = 1.0
     link.send(lambda: pytest.fail("it arrived"))
-    link.deliver_late()
-    assert link.hear(*at_rest(1.0)) == last
+    link.deliver_due()
+    assert link.receive(*at_rest(1.0)) == last
     flight.faults.active.clear()
-    assert link.hear(*at_rest(1.0)) == at_rest(1.0)
+    assert link.receive(*at_rest(1.0)) == at_rest(1.0)
     assert replace(last[1], heartbeat_stamp_s=1.0) == at_rest(1.0)[1]
 
 
@@ -174,7 +174,7 @@ def recorder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_on_a_full_disk_the_recorder_alone_cannot_write(recorder: subprocess.Popen[str], tmp_path: Path) -> None:
-    assert strike("disk_full", os.getpid())
+    assert inject_process_fault("disk_full", os.getpid())
     out, _ = recorder.communicate("\n", timeout=DEADLINE_S)
     assert out.strip().isdigit(), "its write went through"
     assert (tmp_path / "log").read_bytes() == b"before"
@@ -182,9 +182,9 @@ def test_on_a_full_disk_the_recorder_alone_cannot_write(recorder: subprocess.Pop
 
 
 def test_the_recorder_is_found_among_the_children_and_killed(recorder: subprocess.Popen[str]) -> None:
-    assert strike("kill_recorder", os.getpid())
+    assert inject_process_fault("kill_recorder", os.getpid())
     assert recorder.wait(DEADLINE_S) == -9
 
 
 def test_a_process_that_is_not_there_is_not_struck() -> None:
-    assert not strike("kill_recorder", os.getpid())
+    assert not inject_process_fault("kill_recorder", os.getpid())

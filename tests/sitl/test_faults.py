@@ -22,7 +22,7 @@ from sitl.campaigns.robustness import draw, throws
 from sitl.campaigns.runner import CampaignError
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.faults.processes import environment
-from sitl.faults.timing import FaultError, in_time
+from sitl.faults.timing import FaultError, with_fault_times
 from tests.support import CATCH, HOVER, SHORT_CATCH
 
 CONFIG = load_sitl(CATCH, preset="recommended")
@@ -54,29 +54,31 @@ def test_a_phase_is_a_time_of_the_plan() -> None:
     plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
     expected: dict[FlightPhase, str] = {"takeoff": "take-off", "line": "catch", "return": "return", "landing": "land"}
     for phase, name in expected.items():
-        (fault,) = in_time(with_faults({"kind": "mocap_loss", "phase": phase})).world.faults
+        (fault,) = with_fault_times(with_faults({"kind": "mocap_loss", "phase": phase})).world.faults
         assert fault.t_s is not None
         assert fault.after == "arming"
         assert plan.segment(fault.t_s - SPOOL_S).name == name, phase
 
 
 def test_the_catch_is_the_world_s_to_tell_unless_nothing_is_thrown() -> None:
-    (fault,) = in_time(with_faults({"kind": "mocap_loss", "phase": "catch"})).world.faults
+    (fault,) = with_fault_times(with_faults({"kind": "mocap_loss", "phase": "catch"})).world.faults
     assert fault.after == "catch"
-    (fault,) = in_time(with_faults({"kind": "mocap_loss", "phase": "catch"}, world="world.payload_kg=0")).world.faults
+    (fault,) = with_fault_times(
+        with_faults({"kind": "mocap_loss", "phase": "catch"}, world="world.payload_kg=0")
+    ).world.faults
     assert fault.after == "arming"
 
 
 def test_a_heavy_payload_is_the_one_that_is_thrown() -> None:
     assert (
-        in_time(with_faults({"kind": "payload_heavy", "phase": "catch"})).world.payload_kg
+        with_fault_times(with_faults({"kind": "payload_heavy", "phase": "catch"})).world.payload_kg
         == KINDS["payload_heavy"].default
     )
 
 
 def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
     with pytest.raises(FaultError, match="mission 'hover' has no return; give t_s instead"):
-        in_time(with_faults({"kind": "mocap_loss", "phase": "return"}, mission=HOVER))
+        with_fault_times(with_faults({"kind": "mocap_loss", "phase": "return"}, mission=HOVER))
     with pytest.raises(CampaignError) as refused:
         prepare({"flights": [{"phase": "return"}]}, [load_sitl(HOVER)])
     assert refused.value.bad_input

@@ -70,7 +70,7 @@ def test_who_still_runs(kind: FlightFaultKind, left: str) -> None:
         wait_until(both, lambda: f"only {seen} run")
         faults = ProcessFaults()
         faults.pid = process.pid
-        assert faults.plant(kind, 5.0, START, 100)
+        assert faults.inject(kind, 5.0, START, 100)
         # After a hundred letters of the thread, or a spell without any, the main thread has had every chance.
         spells = 0
         while "m" in (found := letters(process)) or spells < 5:
@@ -106,32 +106,32 @@ def test_hooks_only_where_they_are_needed() -> None:
 
 def test_nothing_happens_without_a_flight_process() -> None:
     faults = ProcessFaults()
-    assert not faults.plant("kill_flight", 1.0, START, 0)
+    assert not faults.inject("kill_flight", 1.0, START, 0)
     assert faults.report() is None
     assert set(SIGNALS) == {"kill_flight", "stop_flight", "hold_gil", "stall_loop"}
 
 
 @pytest.fixture
-def planted() -> Iterator[ProcessFaults]:
+def injected() -> Iterator[ProcessFaults]:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         faults = ProcessFaults()
         faults.pid = process.pid
-        assert faults.plant("stop_flight", 5.0, START, 100)
-        assert not faults.plant("kill_flight", 5.1, START, 100), "once"
+        assert faults.inject("stop_flight", 5.0, START, 100)
+        assert not faults.inject("kill_flight", 5.1, START, 100), "once"
         yield faults
         process.kill()
 
 
-def test_the_report_tells_late_setpoints_a_gap_in_vision_and_drift(planted: ProcessFaults) -> None:
+def test_the_report_tells_late_setpoints_a_gap_in_vision_and_drift(injected: ProcessFaults) -> None:
     poses = 100
     for k in range(1, 2001):
         t_s = 5.0 + 0.002 * k
         setpoint_at_s = 5.0 + min(0.002 * k, 0.3)  # a stale setpoint is re-sent for 0.3 s
         poses += t_s < 5.05 or t_s > 5.45
         nav_state = NavState.LAND if t_s > 5.8 else NavState.OFFBOARD
-        if planted.watch(t_s, setpoint_at_s, poses, nav_state, armed=t_s < 8.0):
-            planted.sample((1.0 + 0.3 * min(1.0, t_s - 5.0), 2.0 - 0.4 * min(1.0, t_s - 5.0), 1.0), LEVEL)
-    report = planted.report()
+        if injected.watch(t_s, setpoint_at_s, poses, nav_state, armed=t_s < 8.0):
+            injected.sample((1.0 + 0.3 * min(1.0, t_s - 5.0), 2.0 - 0.4 * min(1.0, t_s - 5.0), 1.0), LEVEL)
+    report = injected.report()
     assert report is not None
     assert report["last_setpoint_s"] == pytest.approx(0.3)
     assert report["vision_gap_s"] == pytest.approx(0.4, abs=0.005)
@@ -141,10 +141,10 @@ def test_the_report_tells_late_setpoints_a_gap_in_vision_and_drift(planted: Proc
     assert report["drift_m"] == pytest.approx(0.5)
 
 
-def test_the_report_does_not_make_up_what_never_happened(planted: ProcessFaults) -> None:
+def test_the_report_does_not_make_up_what_never_happened(injected: ProcessFaults) -> None:
     for k in range(1, 2000):
-        planted.watch(5.0 + 0.002 * k, 4.999, 100, NavState.OFFBOARD, armed=True)
-    report = planted.report()
+        injected.watch(5.0 + 0.002 * k, 4.999, 100, NavState.OFFBOARD, armed=True)
+    report = injected.report()
     assert report is not None
     assert (report["last_setpoint_s"], report["vision_back_s"], report["land_s"], report["disarmed_s"]) == (
         0.0,

@@ -15,7 +15,7 @@ from companion.sitl_config.faults import Fault
 from companion.sitl_config.world import World
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
-from sitl.px4.backend import OF_THE_STUB, refuse_what_needs_the_stub
+from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_what_needs_the_stub
 from sitl.px4.control_link import ControlLink, same
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.parameters import parameters, rotor_geometry
@@ -112,10 +112,10 @@ def test_the_hover_thrust_is_wrong_by_what_the_world_says() -> None:
     assert parameters(VEHICLE.airframe, World(hover_thrust_error=0.1), 0.5)["MPC_THR_HOVER"] == pytest.approx(0.55)
 
 
-@pytest.mark.parametrize("kind", list(OF_THE_STUB))
+@pytest.mark.parametrize("kind", list(STUB_ONLY_FAULTS))
 def test_a_fault_that_needs_the_stub_is_refused_in_one_line(kind: str) -> None:
     world = World(faults=(Fault.model_validate({"kind": kind, "t_s": 1.0}),))
-    with pytest.raises(Px4Error, match=f"world.faults: {kind} .* needs the stub's inside; fly it with --sitl"):
+    with pytest.raises(Px4Error, match=f"world.faults: {kind} .* which only the stub can simulate; fly it with --sitl"):
         refuse_what_needs_the_stub(world)
 
 

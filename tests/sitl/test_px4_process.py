@@ -108,7 +108,7 @@ def test_one_that_dies_is_told_with_its_last_complaint(tmp_path: Path) -> None:
         assert asyncio.run(process.until_ended(DEADLINE_S))
         process.kill()
     scratch = tmp_path / "scratch"
-    assert process.epitaph() == (
+    assert process.exit_summary() == (
         f"PX4: px4 -i {instance.number} ended with exit code 7 (ERROR [init] Unknown model); see {scratch / 'px4.log'}"
     )
 
@@ -121,6 +121,6 @@ def test_one_that_does_not_listen_is_killed(tmp_path: Path) -> None:
         process = Px4Process(installation, instance, tmp_path / "scratch", {})
         process.kill()
     assert not process.running
-    assert f"ended by {signal.SIGKILL.name}" in process.epitaph()
+    assert f"ended by {signal.SIGKILL.name}" in process.exit_summary()
     with pytest.raises(ProcessLookupError):
         os.kill(process.pid, 0)

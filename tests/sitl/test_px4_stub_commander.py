@@ -136,7 +136,7 @@ def test_in_flight_a_mode_that_cannot_run_is_refused(state: NavState, health: He
     if result is Result.ACCEPTED:
         assert it.nav_state is state
     else:
-        assert it.wish is NavState.TAKEOFF
+        assert it.user_intention is NavState.TAKEOFF
 
 
 @pytest.mark.parametrize(
@@ -256,7 +256,7 @@ def test_custom_modes_go_there_and_back(state: NavState) -> None:
 def test_unknown_custom_modes_are_rejected(main: int, sub: int) -> None:
     it = commander()
     assert ask(it, Command.DO_SET_MODE, 1.0, float(main), float(sub)) is Result.TEMPORARILY_REJECTED
-    assert it.wish is NavState.LOITER
+    assert it.user_intention is NavState.LOITER
 
 
 def test_a_mode_command_made_of_nan_is_denied() -> None:

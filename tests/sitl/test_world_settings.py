@@ -130,7 +130,7 @@ def test_it_changes_a_flight_in_the_fast_loop(pair: Pair) -> None:
 @pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair.setting)
 def test_it_changes_what_the_devices_send(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     # The server notes what it struck; no process of ours is struck.
-    monkeypatch.setattr("sitl.server.strike", lambda kind, pid: True)
+    monkeypatch.setattr("sitl.server.inject_process_fault", lambda kind, pid: True)
     differ = any(devices_differ(pair, end) for end in tried(pair, UNTIL_STEPS))
     assert differ, f"world.{pair.setting} does nothing on the wires"
 

@@ -1,1 +1,1 @@
-"""Goes onto the flight process's PYTHONPATH when the world is to hang it: `sitecustomize` is imported by every Python at its start."""
+"""Folder on the flight process's PYTHONPATH, so that Python imports `sitecustomize` at its start."""

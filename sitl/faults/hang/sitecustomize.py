@@ -1,4 +1,4 @@
-"""Two ways for a flight process to hang, on a signal from the simulated world. Nothing happens in any other process."""
+"""Makes the flight process hang on a signal from the simulated world, in one of two ways. Other processes are not affected."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import time
 
 
 def _hold_gil(*_: object) -> None:
-    """As an extension does that blocks inside the interpreter's lock: no thread of Python runs any more."""
+    """Block while holding the interpreter lock, as a faulty extension module does: no Python thread runs any more."""
     libc = ctypes.PyDLL(None)
     while True:
         libc.sleep(3600)
 
 
 def _stall_loop(*_: object) -> None:
-    """As a blocking call on the event loop: other threads run on, no tick comes."""
-    # The signal interrupts the event loop; what sleeps here is its thread.
+    """Block the event loop: other threads go on, but no tick runs."""
+    # The signal handler runs in the thread of the event loop.
     until_s = time.monotonic() + float(os.environ.get("COMPANION_SITL_STALL_S", "inf"))
     while (left_s := until_s - time.monotonic()) > 0.0:
         time.sleep(min(left_s, 3600.0))
