@@ -231,24 +231,29 @@ def percentiles(durations_s: Array) -> Percentiles | None:
     return Percentiles(float(p50) * 1e3, float(p99) * 1e3, float(known.max()) * 1e3)
 
 
-def min_slack_m(log: FlightLog) -> float | None:
-    """Return the least of tether length minus distance from the anchor to the attachment point, between take-off and touchdown, by
-    motion capture.
+def slack_m(log: FlightLog) -> Array:
+    """Return the tether length minus the distance from the anchor to the attachment point, by motion capture, for each tick.
+
+    NaN on the ground and where it is not known.
     """
+    slack = np.full(len(log.inputs), np.nan)
     tether = (log.config.get("vehicle") or {}).get("tether")
     if not isinstance(tether, dict) or not {"anchor_world_m", "length_m"} <= tether.keys():
-        return None
+        return slack
     anchor, offset = tether["anchor_world_m"], tuple(tether.get("attachment_body_m", (0.0, 0.0, 0.0)))
-    least: float | None = None
     known = np.isfinite(log.columns.mocap_position_world_m[:, 0])
     for k, (i, o, _) in enumerate(log.rows()):
-        if o.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE) or not known[k] or i.mocap is None:
-            continue
-        arm = quat_rotate(i.mocap.attitude_wxyz, offset)
-        point = [p + a for p, a in zip(i.mocap.position_world_m, arm, strict=True)]
-        slack = float(tether["length_m"]) - math.dist(point, anchor)
-        least = slack if least is None else min(least, slack)
-    return least
+        if o.phase_kind not in (PhaseKind.GROUND, PhaseKind.DONE) and known[k] and i.mocap is not None:
+            arm = quat_rotate(i.mocap.attitude_wxyz, offset)
+            point = [p + a for p, a in zip(i.mocap.position_world_m, arm, strict=True)]
+            slack[k] = float(tether["length_m"]) - math.dist(point, anchor)
+    return slack
+
+
+def min_slack_m(log: FlightLog) -> float | None:
+    """Return the least of `slack_m`; None if it is never known."""
+    slack = slack_m(log)
+    return float(np.nanmin(slack)) if np.isfinite(slack).any() else None
 
 
 def _diagonals(controller: Any, *names: str) -> tuple[Array, ...] | None:

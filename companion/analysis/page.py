@@ -45,41 +45,30 @@ class Section:
     """Small tables beside each other, above everything else."""
 
 
-def write_page(
-    path: Path,
-    title: str,
-    subtitle: str,
-    sections: Sequence[Section],
-    *,
-    notes: Sequence[str] = (),
-    verdict: str = "",
-    good: bool = True,
-    badge: str = "",
-    player_html: str = "",
-    width_rem: int = 86,
-) -> None:
-    """Write a page.
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The content of a page."""
 
-    Args:
-        path: HTML file.
-        title: heading of the page.
-        subtitle: below the heading.
-        sections: the page's parts, in order.
-        notes: remarks at the top: what the reader must know before the figures.
-        verdict: one sentence above the notes; empty for none.
-        good: whether the verdict is good.
-        badge: the outcome, beside the title.
-        player_html: element that plays an animation of the flight; inserted as it is.
-        width_rem: largest width of the text.
+    title: str
+    subtitle: str
+    sections: Sequence[Section]
+    verdict: str = ""
+    """One sentence at the top."""
+    good: bool = True
+    """Whether the verdict is good."""
+    notes: Sequence[str] = ()
+    """What the reader must know before the figures."""
+    badge: str = ""
+    """The outcome, beside the title."""
+    player_html: str = ""
+    """Element that plays an animation of the flight; inserted as it is."""
+    width_rem: int = 86
+    """Largest width of the text."""
 
-    Raises:
-        OSError: the file cannot be written, or a picture cannot be read.
-    """
-    text = _environment().get_template("page.html").render(
-        title=title, subtitle=subtitle, sections=sections, notes=notes, verdict=verdict, good=good,
-        badge=badge, player=Markup(player_html), width_rem=width_rem,
-    )  # fmt: skip
-    path.write_text(text, encoding="utf-8")
+
+def write_page(page: Page, path: Path) -> None:
+    """Write a page; raises OSError if the file cannot be written."""
+    path.write_text(_environment().get_template("page.html").render(page=page), encoding="utf-8")
 
 
 def _environment() -> Environment:

@@ -10,7 +10,7 @@ from typing import Any
 
 from companion.analysis.animation import movie_of, player_html
 from companion.analysis.log import FlightLog
-from companion.analysis.page import Picture, Section, write_page
+from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.plots import write_plots
 from companion.analysis.summary import effective_config
 from companion.analysis.table import Cell, Column, Table, table
@@ -37,8 +37,7 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
         if name not in ("companion", "config"):
             folded[f"Metadata: {name}"] = json.dumps(values, indent=2, sort_keys=True)
     path = out_dir / "report.html"
-    write_page(
-        path,
+    page = Page(
         str((log.config.get("mission") or {}).get("name", "flight")),
         " · ".join(text for text in about if text),
         [
@@ -51,6 +50,7 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
         player_html="" if movie is None else player_html(movie),
         width_rem=62,
     )
+    write_page(page, path)
     return path
 
 

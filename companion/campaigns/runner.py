@@ -12,14 +12,14 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from companion.analysis.page import Picture, Section, write_page
+from companion.analysis.page import Page, Picture, Section, write_page
 from companion.campaigns.process import CampaignError, CampaignProcess, Message
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
 from companion.runtime.console import tell
@@ -37,17 +37,6 @@ class Flights(Protocol):
 
     def ask_to_stop(self) -> None:
         """Make `results` end soon. Safe in a signal handler."""
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
-    """The content of a campaign's HTML page."""
-
-    title: str
-    subtitle: str
-    sections: Sequence[Section]
-    verdict: str = ""
-    good: bool = True
 
 
 @dataclass(kw_only=True)
@@ -107,7 +96,7 @@ class Campaign(ABC):
         """Return the row as columns of the CSV file."""
 
     @abstractmethod
-    def report(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Report:
+    def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the content of the HTML page."""
 
     @abstractmethod
@@ -236,22 +225,14 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     except ImportError:
         tell(f"companion {campaign.name}: plots need matplotlib: pip install 'companion[analysis]'")
         pictures = []
-    report = campaign.report(rows, pictures)
-    errors = [f"{campaign.label(row)}: {row['error']}" for row in rows if row["error"]]
+    page = campaign.page(rows, pictures)
     record = {
-        "Internal errors": "\n".join(errors),
+        "Internal errors": "\n".join(f"{campaign.label(row)}: {row['error']}" for row in rows if row["error"]),
         "Settings": json.dumps(settings, indent=2),
         "Versions": json.dumps(used, indent=2),
     }
-    write_page(
-        out / f"{campaign.name}.html",
-        report.title,
-        report.subtitle,
-        [*report.sections, Section("Record", folded=record)],
-        notes=flown.notes,
-        verdict=report.verdict,
-        good=report.good,
-    )
+    sections = [*page.sections, Section("Record", folded=record)]
+    write_page(replace(page, sections=sections, notes=flown.notes), out / f"{campaign.name}.html")
     campaign.write_more(rows, out)
     wall_s = [message["wall_s"] for message in flown.messages]
     # The last file: where it exists, all the others do.
@@ -267,6 +248,15 @@ def outcomes(rows: Iterable[Row]) -> dict[str, int]:
 def counted(rows: Iterable[Row]) -> str:
     """Return the outcomes as text: `12 landed, 1 crashed`."""
     return ", ".join(f"{count} {name}" for name, count in outcomes(rows).items())
+
+
+def flat(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested mappings under their keys joined by dots."""
+    for key, value in row.items():
+        if isinstance(value, dict):
+            yield from ((f"{key}.{below}", found) for below, found in flat(value))
+        else:
+            yield key, value
 
 
 def to_json(data: Any) -> str:

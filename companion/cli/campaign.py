@@ -8,6 +8,7 @@ import datetime
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -43,6 +44,16 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool) -> None:
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, to fly on its workers")
     parser.add_argument("--out", metavar="DIR", help="folder for the results (default: a new one, named by the time)")
     parser.add_argument("--json", action="store_true", help="print rows and their summary as JSON and nothing else")
+
+
+def common(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the fields of a `Campaign` that the shared options set."""
+    return {
+        "command": arguments.command_line,
+        "overrides": arguments.overrides,
+        "jobs": arguments.jobs,
+        "scheduler": arguments.scheduler,
+    }
 
 
 def count(text: str) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 
 from companion.campaigns.compare.campaign import Compare
 from companion.campaigns.compare.grid import flights_of, variants_of
-from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, count, fly, names
+from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, count, fly, names
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -83,10 +83,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
     return Compare(
         configs=configs,
         flights=flights_of(variants, arguments.payloads, seeds),
-        command=arguments.command_line,
-        overrides=arguments.overrides,
-        jobs=arguments.jobs,
-        scheduler=arguments.scheduler,
+        **common(arguments),
         variants=variants,
         payloads_kg=arguments.payloads,
         seeds=seeds,

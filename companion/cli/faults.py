@@ -10,7 +10,7 @@ from typing import Any
 from companion.analysis.table import for_terminal
 from companion.campaigns.faults.campaign import Faults, kinds_list, kinds_table
 from companion.campaigns.faults.variants import WIRES, planned
-from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, fly, names, wide_console
+from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, fly, names, wide_console
 from companion.config.document import ConfigError
 from companion.config.explain import nearest
 from companion.model.exit_codes import EXIT_OK
@@ -92,10 +92,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
             {"variant": 0, "kind": v.kind, "size": v.size, "duration_s": v.duration_s, "phase": phase}
             for v, phase in flights
         ],
-        command=arguments.command_line,
-        overrides=arguments.overrides,
-        jobs=arguments.jobs,
-        scheduler=arguments.scheduler,
+        **common(arguments),
         planned=flights,
         wires=_fly_options(arguments) if arguments.wires else None,
     )

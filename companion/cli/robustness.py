@@ -8,7 +8,7 @@ from typing import Any
 
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
-from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, count, fly
+from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, count, fly
 from companion.config.document import ConfigError
 
 
@@ -69,10 +69,7 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         configs=[checked(mission, arguments.vehicle, law, preset, arguments.overrides)],
         flights=[{"variant": 0, "name": case.name, "number": None, "world": case.knobs()} for case in cases]
         or [{"variant": 0, "name": f"draw {n}", "number": n, "world": None} for n in numbers],
-        command=arguments.command_line,
-        overrides=arguments.overrides,
-        jobs=arguments.jobs,
-        scheduler=arguments.scheduler,
+        **common(arguments),
         mission=mission,
         seed=arguments.seed,
         cases=cases,

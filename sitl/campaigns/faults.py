@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from companion.campaigns.faults.judge import FaultFlight, Point, Tick, row_of
+from companion.campaigns.faults.judge import FaultFlight, Point, row_of, ticks_of
 from companion.campaigns.faults.variants import Variant
 from companion.model.frames import quat_rotate, tilt_rad
 from companion.model.types import Outcome
@@ -59,16 +59,14 @@ def record_of(flown: Flown) -> FaultFlight:
 
     # A flight process that stalls leaves snapshots between its ticks.
     course = sorted((point(s) for s in (*result.snapshots, *result.after)), key=lambda at: at.t_s)
-    ticks = [
-        Tick(o.t_s, o.phase_kind, o.action, o.reference.position_world_m if o.reference is not None else None)
-        for o in result.outputs
-    ]
     events = sorted(
         [*(event for o in result.outputs for event in o.events), *result.guardian_events], key=lambda event: event.t_s
     )
     low_m = fast.config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
     landed = bool(course) and course[-1].position_world_m[2] < low_m and not result.armed
-    return FaultFlight(_outcome(result).value, fast.faults.begun_s, course, ticks, events, landed, result.caught)
+    return FaultFlight(
+        _outcome(result).value, fast.faults.begun_s, course, ticks_of(result.outputs), events, landed, result.caught
+    )
 
 
 def _outcome(result: FastResult) -> Outcome:

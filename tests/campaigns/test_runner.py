@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from companion.campaigns.compare.aggregate import flat
 from companion.campaigns.process import CampaignError
+from companion.campaigns.runner import flat
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
 from tests.campaigns.made_up import compare_row, draw_row, fault_row, fly_made_up
 from tests.support import CATCH, HOVER, run_here

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from companion.campaigns.compare.grid import is_ablation
 from companion.campaigns.compare.printed import PrintedFlight, printed
-from companion.campaigns.runner import Row
+from companion.campaigns.runner import Row, flat
 
 COMPLETED = "completed"
 MISSED = "missed"
@@ -114,19 +114,8 @@ def figure(row: Row, name: str) -> float | None:
     """Return one of `FIGURES` of a row."""
     if name == "final_abs_e_z_m":
         return None if row["final_e_z_m"] is None else abs(row["final_e_z_m"])
-    value: Any = row
-    for key in name.split("."):
-        value = value[key]
+    value = dict(flat(row))[name]
     return None if value is None else float(value)
-
-
-def flat(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the names and values of a row without nesting; nested names are joined by dots."""
-    for key, value in row.items():
-        if isinstance(value, dict):
-            yield from ((f"{key}.{below}", found) for below, found in flat(value))
-        else:
-            yield key, value
 
 
 def _nested(figures: Mapping[str, float | None]) -> dict[str, Any]:

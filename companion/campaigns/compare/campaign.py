@@ -10,13 +10,13 @@ from typing import Any
 from rich.console import Console
 from rich.measure import Measurement
 
-from companion.analysis.page import Picture, Section
+from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, table
-from companion.campaigns.compare.aggregate import MISSED, Group, aggregate, flat
+from companion.campaigns.compare.aggregate import MISSED, Group, aggregate
 from companion.campaigns.compare.grid import Variant, is_ablation, short_label
 from companion.campaigns.compare.printed import SOURCE
 from companion.campaigns.process import Message
-from companion.campaigns.runner import Campaign, Report, Row
+from companion.campaigns.runner import Campaign, Row, flat
 
 EXPLAINED = (
     "RMS, mean ± standard deviation over seeds. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
@@ -79,7 +79,7 @@ class Compare(Campaign):
         """Return the row with nested names joined by dots."""
         return dict(flat(row))
 
-    def report(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Report:
+    def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return both tables and the pictures."""
         groups = by_payload(aggregate(rows))
         lead = f"RMS, mean ± standard deviation over seeds. Grey: as printed in the paper ({SOURCE})."
@@ -90,7 +90,7 @@ class Compare(Campaign):
         ]
         seeds = ", ".join(map(str, self.seeds))
         mission = self.configs[0].sources.mission
-        return Report(
+        return Page(
             "Comparison of controllers", f"{mission} · {len(rows)} flights in the fast loop · seeds {seeds}", sections
         )
 

@@ -10,13 +10,13 @@ from typing import Any
 
 from rich.console import Console
 
-from companion.analysis.page import Picture, Section
+from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, number, table
 from companion.campaigns.faults.judge import good
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.faults.wires import WireFlights, default_jobs
 from companion.campaigns.process import Message
-from companion.campaigns.runner import Campaign, Flights, Report, Row, counted, outcomes
+from companion.campaigns.runner import Campaign, Flights, Row, counted, outcomes
 from companion.sitl_config.faults import KINDS, FlightPhase
 
 
@@ -67,7 +67,7 @@ class Faults(Campaign):
         """Return the row with its lists as text."""
         return {key: "; ".join(value) if isinstance(value, list) else value for key, value in row.items()}
 
-    def report(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Report:
+    def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the bad flights, then all of them."""
         bad = [row for row in rows if not good(row)]
         explained = (
@@ -77,7 +77,7 @@ class Faults(Campaign):
         sections = [Section("All flights", tables=[flights_table(rows, details=True)], text=explained)]
         if bad:
             sections.insert(0, Section("Bad flights", tables=[flights_table(bad, details=True)]))
-        return Report(
+        return Page(
             "Fault campaign",
             f"{self.configs[0].sources.mission} · {len(rows)} flights {self._where} · {counted(rows)}",
             sections,

@@ -8,13 +8,13 @@ from __future__ import annotations
 import itertools
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.runner import Row
 from companion.config.vehicle import Vehicle
-from companion.model.types import Event, Outcome, PhaseKind, SafetyAction, Vec3
+from companion.model.types import Event, Outcome, Outputs, PhaseKind, SafetyAction, Vec3
 from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 
 COLUMNS = (
@@ -54,6 +54,14 @@ class Tick:
     kind: PhaseKind
     action: SafetyAction
     reference_world_m: Vec3 | None
+
+
+def ticks_of(outputs: Iterable[Outputs]) -> list[Tick]:
+    """Return what the companion decided in each tick of a flight."""
+    return [
+        Tick(o.t_s, o.phase_kind, o.action, o.reference.position_world_m if o.reference is not None else None)
+        for o in outputs
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from companion.analysis.log import FlightLog, LogError
-from companion.campaigns.faults.judge import FaultFlight, Point, Tick, row_of
+from companion.campaigns.faults.judge import FaultFlight, Point, row_of, ticks_of
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.process import Message
 from companion.campaigns.runner import Row
@@ -133,7 +133,7 @@ def flown(folder: Path, config: FlightConfig) -> FaultFlight:
     except (OSError, ValueError, LogError) as error:
         return _lost(str(error))
     begun_s = world["fault_begun_s"]
-    ticks, events = _ticks(log), _events(log, summary)
+    ticks, events = ticks_of(log.outputs if log is not None else ()), _events(log, summary)
     offset_s = _offset_s(log.inputs if log is not None else (), world["mocap_frames"], begun_s or 0.0)
     course = [
         Point(t_s + offset_s, (x, y, z), tilt_rad, slack_m, abs(tension_n))
@@ -154,15 +154,6 @@ def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], beg
             if near in stamps:
                 return stamps[near] - world_s
     return 0.0
-
-
-def _ticks(log: FlightLog | None) -> list[Tick]:
-    if log is None:
-        return []
-    return [
-        Tick(o.t_s, o.phase_kind, o.action, o.reference.position_world_m if o.reference is not None else None)
-        for o in log.outputs
-    ]
 
 
 def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:

@@ -9,12 +9,12 @@ from typing import Any
 
 from rich.console import Console
 
-from companion.analysis.page import Picture, Section
+from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, number, table
 from companion.campaigns.process import Message
 from companion.campaigns.robustness.cases import Case, Cases, as_cases, fly_command, worse_than, write_cases
 from companion.campaigns.robustness.draws import DRIVERS, SAFE, drivers, influence, thirds, worst
-from companion.campaigns.runner import Campaign, Report, Row, counted, outcomes
+from companion.campaigns.runner import Campaign, Row, counted, outcomes
 from companion.model.types import Outcome
 
 
@@ -75,11 +75,11 @@ class Robustness(Campaign):
         results = {key: value for key, value in row.items() if key not in ("world", "events")}
         return {**results, "events": " ".join(row["events"]), "seed": row["world"].get("seed"), **drivers(row["world"])}
 
-    def report(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Report:
+    def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the distribution, its plot and the hardest flights."""
         law, preset = self.law
         unsafe = sum(row["outcome"] not in SAFE for row in rows)
-        return Report(
+        return Page(
             "Robustness",
             f"{self.mission} · {law}/{preset} · {len(rows)} worlds in the fast loop",
             [

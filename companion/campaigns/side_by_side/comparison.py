@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from companion.campaigns.runner import flat
 from companion.campaigns.side_by_side.flight import Flight
 from companion.campaigns.side_by_side.settings import Setting, fairness, payload_kg, settings_of, simulated
 
@@ -137,7 +138,7 @@ def jsonable(comparison: Comparison) -> dict[str, Any]:
         return [
             {
                 "key": setting.key,
-                "values": list(setting.values),
+                "values": setting.values,
                 "absent": [letter for letter, there in zip(letters, setting.present, strict=True) if not there],
             }
             for setting in settings
@@ -156,19 +157,11 @@ def jsonable(comparison: Comparison) -> dict[str, Any]:
             }
             for n, flight in enumerate(comparison.flights)
         ],
-        "align": comparison.align,
-        "fair": comparison.fair,
-        "cautions": list(comparison.cautions),
-        "notes": list(comparison.notes),
+        **{name: getattr(comparison, name) for name in ("align", "fair", "cautions", "notes")},
         "configuration": rows(comparison.settings),
         "addresses": rows(comparison.addresses),
         "figures": [
-            {
-                "key": figure.key,
-                "values": list(figure.values),
-                "differences": list(figure.differences),
-                "verdicts": list(figure.verdicts),
-            }
+            {name: getattr(figure, name) for name in ("key", "values", "differences", "verdicts")}
             for figure in comparison.figures
         ],
     }
@@ -245,12 +238,12 @@ def _version(flight: Flight) -> str:
 
 
 def _figures(flights: Sequence[Flight], same_mission: bool) -> tuple[Figure, ...]:
-    leaves = [_leaves(flight.summary) for flight in flights]
+    numbers = [_numbers(flight.summary) for flight in flights]
     known = {key: (label, digits, judge) for key, label, digits, judge in _KNOWN}
-    keys = dict.fromkeys([*known, *(key for one in leaves for key in one)])
+    keys = dict.fromkeys([*known, *(key for one in numbers for key in one)])
     figures = []
     for key in keys:
-        values = tuple(one.get(key) for one in leaves)
+        values = tuple(one.get(key) for one in numbers)
         if all(value is None for value in values):
             continue
         label, digits, judge = known.get(key, (key, 4, ""))
@@ -266,21 +259,13 @@ def _figures(flights: Sequence[Flight], same_mission: bool) -> tuple[Figure, ...
     return tuple(figures)
 
 
-def _leaves(summary: dict[str, Any]) -> dict[str, float | None]:
+def _numbers(summary: dict[str, Any]) -> dict[str, float | None]:
     """Return the numbers of a summary by dotted key, and the number of events of each severity."""
-    out: dict[str, float | None] = {}
-
-    def walk(tree: dict[str, Any], prefix: str) -> None:
-        for key, value in tree.items():
-            if isinstance(value, dict):
-                walk(value, f"{prefix}{key}.")
-            elif isinstance(value, int | float) and not isinstance(value, bool):
-                out[prefix + key] = value
-
-    walk(summary, "")
+    found: dict[str, float | None] = {
+        k: v for k, v in flat(summary) if isinstance(v, int | float) and not isinstance(v, bool)
+    }
     severities = [event["severity"] for event in summary["events"]]
-    out.update({f"events.{name}": severities.count(name) for name in ("info", "warning", "critical")})
-    return out
+    return found | {f"events.{name}": severities.count(name) for name in ("info", "warning", "critical")}
 
 
 def _verdict(first: float | None, value: float | None) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.summary import effective_config
-from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 
 _FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
@@ -44,22 +42,6 @@ class Course:
     """Time of the take-off command."""
 
 
-def slack_m(log: FlightLog) -> Array:
-    """Return the tether length minus the distance from anchor to attachment point, by mocap; NaN on the ground and if unknown."""
-    blank = np.full(len(log.inputs), np.nan)
-    tether = (log.config.get("vehicle") or {}).get("tether")
-    if not isinstance(tether, dict) or not {"anchor_world_m", "length_m"} <= tether.keys():
-        return blank
-    anchor, offset = tether["anchor_world_m"], tuple(tether.get("attachment_body_m", (0.0, 0.0, 0.0)))
-    known = np.isfinite(log.columns.mocap_position_world_m[:, 0])
-    for k, (i, o, _) in enumerate(log.rows()):
-        if o.phase_kind in _FLYING and known[k] and i.mocap is not None:
-            arm = quat_rotate(i.mocap.attitude_wxyz, offset)
-            point = [p + a for p, a in zip(i.mocap.position_world_m, arm, strict=True)]
-            blank[k] = float(tether["length_m"]) - math.dist(point, anchor)
-    return blank
-
-
 def course_of(log: FlightLog) -> Course:
     """Return the time series of a log."""
     if not log.inputs:
@@ -80,7 +62,7 @@ def course_of(log: FlightLog) -> Course:
         e_alpha_deg=np.degrees(_norm(metrics.arm_error_rad(log))),
         thrust_percent=100.0 * log.column(lambda i, o, s: o.attitude.thrust if o.attitude else None),
         rho=rho if np.nan_to_num(rho).any() else np.full(len(rho), np.nan),
-        slack_m=slack_m(log),
+        slack_m=metrics.slack_m(log),
         flown_world_m=c.mocap_position_world_m,
         reference_world_m=c.reference_position_world_m,
         lateness_s=log.timing.lateness_s,

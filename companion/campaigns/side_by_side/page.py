@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.analysis.page import Picture, Section, write_page
+from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.table import Cell, Column, Table, table
 from companion.campaigns.side_by_side.comparison import MARKED_FROM, Comparison, Figure
 from companion.campaigns.side_by_side.plots import LINES
@@ -39,8 +39,7 @@ def write_html(comparison: Comparison, pictures: Sequence[Picture], path: Path) 
         *([Section("Pictures", pictures=pictures)] if pictures else []),
         Section("Events", "" if events.rows else "None.", [events] if events.rows else ()),
     ]
-    write_page(
-        path,
+    page = Page(
         "Flights side by side",
         f"{len(comparison.flights)} flights, aligned at {zero}; differences are from A.",
         sections,
@@ -48,6 +47,7 @@ def write_html(comparison: Comparison, pictures: Sequence[Picture], path: Path) 
         verdict=comparison.fair,
         good=not comparison.cautions,
     )
+    write_page(page, path)
 
 
 def _columns(comparison: Comparison, show: Callable[[Any, int], Cell], *, left: bool = True) -> list[Column]:
