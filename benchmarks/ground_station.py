@@ -171,11 +171,6 @@ def _said(tick: int, t_s: float) -> tuple[Inputs, Outputs]:
     inputs = Inputs(
         tick=tick,
         t_s=t_s,
-        vehicle=None,
-        status=None,
-        mocap=None,
-        arm=None,
-        force=None,
         command=OperatorCommand.NONE,
         recorder_dropped=0,
     )

@@ -58,8 +58,6 @@ class Px4State:
             armed=armed,
             mode=mode,
             landed=messages.landed_state(self._landed),
-            battery_voltage_v=None,
-            battery_remaining=None,
             system_status=system,
         )
 

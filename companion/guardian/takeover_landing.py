@@ -243,8 +243,6 @@ class TakeoverLanding:
             vehicle=self._px4.vehicle(),
             status=status,
             mocap=self._pose,
-            arm=None,
-            force=None,
             command=OperatorCommand.NONE,
             recorder_dropped=0,
         )

@@ -194,11 +194,7 @@ def pose(frame: int, stamp_s: float) -> Inputs:
     return Inputs(
         tick=frame,
         t_s=stamp_s,
-        vehicle=None,
-        status=None,
         mocap=seen,
-        arm=None,
-        force=None,
         command=OperatorCommand.NONE,
         recorder_dropped=0,
     )

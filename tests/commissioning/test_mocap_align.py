@@ -55,7 +55,6 @@ def test_a_y_up_stream_read_as_such_is_right() -> None:
             position_m, attitude = z_up_from_y_up(sample.pose.position_world_m, sample.pose.attitude_wxyz)
             poses[sample.pose.frame_number] = MocapPose(
                 stamp_s=sample.pose.stamp_s,
-                latency_s=None,
                 frame_number=sample.pose.frame_number,
                 position_world_m=position_m,
                 attitude_wxyz=attitude,

@@ -182,7 +182,6 @@ def test_nobody_takes_thrust_back_from_what_sinks() -> None:
         z -= 0.005 * sink_m_s
         pose = MocapPose(
             stamp_s=t_s,
-            latency_s=None,
             frame_number=k,
             position_world_m=(0.0, 0.0, z),
             attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
@@ -207,7 +206,6 @@ def test_hanging_on_the_tether_is_no_touchdown() -> None:
         t_s = 1.0 + 0.005 * k
         pose = MocapPose(
             stamp_s=t_s,
-            latency_s=None,
             frame_number=k,
             position_world_m=(0.0, 0.0, 1.2),
             attitude_wxyz=(1.0, 0.0, 0.0, 0.0),

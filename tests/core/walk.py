@@ -141,7 +141,6 @@ class Machine:
             attitude_wxyz=self.attitude,
             angular_rate_body_rad_s=(jitter, jitter, jitter),
             specific_force_body_m_s2=(jitter, jitter, self.feels_m_s2),
-            boot_s=None,
         )
         status = AutopilotStatus(
             heartbeat_stamp_s=t_s,

@@ -81,7 +81,6 @@ def sent_at(tick: int, t_s: float) -> Sent:
     return Sent(
         tick=tick,
         attitude_sent=True,
-        arm_torque_sent_nm=None,
         start_s=t_s - 0.0008,
         lateness_s=0.0003,
         joint_read_s=t_s,

@@ -105,12 +105,9 @@ def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
         armed=armed,
         mode=FlightMode.OFFBOARD,
         landed=LandedState.IN_AIR,
-        battery_voltage_v=None,
-        battery_remaining=None,
     )
     mocap = MocapPose(
         stamp_s=4.9,
-        latency_s=None,
         frame_number=1,
         position_world_m=(1.0, 2.0, 3.0),
         attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
@@ -120,11 +117,8 @@ def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
     return Inputs(
         tick=9,
         t_s=5.0,
-        vehicle=None,
         status=status,
         mocap=mocap,
-        arm=None,
-        force=None,
         command=OperatorCommand.NONE,
         recorder_dropped=0,
     )

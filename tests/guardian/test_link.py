@@ -27,7 +27,6 @@ from tests.support import DEADLINE_S, wait_until
 
 POSE = MocapPose(
     stamp_s=12.345678,
-    latency_s=None,
     frame_number=7,
     position_world_m=(1.25, -2.5, 0.75),
     attitude_wxyz=quat_from_euler_zyx(0.1, -0.2, 2.3),

@@ -114,7 +114,6 @@ class Landing:
                     [
                         MocapPose(
                             stamp_s=self.t_s,
-                            latency_s=None,
                             frame_number=number,
                             position_world_m=position,
                             attitude_wxyz=attitude,

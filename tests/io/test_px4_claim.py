@@ -288,7 +288,6 @@ def test_px4_that_restarts_at_the_same_address_is_heard_again() -> None:
                     autopilot.send_vision(
                         MocapPose(
                             stamp_s=1.0 + tick,
-                            latency_s=None,
                             frame_number=tick,
                             position_world_m=(0.0, 0.0, 0.0),
                             attitude_wxyz=LEVEL,

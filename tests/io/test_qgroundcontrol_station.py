@@ -59,11 +59,6 @@ def inputs(tick: int = 0) -> Inputs:
     return Inputs(
         tick=tick,
         t_s=tick * 0.005,
-        vehicle=None,
-        status=None,
-        mocap=None,
-        arm=None,
-        force=None,
         command=OperatorCommand.NONE,
         recorder_dropped=0,
     )

@@ -59,15 +59,12 @@ def seen(
         ),
         mocap=MocapPose(
             stamp_s=t_s if mocap else 0.0,
-            latency_s=None,
             frame_number=1,
             position_world_m=position,
             attitude_wxyz=LEVEL,
             tracking_valid=True,
             marker_error_m=0.0,
         ),
-        arm=None,
-        force=None,
         command=OperatorCommand.NONE,
         recorder_dropped=0,
     )

@@ -57,11 +57,7 @@ def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
         Inputs(
             tick=k,
             t_s=t_s,
-            vehicle=None,
-            status=None,
             mocap=pose,
-            arm=None,
-            force=None,
             command=OperatorCommand.NONE,
             recorder_dropped=0,
         ),
@@ -81,7 +77,6 @@ def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
         Sent(
             tick=k,
             attitude_sent=False,
-            arm_torque_sent_nm=None,
             start_s=t_s,
             lateness_s=1e-4,
             joint_read_s=t_s,
