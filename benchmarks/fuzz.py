@@ -83,8 +83,15 @@ class Worker:
     def _lost(self, text: str) -> Stretch:
         index = int(self.index.value)
         data = target_class(self.name)().make(generator(self.name, self.seed, index))
-        finding = Finding(self.name, self.seed, index, text, data)
-        return Stretch(index - self.first, 0.0, 0.0, index, (0, 0), (finding,))
+        finding = Finding(target=self.name, seed=self.seed, index=index, text=text, data=data)
+        return Stretch(
+            inputs=index - self.first,
+            duration_s=0.0,
+            slowest_s=0.0,
+            slowest_index=index,
+            memory_bytes=(0, 0),
+            findings=(finding,),
+        )
 
 
 def _work(name: str, seed: int, first: int, last: int, until_s: float, index: Any, sender: Connection) -> None:

@@ -106,12 +106,12 @@ class Px4Log:
         position = topics["vehicle_local_position"]
         origin_s = CLOCK_ORIGIN_S - clock_begun_s
         return Px4Log(
-            tuple(_changes(topics["vehicle_status"], origin_s)),
-            _times(topics.get("vehicle_visual_odometry"), origin_s),
-            _times(topics.get("vehicle_attitude_setpoint"), origin_s),
-            _times(position, origin_s),
-            np.stack([np.asarray(position[axis], float) for axis in "xyz"], axis=1),
-            dict(log.initial_parameters),
+            changes=tuple(_changes(topics["vehicle_status"], origin_s)),
+            vision_s=_times(topics.get("vehicle_visual_odometry"), origin_s),
+            setpoint_s=_times(topics.get("vehicle_attitude_setpoint"), origin_s),
+            estimate_s=_times(position, origin_s),
+            position_ned_m=np.stack([np.asarray(position[axis], float) for axis in "xyz"], axis=1),
+            parameters=dict(log.initial_parameters),
         )
 
     def after(self, fault_s: float) -> AfterFault:
@@ -122,12 +122,12 @@ class Px4Log:
         failsafe = next((change for change in later if change.failsafe), None)
         disarmed = next((change for change in later if not change.armed), None)
         return AfterFault(
-            _last_before_pause(self.setpoint_s, fault_s, until_s),
-            _longest_gap(self.vision_s, fault_s),
-            None if left is None else left.mode,
-            None if left is None else left.t_s - fault_s,
-            None if failsafe is None else failsafe.t_s - fault_s,
-            None if disarmed is None else disarmed.t_s - fault_s,
+            last_setpoint_s=_last_before_pause(self.setpoint_s, fault_s, until_s),
+            vision_gap_s=_longest_gap(self.vision_s, fault_s),
+            mode=None if left is None else left.mode,
+            mode_s=None if left is None else left.t_s - fault_s,
+            failsafe_s=None if failsafe is None else failsafe.t_s - fault_s,
+            disarmed_s=None if disarmed is None else disarmed.t_s - fault_s,
         )
 
     def modes(self) -> str:

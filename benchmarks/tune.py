@@ -236,7 +236,7 @@ def fly(config: SitlConfig) -> Grade:
     catch_s = next((e.t_s for o in result.outputs for e in o.events if e.id == "catch"), None)
     after = [k for k, (i, _) in enumerate(rows) if catch_s is not None and i.t_s >= catch_s]
     if not completed or len(after) < 10:
-        return Grade(math.inf, math.inf, math.inf, math.inf, False)
+        return Grade(e_p_m=math.inf, arm_nm=math.inf, rigid_nm=math.inf, activity_nm=math.inf, completed=False)
     inputs, outputs = zip(*rows, strict=True)
     e_p = [
         math.dist(i.mocap.position_world_m, o.reference.position_world_m)
@@ -246,11 +246,11 @@ def fly(config: SitlConfig) -> Grade:
     error, rigid = arm_impedance_error_nm(config, inputs, outputs)
     torque = np.array([o.arm_torque_nm or (0.0, 0.0) for o in outputs[after[0] :]])
     return Grade(
-        rms(np.array(e_p)[:, None]),
-        rms(error[after[0] :]),
-        rms(rigid[after[0] :]),
-        rms(np.diff(torque, axis=0)),
-        True,
+        e_p_m=rms(np.array(e_p)[:, None]),
+        arm_nm=rms(error[after[0] :]),
+        rigid_nm=rms(rigid[after[0] :]),
+        activity_nm=rms(np.diff(torque, axis=0)),
+        completed=True,
     )
 
 

@@ -88,10 +88,20 @@ def run(stage: Stage) -> Result:
         code = _wait(subprocess.Popen((*stage.command, *more)))
         duration_s = time.monotonic() - begun_s
         if not tally.exists():
-            return Result(stage, code == 0, duration_s, int(code == 0), int(code != 0))
+            return Result(
+                stage=stage, ok=code == 0, duration_s=duration_s, passed=int(code == 0), failed=int(code != 0)
+            )
         counts = json.loads(tally.read_text(encoding="utf-8"))
     failed = max(len(counts["failed"]), int(code != 0))
-    return Result(stage, code == 0, duration_s, counts["passed"], failed, tuple(counts["failed"]), counts["skipped"])
+    return Result(
+        stage=stage,
+        ok=code == 0,
+        duration_s=duration_s,
+        passed=counts["passed"],
+        failed=failed,
+        failed_tests=tuple(counts["failed"]),
+        skipped=counts["skipped"],
+    )
 
 
 def _wait(process: subprocess.Popen[bytes]) -> int:

@@ -137,7 +137,7 @@ def run(
         if took_s > slowest_s:
             slowest_s, slowest_index = took_s, index
         if text is not None:
-            findings.append(Finding(target.name, seed, index, text, data))
+            findings.append(Finding(target=target.name, seed=seed, index=index, text=text, data=data))
             if len(findings) == FINDINGS_MAX:
                 break
     end, end_files = _resident_bytes(), _open_files()
@@ -146,7 +146,14 @@ def run(
         findings.append(Finding(target.name, seed, None, text))
     if end_files > files:
         findings.append(Finding(target.name, seed, None, f"open files grew from {files} to {end_files}"))
-    return Stretch(done, time.monotonic() - start_s, slowest_s, slowest_index, (memory, end), tuple(findings))
+    return Stretch(
+        inputs=done,
+        duration_s=time.monotonic() - start_s,
+        slowest_s=slowest_s,
+        slowest_index=slowest_index,
+        memory_bytes=(memory, end),
+        findings=tuple(findings),
+    )
 
 
 def feed_watched(target: Target, data: bytes, cpu_limit_s: float = CPU_LIMIT_S) -> str | None:

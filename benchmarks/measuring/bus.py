@@ -147,12 +147,12 @@ def _bus_cycles(path: str, cycles: int) -> BusCycles:
         port.closePort()
     request, written = sent
     return BusCycles(
-        Latency.of(written_s - read_s for _, read_s, written_s in times[WARM_UP:]),
-        Latency.of(written_s - begun_s for begun_s, _, written_s in times[WARM_UP:]),
-        len(said),
-        request,
-        sum(received),
-        written,
+        command_ms=Latency.of(written_s - read_s for _, read_s, written_s in times[WARM_UP:]),
+        cycle_ms=Latency.of(written_s - begun_s for begun_s, _, written_s in times[WARM_UP:]),
+        failed=len(said),
+        request_bytes=request,
+        answer_bytes=sum(received),
+        write_bytes=written,
     )
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from mcap.reader import make_reader
 
 from companion.analysis.timing import Stopwatch, Timing
-from companion.model.codec import from_jsonable
+from companion.model.codec import from_json
 from companion.model.types import Inputs, Sent
 
 Array = npt.NDArray[np.float64]
@@ -58,9 +58,9 @@ def read_hover(path: Path, phase: str, settle_s: float) -> HoverLog:
                 inside = data["phase"] == phase
                 begun_s = data["t_s"] if inside and begun_s is None else begun_s
             elif channel.topic == "/inputs":
-                inputs = from_jsonable(Inputs, data)
+                inputs = from_json(Inputs, message.data)
             elif inside and begun_s is not None and inputs is not None and data["start_s"] >= begun_s + settle_s:
-                sent = from_jsonable(Sent, data)
+                sent = from_json(Sent, message.data)
                 stopwatch.take(inputs, sent)
                 start_s.append(sent.start_s)
                 if sent.attitude_sent:
@@ -69,4 +69,10 @@ def read_hover(path: Path, phase: str, settle_s: float) -> HoverLog:
         raise ValueError(f"{path}: no tick of the phase {phase!r} after its first {settle_s:g} s")
     offset_s = int(metadata["companion"]["epoch_offset_ns"]) * 1e-9
     realtime = metadata.get("realtime", {}).get("got")
-    return HoverLog(stopwatch.read(), np.array(start_s), np.array(setpoint_s), offset_s, realtime)
+    return HoverLog(
+        timing=stopwatch.read(),
+        start_s=np.array(start_s),
+        start_to_setpoint_s=np.array(setpoint_s),
+        epoch_offset_s=offset_s,
+        realtime=realtime,
+    )

@@ -35,4 +35,4 @@ class Latency:
             raise ValueError("no samples: nothing came back over the wire")
         last = len(ordered) - 1
         p50, p99, p999, worst = (float(1e3 * ordered[round(part * last)]) for part in (0.5, 0.99, 0.999, 1.0))
-        return cls(p50, p99, worst, len(ordered), p999)
+        return cls(p50=p50, p99=p99, max=worst, samples=len(ordered), p999=p999)

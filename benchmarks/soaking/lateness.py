@@ -67,7 +67,7 @@ class Minutes:
             values_ms = 1e3 * np.array(self._lateness_s)
             p50, p99 = np.percentile(values_ms, [50, 99])
             count, most = len(values_ms), float(values_ms.max())
-            self.done.append(Minute(begin_s, count, float(p50), float(p99), most))
+            self.done.append(Minute(begin_s=begin_s, ticks=count, p50=float(p50), p99=float(p99), max=most))
         self._lateness_s = array("d")
 
 
@@ -136,4 +136,6 @@ def run_empty_loop(path: Path) -> None:
 
 def read_minutes(rows: Iterable[list[float]]) -> list[Minute]:
     """What `run_empty_loop` has written."""
-    return [Minute(begin_s, int(ticks), p50, p99, most) for begin_s, ticks, p50, p99, most in rows]
+    return [
+        Minute(begin_s=begin_s, ticks=int(ticks), p50=p50, p99=p99, max=most) for begin_s, ticks, p50, p99, most in rows
+    ]

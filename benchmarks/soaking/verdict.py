@@ -70,7 +70,18 @@ def memory_growth(samples: Sequence[Sample]) -> list[Growth]:
             before, after = (fmean(sample.rss_mb[role] for sample in part) for part in (early, late))
             pss, late_pss = (_mean([s.pss_mb[role] for s in part if role in s.pss_mb]) for part in (early, late))
             cpu, late_cpu = (_cpu_percent(part, role) for part in (early, late))
-            found.append(Growth(role, before, after, after / before, pss, late_pss, cpu, late_cpu))
+            found.append(
+                Growth(
+                    role=role,
+                    early_mb=before,
+                    late_mb=after,
+                    ratio=after / before,
+                    early_pss_mb=pss,
+                    late_pss_mb=late_pss,
+                    early_cpu_percent=cpu,
+                    late_cpu_percent=late_cpu,
+                )
+            )
     return found
 
 

@@ -139,7 +139,13 @@ class _Track:
         assert mocap is not None
         assert arm is not None
         caught = self._caught is not None and k >= self._caught
-        return Pose(mocap.position_world_m, mocap.attitude_wxyz, arm.angle_rad, self._ball(k), caught)
+        return Pose(
+            position_world_m=mocap.position_world_m,
+            attitude_wxyz=mocap.attitude_wxyz,
+            arm_rad=arm.angle_rad,
+            ball_world_m=self._ball(k),
+            caught=caught,
+        )
 
     def _ball(self, k: int) -> tuple[Vec3, ...]:
         if self._caught is None or self._throw is None:

@@ -91,7 +91,16 @@ class FlightLog:
         inputs = tuple(row[0] for row in rows.kept)
         outputs = tuple(row[1] for row in rows.kept)
         sent = tuple(row[2] for row in rows.kept)
-        return FlightLog(path, inputs, outputs, sent, metadata, closed, rows.stride, rows.measured)
+        return FlightLog(
+            path=path,
+            inputs=inputs,
+            outputs=outputs,
+            sent=sent,
+            metadata=metadata,
+            closed=closed,
+            stride=rows.stride,
+            measured=rows.measured,
+        )
 
     @property
     def config_json(self) -> str | None:

@@ -66,7 +66,10 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
         found = differences(logged, recomputed)
         if found is not None:
             field, old, new = found
-            return ReplayResult(k + 1, Difference(inputs.tick, inputs.t_s, field or "outputs", old, new))
+            return ReplayResult(
+                k + 1,
+                Difference(tick=inputs.tick, t_s=inputs.t_s, field=field or "outputs", logged=old, recomputed=new),
+            )
     return ReplayResult(len(log.inputs), None)
 
 

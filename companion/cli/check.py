@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> i
     found = problems(config)
     if arguments.plan_only:
         return _plan_only(arguments, config, found)
-    task = Task(config, arguments.mission, arguments.sitl, arguments.hand, arguments.json)
+    task = Task(config=config, mission=arguments.mission, sitl=arguments.sitl, hand=arguments.hand, json=arguments.json)
     people = console_on(sys.stderr)
     scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
     try:

@@ -189,7 +189,15 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
             [f"{vehicle or mission}: the service waits for an operator's START, but commands are not possible: {key}"]
         )
     arm, force, told = choose_adapters(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
-    return Settings(arguments.user, files["--program"], mission, vehicle, arm, force, arguments.at_boot), told
+    return Settings(
+        user=arguments.user,
+        program=files["--program"],
+        mission=mission,
+        vehicle=vehicle,
+        arm_serial=arm,
+        force_serial=force,
+        at_boot=arguments.at_boot,
+    ), told
 
 
 def _seen_by_the_service(option: str, file: str, root: Path) -> str:

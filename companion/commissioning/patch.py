@@ -124,7 +124,7 @@ def propose(vehicle_path: str | Path, changes: Mapping[Location, Data]) -> Patch
         raise ConfigError([f"{shown}: {error}"]) from None
     _check(shown, new_text, wanted)
     bom = _BOM if before.startswith(_BOM.encode()) else ""
-    return Patch(path, shown, wanted, before, (bom + new_text).encode())
+    return Patch(path=path, shown=shown, changes=wanted, before=before, after=(bom + new_text).encode())
 
 
 def _change(document: Document, location: Location, new: Data) -> Change:

@@ -145,14 +145,14 @@ class FlightCore:
         self._watch_tether(i)
         resume = any(event.id == OPERATOR_RESUME for event in events)
         return events, Observation(
-            i,
-            situation.airborne,
-            armed_by_others,
-            self._monitors.standing() if resume else None,
-            self._reference,
-            situation.tether,
-            self._pilot.thrust_share,
-            self._pose_s,
+            inputs=i,
+            airborne=situation.airborne,
+            armed_by_others=armed_by_others,
+            standing=self._monitors.standing() if resume else None,
+            reference=self._reference,
+            tether=situation.tether,
+            thrust_share=self._pilot.thrust_share,
+            pose_s=self._pose_s,
         )
 
     def _watch_tether(self, i: Inputs) -> None:

@@ -38,7 +38,7 @@ def adapters(sysfs: Path = Path("/sys")) -> tuple[Adapter, ...]:
             vendor, product, serial, name = (
                 _text(device / key) for key in ("idVendor", "idProduct", "serial", "product")
             )
-            found.append(Adapter(tty.name, vendor, product, serial, name))
+            found.append(Adapter(tty=tty.name, vendor=vendor, product=product, serial=serial, name=name))
     return tuple(found)
 
 

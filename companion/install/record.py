@@ -68,7 +68,7 @@ def load(root: Path) -> Record | None:
             for name, entry in data["files"].items()
         }
         folders, users, joined = (tuple(map(str, data[key])) for key in ("folders", "users", "joined"))
-        return Record(entries, folders, users, joined, bool(data["complete"]))
+        return Record(entries=entries, folders=folders, users=users, joined=joined, complete=bool(data["complete"]))
     except FileNotFoundError:
         return None
     except OSError as error:

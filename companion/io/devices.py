@@ -104,7 +104,15 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
                 failures.append(
                     f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded in a flight found under way"
                 )
-            yield Devices(vision, autopilot, mocap, arm, None, found_armed=True, failures=tuple(failures))
+            yield Devices(
+                vision=vision,
+                autopilot=autopilot,
+                mocap=mocap,
+                arm=arm,
+                force=None,
+                found_armed=True,
+                failures=tuple(failures),
+            )
             return
         if problem is not None:
             raise problem
@@ -113,7 +121,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
         if ground_address is not None:
             ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
         arm = await stack.enter_async_context(_arm(config, clock))
-        yield Devices(vision, autopilot, mocap, arm, force, ground=ground)
+        yield Devices(vision=vision, autopilot=autopilot, mocap=mocap, arm=arm, force=force, ground=ground)
 
 
 @contextlib.asynccontextmanager

@@ -161,7 +161,14 @@ class Launcher:
             outcome = Outcome.CRASHED
         recorder = self._result.get("recorder") if self._result else None
         events = tuple(self._guardian.summary_events()) if self._guardian is not None else ()
-        return FlightResult(outcome, recorder, world, tuple(self._events), events, self._user_lines(outcome))
+        return FlightResult(
+            outcome=outcome,
+            recorder=recorder,
+            world=world,
+            events=tuple(self._events),
+            guardian_events=events,
+            lines=self._user_lines(outcome),
+        )
 
     def _on_world_message(self, message: dict[str, Any]) -> None:
         self._on_message({**message, "source": "sitl"})

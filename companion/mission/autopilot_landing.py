@@ -94,7 +94,14 @@ class AutopilotLanding:
             flipped: the vehicle is known to be flipped, and has been for long enough.
         """
         stop = RotorStop.begin(clearance_m, tilt_max_rad, pose_s, flipped=flipped)
-        return cls(start_s, clearance_m, pilot, pose_s, stop, HeightEvidence(low_below_m(clearance_m)))
+        return cls(
+            start_s=start_s,
+            clearance_m=clearance_m,
+            pilot=pilot,
+            pose_s=pose_s,
+            stop=stop,
+            height=HeightEvidence(low_below_m(clearance_m)),
+        )
 
     def step(self, i: Inputs) -> tuple[AutopilotLanding, LandingStep]:
         """Return the landing after one more tick, and what that tick requests."""
@@ -105,30 +112,42 @@ class AutopilotLanding:
             now, takes_over = now._watch_mode(i)
             if takes_over:
                 text = "a pilot took over"
-                return replace(now, pilot=True), LandingStep(AutopilotRequest.NONE, False, False, False, text)
+                return replace(now, pilot=True), LandingStep(
+                    request=AutopilotRequest.NONE, zero_thrust=False, ended=False, landed=False, text=text
+                )
         if heard and not is_armed(i.status) and elapsed > 0.5:
             overturned = "the vehicle was flipped or tipped over; it is disarmed" if now.overturned else None
-            return now, LandingStep(AutopilotRequest.NONE, False, True, True, overturned)
+            return now, LandingStep(
+                request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=overturned
+            )
         if elapsed > TIMEOUT_S and not (now.pilot and heard):  # a pilot may fly on for as long as they like
             text = "the landing could not be confirmed"
-            return now, LandingStep(AutopilotRequest.NONE, False, True, False, text)
+            return now, LandingStep(
+                request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=False, text=text
+            )
         if not heard:
             now, stands = now._watch_standing(i)
             if stands:
                 text = (
                     "the vehicle stands, motion capture says; PX4 does not answer: go and disarm it by hand, with care"
                 )
-                return now, LandingStep(AutopilotRequest.NONE, False, True, True, text)
+                return now, LandingStep(
+                    request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=text
+                )
         if now.pilot:
             return now, LandingStep(AutopilotRequest.NONE, False, False, False)
         if now.stop.overturned:
             found = None if now.overturned else FLIPPED if now.stop.flipped else TIPPED
-            return replace(now, overturned=True), LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False, found)
+            return replace(now, overturned=True), LandingStep(
+                request=AutopilotRequest.FORCE_DISARM, zero_thrust=True, ended=False, landed=False, text=found
+            )
         if now.touched_s is None and heard:
             now, touches = now._watch_touchdown(i)
             if touches:
                 now = replace(now, touched_s=i.t_s)
-                return now, LandingStep(AutopilotRequest.LAND, True, False, False, "touchdown")
+                return now, LandingStep(
+                    request=AutopilotRequest.LAND, zero_thrust=True, ended=False, landed=False, text="touchdown"
+                )
         if now.touched_s is None:
             done = on_ground(i.status) and elapsed > 1.0 and now.stop.may_disarm
             return now, LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND, False, False, False)

@@ -80,7 +80,7 @@ class Course:
         plan_s, rate, _, _ = self.pace(t_s)
         speed_m_s = math.hypot(*self.plan.reference(plan_s).velocity_world_m_s)
         duration_s = max(STOP_MIN_S, REST_TO_REST_PEAK_SPEED * speed_m_s / HOLD_DECELERATION_M_S2)
-        return replace(self, change=Change(t_s, plan_s, duration_s, rate, after))
+        return replace(self, change=Change(begin_s=t_s, plan_s=plan_s, duration_s=duration_s, before=rate, after=after))
 
     def reference(self, t_s: float) -> Reference:
         """Return where the vehicle should be at a flight time."""

@@ -125,7 +125,9 @@ class Plan:
             else:
                 builder.t_s += phase.duration_s
             name = counted(_name(phase), repetition, mission.repeat)
-            builder.segments.append(Segment(name, kind, start_s, builder.t_s, index, repetition))
+            builder.segments.append(
+                Segment(name=name, kind=kind, start_s=start_s, end_s=builder.t_s, index=index, repetition=repetition)
+            )
         return builder.plan(
             mission.name, repeats_of(mission, builder.segments, tuple(map(_name, mission.phases[1:-1])))
         )
@@ -162,7 +164,14 @@ class Plan:
         number = min(number, len(repeats.names) - 1)
         like = self.segments[repeats.first + number]
         name = counted(repeats.names[number], before + 2, repeats.count)
-        return Segment(name, like.kind, like.start_s + shift_s, like.end_s + shift_s, like.index, before + 2)
+        return Segment(
+            name=name,
+            kind=like.kind,
+            start_s=like.start_s + shift_s,
+            end_s=like.end_s + shift_s,
+            index=like.index,
+            repetition=before + 2,
+        )
 
     def progress(self, t_s: float) -> float:
         """Return the completed share of the whole duration, 0 to 1."""
@@ -201,11 +210,11 @@ def landing_from(
     reach_m = sum(arm.link_lengths_m) - arm.shoulder_body_m[2] + vehicle.tool.net_radius_m
     free_s = max(0.0, builder.height_m - reach_m) / speed_m_s
     builder.t_s = max(stop_s, fold_s - free_s)
-    builder.segments.append(Segment("stop", PhaseKind.LANDING, 0.0, builder.t_s, -1))
+    builder.segments.append(Segment(name="stop", kind=PhaseKind.LANDING, start_s=0.0, end_s=builder.t_s, index=-1))
     start_s = builder.t_s
     end_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
     builder.t_s = max(end_s, fold_s)
-    builder.segments.append(Segment("land", PhaseKind.LANDING, start_s, builder.t_s, -1))
+    builder.segments.append(Segment(name="land", kind=PhaseKind.LANDING, start_s=start_s, end_s=builder.t_s, index=-1))
     return builder.plan("landing")
 
 
@@ -263,7 +272,17 @@ class PlanBuilder:
         way = route(((x_m, y_m, z_m), *points_m), limits, progress)
         scale_s = way.least_scale_s if duration_s is None else duration_s / way.knots[-1]
         duration_s = duration_s or scale_s * way.knots[-1]
-        self._append(0, Curve(self.t_s, duration_s, scale_s, way.knots, way.pieces, points_m[-1]))
+        self._append(
+            0,
+            Curve(
+                start_s=self.t_s,
+                duration_s=duration_s,
+                scale_s=scale_s,
+                knots=way.knots,
+                pieces=way.pieces,
+                end=points_m[-1],
+            ),
+        )
         return duration_s
 
     def turn(self, to_yaw_rad: float, duration_s: float) -> None:
@@ -295,7 +314,16 @@ class PlanBuilder:
         """Append a stop of the given duration."""
         vx, vy, vz = velocity_world_m_s
         reach = duration_s
-        self._append(0, Move(self.t_s, duration_s, self._at[0], (vx * reach, vy * reach, vz * reach), slow_down))
+        self._append(
+            0,
+            Move(
+                start_s=self.t_s,
+                duration_s=duration_s,
+                origin=self._at[0],
+                delta=(vx * reach, vy * reach, vz * reach),
+                profile=slow_down,
+            ),
+        )
         return self.t_s + duration_s
 
     def descend(self, speed_m_s: float, to_height_m: float) -> float:
@@ -311,7 +339,16 @@ class PlanBuilder:
         steady_s = (depth_m - ramps_m) / speed_m_s
         for duration_s, profile in ((LAND_SPEED_UP_S, speed_up), (steady_s, steady), (LAND_SLOW_DOWN_S, slow_down)):
             if duration_s > 0.0:
-                self._append(0, Move(t_s, duration_s, self._at[0], (0.0, 0.0, -speed_m_s * duration_s), profile))
+                self._append(
+                    0,
+                    Move(
+                        start_s=t_s,
+                        duration_s=duration_s,
+                        origin=self._at[0],
+                        delta=(0.0, 0.0, -speed_m_s * duration_s),
+                        profile=profile,
+                    ),
+                )
                 t_s += duration_s
         return t_s
 
@@ -326,7 +363,16 @@ class PlanBuilder:
             left_out_s = repeats.left_out_s
             *earlier, last = segments
             segments = [*earlier, replace(last, start_s=repeats.end_s, end_s=last.end_s + left_out_s)]
-        return Plan(name, tuple(segments), self.t_s + left_out_s, starts_s, position, yaw, arm, repeats)
+        return Plan(
+            name=name,
+            segments=tuple(segments),
+            duration_s=self.t_s + left_out_s,
+            _starts_s=starts_s,
+            _position=position,
+            _yaw=yaw,
+            _arm=arm,
+            _repeats=repeats,
+        )
 
     def _arm_delta(self, to_rad: Vec2) -> Vec2:
         first_rad, second_rad = self._at[2]
@@ -335,7 +381,10 @@ class PlanBuilder:
     def _go(self, track: int, to: tuple[float, ...], start_s: float, duration_s: float, profile: Profile) -> None:
         delta = tuple(b - a for a, b in zip(self._at[track], to, strict=True))
         if any(delta):
-            self._append(track, Move(start_s, duration_s, self._at[track], delta, profile))
+            self._append(
+                track,
+                Move(start_s=start_s, duration_s=duration_s, origin=self._at[track], delta=delta, profile=profile),
+            )
             self._at[track] = to  # not the last bit's difference: what comes next does not depend on what came before
 
     def _append(self, track: int, move: Motion) -> None:

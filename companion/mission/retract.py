@@ -66,7 +66,7 @@ def retract_from(
     builder.fold_arm(arm_fold_rad, fold_s)
     velocity, stop_s = stopping(inward_only(velocity_world_m_s, position_world_m, anchor))
     builder.t_s = builder.stop_within(_never_outward(velocity, stop_s, position_world_m, anchor), stop_s)
-    segments = [Segment("stop", PhaseKind.FLIGHT, 0.0, builder.t_s, -1)]
+    segments = [Segment(name="stop", kind=PhaseKind.FLIGHT, start_s=0.0, end_s=builder.t_s, index=-1)]
     x, y, z = builder.position_m
     away_m = math.hypot(x - anchor[0], y - anchor[1])
     lever_m = math.hypot(*tether.attachment_body_m)
@@ -82,7 +82,9 @@ def retract_from(
         builder.go((*to, z), duration_s)
         builder.t_s = start_s + duration_s
     builder.t_s = max(builder.t_s, fold_s)
-    segments.append(Segment("return", PhaseKind.FLIGHT, segments[0].end_s, builder.t_s, -1))
+    segments.append(
+        Segment(name="return", kind=PhaseKind.FLIGHT, start_s=segments[0].end_s, end_s=builder.t_s, index=-1)
+    )
     builder.segments += segments
     return builder.plan("retract")
 

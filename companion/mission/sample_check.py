@@ -107,11 +107,11 @@ class SampleCheck:
             return  # the reference goes on below the floor until touchdown is detected
         if kind is PhaseKind.FLIGHT and z_m < clearance_m - TOLERANCE:
             yield Violation(
-                "floor",
-                clearance_m - z_m,
-                "flies into the floor",
-                f"the body's origin at {z_m:.2f} m, {clearance_m:.2f} m is the lowest",
-                "raise the waypoint",
+                limit="floor",
+                excess=clearance_m - z_m,
+                what="flies into the floor",
+                detail=f"the body's origin at {z_m:.2f} m, {clearance_m:.2f} m is the lowest",
+                advice="raise the waypoint",
             )
         position = (x_m, y_m, max(z_m, clearance_m)) if kind is PhaseKind.TAKEOFF else reference.position_world_m
         off_m = self._off_m(t_s, position, kind)
@@ -144,21 +144,21 @@ class SampleCheck:
             for edge, excess, reach in (("low", span[0] - low + off_m, low), ("high", high + off_m - span[1], high)):
                 if excess > TOLERANCE:
                     yield Violation(
-                        f"room {name} {edge}",
-                        excess,
-                        "leaves the room",
-                        f"rotors, arm and net reach {name} = {reach:.2f} m, the room is {span[0]:g} to {span[1]:g} m less {why}",
-                        "move the waypoint inwards",
+                        limit=f"room {name} {edge}",
+                        excess=excess,
+                        what="leaves the room",
+                        detail=f"rotors, arm and net reach {name} = {reach:.2f} m, the room is {span[0]:g} to {span[1]:g} m less {why}",
+                        advice="move the waypoint inwards",
                     )
         beyond_m = self._safe.breach_tether_m(position) + off_m
         if beyond_m > TOLERANCE:
             limit_m = self._safe.radius_m - off_m
             yield Violation(
-                "tether",
-                beyond_m,
-                "leaves the tether sphere",
-                f"{limit_m + beyond_m:.2f} m from the anchor, {limit_m:.2f} m (length less margin and {why}) allowed",
-                "shorten the line or move the anchor",
+                limit="tether",
+                excess=beyond_m,
+                what="leaves the tether sphere",
+                detail=f"{limit_m + beyond_m:.2f} m from the anchor, {limit_m:.2f} m (length less margin and {why}) allowed",
+                advice="shorten the line or move the anchor",
             )
 
     def _stop(self, position: Vec3, reference: Reference, kind: PhaseKind, off_m: float) -> Iterator[Violation]:
@@ -184,11 +184,11 @@ class SampleCheck:
         for limit, what, beyond_m, with_m in found:
             if beyond_m > TOLERANCE:
                 yield Violation(
-                    f"{STOP}{limit}",
-                    beyond_m,
-                    f"could not stop within the {what}",
-                    f"{speed:.2f} m/s take {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
-                    "fly slower towards its edge or turn round earlier",
+                    limit=f"{STOP}{limit}",
+                    excess=beyond_m,
+                    what=f"could not stop within the {what}",
+                    detail=f"{speed:.2f} m/s take {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
+                    advice="fly slower towards its edge or turn round earlier",
                 )
 
     def _line(self, t_s: float, position: Vec3, reference: Reference) -> Iterator[Violation]:
@@ -201,7 +201,11 @@ class SampleCheck:
         if abs(state.turns) > tether.turns_max:
             detail = f"{abs(state.turns):.2f} turns about anchor or vehicle, tether.turns_max is {tether.turns_max:g}"
             yield Violation(
-                "turns", abs(state.turns), "winds up the tether", detail, "fly back the way it came, or turn back"
+                limit="turns",
+                excess=abs(state.turns),
+                what="winds up the tether",
+                detail=detail,
+                advice="fly back the way it came, or turn back",
             )
         if state.clearance_m < tether.clearance_min_m:
             detail = (
@@ -210,7 +214,11 @@ class SampleCheck:
             )
             advice = "fly higher or nearer to the anchor, accelerate less, or tie it elsewhere"
             yield Violation(
-                "line", tether.clearance_min_m - state.clearance_m, "brings the tether to the rotors", detail, advice
+                limit="line",
+                excess=tether.clearance_min_m - state.clearance_m,
+                what="brings the tether to the rotors",
+                detail=detail,
+                advice=advice,
             )
 
     def _arm(self, position: Vec3, reference: Reference) -> Iterator[Violation]:
@@ -222,7 +230,9 @@ class SampleCheck:
             if excess > TOLERANCE:
                 what = f"drives joint {number} through its wall"
                 detail = f"{angle_deg:.1f} deg, {low_deg:g} to {high_deg:g} deg allowed"
-                yield Violation(f"joint {number}", excess, what, detail, "change arm_deg")
+                yield Violation(
+                    limit=f"joint {number}", excess=excess, what=what, detail=detail, advice="change arm_deg"
+                )
         net_z_m = position[2] + self._manipulator.net_body_m(reference.arm_rad)[2] - self._vehicle.tool.net_radius_m
         elbow_z_m = position[2] + self._manipulator.elbow_body_m(reference.arm_rad)[2] - ARM_RADIUS_M
         for part, lowest_m in (("net", net_z_m), ("elbow", elbow_z_m)):
@@ -230,7 +240,11 @@ class SampleCheck:
                 what = f"drags the {part} over the floor"
                 detail = f"its lowest point is {lowest_m:.2f} m high, {FLOOR_GAP_M:g} m is the least"
                 yield Violation(
-                    f"floor {part}", FLOOR_GAP_M - lowest_m, what, detail, "fly higher or fold the arm first"
+                    limit=f"floor {part}",
+                    excess=FLOOR_GAP_M - lowest_m,
+                    what=what,
+                    detail=detail,
+                    advice="fly higher or fold the arm first",
                 )
 
     def _motion(self, reference: Reference, jerks: tuple[Vec3, Vec2]) -> Iterator[Violation]:
@@ -258,13 +272,21 @@ class SampleCheck:
         for key, value, limit, unit, what in checked:
             if value > limit * (1.0 + TOLERANCE):
                 detail = f"{value:.3g} {unit}, limits.{key} is {limit:g}"
-                yield Violation(key, value / limit, what, detail, "take longer or go less far")
+                yield Violation(
+                    limit=key, excess=value / limit, what=what, detail=detail, advice="take longer or go less far"
+                )
         for number, joint in enumerate(self._vehicle.arm.joints, start=1):
             rate = abs(math.degrees(reference.arm_rate_rad_s[number - 1]))
             if rate > joint.velocity_max_deg_s * (1.0 + TOLERANCE):
                 what = f"turns joint {number} faster than it can"
                 detail = f"{rate:.3g} deg/s, the joint's velocity_max_deg_s is {joint.velocity_max_deg_s:g}"
-                yield Violation(f"velocity {number}", rate, what, detail, "take longer or go less far")
+                yield Violation(
+                    limit=f"velocity {number}",
+                    excess=rate,
+                    what=what,
+                    detail=detail,
+                    advice="take longer or go less far",
+                )
 
     def _thrust(self, reference: Reference) -> Iterator[Violation]:
         limits, airframe = self._limits, self._vehicle.airframe
@@ -278,11 +300,19 @@ class SampleCheck:
                 f"{thrust_n:.1f} N with {self._payload_kg:g} kg of payload and the tether's weight, {allowed_n:.1f} N allowed "
                 f"({share:g} of {airframe.thrust_max_n:g} N)"
             )
-            yield Violation("thrust", thrust_n, "needs too much thrust", detail, "take longer or carry less")
+            yield Violation(
+                limit="thrust",
+                excess=thrust_n,
+                what="needs too much thrust",
+                detail=detail,
+                advice="take longer or carry less",
+            )
         tilt_deg = math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2))
         if tilt_deg > airframe.tilt_max_deg * (1.0 + TOLERANCE):
             detail = f"{tilt_deg:.1f} deg, airframe.tilt_max_deg is {airframe.tilt_max_deg:g}"
-            yield Violation("tilt", tilt_deg, "leans too far", detail, "take longer or go less far")
+            yield Violation(
+                limit="tilt", excess=tilt_deg, what="leans too far", detail=detail, advice="take longer or go less far"
+            )
 
 
 def _allowance(off_m: float) -> str:

@@ -68,7 +68,13 @@ def repeats_of(mission: Mission, segments: Sequence[Segment], names: tuple[str, 
         return None
     second = [number for number, segment in enumerate(segments) if segment.repetition == 2]
     begin_s = segments[second[0]].start_s
-    return Repeats(mission.repeat, second[0], begin_s, segments[second[-1]].end_s - begin_s, names)
+    return Repeats(
+        count=mission.repeat,
+        first=second[0],
+        begin_s=begin_s,
+        period_s=segments[second[-1]].end_s - begin_s,
+        names=names,
+    )
 
 
 def counted(name: str, repetition: int, count: int) -> str:

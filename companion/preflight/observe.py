@@ -235,13 +235,13 @@ class _Watcher:
             frames = counts.frames + counts.superseded
             numbers = latest.frame_number if latest is not None else 0
         return _Counts(
-            self._clock(),
-            frames,
-            numbers,
-            devices.force.counts().samples if devices.force is not None else 0,
-            devices.autopilot.counts() if devices.autopilot is not None else StateCounts(0, 0, 0),
-            self._arm_cycles,
-            self._arm_missed,
+            t_s=self._clock(),
+            mocap_frames=frames,
+            mocap_numbers=numbers,
+            force_samples=devices.force.counts().samples if devices.force is not None else 0,
+            state=devices.autopilot.counts() if devices.autopilot is not None else StateCounts(0, 0, 0),
+            arm_cycles=self._arm_cycles,
+            arm_missed=self._arm_missed,
         )
 
     def _mocap_stream(self, first: _Counts, now: _Counts) -> MocapStream | None:

@@ -101,7 +101,9 @@ def _entry(line: str, number: int) -> Entry:
     if kind not in (str(INT32), str(REAL32)):
         raise _WrongError(f"{name}: expected type {INT32} (INT32) or {REAL32} (REAL32), found {kind!r}")
     number_of = _int32 if kind == str(INT32) else _real32
-    return Entry(name, number_of(name, value), number, int(vehicle), int(component))
+    return Entry(
+        name=name, value=number_of(name, value), line=number, vehicle_id=int(vehicle), component_id=int(component)
+    )
 
 
 def _int32(name: str, cell: str) -> int:

@@ -94,11 +94,11 @@ def machine_of(config: Any) -> Machine:
     tether = None
     if anchor is not None and length_m is not None and length_m > 0.0:
         tether = TetherShape(
-            _vec3(anchor),
-            _vec3(_numbers(config, 3, "vehicle", "tether", "attachment_body_m") or (0.0, 0.0, 0.0)),
-            length_m,
-            _number(config, "vehicle", "tether", "margin_m") or 0.0,
-            _number(config, "vehicle", "tether", "taut_slack_m") or 0.0,
+            anchor_world_m=_vec3(anchor),
+            attachment_body_m=_vec3(_numbers(config, 3, "vehicle", "tether", "attachment_body_m") or (0.0, 0.0, 0.0)),
+            length_m=length_m,
+            margin_m=_number(config, "vehicle", "tether", "margin_m") or 0.0,
+            taut_slack_m=_number(config, "vehicle", "tether", "taut_slack_m") or 0.0,
         )
     spans = [_numbers(config, 2, "vehicle", "room", axis) for axis in ("x_m", "y_m", "z_m")]
     known = [span for span in spans if span is not None]

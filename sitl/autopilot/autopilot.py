@@ -370,14 +370,14 @@ class Px4Stub:
         estimate = self.estimate
         origin_set = self.origin is not None
         return Health(
-            estimate is not None and estimate.attitude_valid,
-            estimate is not None and estimate.position_valid,
-            origin_set,
-            origin_set and self.home_ned_m is not None,
-            self.land.landed,
-            self.land.maybe_landed,
-            None if self._setpoint_at_s is None or self.refuses_offboard else t_s - self._setpoint_at_s,
-            self._setpoint_kind,
+            attitude_valid=estimate is not None and estimate.attitude_valid,
+            position_valid=estimate is not None and estimate.position_valid,
+            origin_set=origin_set,
+            home_set=origin_set and self.home_ned_m is not None,
+            landed=self.land.landed,
+            maybe_landed=self.land.maybe_landed,
+            setpoint_age_s=None if self._setpoint_at_s is None or self.refuses_offboard else t_s - self._setpoint_at_s,
+            setpoint_kind=self._setpoint_kind,
         )
 
     def _collect_notices(self) -> None:

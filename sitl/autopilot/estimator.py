@@ -190,15 +190,15 @@ class Estimator:
         t_s = self._t_s or 0.0
         since = t_s - self._fused_t_s if self._fused_t_s is not None else math.inf
         return Estimate(
-            t_s,
-            self._p,
-            self._v,
-            self._q,
-            self._rates,
-            self._accel,
-            since <= VISION_FUSED_TIMEOUT_S,
-            since <= POSITION_VALID_TIMEOUT_S,
-            self._tilt_aligned,
+            t_s=t_s,
+            position_ned_m=self._p,
+            velocity_ned_m_s=self._v,
+            attitude_ned_frd=self._q,
+            rates_frd_rad_s=self._rates,
+            accel_frd_m_s2=self._accel,
+            vision_fused=since <= VISION_FUSED_TIMEOUT_S,
+            position_valid=since <= POSITION_VALID_TIMEOUT_S,
+            attitude_valid=self._tilt_aligned,
         )
 
 

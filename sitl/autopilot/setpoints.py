@@ -106,11 +106,13 @@ def decode_position_target(
     if frame == MAV_FRAME_BODY_NED:
         where, speed, push = NOTHING, _turned(speed, heading_rad), _turned(push, heading_rad)
     target = PositionTarget(
-        where,
-        speed,
-        push,
-        None if type_mask & _YAW_IGNORE or not math.isfinite(yaw_rad) else yaw_rad,
-        None if type_mask & _YAW_RATE_IGNORE_POSITION or not math.isfinite(yaw_rate_rad_s) else yaw_rate_rad_s,
+        position_ned_m=where,
+        velocity_ned_m_s=speed,
+        acceleration_ned_m_s2=push,
+        yaw_rad=None if type_mask & _YAW_IGNORE or not math.isfinite(yaw_rad) else yaw_rad,
+        yaw_rate_rad_s=None
+        if type_mask & _YAW_RATE_IGNORE_POSITION or not math.isfinite(yaw_rate_rad_s)
+        else yaw_rate_rad_s,
     )
     return None if target.empty else target
 

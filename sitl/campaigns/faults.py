@@ -45,7 +45,16 @@ def record_of(flown: Flown) -> FaultFlight:
     """Return the record of a flight for the judge."""
     fast, result = flown.fast, flown.result
     if fast is None:
-        return FaultFlight(Outcome.LOST.value, None, (), (), (), False, False, flown.error)
+        return FaultFlight(
+            outcome=Outcome.LOST.value,
+            begun_s=None,
+            course=(),
+            ticks=(),
+            events=(),
+            landed=False,
+            caught=False,
+            error=flown.error,
+        )
     tether, layout = fast.config.vehicle.tether, result.layout
     anchor, lever = tether.anchor_world_m, tether.attachment_body_m
     assert layout is not None
@@ -55,7 +64,13 @@ def record_of(flown: Flown) -> FaultFlight:
         attitude = (w, i, j, k)
         tied = [a + b for a, b in zip((x, y, z), quat_rotate(attitude, lever), strict=True)]
         slack_m = tether.length_m - math.dist(tied, anchor)
-        return Point(snapshot.t_s, (x, y, z), tilt_rad(attitude), slack_m, abs(snapshot.sensors[layout.tether]))
+        return Point(
+            t_s=snapshot.t_s,
+            position_world_m=(x, y, z),
+            tilt_rad=tilt_rad(attitude),
+            slack_m=slack_m,
+            tension_n=abs(snapshot.sensors[layout.tether]),
+        )
 
     # A flight process that stalls leaves snapshots between its ticks.
     course = sorted((point(s) for s in (*result.snapshots, *result.after)), key=lambda at: at.t_s)
@@ -65,7 +80,13 @@ def record_of(flown: Flown) -> FaultFlight:
     low_m = fast.config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
     landed = bool(course) and course[-1].position_world_m[2] < low_m and not result.armed
     return FaultFlight(
-        _outcome(result).value, fast.faults.begun_s, course, ticks_of(result.outputs), events, landed, result.caught
+        outcome=_outcome(result).value,
+        begun_s=fast.faults.begun_s,
+        course=course,
+        ticks=ticks_of(result.outputs),
+        events=events,
+        landed=landed,
+        caught=result.caught,
     )
 
 

@@ -293,5 +293,9 @@ def sample(world: World, anchor_world_m: Vec3) -> Sample:
     slack_m = world.tether_length_m - math.dist(world.attachment_world_m, anchor_world_m)
     tension_n = world.sensors()[world.layout.tether]
     return Sample(
-        world.t_s, (x, y, z), tilt_rad((attitude[0], attitude[1], attitude[2], attitude[3])), slack_m, tension_n
+        t_s=world.t_s,
+        position_world_m=(x, y, z),
+        tilt_rad=tilt_rad((attitude[0], attitude[1], attitude[2], attitude[3])),
+        slack_m=slack_m,
+        tension_n=tension_n,
     )

@@ -287,7 +287,9 @@ class ServoModel:
         i = 0
         while i < len(data):
             target = targets[i]
-            register = reg.REGISTER_AT.get(target) or Register(target, 1, "indirect data", True, 0, 0, 255)
+            register = reg.REGISTER_AT.get(target) or Register(
+                address=target, size=1, name="indirect data", writable=True, initial=0, low=0, high=255
+            )
             end = i + register.size
             if targets[i:end] != list(range(register.address, register.address + register.size)):
                 raise ServoRefusal(StatusError.DATA_LENGTH)

@@ -49,11 +49,11 @@ class Register:
 def _read_only(address: int, size: int, name: str, initial: int = 0, *, signed: bool = False) -> Register:
     span = 1 << 8 * size
     low, high = (-span // 2, span // 2 - 1) if signed else (0, span - 1)
-    return Register(address, size, name, False, initial, low, high)
+    return Register(address=address, size=size, name=name, writable=False, initial=initial, low=low, high=high)
 
 
 def _read_write(address: int, size: int, name: str, initial: int, low: int, high: int) -> Register:
-    return Register(address, size, name, True, initial, low, high)
+    return Register(address=address, size=size, name=name, writable=True, initial=initial, low=low, high=high)
 
 
 MODEL_NUMBER = _read_only(0, 2, "model number", MODEL)

@@ -262,7 +262,18 @@ class Plant:
             position, attitude, valid = faults.pose(position, attitude)
         if self._spoiled is not None:
             position, attitude = self._spoiled.pose(position, attitude)
-        self._mocap_queue.append((t_s + latency_s, MocapFrame(self._mocap_number, t_s, position, attitude, valid)))
+        self._mocap_queue.append(
+            (
+                t_s + latency_s,
+                MocapFrame(
+                    number=self._mocap_number,
+                    exposure_t_s=t_s,
+                    position_world_m=position,
+                    attitude_wxyz=attitude,
+                    valid=valid,
+                ),
+            )
+        )
 
     def take_mocap(self) -> list[MocapFrame]:
         """Return and remove the frames that the motion-capture server has sent by now."""

@@ -33,7 +33,14 @@ def flown(phase: str | None = None) -> FlightLog:
     outputs = tuple(o if phase is None else replace(o, phase=phase) for _, o, _ in rows)
     config = {**CONFIG, "vehicle": json.loads(VEHICLE.model_dump_json())}
     metadata = {"config": {"json": json.dumps(config)}}
-    return FlightLog(Path("flight.mcap"), tuple(r[0] for r in rows), outputs, tuple(r[2] for r in rows), metadata, True)
+    return FlightLog(
+        path=Path("flight.mcap"),
+        inputs=tuple(r[0] for r in rows),
+        outputs=outputs,
+        sent=tuple(r[2] for r in rows),
+        metadata=metadata,
+        closed=True,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +77,9 @@ def test_a_log_without_geometry_has_no_animation() -> None:
 @pytest.mark.parametrize("arm_rad", [(math.radians(165), math.radians(140)), (1.2, -0.1)])
 def test_the_net_is_where_the_control_law_has_it(arm_rad: Vec2) -> None:
     attitude = quat_from_euler_zyx(0.1, -0.2, 2.0)
-    pose = Pose((1.0, -0.5, 1.2), attitude, arm_rad, (), False)
+    pose = Pose(
+        position_world_m=(1.0, -0.5, 1.2), attitude_wxyz=attitude, arm_rad=arm_rad, ball_world_m=(), caught=False
+    )
     expected = np.add(
         pose.position_world_m, quat_rotate(attitude, Manipulator(VEHICLE.arm, VEHICLE.tool).net_body_m(arm_rad))
     )

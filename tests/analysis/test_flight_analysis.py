@@ -45,7 +45,7 @@ def flown() -> list[Row]:
 def made_of(rows: list[Row], config: dict[str, Any] | None = None) -> FlightLog:
     metadata = {"companion": {"version_companion": "0.1.0"}, "config": {"json": json.dumps(config or CONFIG)}}
     inputs, outputs, sent = zip(*rows, strict=True)
-    return FlightLog(Path("made.mcap"), inputs, outputs, sent, metadata, closed=True)
+    return FlightLog(path=Path("made.mcap"), inputs=inputs, outputs=outputs, sent=sent, metadata=metadata, closed=True)
 
 
 def changed(change: Callable[[Inputs, Outputs, Sent], Row]) -> FlightLog:

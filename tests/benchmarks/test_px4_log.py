@@ -14,7 +14,14 @@ FAULT_S = 20.0
 
 
 def log(*changes: Change, vision_s: tuple[float, ...] = (), setpoint_s: tuple[float, ...] = ()) -> Px4Log:
-    return Px4Log(changes, np.array(vision_s), np.array(setpoint_s), np.zeros(0), np.zeros((0, 3)), {})
+    return Px4Log(
+        changes=changes,
+        vision_s=np.array(vision_s),
+        setpoint_s=np.array(setpoint_s),
+        estimate_s=np.zeros(0),
+        position_ned_m=np.zeros((0, 3)),
+        parameters={},
+    )
 
 
 HOLD = Change(2.0, "HOLD", armed=False, failsafe=False)
@@ -41,7 +48,9 @@ def test_px4s_own_failsafe_is_told_from_a_command() -> None:
 
 
 def test_what_never_happened_is_none() -> None:
-    assert log(HOLD, OFFBOARD).after(FAULT_S) == AfterFault(None, None, None, None, None, None)
+    assert log(HOLD, OFFBOARD).after(FAULT_S) == AfterFault(
+        last_setpoint_s=None, vision_gap_s=None, mode=None, mode_s=None, failsafe_s=None, disarmed_s=None
+    )
 
 
 def test_modes_are_those_that_flew() -> None:

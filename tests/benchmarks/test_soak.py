@@ -40,7 +40,7 @@ def hour(growing: str | None = None, mb_per_hour: float = 0.0) -> list[Sample]:
 
 
 def minutes(p99: list[float], p50: float = 0.5) -> list[Minute]:
-    return [Minute(60.0 * number, 12000, p50, value, 3.0) for number, value in enumerate(p99)]
+    return [Minute(begin_s=60.0 * number, ticks=12000, p50=p50, p99=value, max=3.0) for number, value in enumerate(p99)]
 
 
 def test_so_many_repetitions_fit_into_the_time() -> None:

@@ -63,12 +63,29 @@ def flight(
         t_s = 8.0 + 0.01 * k
         sunk_m = min(z - STANDING_M, max(0.0, t_s - 11.0) * sink_m_s)
         sideways = drift_m * min(1.0, max(0.0, t_s - 10.5))
-        course.append(Point(t_s, (x + sideways, y, z - sunk_m), 0.1, slack_m, tension_n if t_s > 12.0 else 0.0))
+        course.append(
+            Point(
+                t_s=t_s,
+                position_world_m=(x + sideways, y, z - sunk_m),
+                tilt_rad=0.1,
+                slack_m=slack_m,
+                tension_n=tension_n if t_s > 12.0 else 0.0,
+            )
+        )
     ticks = [
         Tick(p.t_s, PhaseKind.FLIGHT, SafetyAction.NOMINAL if p.t_s < 10.12 else SafetyAction.AUTOPILOT_LAND, at)
         for p in course
     ]
-    return FaultFlight(outcome, begun_s, course, ticks, events, landed, False, error)
+    return FaultFlight(
+        outcome=outcome,
+        begun_s=begun_s,
+        course=course,
+        ticks=ticks,
+        events=events,
+        landed=landed,
+        caught=False,
+        error=error,
+    )
 
 
 def test_a_flight_that_was_given_up_and_stands_has_landed() -> None:
@@ -117,13 +134,27 @@ def test_a_tether_that_was_made_taut_may_be_so_but_not_be_followed_outward() -> 
     assert good(row_of(Variant("tether_taut", 0.1), "line", flight(tension_n=20.0, events=(taut,)), VEHICLE))
     made = flight(tension_n=20.0, events=(taut,))
     outward = [
-        Point(p.t_s, p.position_world_m, p.tilt_rad, p.slack_m - (0.3 if p.t_s > 12.5 else 0.0), p.tension_n)
+        Point(
+            t_s=p.t_s,
+            position_world_m=p.position_world_m,
+            tilt_rad=p.tilt_rad,
+            slack_m=p.slack_m - (0.3 if p.t_s > 12.5 else 0.0),
+            tension_n=p.tension_n,
+        )
         for p in made.course
     ]
     row = row_of(
         Variant("tether_taut", 0.1),
         "line",
-        FaultFlight("aborted", 10.0, outward, made.ticks, made.events, True, False),
+        FaultFlight(
+            outcome="aborted",
+            begun_s=10.0,
+            course=outward,
+            ticks=made.ticks,
+            events=made.events,
+            landed=True,
+            caught=False,
+        ),
         VEHICLE,
     )
     assert row["problems"] == ["outward on a taut tether"]
@@ -135,7 +166,15 @@ def test_what_is_told_after_the_landing_is_no_answer() -> None:
     row = row_of(
         Variant("force_loss"),
         "line",
-        FaultFlight("completed", 10.0, made.course, ticks, made.events, True, True),
+        FaultFlight(
+            outcome="completed",
+            begun_s=10.0,
+            course=made.course,
+            ticks=ticks,
+            events=made.events,
+            landed=True,
+            caught=True,
+        ),
         VEHICLE,
     )
     assert (row["action"], row["event"], row["reacted_s"]) == ("nominal", None, None)

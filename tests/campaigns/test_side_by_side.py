@@ -55,7 +55,15 @@ def made(
         "companion": {**VERSIONS, "epoch_offset_ns": "1700000000000000000", **(about or {})},
         "config": {"json": json.dumps(config)},
     }
-    log = FlightLog(Path(f"{letter}.mcap"), inputs, outputs, sent, metadata, closed=True, stride=stride)
+    log = FlightLog(
+        path=Path(f"{letter}.mcap"),
+        inputs=inputs,
+        outputs=outputs,
+        sent=sent,
+        metadata=metadata,
+        closed=True,
+        stride=stride,
+    )
     law = config["controller"]
     summary = summarise(log, outcome=outcome, controller=law["law"], preset=law["preset"], payload_kg=payload_kg)
     return flight_of(letter, f"flight {letter}", f"{letter}.mcap", digest or letter, log, summary)

@@ -60,7 +60,20 @@ def test_the_value_that_it_gives_is_one_that_flies(recorded: Path, capsys: pytes
     """As JSON; the patch is a value that the vehicle file takes."""
     assert cli.main(["hover", "fit", str(recorded), "--json"]) == 0
     told: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert set(told) == set(jsonable(HoverFit(0.5, 0.0, 2.0, None, None, None, None, None)))
+    assert set(told) == set(
+        jsonable(
+            HoverFit(
+                hover_thrust=0.5,
+                standard_error=0.0,
+                used_s=2.0,
+                configured=None,
+                last_estimate=None,
+                voltage_mean_v=None,
+                voltage_span_v=None,
+                slope=None,
+            )
+        )
+    )
     value = told["patch"]["airframe"]["hover_thrust"]
     config = load_sitl("configs/missions/catch.yaml", overrides=(f"vehicle.airframe.hover_thrust={value}",))
     assert config.vehicle.airframe.hover_thrust == value == round(told["hover_thrust"], 4)
@@ -73,7 +86,14 @@ def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_l
 ) -> None:
     log = flown[0]
     ground = sum(o.mission_t_s == 0.0 for o in log.outputs)
-    short = FlightLog(log.path, log.inputs[:ground], log.outputs[:ground], log.sent[:ground], log.metadata, True)
+    short = FlightLog(
+        path=log.path,
+        inputs=log.inputs[:ground],
+        outputs=log.outputs[:ground],
+        sent=log.sent[:ground],
+        metadata=log.metadata,
+        closed=True,
+    )
     text = tmp_path / "notes.txt"
     text.write_text("thirty characters and then some", encoding="utf-8")
     for path, reason in (
@@ -90,7 +110,16 @@ def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_l
 
 
 def test_a_slope_is_told_with_the_voltage_that_the_value_holds_for() -> None:
-    fit = HoverFit(0.4912, 0.0003, 31.2, 0.5, 0.492, 15.62, 1.4, VoltageSlope(-0.021, 0.0008))
+    fit = HoverFit(
+        hover_thrust=0.4912,
+        standard_error=0.0003,
+        used_s=31.2,
+        configured=0.5,
+        last_estimate=0.492,
+        voltage_mean_v=15.62,
+        voltage_span_v=1.4,
+        slope=VoltageSlope(-0.021, 0.0008),
+    )
     told = lines(fit, "my_vehicle.yaml")
     assert told[0] == "hover thrust      0.4912 ± 0.0003 (standard error) at 15.62 V, from 31.2 s of calm flight"
     assert told[1] == "flight began with 0.5000, +1.79 % of the fitted one"

@@ -50,13 +50,13 @@ def swept(
             wander = 0.97 * wander + math.sqrt(1.0 - 0.97**2) * noise_a * rng.standard_normal()
             current = (gravity + way * dry_nm + viscous_nms * rate) / k[joint] + wander
             yield Sample(
-                number,
-                joint,
-                int(way),
-                100.0 * number + tick / RATE_HZ,
-                (angle[0], angle[1]),
-                rate,
-                round(current / 2.69e-3) * 2.69e-3,
+                leg=number,
+                joint=joint,
+                direction=int(way),
+                t_s=100.0 * number + tick / RATE_HZ,
+                angle_rad=(angle[0], angle[1]),
+                velocity_rad_s=rate,
+                current_a=round(current / 2.69e-3) * 2.69e-3,
             )
 
     samples: list[Sample] = []

@@ -134,7 +134,10 @@ def test_a_stream_that_shows_something_else_is_not_believed() -> None:
 
 
 def made_up(*delays_ms: float, problem: str = "") -> list[TapDelay]:
-    return [TapDelay(Tap(float(k), 9.0), 1e-3 * ms, 0.001, 0.9, problem) for k, ms in enumerate(delays_ms)]
+    return [
+        TapDelay(tap=Tap(float(k), 9.0), delay_s=1e-3 * ms, error_s=0.001, correlation=0.9, problem=problem)
+        for k, ms in enumerate(delays_ms)
+    ]
 
 
 def test_too_few_taps_are_refused() -> None:
@@ -170,7 +173,14 @@ def test_lost_frames_around_a_tap_make_it_not_count() -> None:
 
 def test_people_get_a_table_and_its_sum() -> None:
     taps = made_up(35.9, 36.4, 35.7, 36.2, 36.0)
-    m = Measured((*taps, *made_up(80.0, problem="too weak: x")), combine(taps), 0.004, 0.002, None, 5.0)
+    m = Measured(
+        taps=(*taps, *made_up(80.0, problem="too weak: x")),
+        delay=combine(taps),
+        round_trip_s=0.004,
+        imu_age_s=0.002,
+        mocap_latency_s=None,
+        px4_ms=5.0,
+    )
     shown = "\n".join(text(m))
     for words in (
         "correlation",
@@ -183,6 +193,6 @@ def test_people_get_a_table_and_its_sum() -> None:
         assert words in shown
     assert [row.id for row in rows(m, 30.0) if not row.ok] == ["latency.delay", "latency.long"]
     assert all(row.ok for row in rows(replace(m, px4_ms=38.0), 50.0))
-    nothing = Measured((), combine([]), 0.004, None, None, 5.0)
+    nothing = Measured(taps=(), delay=combine([]), round_trip_s=0.004, imu_age_s=None, mocap_latency_s=None, px4_ms=5.0)
     assert [row.id for row in rows(nothing, 30.0)] == ["latency.taps"]
     assert "unknown" in "\n".join(text(nothing))

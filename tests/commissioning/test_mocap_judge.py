@@ -18,7 +18,15 @@ from companion.model.types import IDENTITY_QUAT, Vec3
 from tests.support import ROOT
 
 VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")
-INFO = ServerInfo("Motive", (3, 0, 0, 0), (4, 1, 0, 0), 10_000_000, 1511, True, "239.255.42.99")
+INFO = ServerInfo(
+    application="Motive",
+    application_version=(3, 0, 0, 0),
+    natnet_version=(4, 1, 0, 0),
+    clock_frequency_hz=10_000_000,
+    data_port=1511,
+    multicast=True,
+    multicast_group="239.255.42.99",
+)
 CABLE = Route("unicast", "10.0.0.2", "eth0", False)
 NAMES = {1: "quad", 5: "wand"}
 
@@ -48,14 +56,25 @@ def frames(
         if lost(number):
             continue
         bodies = tuple(
-            RigidBody(id_, place(t_s), IDENTITY_QUAT, 0.0003, True) for id_, place in (places or {1: still}).items()
+            RigidBody(id=id_, position_m=place(t_s), quat_wxyz=IDENTITY_QUAT, error_m=0.0003, tracking_valid=True)
+            for id_, place in (places or {1: still}).items()
         )
-        found.append(FrameSeen(10.0 + t_s + late_s(number), number + 1000, 50.0 + t_s, latency_s, bodies))
+        found.append(
+            FrameSeen(
+                arrived_s=10.0 + t_s + late_s(number),
+                number=number + 1000,
+                timestamp_s=50.0 + t_s,
+                latency_s=latency_s,
+                bodies=bodies,
+            )
+        )
     return found
 
 
 def judged(seen: Sequence[FrameSeen], *, moving: bool = False, route: Route = CABLE) -> Judged:
-    return mocap_judge.judge(Watched(seen, NAMES, INFO, route, 4.0, moving), VEHICLE)
+    return mocap_judge.judge(
+        Watched(frames=seen, names=NAMES, info=INFO, route=route, duration_s=4.0, moving=moving), VEHICLE
+    )
 
 
 def bad(found: Judged) -> set[str]:

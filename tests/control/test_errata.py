@@ -213,17 +213,17 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
         big_e = INERTIA @ acceleration - m_d * acceleration + machine.unknown() - unanswered - added
         out.append(
             Instant(
-                e,
-                e_rate,
-                e_acceleration,
-                s,
-                rate_of(s_after),
-                np.array(gamma_now)[ROWS],
-                rate_of(lambda h, after=gamma_after: np.array(after(h))[ROWS]),  # type: ignore[misc]
-                np.array(e_tau)[ROWS],
-                big_e,
-                -log.rho * weight**2 * s / norm,
-                added,
+                e=e,
+                e_rate=e_rate,
+                e_acceleration=e_acceleration,
+                s=s,
+                s_rate=rate_of(s_after),
+                gamma=np.array(gamma_now)[ROWS],
+                gamma_rate=rate_of(lambda h, after=gamma_after: np.array(after(h))[ROWS]),  # type: ignore[misc]
+                e_tau=np.array(e_tau)[ROWS],
+                big_e=big_e,
+                dtau=-log.rho * weight**2 * s / norm,
+                added=added,
             )
         )
         gamma_before = list(log.gamma)
@@ -361,7 +361,7 @@ def fly(
         rate = rate + DT_S * acceleration
         e = e + DT_S * rate
     e_rows, s_rows, gamma_rows, h_rows, zeta_rows = (np.array(column) for column in zip(*rows, strict=True))
-    return Flown(e_rows, s_rows, gamma_rows, h_rows, zeta_rows, lost_s)
+    return Flown(e=e_rows, s=s_rows, gamma=gamma_rows, h=h_rows, zeta=zeta_rows, lost_s=lost_s)
 
 
 def test_corrected_law_comes_to_rest(table: AdaptiveConfig) -> None:

@@ -208,7 +208,13 @@ def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) ->
     channel.setblocking(False)
     autopilot, arm = ObedientAutopilot(config, clock), OtherArm(config, clock)
     autopilot.on_armed = lambda: ipc.send(launcher, {"type": "land"})
-    devices = Devices(VisionFilter(), autopilot, OtherMocap(config, clock), arm, OtherForceTorque(config, clock))
+    devices = Devices(
+        vision=VisionFilter(),
+        autopilot=autopilot,
+        mocap=OtherMocap(config, clock),
+        arm=arm,
+        force=OtherForceTorque(config, clock),
+    )
 
     async def flown() -> Outcome:
         operator = Operator(channel)

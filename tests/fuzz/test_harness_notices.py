@@ -126,7 +126,7 @@ def test_a_finding_is_saved_under_its_name(tmp_path: os.PathLike[str]) -> None:
     from pathlib import Path
 
     folder = Path(tmp_path)
-    path = save(Finding("mavlink-wire", 1, 93, "text", b"\x00\x01"), folder)
+    path = save(Finding(target="mavlink-wire", seed=1, index=93, text="text", data=b"\x00\x01"), folder)
     assert path == folder / "mavlink-wire-1-93.bin"
     assert path.read_bytes() == b"\x00\x01"
     assert save(Finding("natnet", 1, None, "memory grew"), folder) is None

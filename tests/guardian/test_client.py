@@ -96,7 +96,22 @@ def test_a_guardian_that_does_not_read_never_blocks_the_flight(pair: Pair) -> No
 
 
 def _beat() -> heartbeat.Heartbeat:
-    return heartbeat.Heartbeat(1, 2.0, 3.0, 0.0, True, False, False, False, 1, 1, 195, 14540, 1.9, (0.0, 0.0, 1.0))
+    return heartbeat.Heartbeat(
+        tick=1,
+        t_s=2.0,
+        origin_s=3.0,
+        mission_t_s=0.0,
+        lifting=True,
+        pilot=False,
+        goodbye=False,
+        mocap_refused=False,
+        autopilot_system=1,
+        own_system=1,
+        own_component=195,
+        local_port=14540,
+        pose_stamp_s=1.9,
+        position_world_m=(0.0, 0.0, 1.0),
+    )
 
 
 def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:

@@ -179,7 +179,16 @@ def test_over_udp_it_lands_beside_a_killed_flight_process_that_does_not_end(
 
 def test_of_two_streams_of_motion_capture_at_one_address_none_is_passed_on() -> None:
     with Cameras(1) as cameras, closing(socket.socket(type=socket.SOCK_DGRAM)) as forger:
-        settings = MocapSettings("127.0.0.1", "127.0.0.1", "unicast", "239.255.42.99", cameras.port, 1511, 1, "z")
+        settings = MocapSettings(
+            server="127.0.0.1",
+            interface="127.0.0.1",
+            transport="unicast",
+            multicast_group="239.255.42.99",
+            command_port=cameras.port,
+            data_port=1511,
+            rigid_body_id=1,
+            up_axis="z",
+        )
         with closing(MocapClient(settings)) as client:
             seen: list[MocapPose] = []
 

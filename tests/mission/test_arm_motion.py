@@ -37,7 +37,7 @@ def test_any_move_keeps_its_limits_and_ends_at_rest(delta_rad: Vec2, limits: Arm
     assume(max(map(abs, delta_rad)) > 1e-6)
     motion = plan_arm(delta_rad, limits, duration_s)
     assert motion.duration_s >= duration_s
-    move = Move(2.0, motion.duration_s, (0.0, 0.0), delta_rad, motion.profile)
+    move = Move(start_s=2.0, duration_s=motion.duration_s, origin=(0.0, 0.0), delta=delta_rad, profile=motion.profile)
     shares = used(delta_rad, limits, move)
     assert max(shares) <= 1.0 + 1e-6
     if motion.duration_s > duration_s:
@@ -67,7 +67,7 @@ def test_the_same_move_is_the_same_bit_for_bit() -> None:
 
 def test_both_joints_move_in_step() -> None:
     motion = plan_arm((1.0, -0.5), LIMITS)
-    move = Move(0.0, motion.duration_s, (0.2, 0.3), (1.0, -0.5), motion.profile)
+    move = Move(start_s=0.0, duration_s=motion.duration_s, origin=(0.2, 0.3), delta=(1.0, -0.5), profile=motion.profile)
     for index in range(100):
         first, second = move.at(move.duration_s * index / 100)[0]
         assert (first - 0.2) / 1.0 == pytest.approx((second - 0.3) / -0.5, abs=1e-12)

@@ -46,7 +46,14 @@ def ways(draw: st.DrawFn) -> tuple[Vec3, ...]:
 def curve(points_m: tuple[Vec3, ...], limits: VehicleLimits) -> Curve:
     way = route(points_m, limits)
     duration_s = way.knots[-1] * way.least_scale_s
-    return Curve(1.0, duration_s, way.least_scale_s, way.knots, way.pieces, points_m[-1])
+    return Curve(
+        start_s=1.0,
+        duration_s=duration_s,
+        scale_s=way.least_scale_s,
+        knots=way.knots,
+        pieces=way.pieces,
+        end=points_m[-1],
+    )
 
 
 @costly

@@ -23,7 +23,7 @@ from companion.preflight.hand_test.record import (
 )
 from tests.support import CATCH
 
-SETUP = Setup("tarot650-2r", "192.168.1.10", 1, "z", "4.1")
+SETUP = Setup(vehicle="tarot650-2r", server="192.168.1.10", rigid_body_id=1, up_axis="z", natnet_version="4.1")
 AT = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 ROWS = [Row(id="hand.forward", title="hand test: forward", ok=True, read="felt 0.29 m forward")]
 

@@ -84,7 +84,7 @@ class Faults(Campaign):
             f"{len(bad)} of {len(rows)} flights did what no flight may do."
             if bad
             else "No flight did what it must not do.",
-            not bad,
+            good=not bad,
         )
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:

@@ -121,7 +121,9 @@ class WireFlights:
 
 
 def _lost(why: str) -> FaultFlight:
-    return FaultFlight(Outcome.LOST.value, None, (), (), (), False, False, why)
+    return FaultFlight(
+        outcome=Outcome.LOST.value, begun_s=None, course=(), ticks=(), events=(), landed=False, caught=False, error=why
+    )
 
 
 def flown(folder: Path, config: FlightConfig) -> FaultFlight:
@@ -136,14 +138,24 @@ def flown(folder: Path, config: FlightConfig) -> FaultFlight:
     ticks, events = ticks_of(log.outputs if log is not None else ()), _events(log, summary)
     offset_s = _offset_s(log.inputs if log is not None else (), world["mocap_frames"], begun_s or 0.0)
     course = [
-        Point(t_s + offset_s, (x, y, z), tilt_rad, slack_m, abs(tension_n))
+        Point(
+            t_s=t_s + offset_s, position_world_m=(x, y, z), tilt_rad=tilt_rad, slack_m=slack_m, tension_n=abs(tension_n)
+        )
         for t_s, (x, y, z), tilt_rad, slack_m, tension_n in world["course"]
     ]
     low_m = config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
     landed = bool(course) and course[-1].position_world_m[2] < low_m and not world["armed"]
     outcome = Outcome.CRASHED.value if world["crashed"] else summary["outcome"]
     fault_s = None if begun_s is None else begun_s + offset_s
-    return FaultFlight(outcome, fault_s, course, ticks, events, landed, bool(world["caught"]))
+    return FaultFlight(
+        outcome=outcome,
+        begun_s=fault_s,
+        course=course,
+        ticks=ticks,
+        events=events,
+        landed=landed,
+        caught=bool(world["caught"]),
+    )
 
 
 def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], begun_s: float) -> float:

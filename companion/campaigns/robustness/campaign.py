@@ -86,8 +86,8 @@ class Robustness(Campaign):
                 Section("Distribution of the error", self._dependence(rows), [thirds_table(rows)], pictures),
                 Section("Flights", tables=[self._flights_table(rows)]),
             ],
-            f"{self._result(rows)}. {f'{unsafe} flights crashed or were lost.' if unsafe else 'Every flight ended safely.'}",
-            not unsafe,
+            verdict=f"{self._result(rows)}. {f'{unsafe} flights crashed or were lost.' if unsafe else 'Every flight ended safely.'}",
+            good=not unsafe,
         )
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:

@@ -255,7 +255,9 @@ def _figures(flights: Sequence[Flight], same_mission: bool) -> tuple[Figure, ...
             for flight, value in zip(flights, values, strict=True)
         )
         differences = tuple(None if first is None or value is None else value - first for value in values)
-        figures.append(Figure(key, label, digits, values, differences, verdicts))
+        figures.append(
+            Figure(key=key, label=label, digits=digits, values=values, differences=differences, verdicts=verdicts)
+        )
     return tuple(figures)
 
 

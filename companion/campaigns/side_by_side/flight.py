@@ -47,7 +47,22 @@ def course_of(log: FlightLog) -> Course:
     if not log.inputs:
         none, three = np.empty(0), np.empty((0, 3))
         mask = np.empty(0, dtype=np.bool_)
-        return Course(none, mask, mask, none, none, none, none, none, none, three, three, none, None, None)
+        return Course(
+            t_s=none,
+            flying=mask,
+            graded=mask,
+            e_p_m=none,
+            e_q_deg=none,
+            e_alpha_deg=none,
+            thrust_percent=none,
+            rho=none,
+            slack_m=none,
+            flown_world_m=three,
+            reference_world_m=three,
+            lateness_s=none,
+            catch=None,
+            takeoff_s=None,
+        )
     c = log.columns
     pre, post = metrics.flight_masks(log)
     rho = log.column(lambda i, o, s: o.control.rho if o.control else None)
@@ -104,4 +119,13 @@ class Flight:
 
 def flight_of(letter: str, name: str, path: str, digest: str, log: FlightLog, summary: dict[str, Any]) -> Flight:
     """Return the flight of a log."""
-    return Flight(letter, name, path, digest, summary, effective_config(log, summary), log.metadata, course_of(log))
+    return Flight(
+        letter=letter,
+        name=name,
+        path=path,
+        digest=digest,
+        summary=summary,
+        config=effective_config(log, summary),
+        metadata=log.metadata,
+        course=course_of(log),
+    )

@@ -205,7 +205,15 @@ def _as_joint_fit(theta: _Array, covariance: _Array, rows: _Array, scatter: floa
 
     constant = Estimate(k, k * k * math.sqrt(max(0.0, float(covariance[0, 0]))))
     span = float(np.ptp(rows[:, 0]))
-    return JointFit(constant, ratio(1), ratio(2), ratio(3, math.degrees(1.0)), span, scatter, len(rows))
+    return JointFit(
+        torque_per_amp_nm_a=constant,
+        dry_nm=ratio(1),
+        viscous_nms=ratio(2),
+        off_deg=ratio(3, math.degrees(1.0)),
+        gravity_span_nm=span,
+        residual_a=scatter,
+        bins=len(rows),
+    )
 
 
 def _together(estimates: Sequence[Estimate]) -> Estimate | None:

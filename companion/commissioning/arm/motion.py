@@ -150,7 +150,14 @@ class Motion:
             and abs(reference[joint] - state.angle_rad[joint]) <= math.radians(REACHED_DEG)
             for joint in (0, 1)
         )
-        return Moved((torque[0], torque[1]), reference, rate, load, reached, stop)
+        return Moved(
+            torque_nm=(torque[0], torque[1]),
+            reference_rad=reference,
+            reference_rate_rad_s=rate,
+            load_nm=load,
+            reached=reached,
+            stop=stop,
+        )
 
     def _lead(self, joint: int, angle_rad: float, dt_s: float) -> None:
         """Move the reference towards the goal, within its speed, and not away from a joint that does not follow."""

@@ -65,10 +65,31 @@ def steps_of(arm: Arm) -> tuple[Step, Step, Step]:
     bent = straight[1] + elbow_deg
     swung = straight[0] + shoulder_deg
     return (
-        Step("straight", f"hold the whole arm {_direction(straight[0])}, both links in one line", None, 0.0, True, straight),
-        Step("elbow", _elbow_text(straight[0], elbow_deg, elbow_exact), 1, elbow_deg, elbow_exact, (straight[0], bent)),
-        Step("shoulder", _shoulder_text(straight[0], shoulder_deg, shoulder_exact), 0, shoulder_deg, shoulder_exact, (swung, bent)),
-    )  # fmt: skip
+        Step(
+            name="straight",
+            instruction=f"hold the whole arm {_direction(straight[0])}, both links in one line",
+            joint=None,
+            by_deg=0.0,
+            exact=True,
+            pose_deg=straight,
+        ),
+        Step(
+            name="elbow",
+            instruction=_elbow_text(straight[0], elbow_deg, elbow_exact),
+            joint=1,
+            by_deg=elbow_deg,
+            exact=elbow_exact,
+            pose_deg=(straight[0], bent),
+        ),
+        Step(
+            name="shoulder",
+            instruction=_shoulder_text(straight[0], shoulder_deg, shoulder_exact),
+            joint=0,
+            by_deg=shoulder_deg,
+            exact=shoulder_exact,
+            pose_deg=(swung, bent),
+        ),
+    )
 
 
 def _within(joint: Joint, angle_deg: float) -> bool:

@@ -103,7 +103,7 @@ def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundSer
             registers = {register.name: talk.read(servo_id, register) for register in SETTINGS}
         except DeviceError:
             registers = {}
-    return FoundServo(servo_id, talk.baud, model, firmware, registers)
+    return FoundServo(servo_id=servo_id, baud=talk.baud, model=model, firmware=firmware, registers=registers)
 
 
 def judge(found: Scan, vehicle: Vehicle) -> Judgement:

@@ -133,7 +133,10 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
         (bus.ID, joint.servo_id, str, "the vehicle file's servo_id"),
         (bus.BAUD, bus.BAUDS.index(device.baud), baud_text, "the vehicle file's devices.arm.baud"),
     ]  # fmt: skip
-    return [Setting(register, servo.value(register), wanted, shown, why) for register, wanted, shown, why in rows]
+    return [
+        Setting(register=register, found=servo.value(register), wanted=wanted, shown=shown, why=why)
+        for register, wanted, shown, why in rows
+    ]
 
 
 @dataclass(frozen=True, slots=True)

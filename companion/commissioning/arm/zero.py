@@ -131,12 +131,12 @@ class ZeroGuide:
         ready = (self._begun or accept) and not notice
         share = min(1.0, still_s / HELD_S) if ready else 0.0
         if share < 1.0:
-            return ZeroView(step, index + 1, moved, share, notice)
+            return ZeroView(step=step, number=index + 1, moved_deg=moved, held=share, notice=notice)
         self._held.append(_mean([one for _, one in window]))
         self._began, self._begun = self._held[-1], False
         window.clear()
         if len(self._held) < len(self.steps):
-            return ZeroView(self.steps[index + 1], index + 2, (0.0, 0.0), 0.0, "")
+            return ZeroView(step=self.steps[index + 1], number=index + 2, moved_deg=(0.0, 0.0), held=0.0, notice="")
         return self._conclude(moved)
 
     def _still_s(self, t_s: float) -> float:
@@ -167,7 +167,7 @@ class ZeroGuide:
     def _conclude(self, moved: tuple[float, float]) -> ZeroView:
         first, second, third = self._held
         elbow, shoulder = _mover(first, second), _mover(second, third)
-        view = ZeroView(None, len(self.steps), moved, 1.0, "")
+        view = ZeroView(step=None, number=len(self.steps), moved_deg=moved, held=1.0, notice="")
         if elbow == shoulder:
             servo_id = self._arm.joints[elbow].servo_id
             text = f"the servo with id {servo_id} turned in both steps, the other one never: was it the elbow first, then the shoulder?"
@@ -179,7 +179,7 @@ class ZeroGuide:
                 text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
                 return _failed(view, f"{text}; hold them more exactly, and look for a horn that slips")
         result = ZeroResult((joints[0], joints[1]), elbow == 0)
-        return ZeroView(None, view.number, moved, 1.0, "", result)
+        return ZeroView(step=None, number=view.number, moved_deg=moved, held=1.0, notice="", result=result)
 
     def _joint(self, joint: int, servo: int, counts: Sequence[int]) -> ZeroJoint:
         # The elbow turns in the second step, the shoulder in the third, where the elbow stays only roughly.
@@ -198,7 +198,9 @@ class ZeroGuide:
 
 
 def _failed(view: ZeroView, text: str) -> ZeroView:
-    return ZeroView(None, view.number, view.moved_deg, 0.0, "", None, text)
+    return ZeroView(
+        step=None, number=view.number, moved_deg=view.moved_deg, held=0.0, notice="", result=None, failed=text
+    )
 
 
 def _moved_deg(began: Counts, counts: Counts, servo: int) -> float:

@@ -70,7 +70,13 @@ async def watch(session: Session) -> Watched:
         health = sensor.counts()
         product = f"{sensor.product_name}, firmware {sensor.firmware}" if sensor.firmware else sensor.product_name
         stream = ForceStream(samples=len(empty) - 1, bad_sums=health.bad_sums, product=product, lost=health.lost)
-        seen = Watched(empty, await angles_rad(), stream, usb_latency_ms(device.port), weight_kg)
+        seen = Watched(
+            empty=empty,
+            arm_rad=await angles_rad(),
+            stream=stream,
+            usb_latency_ms=usb_latency_ms(device.port),
+            weight_kg=weight_kg,
+        )
         if weight_kg is None:
             return seen
         try:
@@ -239,6 +245,20 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
 
 
 TOOLS: Final = {
-    "check": Tool("ft check", SENSORS, watch, judge, preflight.DEVICE, {"rest": None, "weight": None}),
-    "tare": Tool("ft tare", SENSORS, watch_drift, judge_drift, preflight.DEVICE, {"drift": None, "tare": None}),
+    "check": Tool(
+        name="ft check",
+        family=SENSORS,
+        collect=watch,
+        fit=judge,
+        device=preflight.DEVICE,
+        no_data={"rest": None, "weight": None},
+    ),
+    "tare": Tool(
+        name="ft tare",
+        family=SENSORS,
+        collect=watch_drift,
+        fit=judge_drift,
+        device=preflight.DEVICE,
+        no_data={"drift": None, "tare": None},
+    ),
 }

@@ -116,7 +116,9 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     seen = [p for p in poses if tap.t_s - BEFORE_S - 0.1 <= p.t_s <= tap.t_s + AFTER_S + high + 0.05]
     rest = [p for p in seen if p.t_s <= tap.t_s - 0.01]
     if len(felt) < 40 or len(rest) < 3 or len(seen) < 15:
-        return TapDelay(tap, 0.0, math.inf, 0.0, "samples are missing around it")
+        return TapDelay(
+            tap=tap, delay_s=0.0, error_s=math.inf, correlation=0.0, problem="samples are missing around it"
+        )
     course = _Course(felt, mean_attitude([pose.attitude for pose in rest[-12:]]))
     delay_s = 0.0
     for step_s, (first_s, last_s) in ((_COARSE_S, DELAY_SPAN_S), (_FINE_S, (0.0, 0.0))):
@@ -128,11 +130,19 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
         until_s = centre_s + AFTER_S + (high if step_s == _COARSE_S else 0.0)
         window = [pose for pose in seen if centre_s - BEFORE_S <= pose.t_s <= until_s]
         if len(window) < 12:
-            return TapDelay(tap, 0.0, math.inf, 0.0, "motion capture was lost around it")
+            return TapDelay(
+                tap=tap, delay_s=0.0, error_s=math.inf, correlation=0.0, problem="motion capture was lost around it"
+            )
         costs, nothing, free = course.costs(window, grid, noise)
         best = int(np.argmin(costs))
         if not 0 < best < len(grid) - 1:
-            return TapDelay(tap, float(grid[best]), math.inf, 0.0, "motion capture shows nothing like it")
+            return TapDelay(
+                tap=tap,
+                delay_s=float(grid[best]),
+                error_s=math.inf,
+                correlation=0.0,
+                problem="motion capture shows nothing like it",
+            )
         delay_s, curvature = _vertex(grid, costs, best)
     least = float(costs[best])
     correlation = math.sqrt(max(0.0, 1.0 - least / nothing)) if nothing > 0.0 else 0.0
@@ -143,7 +153,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
         problem = f"too weak: the IMU explains too little of what motion capture saw (correlation {correlation:.2f})"
     elif error_s > TAP_ERROR_MAX_S:
         problem = f"too weak: its time is only known to {1e3 * error_s:.1f} ms"
-    return TapDelay(tap, delay_s, error_s, correlation, problem)
+    return TapDelay(tap=tap, delay_s=delay_s, error_s=error_s, correlation=correlation, problem=problem)
 
 
 def agreeing(taps: Sequence[TapDelay]) -> list[TapDelay]:

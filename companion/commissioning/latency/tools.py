@@ -263,4 +263,13 @@ def as_json(m: Measured) -> dict[str, Any]:
     }
 
 
-TOOLS: Final = {"latency": Tool("latency", SENSORS, measure, judge, DEVICES, {"ev_delay_ms": None, "taps": []})}
+TOOLS: Final = {
+    "latency": Tool(
+        name="latency",
+        family=SENSORS,
+        collect=measure,
+        fit=judge,
+        device=DEVICES,
+        no_data={"ev_delay_ms": None, "taps": []},
+    )
+}

@@ -58,7 +58,14 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
     if upright:
         x, y, _ = result.forward.seen_world_m
         world_yaw_deg = math.degrees(wrap_rad(math.atan2(y, x) - start_yaw_rad))
-    return Alignment(axes, axes.determinant < 0, level, proposed, yaw_offset_deg(result.forward), world_yaw_deg)
+    return Alignment(
+        axes=axes,
+        mirrored=axes.determinant < 0,
+        level=level,
+        up_axis=proposed,
+        body_yaw_deg=yaw_offset_deg(result.forward),
+        world_yaw_deg=world_yaw_deg,
+    )
 
 
 def changes(found: Alignment, up_axis: str) -> dict[Location, Data]:

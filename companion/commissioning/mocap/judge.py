@@ -144,7 +144,16 @@ def bodies(frames: Sequence[FrameSeen], names: Mapping[int, str]) -> list[BodyMo
             spans = [max(b.position_m[i] for b in tracked) - min(b.position_m[i] for b in tracked) for i in range(3)]
             moved_m = math.sqrt(sum(span * span for span in spans))
         error_m = sum(body.error_m for body in tracked) / len(tracked) if tracked else 0.0
-        found.append(BodyMotion(number, names.get(number, ""), len(seen), len(tracked), moved_m, error_m))
+        found.append(
+            BodyMotion(
+                id=number,
+                name=names.get(number, ""),
+                frames=len(seen),
+                tracked=len(tracked),
+                moved_m=moved_m,
+                error_m=error_m,
+            )
+        )
     return found
 
 

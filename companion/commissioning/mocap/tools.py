@@ -65,7 +65,14 @@ async def watch(session: Session) -> Watched | NotStreaming:
             info = driver.server_info
             assert info is not None
             route = path_to(driver.server_ip, device)
-            return Watched(tuple(frames), driver.names, info, route, clock() - start_s, arguments.move)
+            return Watched(
+                frames=tuple(frames),
+                names=driver.names,
+                info=info,
+                route=route,
+                duration_s=clock() - start_s,
+                moving=arguments.move,
+            )
     except DeviceError as error:
         if driver.server_info is not None:
             return NotStreaming(str(error), driver.server_info, {})

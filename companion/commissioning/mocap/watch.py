@@ -82,7 +82,15 @@ class MocapWatch(NatNetMocap):
             if isinstance(seen, Frame) and seen.body is not None:
                 found.append(seen.body)
         if isinstance(seen, Frame):
-            self._on_frame(FrameSeen(arrived_s, seen.number, seen.timestamp_s, seen.latency_s, tuple(found)))
+            self._on_frame(
+                FrameSeen(
+                    arrived_s=arrived_s,
+                    number=seen.number,
+                    timestamp_s=seen.timestamp_s,
+                    latency_s=seen.latency_s,
+                    bodies=tuple(found),
+                )
+            )
 
 
 async def discover(interface: str, command_port: int, within_s: float = 1.0) -> dict[str, ServerInfo]:

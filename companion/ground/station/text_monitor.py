@@ -146,13 +146,13 @@ class _Screen:
     def _station_status(self, station: Station) -> StationStatus:
         names = sorted(station.tracker.vehicles)
         return StationStatus(
-            station.link.text,
-            station.link.connected,
-            station.commands.operator,
-            station.commands.view_only_reason,
-            tuple(names) if len(names) > 1 else (),
-            station.tracker.rejected,
-            tuple(self._notices),
+            broker=station.link.text,
+            connected=station.link.connected,
+            operator=station.commands.operator,
+            view_only_reason=station.commands.view_only_reason,
+            others=tuple(names) if len(names) > 1 else (),
+            rejected=station.tracker.rejected,
+            notices=tuple(self._notices),
         )
 
     async def _key_or_period(self) -> None:

@@ -193,7 +193,9 @@ class VehicleTracker:
                 return False
             proven = None
         if proven is None:
-            proven = ProvenState(stream.session, stream.wall_s, stream.t_s, stream.hold or 0, now_s)
+            proven = ProvenState(
+                session=stream.session, wall_s=stream.wall_s, t_s=stream.t_s, hold=stream.hold or 0, received_s=now_s
+            )
             self._vehicle(name, now_s).proven = proven
         elif stream.t_s <= proven.t_s:
             return False  # a replayed message: the vehicle sends none without a new tick

@@ -160,7 +160,15 @@ class StreamBuilder:
         i, o, sent = self._newest
         lost = max(dropped, i.recorder_dropped)
         ages = self._ages_of_the_last_second(i.t_s)
-        snapshot = Snapshot(i, o, ages, self._mocap_rate_hz(i.t_s), self._missed, lost, recorder_error)
+        snapshot = Snapshot(
+            inputs=i,
+            outputs=o,
+            ages=ages,
+            mocap_rate_hz=self._mocap_rate_hz(i.t_s),
+            missed=self._missed,
+            dropped=lost,
+            recorder_error=recorder_error,
+        )
         timing = self._worst.message(self._missed, lost)
         self._ages, self._worst = WorstAges(), WorstTimings()
         self._seq += 1

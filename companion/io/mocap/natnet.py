@@ -290,7 +290,9 @@ def _frame(data: bytes, sized: bool, body_id: int, clock_frequency_hz: int | Non
     if clock_frequency_hz and exposure and transmit >= exposure:
         latency_s = (transmit - exposure) / clock_frequency_hz
         exposure_s = exposure / clock_frequency_hz
-    return Frame(number, timestamp_s, latency_s, exposure_s, body, ids)
+    return Frame(
+        number=number, timestamp_s=timestamp_s, latency_s=latency_s, exposure_s=exposure_s, body=body, body_ids=ids
+    )
 
 
 def _rigid_body(data: bytes, offset: int) -> RigidBody | Malformed:
@@ -299,13 +301,19 @@ def _rigid_body(data: bytes, offset: int) -> RigidBody | Malformed:
     norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     pose_ok = math.isfinite(x + y + z + error_m) and abs(norm - 1.0) < _QUAT_NORM_TOLERANCE
     if pose_ok:
-        return RigidBody(number, (x, y, z), (qw / norm, qx / norm, qy / norm, qz / norm), error_m, valid)
+        return RigidBody(
+            id=number,
+            position_m=(x, y, z),
+            quat_wxyz=(qw / norm, qx / norm, qy / norm, qz / norm),
+            error_m=error_m,
+            tracking_valid=valid,
+        )
     if valid:
         return Malformed(
             f"rigid body {number}: tracked, but its pose is not finite or its quaternion's norm is {norm:g}"
         )
     # Motive fills an untracked body with whatever it likes, zeros included.
-    return RigidBody(number, (0.0, 0.0, 0.0), IDENTITY_QUAT, 0.0, False)
+    return RigidBody(id=number, position_m=(0.0, 0.0, 0.0), quat_wxyz=IDENTITY_QUAT, error_m=0.0, tracking_valid=False)
 
 
 def _section(data: bytes, offset: int, sized: bool) -> tuple[int, int]:

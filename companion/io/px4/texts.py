@@ -55,7 +55,9 @@ class Texts:
             lines = []
         else:
             lines = self._finish(now_s)
-            self._parts = _Parts(identity, int(fields["severity"]), text, chunk + 1, now_s)
+            self._parts = _Parts(
+                identity=identity, severity=int(fields["severity"]), text=text, next_chunk=chunk + 1, stamp_s=now_s
+            )
         if len(text) < CHUNK_CHARACTERS:
             lines += self._finish(now_s)
         return lines

@@ -210,7 +210,9 @@ def _frame_at(datagram: bytes, at: int) -> Frame | None:
     if left < head + length + tail:
         return None
     data = datagram[at : at + head + length + tail]
-    return Frame(data, message_id, system, component, data[head : head + length])
+    return Frame(
+        data=data, message_id=message_id, system=system, component=component, payload=data[head : head + length]
+    )
 
 
 def _checksum(data: bytes, extra: int) -> int:

@@ -42,7 +42,13 @@ class Setup:
     def of(cls, vehicle: Vehicle, natnet_version: str) -> Setup:
         """Return the set-up of a vehicle file and a server's reply."""
         device = vehicle.devices.mocap
-        return cls(vehicle.name, device.server, device.rigid_body_id, device.up_axis, natnet_version)
+        return cls(
+            vehicle=vehicle.name,
+            server=device.server,
+            rigid_body_id=device.rigid_body_id,
+            up_axis=device.up_axis,
+            natnet_version=natnet_version,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,7 +156,14 @@ class HandTest:
             assert self._stood is not None
             m = self._motions
             result = HandResult(self._stood, m[Step.LIFT], m[Step.FORWARD], m[Step.TURN])
-        return HandView(self._step, self._progress, self._seen, self._notice, self._ended, result)
+        return HandView(
+            step=self._step,
+            progress=self._progress,
+            seen=self._seen,
+            notice=self._notice,
+            ended=self._ended,
+            result=result,
+        )
 
     def _hear(self, sample: HandSample) -> None:
         assert self._heard_s is not None

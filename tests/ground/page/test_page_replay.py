@@ -198,7 +198,14 @@ def test_the_real_monitor_plays_the_log_of_a_flight(browser: Any, tmp_path: Path
     result = catch_flight()
     sent = tuple(sent_at(i.tick, i.t_s) for i in result.inputs)
     metadata = {"config": {"json": load_sitl(CATCH).flight.model_dump_json()}}
-    log = FlightLog(tmp_path, tuple(result.inputs), tuple(result.outputs), sent, metadata, True)
+    log = FlightLog(
+        path=tmp_path,
+        inputs=tuple(result.inputs),
+        outputs=tuple(result.outputs),
+        sent=sent,
+        metadata=metadata,
+        closed=True,
+    )
     path = record(log, tmp_path / "flight.mcap")
     url = f"http://127.0.0.1:{(port := free_port())}/"
     with sandbox_in(tmp_path / "sandbox") as sandbox, sandbox.start("monitor", path, "--port", port) as monitor:
