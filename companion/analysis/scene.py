@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -260,6 +261,7 @@ def _circle(centre: Array, u: Array, v: Array, radius_m: float) -> Array:
     return out
 
 
+@lru_cache(maxsize=1)
 def _rotation(attitude_wxyz: Quat) -> Array:
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return np.array([quat_rotate(attitude_wxyz, axis) for axis in axes]).T
