@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Final
 
@@ -23,13 +24,7 @@ JOINT_KEYS: Final = {"1": 0, "2": 1}
 
 def keys_in(data: str) -> list[str]:
     """Split what a terminal sends into keys; an arrow is three characters."""
-    keys: list[str] = []
-    at = 0
-    while at < len(data):
-        size = 3 if data[at : at + 2] == "\x1b[" and len(data) >= at + 3 else 1
-        keys.append(data[at : at + size])
-        at += size
-    return keys
+    return re.findall(r"\x1b\[.|.", data, re.DOTALL)
 
 
 class ByKeys:

@@ -102,41 +102,34 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
         within_s: how long to wait.
     """
     found: dict[str, ServerInfo] = {}
-    loop = asyncio.get_running_loop()
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         try:
             opened.bind((interface, 0))
         except OSError:
             return found  # not an address of this computer; the driver has reported it
-
-        def drain() -> None:
-            with contextlib.suppress(OSError):
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
                 while True:
-                    datagram, address = opened.recvfrom(65535)
-                    if natnet.message_id(datagram) == Message.SERVER_INFO:
-                        info = natnet.parse_server_info(datagram)
-                        if isinstance(info, ServerInfo):
-                            found[address[0]] = info
-
-        loop.add_reader(opened.fileno(), drain)
-        try:
-            until_s = loop.time() + within_s
-            while loop.time() < until_s:
-                for target in _broadcast_addresses(interface):
-                    with contextlib.suppress(OSError):  # a segment that is down
-                        opened.sendto(natnet.encode_connect(), (target, command_port))
-                await asyncio.sleep(min(_ASK_PERIOD_S, max(0.0, until_s - loop.time())))
-            for address in found:  # a unicast server took the request for a client's
-                with contextlib.suppress(OSError):
-                    opened.sendto(natnet.encode_message(Message.DISCONNECT), (address, command_port))
-        finally:
-            loop.remove_reader(opened.fileno())
-    finally:
-        opened.close()
+                    for target in _broadcast_addresses(interface):
+                        with contextlib.suppress(OSError):  # a segment that is down
+                            opened.sendto(natnet.encode_connect(), (target, command_port))
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout(_ASK_PERIOD_S):
+                            await _collect(opened, found)
+        for address in found:  # a unicast server took the request for a client's
+            with contextlib.suppress(OSError):
+                opened.sendto(natnet.encode_message(Message.DISCONNECT), (address, command_port))
     return found
+
+
+async def _collect(opened: socket.socket, found: dict[str, ServerInfo]) -> None:
+    while True:
+        datagram, address = await asyncio.get_running_loop().sock_recvfrom(opened, 65535)
+        info = natnet.parse_server_info(datagram) if natnet.message_id(datagram) == Message.SERVER_INFO else None
+        if isinstance(info, ServerInfo):
+            found[address[0]] = info
 
 
 def path_to(server_ip: str, device: MocapDevice) -> Route:
