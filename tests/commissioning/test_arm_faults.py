@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,9 +29,14 @@ SET_UP = "return_delay_us: 0, operating_mode: 0"
 
 
 @pytest.fixture(autouse=True)
-def few_baud_rates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Full scans of this process try those baud rates only at which a test has servos: each rate takes a second."""
-    monkeypatch.setattr(arm_scan, "SEARCHED", (3_000_000, 1_000_000, 57_600))
+def searched(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Full scans of this process try the vehicle file's baud rate and those only that a test asks for: each takes a second."""
+
+    def search(*bauds: int) -> None:
+        monkeypatch.setattr(arm_scan, "SEARCHED", bauds)
+
+    search()
+    return search
 
 
 def test_servos_out_of_their_boxes_are_set_up_and_nothing_else_is_wrong(tmp_path: Path) -> None:
@@ -72,7 +78,8 @@ def test_a_wrong_id_is_found_and_the_servo_gives_way(tmp_path: Path) -> None:
         one.assert_check_passes_the_arm()
 
 
-def test_a_wrong_baud_rate_is_found_and_set_last(tmp_path: Path) -> None:
+def test_a_wrong_baud_rate_is_found_and_set_last(tmp_path: Path, searched: Callable[..., None]) -> None:
+    searched(1_000_000, 57_600)
     with bench(tmp_path, "[{baud: 57600, id: 4}, {baud: 1000000}]") as one:
         code, found = one.json("scan", process=True)
         assert code == EXIT_REFUSED
@@ -91,7 +98,10 @@ def test_a_wrong_baud_rate_is_found_and_set_last(tmp_path: Path) -> None:
         one.assert_check_passes_the_arm()
 
 
-def test_servos_that_agree_on_another_baud_rate_may_be_what_the_file_says(tmp_path: Path) -> None:
+def test_servos_that_agree_on_another_baud_rate_may_be_what_the_file_says(
+    tmp_path: Path, searched: Callable[..., None]
+) -> None:
+    searched(1_000_000)
     with bench(tmp_path, f"[{{baud: 1000000, {SET_UP}}}, {{baud: 1000000, {SET_UP}}}]") as one:
         code, found = one.json("scan", "--baud", "1000000")
         assert (code, bad_ids(found), keys(found)) == (EXIT_REFUSED, {"arm.scan.baud"}, {"devices.arm.baud": 1000000})
@@ -99,8 +109,9 @@ def test_servos_that_agree_on_another_baud_rate_may_be_what_the_file_says(tmp_pa
         one.assert_check_passes_the_arm()
 
 
-def test_two_servos_with_one_id_are_not_set_up_together(tmp_path: Path) -> None:
+def test_two_servos_with_one_id_are_not_set_up_together(tmp_path: Path, searched: Callable[..., None]) -> None:
     """As they come: both id 1 at 57600 baud. Nobody can write to one of them alone before one is unplugged."""
+    searched(57_600)
     with bench(tmp_path, "[{baud: 57600}, {baud: 57600, id: 1}]") as one:
         code, found = one.json("scan", "--baud", "57600")
         assert code == EXIT_REFUSED and found["garbled_at"] == [57600]
@@ -109,8 +120,9 @@ def test_two_servos_with_one_id_are_not_set_up_together(tmp_path: Path) -> None:
         assert (code, refused["outcome"], refused["servos"]) == (EXIT_REFUSED, "refused", [])
 
 
-def test_two_servos_with_one_id_are_set_up_one_at_a_time(tmp_path: Path) -> None:
+def test_two_servos_with_one_id_are_set_up_one_at_a_time(tmp_path: Path, searched: Callable[..., None]) -> None:
     """The elbow's servo after the shoulder's: it still has the shoulder's id."""
+    searched(57_600)
     with bench(tmp_path, "[{connected: false}, {baud: 57600, id: 1}]") as one:
         code, done = one.json("setup", "--yes", "--joint", "2")
         assert (code, done["outcome"]) == (EXIT_OK, "written")
