@@ -122,14 +122,14 @@ class _Rig:
     def feed(self, datagram: bytes, *, fresh: bool) -> None:
         edge = self.edge
         if fresh:
-            edge._info, edge._version = None, None
+            edge.client.info = edge.client.version = None
         self.t_s += 1.0
         self._send(datagram)
         self._wait()
         edge._drain(self.socket)
-        if fresh and edge._info is not None:
+        if fresh and edge.client.info is not None:
             try:
-                edge._check_server(edge._info)
+                edge._check_server(edge.client.info)
             except DeviceError as error:
                 one_line(str(error), "the refusal of a server")
         self._check_state()
@@ -147,18 +147,19 @@ class _Rig:
                 raise Wrong(f"a pose that is not finite: {pose}")
             if abs(math.hypot(*pose.attitude_wxyz) - 1.0) > 1e-9:
                 raise Wrong(f"an attitude that is not of unit norm: {pose}")
-        for number, name in edge._names.items():
+        for number, name in edge.client.names.items():
             one_line(edge._label(number), "the label of a rigid body")
             if len(name) > natnet.MAX_NAME_BYTES:
                 raise Wrong(f"a name of {len(name)} characters")
-        if health.last_malformed is not None:
-            one_line(health.last_malformed, "the reason for a malformed datagram")
+        if health.problem is not None:
+            one_line(health.problem, "the reason for a malformed datagram")
 
     def _check_that_it_goes_on(self) -> None:
         edge = self.edge
-        edge._info, edge._version, edge._names = self.info, self.version, {}
+        client = edge.client
+        client.info, client.version, client.names = self.info, self.version, {}
         self.t_s += 1.0  # as after the loss of some frames
-        number = ((edge._last_number or 0) + 1) & 0xFFFFFFFF
+        number = ((client._last_number or 0) + 1) & 0xFFFFFFFF
         x_m = float(number & 0xFFFF)
         body = BodyPose(_BODY_ID, (x_m, 0.0, 0.0), _UPRIGHT)
         self._send(encode_frame(self.version, number, 1.0, [body], 0.99, {_BODY_ID: "b"}))

@@ -74,7 +74,8 @@ class MocapCounts(Record, frozen=True, kw_only=True):
     malformed: int
     foreign: int
     """Datagrams from another address than the server's."""
-    last_malformed: str | None
+    problem: str | None
+    """Why the newest rejected datagram was rejected; None if none was."""
     callback_error: str | None
     """First exception that the receiver of the poses raised."""
 

@@ -46,7 +46,7 @@ from tests.support import DEADLINE_S, HOVER
 
 ZERO = (0.0, 0.0, 0.0)
 RECORDED = MocapCounts(
-    frames=0, superseded=0, out_of_order=0, malformed=0, foreign=0, last_malformed=None, callback_error=None
+    frames=0, superseded=0, out_of_order=0, malformed=0, foreign=0, problem=None, callback_error=None
 )
 
 

@@ -1,11 +1,12 @@
-"""The mocap edge against the SITL's NatNet server: real sockets, both transports, both versions, and everything that can be wrong."""
+"""The motion-capture driver against the SITL's NatNet server: real sockets, both transports, both versions, and every refusal.
+
+What the client makes of datagrams: test_natnet_client.py.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import math
-import random
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable
@@ -19,11 +20,9 @@ from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.natnet import Message, NatNetVersion
 from companion.io.protocols import DeviceError, Mocap
-from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.types import MocapPose, Quat, Vec3
+from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
-from companion.safety.stream_watch import StreamWatch
-from sitl.natnet import BodyPose, NatNetServer, encode_frame
+from sitl.natnet import BodyPose, NatNetServer
 
 pytestmark = pytest.mark.waits
 
@@ -131,32 +130,6 @@ def test_unicast_client_of_a_multicast_server() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.parametrize("ahead", [0, 50, 1_000_000], ids=["the same numbers", "a little ahead", "far ahead"])
-def test_a_second_stream_at_the_servers_address_does_not_displace_the_first_unseen(ahead: int) -> None:
-    """What is delivered steps back again and again: `mocap_two_streams` is raised by that."""
-
-    async def run() -> None:
-        inbox = Inbox()
-        async with NatNetServer() as server, streaming(server, POSE), mocap(device_for(server), inbox) as edge:
-            assert edge._command_socket is not None
-            ours = edge._command_socket.getsockname()
-            forged = BodyPose(1, (0.0, 0.5, 1.0), POSE.quat_wxyz)
-            watch = StreamWatch()
-            with closing(socket.socket(type=socket.SOCK_DGRAM)) as forger:
-                for _ in range(2000):
-                    pose = await inbox.next()
-                    if watch.update(pose.frame_number, pose.position_world_m, pose.stamp_s):
-                        break
-                    if pose.position_world_m == POSE.position_m:
-                        number = pose.frame_number + ahead
-                        frame = encode_frame(server.version, number, pose.stamp_s, (forged,), None, {})
-                        forger.sendto(frame, ours)
-                else:
-                    pytest.fail("two streams looked like one")
-
-    asyncio.run(run())
-
-
 def test_multicast_of_another_sender_is_dropped_by_the_kernel() -> None:
     async def run() -> None:
         inbox = Inbox()
@@ -221,23 +194,6 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.001)
 
 
-def handled(edge: NatNetMocap) -> int:
-    """Frames of every fate, so far."""
-    health = edge.counts()
-    return health.frames + health.superseded + health.out_of_order + health.malformed
-
-
-async def send_and_wait(server: NatNetServer, edge: NatNetMocap, *datagrams: bytes) -> None:
-    """Datagrams of the test's own making, from the server's address, one at a time."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.bind(("127.0.0.1", 0))
-        for datagram in datagrams:
-            before = handled(edge)
-            for client in server.unicast_clients:
-                sender.sendto(datagram, client)
-            await until(lambda before=before: handled(edge) > before)  # type: ignore[misc]
-
-
 def test_newest_of_the_waiting_frames_wins() -> None:
     async def run() -> None:
         inbox = Inbox()
@@ -264,68 +220,6 @@ def test_newest_of_the_waiting_frames_wins() -> None:
     asyncio.run(run())
 
 
-def test_untracked_frame_is_delivered_and_marked() -> None:
-    async def run() -> None:
-        inbox = Inbox()
-        async with quiet_after_opening(inbox) as (server, _):
-            inbox.clear()
-            server.publish(10.0, [BodyPose(1, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), valid=False)], 9.99)
-            assert not (await inbox.next()).tracking_valid
-
-    asyncio.run(run())
-
-
-def numbered(number: int) -> bytes:
-    return encode_frame("4.1", number, 1.0, [POSE], None, {})
-
-
-def test_old_and_repeated_frames_are_dropped() -> None:
-    async def run() -> None:
-        inbox = Inbox()
-        async with quiet_after_opening(inbox) as (server, edge):
-            inbox.clear()
-            await send_and_wait(server, edge, *map(numbered, (100_000, 100_000, 99_998, 100_002)))
-            assert [(await inbox.next()).frame_number for _ in range(2)] == [100_000, 100_002]
-            assert inbox.queue.empty()
-            assert edge.counts().out_of_order == 2
-
-    asyncio.run(run())
-
-
-def test_reordered_and_duplicated_datagrams_displace_no_frame() -> None:
-    """A minute at 240 Hz with 5 % of the frames up to three places late and 1 % twice: each late one is dropped, nothing else."""
-
-    async def run() -> None:
-        async with quiet_after_opening(Inbox()) as (_, edge):
-            draw = random.Random(3)
-            placed = [(k + (draw.randint(1, 3) + 0.5 if draw.random() < 0.05 else 0.0), k) for k in range(60 * 240)]
-            placed += [(k + draw.randint(0, 3) + 0.6, k) for k in range(60 * 240) if draw.random() < 0.01]
-            newest, in_order = -1, []
-            taken = []
-            for arrival, (_, k) in enumerate(sorted(placed)):
-                body = BodyPose(1, (k * 1e-3, 0.0, 1.0), POSE.quat_wxyz)
-                datagram = encode_frame("4.1", 100_000 + k, k / 240, [body], None, {})
-                if edge._take_frame(datagram, arrival / 240) is not None:
-                    taken.append(k)
-                if k > newest:
-                    newest = k
-                    in_order.append(k)
-            assert taken == in_order
-
-    asyncio.run(run())
-
-
-def test_restarted_server_is_believed_again() -> None:
-    async def run() -> None:
-        inbox = Inbox()
-        async with quiet_after_opening(inbox) as (server, edge):
-            inbox.clear()
-            await send_and_wait(server, edge, *map(numbered, (100_000, 1, 2)))
-            assert [(await inbox.next()).frame_number for _ in range(3)] == [100_000, 1, 2]
-
-    asyncio.run(run())
-
-
 def test_unicast_server_that_was_restarted_is_connected_again() -> None:
     async def run() -> None:
         inbox = Inbox()
@@ -336,26 +230,6 @@ def test_unicast_server_that_was_restarted_is_connected_again() -> None:
             moved = BodyPose(1, (9.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
             async with NatNetServer(command_port=port) as successor, streaming(successor, moved):
                 assert (await inbox.next()).position_world_m == (9.0, 0.0, 1.0)
-
-    asyncio.run(run())
-
-
-def test_malformed_datagrams_do_not_stop_reception() -> None:
-    async def run() -> None:
-        inbox = Inbox()
-        async with quiet_after_opening(inbox) as (server, edge):
-            inbox.clear()
-            whole = numbered(100_000)
-            frame, info = struct.pack("<HH", Message.FRAME, 4), struct.pack("<HH", Message.SERVER_INFO, 4)
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-                sender.bind(("127.0.0.1", 0))
-                for junk in (b"", b"\x07", bytes(2000), b"\xff" * 2000):  # no message of a server: not even counted
-                    sender.sendto(junk, server.unicast_clients[0])
-            await send_and_wait(server, edge, whole[:60], frame + b"\xff" * 4, info + b"\0" * 4)
-            assert inbox.queue.empty()
-            assert edge.counts().malformed == 3
-            await send_and_wait(server, edge, whole)
-            assert (await inbox.next()).frame_number == 100_000
 
     asyncio.run(run())
 
@@ -381,35 +255,6 @@ def test_callback_that_fails_does_not_stop_reception(caplog: pytest.LogCaptureFi
     with caplog.at_level(logging.ERROR):
         asyncio.run(run())
     assert len([record for record in caplog.records if "on_pose failed" in record.message]) == 1
-
-
-@pytest.mark.parametrize("yaw_deg", [0, 45, 90, 180, -90])
-def test_y_up_stream_at_compass_points(yaw_deg: int) -> None:
-    yaw_rad = math.radians(yaw_deg)
-    # Motive's own axes: y up, so z is to the right of x and a turn to the left is one about +y.
-    y_up = BodyPose(1, (2.0, 1.5, -0.75), (math.cos(yaw_rad / 2), 0.0, math.sin(yaw_rad / 2), 0.0))
-
-    async def run() -> None:
-        inbox = Inbox()
-        async with quiet_after_opening(inbox, up_axis="y") as (server, _):
-            inbox.clear()
-            server.publish(10.0, [y_up], None)
-            pose = await inbox.next()
-            assert pose.position_world_m == (2.0, 0.75, 1.5)
-            nose = quat_rotate(pose.attitude_wxyz, (1.0, 0.0, 0.0))
-            left = quat_rotate(pose.attitude_wxyz, (0.0, 1.0, 0.0))
-            assert nose == pytest.approx((math.cos(yaw_rad), math.sin(yaw_rad), 0.0), abs=1e-6)
-            assert left == pytest.approx((-math.sin(yaw_rad), math.cos(yaw_rad), 0.0), abs=1e-6)
-
-    asyncio.run(run())
-
-
-def test_y_up_turns_world_and_body_alike() -> None:
-    quat: Quat = quat_from_euler_zyx(0.3, -0.5, 1.1)
-    vector: Vec3 = (0.2, -0.7, 0.4)
-    turned_vector, turned_quat = natnet.z_up_from_y_up(vector, quat)
-    expected, _ = natnet.z_up_from_y_up(quat_rotate(quat, vector), quat)
-    assert quat_rotate(turned_quat, turned_vector) == pytest.approx(expected)
 
 
 # -- what can be wrong ---------------------------------------------------------------------------------------------------------

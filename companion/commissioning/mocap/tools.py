@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from companion.commissioning.mocap import align as mocap_align
 from companion.commissioning.mocap import judge as mocap_judge
 from companion.commissioning.mocap.judge import FrameSeen, Watched
-from companion.commissioning.mocap.watch import MocapWatch, discover, path_to
+from companion.commissioning.mocap.watch import discover, path_to, watcher
 from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
 from companion.config.base import Location
 from companion.config.document import Data
@@ -49,13 +49,13 @@ async def watch(session: Session) -> Watched | NotStreaming:
     arguments, device = session.arguments, session.vehicle.devices.mocap
     clock = flight_clock()
     frames: list[FrameSeen] = []
-    driver = MocapWatch(device, clock, frames.append)
+    driver = watcher(device, clock, frames.append)
     session.say(f"motion capture: {device.server}, {device.transport}; nothing moves by itself")
     try:
         async with driver:
             with contextlib.suppress(TimeoutError):  # without a description the bodies have no names
                 async with asyncio.timeout(_DESCRIPTION_TIMEOUT_S):
-                    while not driver.names:  # noqa: ASYNC110 - the driver signals nothing
+                    while not driver.client.names:  # noqa: ASYNC110 - the driver signals nothing
                         await asyncio.sleep(0.02)
             move = "; carry the vehicle about, some 30 cm and back" if arguments.move else ""
             session.say(f"watching for {arguments.seconds:g} s{move}")
@@ -67,7 +67,7 @@ async def watch(session: Session) -> Watched | NotStreaming:
             route = path_to(driver.server_ip, device)
             return Watched(
                 frames=tuple(frames),
-                names=driver.names,
+                names=driver.client.names,
                 info=info,
                 route=route,
                 duration_s=clock() - start_s,

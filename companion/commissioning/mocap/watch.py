@@ -16,16 +16,15 @@ from companion.commissioning.mocap.judge import FrameSeen, Route
 from companion.config.vehicle import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
-from companion.io.mocap.natnet import Frame, Malformed, Message, ServerInfo
-from companion.io.protocols import DeviceError
+from companion.io.mocap.natnet import Frame, Message, ServerInfo
 from companion.runtime.clock import Clock
 
 _SIOCGIFADDR, _SIOCGIFNETMASK = 0x8915, 0x891B
 _ASK_PERIOD_S: Final = 0.25
 
 
-class MocapWatch(NatNetMocap):
-    """The motion-capture driver, which reports every body instead of waiting for one.
+def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], None]) -> NatNetMocap:
+    """Return the motion-capture driver, not yet open, which reports every rigid body of every frame and waits for none.
 
     Args:
         device: addresses, transport, version.
@@ -33,64 +32,19 @@ class MocapWatch(NatNetMocap):
         on_frame: called with every frame in order of arrival, also with those that are read together.
     """
 
-    def __init__(
-        self,
-        device: MocapDevice,
-        clock: Clock,
-        on_frame: Callable[[FrameSeen], None],
-    ) -> None:
-        super().__init__(device, clock, lambda _: None)
-        self._on_frame = on_frame
-        self._any_frame = asyncio.Event()
+    def show(frame: Frame, datagram: bytes, arrived_s: float) -> None:
+        bodies = (driver.client.other_body(datagram, number) for number in frame.body_ids)
+        found = tuple(body for body in bodies if body is not None)
+        on_frame(FrameSeen(
+                arrived_s=arrived_s,
+                number=frame.number,
+                timestamp_s=frame.timestamp_s,
+                latency_s=frame.latency_s,
+                bodies=found,
+            ))
 
-    @property
-    def server_ip(self) -> str:
-        """Numeric address of the server; empty until it is resolved."""
-        return self._server_ip
-
-    @property
-    def names(self) -> dict[int, str]:
-        """Rigid bodies by streaming id, as the server describes them."""
-        return dict(self._names)
-
-    async def _wait_for_body(self) -> None:
-        """Wait for any frame; without one the driver's own error says what is wrong."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(self._body_timeout_s):
-                await self._any_frame.wait()
-            return
-        self._body_timeout_s, waited_s = 0.0, self._body_timeout_s
-        try:
-            await super()._wait_for_body()
-        except DeviceError as error:
-            raise DeviceError(str(error).replace("within 0 s", f"within {waited_s:g} s")) from None
-
-    def _take_frame(self, datagram: bytes, arrived_s: float) -> Frame | None:
-        before = self._last_number
-        frame = super()._take_frame(datagram, arrived_s)
-        if self._last_number != before and self._version is not None and self._info is not None:
-            self._any_frame.set()
-            self._show(datagram, arrived_s)
-        return frame
-
-    def _show(self, datagram: bytes, arrived_s: float) -> None:
-        assert self._version is not None and self._info is not None
-        frequency_hz, found = self._info.clock_frequency_hz, []
-        seen: Frame | Malformed | None = None
-        for number in self._seen_ids or (self._device.rigid_body_id,):
-            seen = natnet.parse_frame(datagram, self._version, number, frequency_hz)
-            if isinstance(seen, Frame) and seen.body is not None:
-                found.append(seen.body)
-        if isinstance(seen, Frame):
-            self._on_frame(
-                FrameSeen(
-                    arrived_s=arrived_s,
-                    number=seen.number,
-                    timestamp_s=seen.timestamp_s,
-                    latency_s=seen.latency_s,
-                    bodies=tuple(found),
-                )
-            )
+    driver = NatNetMocap(device, clock, lambda _: None, on_frame=show)
+    return driver
 
 
 async def discover(interface: str, command_port: int, within_s: float = 1.0) -> dict[str, ServerInfo]:

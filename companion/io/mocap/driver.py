@@ -12,25 +12,19 @@ from types import TracebackType
 from typing import Final, Self
 
 from companion.config.vehicle import MocapDevice
-from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
-from companion.io.mocap import natnet
-from companion.io.mocap.natnet import Frame, Malformed, Message, NatNetVersion, ServerInfo
-from companion.io.mocap.natnet_source import join_source
-from companion.io.mocap.pose import VERSIONS, mocap_pose
+from companion.io.arrival import arrived_s
+from companion.io.mocap import natnet, sockets
+from companion.io.mocap.client import CONNECT_PERIOD_S, VERSIONS, NatNetClient
+from companion.io.mocap.natnet import Frame, Message, ServerInfo
 from companion.io.protocols import DeviceError
 from companion.model.observations import MocapCounts, MocapServer
 from companion.model.types import MocapPose
 from companion.runtime.clock import Clock
-from companion.safety.stream_watch import StreamWatch
 
-_LOG = logging.getLogger(__name__)
+_LOG: Final = logging.getLogger(__name__)
 
-_CONNECT_PERIOD_S: Final = 0.25
-_KEEP_ALIVE_PERIOD_S: Final = 0.5
-_SILENCE_RECONNECT_S: Final = 1.0
-_MAX_DATAGRAMS_PER_WAKE: Final = 256
-"""A flood must not keep the control loop from running."""
-_MAX_DATAGRAM_BYTES: Final = 65535
+OnFrame = Callable[[Frame, bytes, float], None]
+"""Called with a frame, its datagram and its arrival on the flight clock, s."""
 
 
 class NatNetMocap:
@@ -42,9 +36,11 @@ class NatNetMocap:
     Args:
         device: addresses, transport, version, body id and up axis.
         clock: the flight clock.
-        on_pose: gets every pose; an exception is logged once and never stops the reception.
-        connect_timeout_s: until the server info has come.
-        body_timeout_s: from then until the body is tracked.
+        on_pose: called with every pose; an exception is logged once and never stops the reception.
+        connect_timeout_s: timeout of the server's answer.
+        body_timeout_s: timeout of the first frame in which the body is tracked.
+        on_frame: called with every frame, also with those that are not delivered. With it, opening waits for any frame and not for
+            the body.
     """
 
     def __init__(
@@ -55,64 +51,64 @@ class NatNetMocap:
         *,
         connect_timeout_s: float = 3.0,
         body_timeout_s: float = 3.0,
+        on_frame: OnFrame | None = None,
     ) -> None:
         self._device = device
         self._clock = clock
         self._on_pose = on_pose
+        self._on_frame = on_frame
         self._connect_timeout_s = connect_timeout_s
         self._body_timeout_s = body_timeout_s
-        self._server_ip = ""
+        self._client = NatNetClient(device.rigid_body_id, device.up_axis, device.transport)
+        self.server_ip = ""
+        """Numeric address of the server; empty until it is resolved."""
         self._command_socket: socket.socket | None = None
         self._data_socket: socket.socket | None = None
         self._keep_alive: asyncio.TimerHandle | None = None
-        self._info_changed = asyncio.Event()
-        self._body_tracked = asyncio.Event()
-        self._info: ServerInfo | None = None
-        self._version: NatNetVersion | None = None
-        self._version_told = False
+        self._answered = asyncio.Event()
+        self._receiving = asyncio.Event()
         self._latest: MocapPose | None = None
-        self._last_number: int | None = None
-        self._last_frame_s = 0.0
-        self._streams = StreamWatch()
-        self._seen_ids: tuple[int, ...] | None = None
-        self._names: dict[int, str] = {}
         self._frames = 0
         self._superseded = 0
-        self._out_of_order = 0
-        self._malformed = 0
         self._foreign = 0
         self._foreign_ip: str | None = None
-        self._last_malformed: str | None = None
+        self._logged: str | None = None
         self._callback_error: str | None = None
 
     def latest(self) -> MocapPose | None:
-        """Newest frame of the rigid body; never blocks."""
+        """Return the newest pose, or None before the first; never blocks."""
         return self._latest
 
     @property
     def server_info(self) -> ServerInfo | None:
         """Return the server's own description, or None before it has answered."""
-        return self._info
+        return self._client.info
 
     @property
     def server(self) -> MocapServer | None:
         """Return name and protocol of the server, or None before it has answered."""
-        return None if self._info is None else MocapServer(name=self._info.name, protocol_version=self._info.version)
+        info = self._client.info
+        return None if info is None else MocapServer(name=info.name, protocol_version=info.version)
+
+    @property
+    def client(self) -> NatNetClient:
+        """Return the protocol's state, for tools."""
+        return self._client
 
     @property
     def bodies(self) -> dict[int, str]:
-        """Rigid bodies of the newest frame by streaming id; the name is empty where the server did not tell it."""
-        return {number: self._names.get(number, "") for number in self._seen_ids or ()}
+        """Return the rigid bodies of the newest frame by streaming id; the name is empty if the server has not sent it."""
+        return {number: self._client.names.get(number, "") for number in self._client.body_ids or ()}
 
     def counts(self) -> MocapCounts:
         """Return the counts since the driver was opened."""
         return MocapCounts(
             frames=self._frames,
             superseded=self._superseded,
-            out_of_order=self._out_of_order,
-            malformed=self._malformed,
+            out_of_order=self._client.out_of_order,
+            malformed=self._client.malformed,
             foreign=self._foreign,
-            last_malformed=self._last_malformed,
+            problem=self._client.problem,
             callback_error=self._callback_error,
         )
 
@@ -125,10 +121,9 @@ class NatNetMocap:
         try:
             await self._resolve()
             self._open_sockets()
-            info = await self._connect()
-            self._version = self._check_server(info)
-            self._send(natnet.encode_request(Message.REQUEST_MODELDEF))
-            self._tick_keep_alive()
+            self._check_server(await self._connect())
+            self._send([natnet.encode_request(Message.REQUEST_MODELDEF)])
+            self._keep_connected()
             await self._wait_for_body()
         except BaseException:
             self._close()
@@ -138,7 +133,7 @@ class NatNetMocap:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Take leave of the server and close; never raises."""
+        """Disconnect from the server and close; never raises."""
         self._close()
 
     # -- opening ---------------------------------------------------------------------------------------------------------------
@@ -157,7 +152,7 @@ class NatNetMocap:
             raise DeviceError(
                 f"{self._where}: the name cannot be resolved; put the Motive machine's IPv4 address into devices.mocap.server"
             ) from None
-        self._server_ip = str(found[0][4][0])
+        self.server_ip = str(found[0][4][0])
 
     def _open_sockets(self) -> None:
         device = self._device
@@ -169,7 +164,7 @@ class NatNetMocap:
         data = self._bind(device.multicast_group, device.data_port, "multicast_group", shared=True)
         self._data_socket = data
         try:
-            join_source(data, device.multicast_group, device.interface, self._server_ip)
+            sockets.join_source(data, device.multicast_group, device.interface, self.server_ip)
         except OSError as error:
             raise DeviceError(
                 f"{self._where}: cannot join {device.multicast_group} on {device.interface} ({error}); "
@@ -178,22 +173,15 @@ class NatNetMocap:
         self._watch(data)
 
     def _bind(self, address: str, port: int, key: str, *, shared: bool) -> socket.socket:
-        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            opened.setblocking(False)
-            stamp_arrivals(opened)
-            if shared:
-                opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            opened.bind((address, port))
+            return sockets.open_udp(address, port, shared=shared)
         except OSError as error:
-            opened.close()
             if error.errno == errno.EADDRINUSE:
                 problem = "another program holds the port; close it or change devices.mocap.data_port"
             else:
                 kind = "the group that Motive streams to" if key == "multicast_group" else "an address of this machine"
                 problem = f"{error.strerror}; set devices.mocap.{key} to {kind}"
             raise DeviceError(f"{self._where}: cannot open UDP {address}:{port}: {problem}") from None
-        return opened
 
     def _watch(self, opened: socket.socket) -> None:
         asyncio.get_running_loop().add_reader(opened.fileno(), self._drain, opened)
@@ -201,7 +189,7 @@ class NatNetMocap:
     async def _connect(self) -> ServerInfo:
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + self._connect_timeout_s
-        while self._info is None:
+        while (info := self._client.info) is None:
             remaining_s = deadline_s - loop.time()
             if remaining_s <= 0.0:
                 raise DeviceError(
@@ -209,7 +197,7 @@ class NatNetMocap:
                     f"with streaming on, and reachable from {self._device.interface}?{self._foreign_hint()}"
                 )
             try:
-                self._send(natnet.encode_connect())
+                self._send(self._client.requests(self._clock()))
             except OSError as error:
                 raise DeviceError(
                     f"{self._where}: cannot send from {self._device.interface} ({error.strerror}); check the network and "
@@ -217,11 +205,11 @@ class NatNetMocap:
                 ) from None
             # A lost datagram is normal on UDP: the request is repeated until the deadline.
             with suppress(TimeoutError):
-                async with asyncio.timeout(min(_CONNECT_PERIOD_S, remaining_s)):
-                    await self._info_changed.wait()
-        return self._info
+                async with asyncio.timeout(min(CONNECT_PERIOD_S, remaining_s)):
+                    await self._answered.wait()
+        return info
 
-    def _check_server(self, info: ServerInfo) -> NatNetVersion:
+    def _check_server(self, info: ServerInfo) -> None:
         device = self._device
         version = VERSIONS.get(info.version)
         wanted = device.natnet_version
@@ -242,144 +230,99 @@ class NatNetMocap:
                     f"{self._where}: the server streams to {info.multicast_group}:{info.data_port}, expected "
                     f"{device.multicast_group}:{device.data_port}; change Motive's streaming pane or devices.mocap"
                 )
-        return version
 
     async def _wait_for_body(self) -> None:
         device = self._device
         try:
             async with asyncio.timeout(self._body_timeout_s):
-                await self._body_tracked.wait()
+                await self._receiving.wait()
             return
         except TimeoutError:
             pass
         within = f"within {self._body_timeout_s:g} s"
-        if self._seen_ids is None:
+        ids = self._client.body_ids
+        if ids is None:
             how = (
                 f"multicast {device.multicast_group}:{device.data_port} on {device.interface}"
                 if device.transport == "multicast"
                 else "unicast"
             )
-            bad = f"; {self._malformed} malformed, the last: {self._last_malformed}" if self._malformed else ""
+            malformed, last = self._client.malformed, self._client.problem
+            bad = f"; {malformed} malformed, the last: {last}" if malformed else ""
             raise DeviceError(
                 f"{self._where}: the server answers but no frame of data came {within} ({how}); check that Motive streams and "
                 f"is not paused, its local interface and the firewall{bad}{self._foreign_hint()}"
             )
-        if device.rigid_body_id in self._seen_ids:
+        if device.rigid_body_id in ids:
             raise DeviceError(
                 f"{self._where}: rigid body {self._label(device.rigid_body_id)} is streamed but was not tracked {within}; "
                 "check that its markers are in view"
             )
-        seen = ", ".join(self._label(number) for number in self._seen_ids) or "none"
+        seen = ", ".join(self._label(number) for number in ids) or "none"
         raise DeviceError(
             f"{self._where}: rigid body id {device.rigid_body_id} was never seen {within}; the server streams: {seen}; "
             "set devices.mocap.rigid_body_id to the body's streaming id"
         )
 
     def _label(self, number: int) -> str:
-        return f'{number} "{self._names[number]}"' if number in self._names else str(number)
+        name = self._client.names.get(number)
+        return str(number) if name is None else f'{number} "{name}"'
 
     def _foreign_hint(self) -> str:
         if self._foreign_ip is None:
             return ""
-        return f" (datagrams came from {self._foreign_ip}, not from {self._server_ip})"
+        return f" (datagrams came from {self._foreign_ip}, not from {self.server_ip})"
 
     # -- running ---------------------------------------------------------------------------------------------------------------
 
-    def _send(self, datagram: bytes) -> None:
-        if self._command_socket is not None:
-            self._command_socket.sendto(datagram, (self._server_ip, self._device.command_port))
+    def _send(self, datagrams: list[bytes]) -> None:
+        for datagram in datagrams:
+            if self._command_socket is not None:
+                self._command_socket.sendto(datagram, (self.server_ip, self._device.command_port))
 
-    def _tick_keep_alive(self) -> None:
-        """Unicast servers forget a client that is silent; one that was restarted knows it only after a new connect request."""
-        silent = self._last_number is not None and self._clock() - self._last_frame_s > _SILENCE_RECONNECT_S
-        with suppress(OSError):  # the network is down for now: stale poses tell, and the next one may get through
-            if silent:
-                self._send(natnet.encode_connect())
-            if self._device.transport == "unicast":
-                self._send(natnet.encode_request(Message.KEEP_ALIVE))
-        self._keep_alive = asyncio.get_running_loop().call_later(_KEEP_ALIVE_PERIOD_S, self._tick_keep_alive)
+    def _keep_connected(self) -> None:
+        client = self._client
+        with suppress(
+            OSError
+        ):  # the network is down for now: poses become stale, and the next datagram may get through
+            self._send(client.requests(self._clock()))
+        if client.problem != self._logged:
+            self._logged = client.problem
+            _LOG.warning("%s: a datagram was rejected: %s", self._where, client.problem)
+        self._keep_alive = asyncio.get_running_loop().call_later(client.request_period_s, self._keep_connected)
 
     def _drain(self, readable: socket.socket) -> None:
         """Read all that waits in the socket; deliver the newest frame only."""
         newest: Frame | None = None
         newest_s = 0.0
-        for _ in range(_MAX_DATAGRAMS_PER_WAKE):
-            try:
-                datagram, notes, _, address = readable.recvmsg(_MAX_DATAGRAM_BYTES, STAMP_ROOM_BYTES)
-            except (BlockingIOError, InterruptedError):
-                break
-            except OSError:  # an ICMP error of an earlier send
-                continue
-            if address[0] != self._server_ip:
+        for datagram, ancillary, sender_ip in sockets.waiting(readable):
+            if sender_ip != self.server_ip:
                 self._foreign += 1
-                self._foreign_ip = address[0]
+                self._foreign_ip = sender_ip
                 continue
-            message = natnet.message_id(datagram)
-            if message == Message.FRAME:
-                stamp_s = arrived_s(notes, self._clock)
-                frame = self._take_frame(datagram, stamp_s)
-                if frame is not None:
-                    self._superseded += newest is not None
-                    newest, newest_s = frame, stamp_s
-            elif message == Message.SERVER_INFO:
-                self._take_server_info(datagram)
-            elif message == Message.MODELDEF and self._version is not None:
-                definitions = natnet.parse_model_definitions(datagram, self._version)
-                if isinstance(definitions, Malformed):
-                    self._count_malformed(definitions)
-                else:
-                    self._names = {definition.id: definition.name for definition in definitions}
+            stamp_s = arrived_s(ancillary, self._clock)
+            frame = self._client.receive(datagram, stamp_s)
+            if frame is None:
+                continue
+            if self._on_frame is not None:
+                self._receiving.set()
+                self._on_frame(frame, datagram, stamp_s)
+            if frame.body is not None:
+                self._superseded += newest is not None
+                newest, newest_s = frame, stamp_s
+        if self._client.info is not None:
+            self._answered.set()
         if newest is not None:
             self._deliver(newest, newest_s)
 
-    def _take_server_info(self, datagram: bytes) -> None:
-        info = natnet.parse_server_info(datagram)
-        if isinstance(info, Malformed):
-            self._count_malformed(info)
-            return
-        if self._version is not None and info.version != self._version:
-            if not self._version_told:
-                self._version_told = True
-                _LOG.error(
-                    "%s: the server was restarted with NatNet %s instead of %s",
-                    self._where,
-                    info.version,
-                    self._version,
-                )
-            return
-        self._version_told = False
-        self._info = info
-        self._info_changed.set()
-
-    def _take_frame(self, datagram: bytes, arrived_s: float) -> Frame | None:
-        if self._version is None or self._info is None:
-            return None
-        frame = natnet.parse_frame(datagram, self._version, self._device.rigid_body_id, self._info.clock_frequency_hz)
-        if isinstance(frame, Malformed):
-            self._count_malformed(frame)
-            return None
-        # While two streams are mixed every frame is delivered, in whatever order: the monitor must see it.
-        two = self._streams.update(frame.number, frame.body, arrived_s)
-        if not two and not natnet.is_newer(frame.number, self._last_number, arrived_s - self._last_frame_s):
-            self._out_of_order += 1
-            return None
-        self._last_number = frame.number
-        self._last_frame_s = arrived_s
-        self._seen_ids = frame.body_ids
-        return frame if frame.body is not None else None
-
-    def _count_malformed(self, bad: Malformed) -> None:
-        self._malformed += 1
-        self._last_malformed = bad.reason
-
-    def _deliver(self, frame: Frame, arrived_s: float) -> None:
-        pose = mocap_pose(frame, arrived_s, self._device.up_axis)
+    def _deliver(self, frame: Frame, stamp_s: float) -> None:
+        pose = self._client.pose(frame, stamp_s)
         if pose is None:
             return
         self._latest = pose
         self._frames += 1
         if pose.tracking_valid:
-            self._body_tracked.set()
+            self._receiving.set()
         try:
             self._on_pose(pose)
         except Exception as error:
@@ -391,9 +334,8 @@ class NatNetMocap:
         if self._keep_alive is not None:
             self._keep_alive.cancel()
             self._keep_alive = None
-        if self._device.transport == "unicast":
-            with suppress(OSError):
-                self._send(natnet.encode_message(Message.DISCONNECT))
+        with suppress(OSError):
+            self._send(self._client.farewell())
         for opened in (self._command_socket, self._data_socket):
             if opened is not None:
                 asyncio.get_running_loop().remove_reader(opened.fileno())

@@ -1,0 +1,161 @@
+"""A NatNet client without I/O: datagrams and their arrival times in, frames, poses and requests out.
+
+The flight (`companion.io.mocap.driver`), the guardian (`companion.guardian.mocap`) and the commissioning tools put sockets around it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from companion.io.mocap import natnet
+from companion.io.mocap.natnet import Frame, Malformed, Message, NatNetVersion, RigidBody, ServerInfo
+from companion.model.types import MocapPose
+from companion.safety.stream_watch import StreamWatch
+
+VERSIONS: Final[dict[str, NatNetVersion]] = {"3.0": "3.0", "4.1": "4.1"}
+"""Supported NatNet versions, as in `ServerInfo.version`."""
+CONNECT_PERIOD_S: Final = 0.25
+KEEP_ALIVE_PERIOD_S: Final = 0.5
+RECONNECT_SILENCE_S: Final = 1.0
+"""A server that was restarted knows its clients only after a new connect request."""
+
+
+class NatNetClient:
+    """Receives one rigid body from one server. The version of the server's first answer stays in use.
+
+    Args:
+        body_id: streaming id of the rigid body.
+        up_axis: "y" or "z": Motive's streaming setting.
+        transport: "unicast" or "multicast"; a unicast server forgets a client that sends no keep-alives.
+        application: name of this client in connect requests.
+    """
+
+    def __init__(self, body_id: int, up_axis: str, transport: str, application: str = "companion") -> None:
+        self._body_id = body_id
+        self._up_axis = up_axis
+        self._unicast = transport == "unicast"
+        self._application = application
+        self._streams = StreamWatch()
+        self._last_number: int | None = None
+        self._last_frame_s = 0.0
+        self._heard_s = -math.inf
+        """Arrival of the newest frame or server info."""
+        self.info: ServerInfo | None = None
+        """The server's description; None before it has answered."""
+        self.version: NatNetVersion | None = None
+        """NatNet version of the frames; None before the server has answered, or if its version is not supported."""
+        self.body_ids: tuple[int, ...] | None = None
+        """Rigid bodies of the newest frame by streaming id; None before the first frame."""
+        self.names: dict[int, str] = {}
+        """Names of the rigid bodies by streaming id, once the server has sent them."""
+        self.two_streams = False
+        """The newest frame belongs to one of two mixed streams: two servers send from the same address."""
+        self.out_of_order = 0
+        self.malformed = 0
+        self.problem: str | None = None
+        """Why the newest datagram that was not accepted was rejected."""
+
+    def requests(self, now_s: float) -> list[bytes]:
+        """Return the datagrams to send to the server now; call it again after `request_period_s`."""
+        if self.version is None:
+            return [natnet.encode_connect(self._application)]
+        requests = []
+        if now_s - self._heard_s > RECONNECT_SILENCE_S:
+            requests.append(natnet.encode_connect(self._application))
+        if self._unicast:
+            requests.append(natnet.encode_request(Message.KEEP_ALIVE))
+        return requests
+
+    @property
+    def request_period_s(self) -> float:
+        """Time between two calls of `requests`, s."""
+        return CONNECT_PERIOD_S if self.version is None else KEEP_ALIVE_PERIOD_S
+
+    def farewell(self) -> list[bytes]:
+        """Return the datagrams to send before the sockets are closed."""
+        return [natnet.encode_message(Message.DISCONNECT)] if self._unicast else []
+
+    def receive(self, datagram: bytes, arrived_s: float) -> Frame | None:
+        """Process a datagram of the server.
+
+        Returns:
+            The frame that it holds, or None if it holds none, or one that is malformed, repeated or late. While two streams are mixed
+            every frame is returned, in any order.
+        """
+        message = natnet.message_id(datagram)
+        if message == Message.FRAME:
+            return self._receive_frame(datagram, arrived_s)
+        if message == Message.SERVER_INFO:
+            self._receive_info(datagram, arrived_s)
+        elif message == Message.MODELDEF and self.version is not None:
+            definitions = natnet.parse_model_definitions(datagram, self.version)
+            if isinstance(definitions, Malformed):
+                self._reject(definitions)
+            else:
+                self.names = {definition.id: definition.name for definition in definitions}
+        return None
+
+    def other_body(self, datagram: bytes, body_id: int) -> RigidBody | None:
+        """Return another rigid body of a frame that `receive` has returned, or None if its pose is malformed."""
+        assert self.version is not None and self.info is not None
+        frame = natnet.parse_frame(datagram, self.version, body_id, self.info.clock_frequency_hz)
+        return frame.body if isinstance(frame, Frame) else None
+
+    def pose(self, frame: Frame, stamp_s: float) -> MocapPose | None:
+        """Return the rigid body's pose in the world frame, or None if the frame does not hold it.
+
+        Args:
+            frame: as returned by `receive`.
+            stamp_s: arrival of its datagram on the flight clock, s.
+        """
+        body = frame.body
+        if body is None:
+            return None
+        position_m, quat_wxyz = body.position_m, body.quat_wxyz
+        if self._up_axis == "y":
+            position_m, quat_wxyz = natnet.z_up_from_y_up(position_m, quat_wxyz)
+        return MocapPose(
+            stamp_s=stamp_s,
+            latency_s=frame.latency_s,
+            frame_number=frame.number,
+            position_world_m=position_m,
+            attitude_wxyz=quat_wxyz,
+            tracking_valid=body.tracking_valid,
+            marker_error_m=body.error_m,
+            exposure_server_s=frame.exposure_s,
+        )
+
+    def _receive_info(self, datagram: bytes, arrived_s: float) -> None:
+        info = natnet.parse_server_info(datagram)
+        if isinstance(info, Malformed):
+            self._reject(info)
+            return
+        if self.version is not None and info.version != self.version:
+            self.problem = f"the server was restarted with NatNet {info.version} instead of {self.version}"
+            return
+        self.info, self.version, self._heard_s = info, VERSIONS.get(info.version), arrived_s
+        if self.version is None:
+            self.problem = f"the server speaks NatNet {info.version}, expected {' or '.join(VERSIONS)}"
+
+    def _receive_frame(self, datagram: bytes, arrived_s: float) -> Frame | None:
+        if self.version is None or self.info is None:
+            return None
+        frame = natnet.parse_frame(datagram, self.version, self._body_id, self.info.clock_frequency_hz)
+        if isinstance(frame, Malformed):
+            self._reject(frame)
+            return None
+        self.two_streams = self._streams.update(frame.number, frame.body, arrived_s)
+        if self.two_streams:
+            self.problem = "two servers at one address: frame numbers arrive in two sequences"
+        elif not natnet.is_newer(frame.number, self._last_number, arrived_s - self._last_frame_s):
+            self.out_of_order += 1
+            return None
+        self._last_number = frame.number
+        self._last_frame_s = self._heard_s = arrived_s
+        self.body_ids = frame.body_ids
+        return frame
+
+    def _reject(self, bad: Malformed) -> None:
+        self.malformed += 1
+        self.problem = bad.reason

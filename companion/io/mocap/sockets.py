@@ -1,0 +1,84 @@
+"""UDP sockets of a NatNet client: opened for one server, read without blocking."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from companion.io.arrival import STAMP_ROOM_BYTES, stamp_arrivals
+
+_IP_ADD_SOURCE_MEMBERSHIP: Final = 39
+"""linux/in.h; `socket` defines the name since Python 3.12."""
+_MAX_DATAGRAMS: Final = 256
+"""Per call of `waiting`: a flood must not block the caller."""
+_MAX_BYTES: Final = 65535
+
+
+class Datagram(NamedTuple):
+    """A datagram from the network."""
+
+    data: bytes
+    ancillary: list[tuple[int, int, bytes]]
+    """For `companion.io.arrival.arrived_s`."""
+    sender_ip: str
+
+
+def open_udp(address: str, port: int = 0, *, shared: bool = False) -> socket.socket:
+    """Open a non-blocking UDP socket whose datagrams the kernel stamps on arrival.
+
+    Args:
+        address: IPv4 address to bind to: of an interface, or of a multicast group, which keeps out everything else.
+        port: 0 for any free port.
+        shared: other processes may bind to the same address and port.
+
+    Raises:
+        OSError: the address is not of this computer, or the port is in use.
+    """
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        opened.setblocking(False)
+        stamp_arrivals(opened)
+        if shared:
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        opened.bind((address, port))
+    except OSError:
+        opened.close()
+        raise
+    return opened
+
+
+def join_source(opened: socket.socket, group: str, interface: str, source: str) -> None:
+    """Join a multicast group for datagrams of one sender: the kernel (and a switch with IGMPv3) drops those of other senders.
+
+    Args:
+        opened: UDP socket, bound to the group.
+        group: multicast address, IPv4.
+        interface: this computer's address on the camera network.
+        source: address of the Motive machine.
+
+    Raises:
+        OSError: no such interface, or not a multicast address.
+    """
+    request = socket.inet_aton(group) + socket.inet_aton(interface) + socket.inet_aton(source)  # struct ip_mreq_source
+    opened.setsockopt(socket.IPPROTO_IP, _IP_ADD_SOURCE_MEMBERSHIP, request)
+
+
+def waiting(opened: socket.socket) -> Iterator[Datagram]:
+    """Read the waiting datagrams, at most 256."""
+    for _ in range(_MAX_DATAGRAMS):
+        try:
+            data, ancillary, _, address = opened.recvmsg(_MAX_BYTES, STAMP_ROOM_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:  # an ICMP error of an earlier send
+            continue
+        yield Datagram(data, ancillary, str(address[0]))
+
+
+def send(opened: socket.socket, datagrams: list[bytes], server: tuple[str, int]) -> None:
+    """Send datagrams; while the network is down they are dropped, and the next ones may get through."""
+    with contextlib.suppress(OSError):
+        for datagram in datagrams:
+            opened.sendto(datagram, server)
