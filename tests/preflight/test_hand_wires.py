@@ -136,7 +136,7 @@ def test_a_whole_round_passes_and_is_kept(config: SitlConfig, tmp_path: Path) ->
     assert passed.startswith("passed on 20")
     assert not changed
     (kept,) = json.loads(path.read_text(encoding="utf-8"))["passed"]
-    assert kept["measured"]["hand.turn"].startswith("felt +4")
+    assert kept["measured"]["hand.turn"].startswith("IMU +4")
 
 
 def test_it_is_refused_when_px4_is_armed() -> None:
@@ -156,7 +156,7 @@ def test_it_is_refused_when_px4_is_armed() -> None:
 
     (row,) = asyncio.run(go())
     assert row.refuses
-    assert row.read.startswith("PX4 says that it is armed")
+    assert row.read.startswith("PX4 reports that it is armed")
 
 
 def test_without_motion_capture_or_px4_it_says_which() -> None:

@@ -35,13 +35,15 @@ def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], N
     def show(frame: Frame, datagram: bytes, arrived_s: float) -> None:
         bodies = (driver.client.other_body(datagram, number) for number in frame.body_ids)
         found = tuple(body for body in bodies if body is not None)
-        on_frame(FrameSeen(
+        on_frame(
+            FrameSeen(
                 arrived_s=arrived_s,
                 number=frame.number,
                 timestamp_s=frame.timestamp_s,
                 latency_s=frame.latency_s,
                 bodies=found,
-            ))
+            )
+        )
 
     driver = NatNetMocap(device, clock, lambda _: None, on_frame=show)
     return driver
