@@ -21,16 +21,16 @@ import tempfile
 import time
 from array import array
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
 from rich.console import Console
-from rich.table import Table
 
 from benchmarks.measuring.hovering import END_TIMEOUT_S, MISSION, NoFlight, await_hover, start_hover
+from benchmarks.report import number, print_table, write_json
 from benchmarks.soaking.lateness import tick_for_nothing
 from companion.analysis.log import FlightLog
 from companion.config.ground import topic_name
@@ -54,21 +54,8 @@ class Slot:
     end_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """All ticks of one condition; lateness in ms."""
-
-    condition: str
-    ticks: int
-    p50: float
-    p99: float
-    p999: float
-    max: float
-    missed: int
-    empty_p50: float
-    empty_p99: float
-    empty_max: float
-    empty_missed: int
+Row = dict[str, Any]
+"""All ticks of one condition; lateness in ms, of the flight and of the empty loop."""
 
 
 class Conditions:
@@ -193,25 +180,14 @@ def judge(slots: list[Slot], folder: Path) -> list[Row]:
     for condition in dict.fromkeys(slot.condition for slot in slots):
         own = [slot for slot in slots if slot.condition == condition]
         ticks, beside = (_within(ticks, own) for ticks in (flown, empty))
-        p50, p99, p999 = np.percentile(ticks, [50.0, 99.0, 99.9])
-        e50, e99 = np.percentile(beside, [50.0, 99.0])
-        period_ms = 1e3 * NOMINAL_DT_S
-        rows.append(
-            Row(
-                condition=condition,
-                ticks=len(ticks),
-                p50=float(p50),
-                p99=float(p99),
-                p999=float(p999),
-                max=float(ticks.max()),
-                missed=int((ticks > period_ms).sum()),
-                empty_p50=float(e50),
-                empty_p99=float(e99),
-                empty_max=float(beside.max()),
-                empty_missed=int((beside > period_ms).sum()),
-            )
-        )
-    return sorted(rows, key=lambda row: row.condition != NO_BROKER)
+        rows.append({"condition": condition, "ticks": len(ticks), **_lateness(ticks), "empty": _lateness(beside)})
+    return sorted(rows, key=lambda row: bool(row["condition"] != NO_BROKER))
+
+
+def _lateness(ticks_ms: Any) -> dict[str, Any]:
+    p50, p99, p999 = map(float, np.percentile(ticks_ms, [50.0, 99.0, 99.9]))
+    missed = int((ticks_ms > 1e3 * NOMINAL_DT_S).sum())
+    return {"p50": p50, "p99": p99, "p999": p999, "max": float(ticks_ms.max()), "missed": missed}
 
 
 def _within(ticks: Any, slots: list[Slot]) -> Any:
@@ -239,11 +215,10 @@ def problems_of(rows: list[Row], code: int, summary: dict[str, Any]) -> list[str
     found = [] if code == 4 else [f"the flight ended with exit code {code}, 4 (landed on demand) was expected"]
     if summary["recorder"]["dropped"]:
         found.append(f"recorder: {summary['recorder']['dropped']} dropped")
-    by_name = {row.condition: row for row in rows}
-    none = by_name[NO_BROKER]
+    none_ms = rows[0]["p99"]
     for row in rows:
-        if row.p99 > P99_RATIO_MAX * none.p99 and row.p99 > none.p99 + P99_MORE_MAX_MS:
-            found.append(f"{row.condition}: p99 {row.p99:.2f} ms, without a broker {none.p99:.2f} ms")
+        if row["p99"] > P99_RATIO_MAX * none_ms and row["p99"] > none_ms + P99_MORE_MAX_MS:
+            found.append(f"{row['condition']}: p99 {row['p99']:.2f} ms, without a broker {none_ms:.2f} ms")
     return found
 
 
@@ -255,30 +230,18 @@ def said(summary: dict[str, Any]) -> list[str]:
     ]
 
 
-def show(rows: list[Row], console: Console) -> None:
-    none = rows[0]
-    table = Table(title="lateness of ticks, ms", title_justify="left")
-    for name in (
-        "condition",
-        "ticks",
-        "p50",
-        "p99",
-        "p99.9",
-        "max",
-        "missed",
-        "p99 / no broker",
-        "empty loop p50",
-        "p99",
-        "max",
-        "missed",
-    ):
-        table.add_column(name, justify="left" if name == "condition" else "right")
-    for row in rows:
-        table.add_row(
-            row.condition, str(row.ticks), f"{row.p50:.2f}", f"{row.p99:.2f}", f"{row.p999:.2f}", f"{row.max:.2f}", str(row.missed),
-            f"{row.p99 / none.p99:.2f}", f"{row.empty_p50:.2f}", f"{row.empty_p99:.2f}", f"{row.empty_max:.2f}", str(row.empty_missed),
-        )  # fmt: skip
-    console.print(table)
+def cells(row: Row, none_ms: float) -> dict[str, str]:
+    """Return the row of the table; `none_ms` is p99 without a broker."""
+    empty = row["empty"]
+    return {
+        "condition": row["condition"],
+        "ticks": str(row["ticks"]),
+        **{name: number(row[key]) for name, key in (("p50", "p50"), ("p99", "p99"), ("p99.9", "p999"), ("max", "max"))},
+        "missed": str(row["missed"]),
+        "p99 / no broker": number(row["p99"] / none_ms),
+        **{f"empty loop {key}": number(empty[key]) for key in ("p50", "p99", "max")},
+        "empty loop missed": str(empty["missed"]),
+    }
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -301,15 +264,13 @@ def main(argv: list[str] | None = None) -> int:
         slots, code = fly(arguments.rounds, arguments.slot, folder, console)
         rows = judge(slots, folder)
         summary = json.loads((folder / "flight/summary.json").read_text())
-    show(rows, console)
+    print_table("lateness of ticks, ms", [cells(row, rows[0]["p99"]) for row in rows], console)
     for text in said(summary):
         console.print(f"the flight said: {text}", highlight=False)
     problems = problems_of(rows, code, summary)
     for problem in problems:
         console.print(problem, style="red", highlight=False)
-    if arguments.json is not None:
-        found = {"rows": [asdict(row) for row in rows], "problems": problems}
-        arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    write_json(arguments.json, {"rows": rows, "problems": problems})
     return 1 if problems else 0
 
 

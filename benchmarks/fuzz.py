@@ -26,10 +26,10 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
 from benchmarks.fuzzing.campaign import Finding, Stretch, feed_watched, generator, run
 from benchmarks.fuzzing.targets import NAMES, target_class
+from benchmarks.report import print_table
 
 REGRESSIONS = Path(__file__).parents[1] / "tests" / "regressions" / "fuzz"
 _STUCK_S = 180.0
@@ -147,22 +147,18 @@ def save(finding: Finding, folder: Path = REGRESSIONS) -> Path | None:
     return path
 
 
-def table(rows: Sequence[Row]) -> Table:
-    """The report."""
-    made = Table()
-    for column in ("target", "inputs", "duration s", "us/input", "slowest ms", "memory MiB 10 % -> end", "findings"):
-        made.add_column(column, justify="left" if column == "target" else "right")
-    for row in rows:
-        made.add_row(
-            row.target,
-            f"{row.inputs:,}",
-            f"{row.duration_s:.0f}",
-            f"{1e6 * row.duration_s / max(1, row.inputs):.0f}",
-            f"{1e3 * row.slowest_s:.0f}",
-            f"{row.memory_bytes[0] / 2**20:.1f} -> {row.memory_bytes[1] / 2**20:.1f}",
-            str(len(row.findings)),
-        )
-    return made
+def cells(row: Row) -> dict[str, str]:
+    """Return the row of the report."""
+    warm_mib, end_mib = (size / 2**20 for size in row.memory_bytes)
+    return {
+        "target": row.target,
+        "inputs": f"{row.inputs:,}",
+        "duration s": f"{row.duration_s:.0f}",
+        "us/input": f"{1e6 * row.duration_s / max(1, row.inputs):.0f}",
+        "slowest ms": f"{1e3 * row.slowest_s:.0f}",
+        "memory MiB 10 % -> end": f"{warm_mib:.1f} -> {end_mib:.1f}",
+        "findings": str(len(row.findings)),
+    }
 
 
 def again(name: str, seed: int, index: int) -> int:
@@ -210,7 +206,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return again(wanted[0], options.seed, options.index)
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
         rows = _fuzz_all(wanted, options, progress)
-    Console(width=None if sys.stdout.isatty() else 120).print(table(rows))
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    print_table("", list(map(cells, rows)), console)
     found = [finding for row in rows for finding in row.findings]
     for finding in found:
         path = save(finding)

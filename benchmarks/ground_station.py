@@ -1,6 +1,6 @@
 """What a MAVLink ground station costs the flight: setpoints and motion capture on their way to PX4, with and without one.
 
-    python benchmarks/ground_station.py [--seconds 4] [--rounds 5] [--json FILE]
+    python -m benchmarks.ground_station [--seconds 4] [--rounds 5] [--json FILE]
 
 Three processes beside the relay: the flight's side (asyncio at 200 Hz through `MavsdkAutopilot` and `GroundStation`), a room that sends
 pose datagrams and plays PX4 (600 telemetry messages a second), and the ground station. The first two claim real-time priority, as a
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import itertools
-import json
 import multiprocessing
 import os
 import socket
@@ -28,8 +27,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 from rich.console import Console
-from rich.table import Table
 
+from benchmarks.measuring.wires import free_udp_port
+from benchmarks.report import print_table, write_json
 from companion.config.vehicle import AutopilotDevice
 from companion.flight.ticker import Ticker
 from companion.io.px4.driver import MavsdkAutopilot
@@ -69,13 +69,6 @@ class Samples:
     """Messages of the ground station that reached PX4."""
     relay_cpu: float = 0.0
     """Share of a core."""
-
-
-def free_udp_port() -> int:
-    """One that was free a moment ago."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def room(parent: Connection, autopilot_port: int, mocap_port: int) -> None:
@@ -331,30 +324,25 @@ def main(arguments: list[str] | None = None) -> int:
         }
         for condition, rounds in measured.items()
     }
-    table = Table(
-        title=f"{RATE_HZ:g} Hz, {options.rounds} x {options.seconds:g} s each; floods of {FLOOD_HZ:g} a second"
-    )
-    heads = ("ground station", "setpoint period ms: p1, p50, p99, max", "mocap -> PX4 ms: p50, p99, max")
-    for title in (*heads, "tell us: p50, p99", "relay, % of a core", "reached PX4"):
-        table.add_column(title)
-    for condition, row in rows.items():
-        period, vision, tell = row["period_ms"], row["vision_ms"], row["tell_us"]
-        table.add_row(
-            condition,
-            _cell(period, ("p1", "p50", "p99", "max"), ".2f"),
-            _cell(vision, ("p50", "p99", "max"), ".2f"),
-            _cell(tell, ("p50", "p99"), ".0f"),
-            f"{row['relay_cpu_percent']:.1f}",
-            str(row["to_px4"]),
-        )
-    Console(width=150).print(table)
-    if options.json is not None:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    title = f"{RATE_HZ:g} Hz, {options.rounds} x {options.seconds:g} s each; floods of {FLOOD_HZ:g} a second"
+    print_table(title, [{"condition": condition, **cells(row)} for condition, row in rows.items()], Console(width=150))
+    write_json(options.json, rows)
     return 0
 
 
-def _cell(found: Any, names: tuple[str, ...], form: str) -> str:
-    return "" if found is None else "  ".join(format(found[name], form) for name in names)
+def cells(row: dict[str, Any]) -> dict[str, str]:
+    """Return the row of the table."""
+
+    def spread(key: str, names: tuple[str, ...], form: str) -> str:
+        return "" if row[key] is None else "  ".join(format(row[key][name], form) for name in names)
+
+    return {
+        "setpoint period ms: p1, p50, p99, max": spread("period_ms", ("p1", "p50", "p99", "max"), ".2f"),
+        "mocap -> PX4 ms: p50, p99, max": spread("vision_ms", ("p50", "p99", "max"), ".2f"),
+        "tell us: p50, p99": spread("tell_us", ("p50", "p99"), ".0f"),
+        "relay, % of a core": f"{row['relay_cpu_percent']:.1f}",
+        "reached PX4": str(row["to_px4"]),
+    }
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Random missions: the mission check accepts or refuses them, and what it accepts is flown in the fast closed loop.
 
-    python benchmarks/missions.py --count 2000 --jobs 2 --json missions.json
+    python -m benchmarks.missions --count 2000 --jobs 2 --json missions.json
 
 Claims, and exit code 1 if one of them fails:
 

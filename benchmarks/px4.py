@@ -1,7 +1,7 @@
 """The same flights on the stub and on a real PX4 (SITL), side by side: what differs, in figures.
 
-    PX4_SITL=.../build/px4_sitl_default python benchmarks/px4.py --keep flights/px4           # 36 flights, half an hour
-    python benchmarks/px4.py --keep flights/px4 --table                                       # only what lies there
+    PX4_SITL=.../build/px4_sitl_default python -m benchmarks.px4 --keep flights/px4           # 36 flights, half an hour
+    python -m benchmarks.px4 --keep flights/px4 --table                                       # only what lies there
 
 Flights that lie in the folder already are not flown again. Times after a fault are on the autopilot's own clock: of a real PX4 by its
 ULog (needs pyulog), of the stub by the world's. Exit code 0: every flight ended as it must, 1: not, or one could not be flown.

@@ -25,6 +25,7 @@ from typing import Any
 
 from rich.console import Console
 
+from benchmarks.report import write_json
 from benchmarks.soaking.lateness import Minute, Ticks, read_minutes, run_empty_loop, ticks_of_log
 from benchmarks.soaking.processes import family, lift, pss_mb, usage
 from benchmarks.soaking.verdict import (
@@ -261,8 +262,7 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         parser.exit(1, f"soak: {error.filename}: {error.strerror}; the flight left nothing to judge\n")
     show(result, folder, arguments.plot, console)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_json(arguments.json, result)
     return 1 if result["problems"] else 0
 
 

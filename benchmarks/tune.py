@@ -1,6 +1,6 @@
 """Tunes the gains of one law on the fast closed loop; every law by the same cost, the same flights and the same budget.
 
-    python benchmarks/tune.py csc --budget 150 --out mine.yaml
+    python -m benchmarks.tune csc --budget 150 --out mine.yaml
 
 Cost, mean over payloads x seeds, each term RMS from the catch to the landing:
 

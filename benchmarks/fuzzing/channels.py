@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import socket
 from random import Random
-from types import TracebackType
 from typing import ClassVar, Self
 
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
@@ -50,9 +49,7 @@ class ChannelsTarget(Target):
         self._client = RecorderClient(ours)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._client.close()
         self._theirs.close()
 

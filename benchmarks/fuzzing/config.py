@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from pathlib import Path
 from random import Random
-from types import TracebackType
 from typing import ClassVar, Self
 
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
@@ -59,9 +58,7 @@ class YamlTarget(Target):
         )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         shutil.rmtree(self._folder)
 
     def make(self, rng: Random) -> bytes:

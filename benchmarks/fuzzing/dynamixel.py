@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable
 from random import Random
-from types import TracebackType
 from typing import ClassVar, Self
 
 from benchmarks.fuzzing.campaign import Endless, Target, Wrong, one_line
@@ -121,9 +120,7 @@ class DynamixelTarget(Target):
             raise failure
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._line.answer, self._line.limit_s = (lambda sent: b""), math.inf
         self._bus.close()
 
@@ -258,9 +255,7 @@ class DynamixelWireTarget(Target):
         self._arm = DynamixelArm(ArmDevice(port=self._bus.path), arm_config(), time.monotonic)
         await self._arm.__aenter__()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._loop.run_until_complete(self._arm.__aexit__(None, None, None))
         self._loop.run_until_complete(self._bus.__aexit__(None, None, None))
         self._loop.close()

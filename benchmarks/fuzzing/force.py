@@ -7,7 +7,6 @@ import math
 import select
 import time
 from random import Random
-from types import TracebackType
 from typing import ClassVar, Self
 
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
@@ -66,9 +65,7 @@ class ForceTarget(Target):
         assert self._edge._serial is not None
         self._fd = self._edge._serial.fileno()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._loop.run_until_complete(self._edge.__aexit__(None, None, None))
         self._loop.run_until_complete(self._sensor.__aexit__(None, None, None))
         self._loop.close()

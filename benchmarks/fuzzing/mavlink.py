@@ -9,7 +9,6 @@ import struct
 import sys
 import time
 from random import Random
-from types import TracebackType
 from typing import Any, ClassVar, Self
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -55,9 +54,7 @@ class MavlinkTarget(Target):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """There is nothing to close."""
 
     def make(self, rng: Random) -> bytes:
@@ -134,9 +131,7 @@ class MavlinkWireTarget(Target):
         self._hook, sys.unraisablehook = sys.unraisablehook, self._on_unraisable
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         sys.unraisablehook = self._hook
         self._loop.run_until_complete(self._edge.__aexit__(None, None, None))
         self._loop.close()

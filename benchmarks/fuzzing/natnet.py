@@ -8,7 +8,6 @@ import select
 import socket
 import struct
 from random import Random
-from types import TracebackType
 from typing import ClassVar, Self
 
 from benchmarks.fuzzing.campaign import Target, Wrong, one_line
@@ -46,9 +45,7 @@ class NatNetTarget(Target):
             self._rigs[version] = self._loop.run_until_complete(_Rig.opened(version))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for rig in self._rigs.values():
             self._loop.run_until_complete(rig.close())
         self._loop.close()

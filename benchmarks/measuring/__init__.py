@@ -1,1 +1,1 @@
-"""Parts of `python -m benchmarks` and of `benchmarks/wire_latency.py`."""
+"""Parts of `python -m benchmarks`."""

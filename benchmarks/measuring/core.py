@@ -1,36 +1,122 @@
-"""One tick of the flight core, beside raw MuJoCo on the same computer."""
+"""Time per tick of the fast closed loop, the flight core and the law, beside raw MuJoCo on the same computer."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
+from statistics import median
 from typing import Any
 
-from benchmarks.fast_loop import core_us, flight_us, law_us, raw_step_us
+import mujoco
+
 from benchmarks.measuring.latency import Latency
-from companion.sitl_config.loader import load_sitl
-from sitl.fast.loop import TICK_S
-from sitl.world.world import PHYSICS_DT_S
+from companion.control.types import PlantState, Wrench
+from companion.core.flight_core import FlightCore
+from companion.model.types import Inputs, Outcome, Reference
+from companion.sitl_config.loader import SitlConfig, load_sitl
+from sitl.fast.loop import TICK_S, FastFlight, FastResult
+from sitl.world.world import PHYSICS_DT_S, World
 from tests.support import CATCH
 
 REPEATS = 5
+_RAW_STARTS, _RAW_STEPS = 100, 50
+
+LawCall = tuple[float, PlantState, Reference, float]
 
 
-def measure(say: Callable[[str], None], repeats: int = REPEATS) -> dict[str, Any]:
-    """Of the catch mission in the fast closed loop.
+def measure(say: Callable[[str], None], repeats: int = REPEATS, mission: Path = CATCH) -> dict[str, Any]:
+    """Fly a mission in the fast closed loop and time its parts; everything but `core_ms` is CPU time, median of the repeats.
 
     Raises:
-        BenchmarkError: the flight did not complete.
+        RuntimeError: the flight did not complete.
     """
     say("flights in the fast closed loop")
-    tick_us, flight, result = flight_us(load_sitl(CATCH), repeats)
+    tick_us, flight, result = flight_us(load_sitl(mission), repeats)
     say("core, law, raw MuJoCo")
-    law, _ = law_us(flight.config, result.inputs, repeats)
     raw_us = raw_step_us(flight.config, flight.plant.world, result, repeats)
     return {
-        "core_ms": asdict(Latency.of(1e-6 * taken_us for taken_us in core_us(flight.config, result.inputs))),
+        "core_ms": asdict(Latency.of(core_s(flight.config, result.inputs))),
         "tick_us": tick_us,
-        "law_us": law,
+        "law_us": law_us(flight.config, result.inputs, repeats),
         "raw_step_us": raw_us,
         "raw_tick_us": raw_us * TICK_S / PHYSICS_DT_S,
     }
+
+
+def flight_us(config: SitlConfig, repeats: int) -> tuple[float, FastFlight, FastResult]:
+    """Return the CPU time per tick of whole flights without their construction, and the last flight.
+
+    Raises:
+        RuntimeError: a flight did not complete.
+    """
+    FastFlight(config).run(limit_s=2.0)  # imports and caches
+    times_us: list[float] = []
+    for _ in range(repeats):
+        flight = FastFlight(config)
+        begun_s = time.process_time()
+        result = flight.run()
+        times_us.append((time.process_time() - begun_s) / len(result.inputs) * 1e6)
+    if result.outputs[-1].outcome is not Outcome.COMPLETED:
+        raise RuntimeError(f"the flight ended as {result.outputs[-1].outcome}, expected one that completes")
+    return median(times_us), flight, result
+
+
+def raw_step_us(config: SitlConfig, world: World, result: FastResult, repeats: int) -> float:
+    """Return the CPU time of `mj_step` on the flight's model, in batches from states all along the flight."""
+    model, data = world.model, mujoco.MjData(world.model)
+    snapshots = result.snapshots[:: max(1, len(result.snapshots) // _RAW_STARTS)]
+    hover_n = world.hover_command * config.vehicle.airframe.thrust_max_n / 4.0
+    times_us = []
+    for _ in range(repeats):
+        used_s = 0.0
+        for snapshot in snapshots:
+            data.qpos[:], data.qvel[:] = snapshot.q, snapshot.v
+            data.ctrl[0:4] = hover_n
+            begun_s = time.process_time()
+            mujoco.mj_step(model, data, _RAW_STEPS)
+            used_s += time.process_time() - begun_s
+        times_us.append(used_s / (len(snapshots) * _RAW_STEPS) * 1e6)
+    return median(times_us)
+
+
+def core_s(config: SitlConfig, inputs: list[Inputs]) -> list[float]:
+    """Return the wall time of every `FlightCore.step` of a recorded flight; one step is too short for the CPU clock."""
+    core = FlightCore(config)
+    times_s = []
+    for given in inputs:
+        begun_s = time.perf_counter()
+        core.step(given)
+        times_s.append(time.perf_counter() - begun_s)
+    return times_s
+
+
+class _RecordedLaw:
+    """A law that records its arguments."""
+
+    def __init__(self, law: Any, calls: list[LawCall]) -> None:
+        self._law = law
+        self._calls = calls
+
+    def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
+        self._calls.append((dt_s, state, reference, vertical_scale))
+        wrench: Wrench = self._law.step(dt_s, state, reference, vertical_scale)
+        return wrench
+
+
+def law_us(config: SitlConfig, inputs: list[Inputs], repeats: int) -> float:
+    """Return the CPU time per update of the law on the states of a recorded flight."""
+    calls: list[LawCall] = []
+    core = FlightCore(config)
+    core._pilot._controller = _RecordedLaw(core._pilot._controller, calls)
+    for given in inputs:
+        core.step(given)
+    times_us: list[float] = []
+    for _ in range(repeats):
+        step = FlightCore(config)._pilot._controller.step
+        begun_s = time.process_time()
+        for call in calls:
+            step(*call)
+        times_us.append((time.process_time() - begun_s) / len(calls) * 1e6)
+    return median(times_us)

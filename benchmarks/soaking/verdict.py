@@ -8,8 +8,8 @@ from pathlib import Path
 from statistics import fmean, median
 
 from rich.console import Console
-from rich.table import Table
 
+from benchmarks.report import number, print_table
 from benchmarks.soaking.lateness import Minute
 
 MEMORY_GROWTH_MAX = 1.05
@@ -121,28 +121,29 @@ def lateness_problems(flight: Sequence[Minute], empty: Sequence[Minute]) -> list
 
 def print_tables(console: Console, growth: Sequence[Growth], flight: Sequence[Minute], empty: Sequence[Minute]) -> None:
     """Both tables."""
-    memory = Table(title="memory and CPU time, early and late in the flight")
-    for name in ("process", "RSS MB", "late", "ratio", "PSS MB", "late", "CPU %", "late"):
-        memory.add_column(name, justify="left" if name == "process" else "right", no_wrap=True)
-    for row in growth:
-        style = "red" if row.ratio > MEMORY_GROWTH_MAX else ""
-        pss = ["-" if value is None else f"{value:.1f}" for value in (row.early_pss_mb, row.late_pss_mb)]
-        cpu = [f"{value:.1f}" for value in (row.early_cpu_percent, row.late_cpu_percent)]
-        memory.add_row(
-            row.role, f"{row.early_mb:.1f}", f"{row.late_mb:.1f}", f"{row.ratio:.3f}", *pss, *cpu, style=style
-        )
-    console.print(memory)
-    lateness = Table(title="tick lateness, ms: median over the minutes of a third")
-    for name in ("loop", "p50 first", "last", "p99 first", "last", "max first", "last", "worst"):
-        lateness.add_column(name, justify="left" if name == "loop" else "right", no_wrap=True)
+    rows = [
+        {
+            "process": row.role,
+            "RSS MB": number(row.early_mb, 1),
+            "RSS MB late": number(row.late_mb, 1),
+            "ratio": number(row.ratio, 3),
+            "PSS MB": number(row.early_pss_mb, 1),
+            "PSS MB late": number(row.late_pss_mb, 1),
+            "CPU %": number(row.early_cpu_percent, 1),
+            "CPU % late": number(row.late_cpu_percent, 1),
+        }
+        for row in growth
+    ]
+    red = [index for index, row in enumerate(growth) if row.ratio > MEMORY_GROWTH_MAX]
+    print_table("memory and CPU time, early and late in the flight", rows, console, red)
+    lateness = []
     for name, minutes in (("flight", flight), ("empty loop", empty)):
-        cells: list[str] = []
-        for value in ("p50", "p99", "max"):
-            pair = thirds(minutes, value)
-            cells += ["-", "-"] if pair is None else [f"{pair[0]:.3f}", f"{pair[1]:.3f}"]
-        worst = max((minute.max for minute in minutes), default=float("nan"))
-        lateness.add_row(name, *cells, f"{worst:.2f}")
-    console.print(lateness)
+        row = {"loop": name}
+        for key in ("p50", "p99", "max"):
+            first, last = thirds(minutes, key) or (None, None)
+            row |= {f"{key} first": number(first, 3), f"{key} last": number(last, 3)}
+        lateness.append({**row, "worst": number(max((minute.max for minute in minutes), default=None))})
+    print_table("tick lateness, ms: median over the minutes of a third", lateness, console)
 
 
 def draw(samples: Sequence[Sample], flight: Sequence[Minute], empty: Sequence[Minute], path: Path) -> None:

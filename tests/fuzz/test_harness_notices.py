@@ -6,7 +6,6 @@ import ctypes
 import os
 import time
 from random import Random
-from types import TracebackType
 from typing import ClassVar, Self
 
 import pytest
@@ -30,9 +29,7 @@ class Broken(Target):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for file in self.files:
             os.close(file)
 

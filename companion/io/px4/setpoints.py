@@ -44,7 +44,7 @@ class DirectSetpoints:
     """Setpoints through MavlinkDirect. Only the flight loop's calls send: PX4's offboard-loss failsafe triggers for a hung companion.
 
     The cost was measured: 0.03 to 0.06 ms more from datagram to wire (p50; 0.1 ms at p99), in a tick of 5 ms.
-    benchmarks/wire_latency.py measures both paths.
+    `python -m benchmarks --only setpoint` measures both paths.
     """
 
     def __init__(self, direct: MavlinkDirect, system_id: int) -> None:
