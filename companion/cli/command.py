@@ -16,10 +16,10 @@ from companion.ground.protocol.messages import CommandName, Topic
 from companion.ground.station.command_sender import FALLBACK_ADVICE, Failed, Sent, ack_text, signer_of
 from companion.ground.station.link import BrokerRefused
 from companion.ground.station.station import Station
-from companion.ground.station.tasks import until_first
 from companion.ground.station.vehicles import LIVE_S, Vehicle
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
+from companion.runtime.tasks import until_first
 
 FOUND_S = 5.0
 """Timeout for the broker and the first message of the vehicle."""

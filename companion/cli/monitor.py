@@ -20,9 +20,9 @@ from companion.ground.protocol.access import BrokerAccess, broker_access
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import signer_of
 from companion.ground.station.link import BrokerRefused
-from companion.ground.station.tasks import until_first
 from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
+from companion.runtime.tasks import until_first
 
 if TYPE_CHECKING:
     from companion.ground.station.replay_log import ReplayLog

@@ -305,7 +305,7 @@ class Guardian:
             yield
         except Exception as error:
             t_s = time.monotonic() - last.origin_s
-            text = f"an error in {what} ({type(error).__name__}: {error}); the landing goes on"
+            text = f"an error in {what} ({type(error).__name__}: {error}); the landing continues"
             if text not in self._errors and len(self._errors) < ERRORS_REPORTED_MAX:
                 self._errors.add(text)
                 _log_line(traceback.format_exc())
@@ -357,7 +357,7 @@ class Guardian:
 
 
 def _log_line(text: str) -> None:
-    """Write one line to guardian.log; if the disk is full the line is lost and the landing goes on."""
+    """Write one line to guardian.log; if the disk is full the line is lost and the landing continues."""
     with contextlib.suppress(OSError):
         os.write(2, text.encode() + b"\n")  # unbuffered, so that a failed write is not tried again at exit
 

@@ -98,7 +98,6 @@ class TakeoverLanding:
         self._attempts = 0
         self._tick = last_heartbeat.tick
         self._pose: MocapPose | None = None
-        self._pose_sent_s: float | None = None
         self._heartbeat_s = self._asked_s = self._zero_s = float("-inf")
         self._request = AutopilotRequest.NONE
         self._requested_s = float("-inf")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import select
 import subprocess
 import sys
 import time
@@ -13,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from companion.runtime.subprocesses import LaunchError, how_it_ended, last_line, terminate, write_text
+from companion.runtime.subprocesses import JsonLines, LaunchError, how_it_ended, last_line, terminate, write_text
 from companion.sitl_config.loader import SitlConfig
 
 SITL_READY_TIMEOUT_S = 30.0
@@ -53,13 +52,12 @@ class SitlProcess:
                 stderr=log,
                 start_new_session=True,
             )
-        self._buffer = b""
+        assert self.process.stdout is not None
+        self._lines = JsonLines(self.process.stdout.fileno())
         self.final: dict[str, Any] = {}
         self.at_rest = False
         self.flight_environment: dict[str, str] = {}
         """Environment variables of the flight process for faults that the world injects into it."""
-        self.ended = False
-        """The world has closed its end of the pipe: it has exited or is about to."""
 
     def devices(
         self,
@@ -109,25 +107,14 @@ class SitlProcess:
 
     def messages(self, deadline_s: float) -> Iterator[dict[str, Any]]:
         """Yield JSON lines until the deadline (0: only those that have arrived) or the end of the process."""
-        if self.ended:
-            return
-        assert self.process.stdout is not None
-        fd = self.process.stdout.fileno()
-        while True:
-            while b"\n" in self._buffer:
-                line, _, self._buffer = self._buffer.partition(b"\n")
-                with contextlib.suppress(ValueError):
-                    message = json.loads(line)
-                    self._update(message)
-                    yield message
-            left_s = max(0.0, deadline_s - time.monotonic())
-            if not select.select([fd], [], [], left_s)[0]:
-                return
-            data = os.read(fd, 65536)
-            if not data:
-                self.ended = True
-                return
-            self._buffer += data
+        for message in self._lines.read(deadline_s):
+            self._update(message)
+            yield message
+
+    @property
+    def ended(self) -> bool:
+        """The world has closed its end of the pipe: it has exited or is about to."""
+        return self._lines.ended
 
     def _update(self, message: dict[str, Any]) -> None:
         if message.get("type") == "final":

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import select
 import socket
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from companion.io.protocols import DeviceError
 from companion.model.codec import to_packet
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Packet, Tick
 from companion.model.types import GroundCommand, Inputs, OperatorCommand, Outputs, SafetyAction, Sent, Severity
+from companion.runtime.subprocesses import JsonLines
 
 _BUFFER_BYTES = 8 * 2**20
 _MESSAGE_MAX_BYTES = 4096
@@ -203,7 +203,8 @@ class RecorderProcess:
         self.process = process
         self.client = client
         self.path = path
-        self._output = b""
+        assert process.stdout is not None
+        self._lines = JsonLines(process.stdout.fileno())
         self._report: RecorderReport | None = None
 
     @classmethod
@@ -277,22 +278,7 @@ class RecorderProcess:
 
     def _answer(self, deadline_s: float) -> dict[str, Any] | None:
         """Return the next JSON line of the process, or None if it ended or the deadline passed."""
-        assert self.process.stdout is not None
-        fd = self.process.stdout.fileno()
-        while b"\n" not in self._output:
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0 or not select.select([fd], [], [], left_s)[0]:
-                return None
-            data = os.read(fd, 65536)
-            if not data:
-                return None
-            self._output += data
-        line, _, self._output = self._output.partition(b"\n")
-        try:
-            answer = json.loads(line)
-        except ValueError:
-            return None
-        return answer if isinstance(answer, dict) else None
+        return next(self._lines.read(deadline_s), None)
 
     def _end(self) -> int:
         """Make sure that the process has ended; return its exit code."""

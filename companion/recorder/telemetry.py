@@ -114,17 +114,11 @@ class TelemetryThread:
             from companion.recorder import telemetry_link
 
             self._counts = telemetry_link.Counts()
+            recorder = telemetry_link.RecorderSide(
+                self._flight, self._packets, self._recorder_state, lambda: self._ending, self._counts
+            )
             try:
-                telemetry_link.run(
-                    self._config_json,
-                    self.session,
-                    self._simulated,
-                    self._flight,
-                    self._packets,
-                    self._recorder_state,
-                    lambda: self._ending,
-                    self._counts,
-                )
+                telemetry_link.run(self._config_json, self.session, self._simulated, recorder)
             except ConfigError as error:
                 self._report(f"no telemetry: {error.lines[0]}")
         except Exception as error:

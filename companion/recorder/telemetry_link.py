@@ -24,6 +24,7 @@ from companion.model.codec import to_packet
 from companion.model.packets import LogLine
 from companion.model.types import Severity
 from companion.recorder.telemetry_session import INFO, WARNING, Outgoing, TelemetrySession
+from companion.runtime.tasks import until_first
 
 ANSWER_S = 4.0
 """Timeout for each answer of the broker."""
@@ -62,6 +63,21 @@ class Counts:
     commands: int = 0
     """Commands forwarded to the flight process."""
     refused: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSide:
+    """The rest of the recorder."""
+
+    flight: FlightSide
+    packets: deque[tuple[float, bytes]]
+    """Queue filled by another thread: time of receipt (CLOCK_MONOTONIC), packet."""
+    state: Callable[[], tuple[int, str | None]]
+    """Returns the number of lost records, and why recording stopped."""
+    ending: Callable[[], bool | None]
+    """Returns None while the flight goes on, else whether it ended normally."""
+    counts: Counts
+    """Updated while the session runs."""
 
 
 class Outbox:
@@ -105,30 +121,14 @@ class Uplink:
     Args:
         session: builds the messages and verifies the commands.
         access: the broker.
-        flight: the rest of the recorder.
-        packets: queue filled by another thread: time of receipt (CLOCK_MONOTONIC), packet.
-        recorder_state: returns the number of lost records, and why recording stopped.
-        ending: returns None while the flight goes on, else whether it ended normally.
-        counts: updated while the session runs.
+        recorder: the rest of the recorder.
     """
 
-    def __init__(
-        self,
-        session: TelemetrySession,
-        access: BrokerAccess,
-        flight: FlightSide,
-        packets: deque[tuple[float, bytes]],
-        recorder_state: Callable[[], tuple[int, str | None]],
-        ending: Callable[[], bool | None],
-        counts: Counts,
-    ) -> None:
+    def __init__(self, session: TelemetrySession, access: BrokerAccess, recorder: RecorderSide) -> None:
         self._session = session
         self._access = access
-        self._flight = flight
-        self._packets = packets
-        self._recorder_state = recorder_state
-        self._ending = ending
-        self._counts = counts
+        self._recorder = recorder
+        self._counts = recorder.counts
         self._outbox = Outbox()
         self._connected = False
         self._last_reported: str | None = None
@@ -153,14 +153,14 @@ class Uplink:
         """Process packets and build messages, 20 times a second."""
         due_s = time.monotonic()
         while True:
-            ending = self._ending()
-            while self._packets:
-                for _ in range(min(200, len(self._packets))):
-                    self._session.take_packet(*self._packets.popleft())
+            ending = self._recorder.ending()
+            while self._recorder.packets:
+                for _ in range(min(200, len(self._recorder.packets))):
+                    self._session.take_packet(*self._recorder.packets.popleft())
                 await asyncio.sleep(0)
             if ending is not None:
                 self._session.end(in_order=ending)
-            dropped, error = self._recorder_state()
+            dropped, error = self._recorder.state()
             self._queue(self._session.collect(time.monotonic(), time.time(), dropped=dropped, recorder_error=error))
             if ending is not None:
                 return
@@ -172,7 +172,7 @@ class Uplink:
         self._counts.refused = self._session.refused
         for t_s, severity, text in out.log:
             line = LogLine(t_s=t_s, severity=Severity(severity), source="ground", text=text)
-            self._flight.inject(to_packet(line))
+            self._recorder.flight.inject(to_packet(line))
         outbox.put(out)
         if out.stream is not None and self._connected:
             self._counts.stream_dropped += outbox.stream is not None
@@ -224,21 +224,7 @@ class Uplink:
             self._session.set_commands_available(refusal is None, text)
         self._outbox.begin()
         self._connected = True
-        parts = {
-            asyncio.create_task(part)
-            for part in (client.wait_broken(), self._send_stream(client), self._send_kept(client))
-        }
-        try:
-            done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
-            for part in done:
-                part.result()
-        finally:
-            for part in parts:
-                part.cancel()
-            await asyncio.wait(parts)
-            for part in parts:
-                if not part.cancelled():
-                    part.exception()
+        await until_first(client.wait_broken(), self._send_stream(client), self._send_kept(client))
 
     async def _send_stream(self, client: Connection) -> None:
         """Send one stream message at a time; while the socket is full the newest replaces the one that waits."""
@@ -279,7 +265,7 @@ class Uplink:
             text = f"the broker does not let this vehicle publish its {topic.value}: {refusal}"
             self._session.notify(time.monotonic(), WARNING, text)
             if not self._refused_topics:  # a wrong login affects all topics; report one
-                self._flight.send({"ground": text})
+                self._recorder.flight.send({"ground": text})
             self._refused_topics.add(topic)
 
     def _on_message(self, topic: str, payload: bytes, retained: bool) -> None:
@@ -309,7 +295,7 @@ class Uplink:
             "nonce": command.nonce,
             "hold": command.hold,
         }
-        if self._flight.send(message):
+        if self._recorder.flight.send(message):
             self._counts.commands += 1
             return
         text = "the flight process does not read commands; use Ctrl-C or the pilot's switch"
@@ -323,19 +309,10 @@ class Uplink:
             return
         self._last_reported = kind
         self._session.notify(time.monotonic(), severity, text, event=False)
-        self._flight.send({"ground": text})
+        self._recorder.flight.send({"ground": text})
 
 
-def run(
-    config_json: str,
-    session: str,
-    simulated: bool,
-    flight: FlightSide,
-    packets: deque[tuple[float, bytes]],
-    recorder_state: Callable[[], tuple[int, str | None]],
-    ending: Callable[[], bool | None],
-    counts: Counts,
-) -> None:
+def run(config_json: str, session: str, simulated: bool, recorder: RecorderSide) -> None:
     """Run the telemetry of one flight until it ends; return at once if no broker is configured. See `Uplink`.
 
     Raises:
@@ -353,7 +330,7 @@ def run(
         telemetry = TelemetrySession(config, session, simulated=simulated, verifier=verifier, no_commands=no_commands)
         if no_commands is not None:
             telemetry.notify(time.monotonic(), WARNING if mqtt.commands else INFO, no_commands, event=False)
-        await Uplink(telemetry, access, flight, packets, recorder_state, ending, counts).run()
+        await Uplink(telemetry, access, recorder).run()
 
     asyncio.run(run_session())
 

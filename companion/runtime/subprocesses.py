@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import select
 import shutil
 import signal
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from companion.runtime.files import write_whole
 
@@ -94,6 +98,35 @@ def how_it_ended(code: int) -> str:
         return f"was ended by {signal.Signals(-code).name}"
     except ValueError:
         return f"was ended by signal {-code}"
+
+
+class JsonLines:
+    """JSON objects, one a line, that a child process writes to a pipe.
+
+    Args:
+        fd: read end of the pipe.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._buffer = b""
+        self.ended = False
+        """The child has closed its end: it has exited or is about to."""
+
+    def read(self, deadline_s: float) -> Iterator[dict[str, Any]]:
+        """Yield objects until the deadline (`time.monotonic`; 0 for those that have arrived) or the end of the pipe."""
+        while not self.ended:
+            while b"\n" in self._buffer:
+                line, _, self._buffer = self._buffer.partition(b"\n")
+                with contextlib.suppress(ValueError):
+                    message = json.loads(line)
+                    if isinstance(message, dict):
+                        yield message
+            if not select.select([self._fd], [], [], max(0.0, deadline_s - time.monotonic()))[0]:
+                return
+            data = os.read(self._fd, 65536)
+            self.ended = not data
+            self._buffer += data
 
 
 _LOG_TAIL_BYTES = 65536

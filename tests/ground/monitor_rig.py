@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import datetime
+import functools
 import ipaddress
 import json
 from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 import aiohttp
 from cryptography import x509
@@ -27,18 +28,25 @@ OPERATORS = Operators([ANNA], "operators.yaml")
 SIGNER = Signer(ANNA.name, ANNA.key)
 
 
-def play(scene: Coroutine[Any, Any, None]) -> None:
+P = ParamSpec("P")
+
+
+def played(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
     """Run a test's coroutine; whatever it waits for has a deadline."""
 
-    async def bounded() -> None:
-        async with asyncio.timeout(DEADLINE_S):
-            await scene
+    @functools.wraps(test)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        async def bounded() -> None:
+            async with asyncio.timeout(DEADLINE_S):
+                await test(*args, **kwargs)
 
-    asyncio.run(bounded())
+        asyncio.run(bounded())
+
+    return run
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Snapshot again and again, until `play`'s deadline."""
+    """Wait for a condition, until the deadline of `played`."""
     while not condition():  # noqa: ASYNC110 - nobody tells
         await asyncio.sleep(0.01)
 

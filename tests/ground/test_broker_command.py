@@ -277,7 +277,7 @@ def test_check_says_why_it_does_not_get_in(site: Site, tmp_path: Path, capsys: p
         assert "the broker's certificate is not trusted" in told(tls, "--login", login, "--ca", str(other))
         assert "does not use TLS" in told(f"mqtts://127.0.0.1:{made.plain_port}", "--ca", str(site.folder / "ca.pem"))
         assert "the broker ended the connection" in told(f"mqtt://127.0.0.1:{made.tls_port}", "--login", login)
-    assert "Connection refused; is the broker running there?" in told(f"mqtt://127.0.0.1:{free_port()}")
+    assert "Connection refused; check that the broker is running" in told(f"mqtt://127.0.0.1:{free_port()}")
     assert told("http://here").startswith("2 ")
     assert told(plain, "--vehicle", "#").startswith("2 --vehicle '#'")
     assert told(plain, "--login", str(tmp_path / "none.yaml")).startswith("2 ")

@@ -11,12 +11,12 @@ import pytest
 
 from companion.cli import command as command_command
 from companion.cli import main as cli
-from companion.ground.protocol.keys import Operator, Operators, load_operators, operators_text, write_private
+from companion.ground.protocol.keys import Operator, load_operators, operators_text, write_private
 from companion.ground.protocol.messages import Presence, Topic
 from companion.ground.station.command_sender import ATTEMPTS
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from tests.broker import Broker, free_port, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, play
+from tests.ground.monitor_rig import ANNA, OPERATORS, played
 from tests.ground.vehicle import played_vehicle
 from tests.support import Ended, sandbox_in
 
@@ -45,136 +45,122 @@ async def command(capsys: pytest.CaptureFixture[str], name: str, broker: Broker 
     return Ended(code, out, err)
 
 
-def test_what_was_done_is_printed(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS) as vehicle:
-            for name in ("hold", "resume", "land", "abort", "start"):
-                ended = await command(capsys, name, broker, keys)
-                assert (ended.code, ended.out, ended.err) == (EXIT_OK, f"rig: {name}: {name}: done\n", "")
-            assert [heard.command.value for heard in vehicle.accepted] == ["hold", "resume", "land", "abort", "start"]
-
-    play(scene())
+@played
+async def test_what_was_done_is_printed(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async with played_vehicle(broker.port, OPERATORS) as vehicle:
+        for name in ("hold", "resume", "land", "abort", "start"):
+            ended = await command(capsys, name, broker, keys)
+            assert (ended.code, ended.out, ended.err) == (EXIT_OK, f"rig: {name}: {name}: done\n", "")
+        assert [heard.command.value for heard in vehicle.accepted] == ["hold", "resume", "land", "abort", "start"]
 
 
-def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS) as vehicle:
-            vehicle.accepts = lambda heard: (False, "start refused: PX4 is not ready")
-            ended = await command(capsys, "start", broker, keys)
-            assert ended.code == EXIT_REFUSED
-            assert ended.err_lines == ["companion command: rig: start refused: PX4 is not ready"]
-            vehicle.streams = False
-            await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
-            ended = await command(capsys, "land", broker, keys, "--vehicle", "rig")
-            assert (ended.code, ended.err_lines) == (
-                EXIT_REFUSED,
-                ["companion command: rig: land: the flight of rig has ended"],
-            )
-
-    play(scene())
+@played
+async def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async with played_vehicle(broker.port, OPERATORS) as vehicle:
+        vehicle.accepts = lambda heard: (False, "start refused: PX4 is not ready")
+        ended = await command(capsys, "start", broker, keys)
+        assert ended.code == EXIT_REFUSED
+        assert ended.err_lines == ["companion command: rig: start refused: PX4 is not ready"]
+        vehicle.streams = False
+        await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
+        ended = await command(capsys, "land", broker, keys, "--vehicle", "rig")
+        assert (ended.code, ended.err_lines) == (
+            EXIT_REFUSED,
+            ["companion command: rig: land: the flight of rig has ended"],
+        )
 
 
-def test_a_stranger_is_told_that_the_vehicle_does_not_have_the_key(
+@played
+async def test_a_stranger_is_told_that_the_vehicle_does_not_have_the_key(
     broker: Broker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Another key of the same name: nothing of the vehicle is proven to it, so no command can be dated."""
     keys = tmp_path / "stranger.yaml"
     write_private(keys, operators_text([Operator("anna", b"x" * 32)]).encode())
 
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS) as vehicle:
-            ended = await command(capsys, "start", broker, str(keys))
-            assert ended.code == EXIT_REFUSED
-            assert "start: no message from rig is proven for anna: it does not have this key" in ended.err
-            assert not vehicle.commands_heard
-
-    play(scene())
+    async with played_vehicle(broker.port, OPERATORS) as vehicle:
+        ended = await command(capsys, "start", broker, str(keys))
+        assert ended.code == EXIT_REFUSED
+        assert "start: no message from rig is proven for anna: it does not have this key" in ended.err
+        assert not vehicle.commands_heard
 
 
-def test_no_answer(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS) as vehicle:
-            vehicle.answers = False
-            ended = await command(capsys, "land", broker, keys)
-            assert ended.code == EXIT_LOST and ended.out == ""
-            assert len(ended.err_lines) == ATTEMPTS == len(vehicle.accepted)
-            assert all("no answer from the vehicle within 1.5 s" in line for line in ended.err_lines)
-
-    play(scene())
+@played
+async def test_no_answer(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async with played_vehicle(broker.port, OPERATORS) as vehicle:
+        vehicle.answers = False
+        ended = await command(capsys, "land", broker, keys)
+        assert ended.code == EXIT_LOST and ended.out == ""
+        assert len(ended.err_lines) == ATTEMPTS == len(vehicle.accepted)
+        assert all("no answer from the vehicle within 1.5 s" in line for line in ended.err_lines)
 
 
-def test_nobody_there(
+@played
+async def test_nobody_there(
     broker: Broker, keys: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command_command, "FOUND_S", 1.0)
 
-    async def scene() -> None:
-        nowhere = f"mqtt://127.0.0.1:{free_port()}"
-        ended = await command(capsys, "land", nowhere, keys)
-        assert ended.code == EXIT_LOST and len(ended.err_lines) == 1
-        assert ended.err.startswith(f"companion command: no broker at {nowhere}")
+    nowhere = f"mqtt://127.0.0.1:{free_port()}"
+    ended = await command(capsys, "land", nowhere, keys)
+    assert ended.code == EXIT_LOST and len(ended.err_lines) == 1
+    assert ended.err.startswith(f"companion command: no broker at {nowhere}")
+    ended = await command(capsys, "land", broker, keys)
+    assert ended.code == EXIT_LOST
+    assert ended.err.startswith("companion command: no message from a vehicle at the broker within")
+    async with played_vehicle(broker.port, OPERATORS):
+        ended = await command(capsys, "land", broker, keys, "--vehicle", "rug")
+    assert ended.code == EXIT_LOST
+    assert "no message from 'rug'" in ended.err and "known: rig (flying)" in ended.err
+
+
+@played
+async def test_several_vehicles_have_to_be_told_apart(
+    broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS, "one") as one,
+        played_vehicle(broker.port, OPERATORS, "two") as two,
+    ):
         ended = await command(capsys, "land", broker, keys)
-        assert ended.code == EXIT_LOST
-        assert ended.err.startswith("companion command: no message from a vehicle at the broker within")
-        async with played_vehicle(broker.port, OPERATORS):
-            ended = await command(capsys, "land", broker, keys, "--vehicle", "rug")
-        assert ended.code == EXIT_LOST
-        assert "no message from 'rug'" in ended.err and "known: rig (flying)" in ended.err
-
-    play(scene())
-
-
-def test_several_vehicles_have_to_be_told_apart(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS, "one") as one,
-            played_vehicle(broker.port, OPERATORS, "two") as two,
-        ):
-            ended = await command(capsys, "land", broker, keys)
-            assert ended.code == EXIT_BAD_INPUT
-            assert ended.err_lines == [
-                "companion command: there are several vehicles (one, two); choose one: --vehicle NAME"
-            ]
-            ended = await command(capsys, "land", broker, keys, "--vehicle", "two")
-            assert (ended.code, ended.out) == (EXIT_OK, "two: land: land: done\n")
-            assert (len(one.accepted), len(two.accepted)) == (0, 1)
-
-    play(scene())
+        assert ended.code == EXIT_BAD_INPUT
+        assert ended.err_lines == [
+            "companion command: there are several vehicles (one, two); choose one: --vehicle NAME"
+        ]
+        ended = await command(capsys, "land", broker, keys, "--vehicle", "two")
+        assert (ended.code, ended.out) == (EXIT_OK, "two: land: land: done\n")
+        assert (len(one.accepted), len(two.accepted)) == (0, 1)
 
 
 @pytest.mark.parametrize("name", ["resume", "start"])
-def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_quiet(
+@played
+async def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_quiet(
     name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What is retained is known before anything is sent, however many there are."""
 
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS, "one") as one:
-            await leave_states(broker)
-            ended = await command(capsys, name, broker, keys)
-            assert ended.code == EXIT_BAD_INPUT and "(one, quiet-49)" in ended.err
-            assert not one.accepted
-
-    play(scene())
+    async with played_vehicle(broker.port, OPERATORS, "one") as one:
+        await leave_states(broker)
+        ended = await command(capsys, name, broker, keys)
+        assert ended.code == EXIT_BAD_INPUT and "(one, quiet-49)" in ended.err
+        assert not one.accepted
 
 
 @pytest.mark.parametrize("name", ["hold", "land", "abort"])
-def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
+@played
+async def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
     name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A retained state of a vehicle may be forged: the one vehicle whose stream is proven is commanded, and the other is named."""
 
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS, "rig") as vehicle:
-            await leave_states(broker)
-            ended = await command(capsys, name, broker, keys)
-            assert (ended.code, ended.out) == (EXIT_OK, f"rig: {name}: {name}: done\n")
-            assert ended.err_lines == [
-                "companion command: sent to rig; no proven messages from: quiet-49; to command another: --vehicle NAME"
-            ]
-            assert [heard.command.value for heard in vehicle.accepted] == [name]
-
-    play(scene())
+    async with played_vehicle(broker.port, OPERATORS, "rig") as vehicle:
+        await leave_states(broker)
+        ended = await command(capsys, name, broker, keys)
+        assert (ended.code, ended.out) == (EXIT_OK, f"rig: {name}: {name}: done\n")
+        assert ended.err_lines == [
+            "companion command: sent to rig; no proven messages from: quiet-49; to command another: --vehicle NAME"
+        ]
+        assert [heard.command.value for heard in vehicle.accepted] == [name]
 
 
 async def leave_states(broker: Broker) -> None:
@@ -209,18 +195,15 @@ def test_bad_input(arguments: list[str], why: str, capsys: pytest.CaptureFixture
     assert len(lines) == 1 and why in lines[0]
 
 
-def test_vehicle_and_ground_station_of_one_user_need_no_setting_up(broker: Broker, tmp_path: Path) -> None:
-    """The real command, with a key file that the vehicle's side has made."""
+@played
+async def test_vehicle_and_ground_station_of_one_user_need_no_setting_up(broker: Broker, tmp_path: Path) -> None:
+    """The real command, with a key file that the vehicle's side has created."""
     home = {"XDG_CONFIG_HOME": str(tmp_path / "config")}
-
-    async def scene(operators: Operators) -> None:
-        async with played_vehicle(broker.port, operators):
-            with sandbox_in(tmp_path, home) as sandbox:
-                ended = await asyncio.to_thread(sandbox.run, "command", "hold", "--broker", broker.url)
-                sandbox.assert_nobody_left()
-        assert (ended.code, ended.out, ended.err) == (EXIT_OK, "rig: hold: hold: done\n", "")
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(*next(iter(home.items())))
         operators = load_operators(None)
-    play(scene(operators))
+    async with played_vehicle(broker.port, operators):
+        with sandbox_in(tmp_path, home) as sandbox:
+            ended = await asyncio.to_thread(sandbox.run, "command", "hold", "--broker", broker.url)
+            sandbox.assert_nobody_left()
+    assert (ended.code, ended.out, ended.err) == (EXIT_OK, "rig: hold: hold: done\n", "")

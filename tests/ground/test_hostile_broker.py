@@ -32,13 +32,13 @@ from companion.ground.protocol.messages import (
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.station.hub import Hub, Outbox
 from companion.ground.station.station import Station
-from companion.ground.station.tasks import until_first
 from companion.ground.station.text_view import StationStatus, render, status_line
 from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, VehicleTracker
 from companion.ground.telemetry.scene import scene_of
 from companion.model.codec import to_jsonable
+from companion.runtime.tasks import until_first
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play, until
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played, until
 from tests.ground.vehicle import flight, played_vehicle, state_of
 
 pytestmark = pytest.mark.waits
@@ -287,64 +287,60 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
         yield broker
 
 
-def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker: Broker) -> None:
+@played
+async def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker: Broker) -> None:
     changes: list[str] = []
 
-    async def scene() -> None:
-        station = Station(
-            broker_access(broker.url, None, None), SIGNER, None, lambda heard: None, lambda connected, text: changes.append(text)
-        )  # fmt: skip
+    station = Station(
+        broker_access(broker.url, None, None), SIGNER, None, lambda heard: None, lambda connected, text: changes.append(text)
+    )  # fmt: skip
 
-        async def fight() -> None:
-            async with (
-                played_vehicle(broker.port, OPERATORS, session="s1") as vehicle,
-                aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as hostile,
+    async def fight() -> None:
+        async with (
+            played_vehicle(broker.port, OPERATORS, session="s1") as vehicle,
+            aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as hostile,
+        ):
+            watch = station.tracker
+            await until(lambda: "rig" in watch.vehicles and watch.vehicles["rig"].proven is not None)
+            for number, (topic, payload) in enumerate(everything_hostile()):
+                await hostile.publish(topic.of("rig"), payload, qos=number % 200 == 0)
+            for lie in (
+                state_of("rig", "s1", presence=Presence.ENDED, outcome="completed"),
+                state_of("rig", "s1", commands=False, text="hears nothing"),
+                state_of("rig", "another flight"),
             ):
-                watch = station.tracker
-                await until(lambda: "rig" in watch.vehicles and watch.vehicles["rig"].proven is not None)
-                for number, (topic, payload) in enumerate(everything_hostile()):
-                    await hostile.publish(topic.of("rig"), payload, qos=number % 200 == 0)
-                for lie in (
-                    state_of("rig", "s1", presence=Presence.ENDED, outcome="completed"),
-                    state_of("rig", "s1", commands=False, text="hears nothing"),
-                    state_of("rig", "another flight"),
-                ):
-                    await hostile.publish(Topic.STATE.of("rig"), encode(lie), qos=1, retain=True)
-                    await until(lambda lie=lie: watch.vehicles["rig"].state == lie)  # type: ignore[misc]
-                    ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
-                    assert ack is not None and ack.accepted
-                assert [command.command for command in vehicle.accepted] == [CommandName.LAND] * 3
-                assert watch.rejected > 4000
-            assert [text for text in changes if not text.startswith("connected")] == []
+                await hostile.publish(Topic.STATE.of("rig"), encode(lie), qos=1, retain=True)
+                await until(lambda lie=lie: watch.vehicles["rig"].state == lie)  # type: ignore[misc]
+                ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
+                assert ack is not None and ack.accepted
+            assert [command.command for command in vehicle.accepted] == [CommandName.LAND] * 3
+            assert watch.rejected > 4000
+        assert [text for text in changes if not text.startswith("connected")] == []
 
-        await until_first(station.run(), fight())
-
-    play(scene())
+    await until_first(station.run(), fight())
 
 
-def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> None:
+@played
+async def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> None:
     """An error of our own while a message is handled costs that message, neither the connection nor the command."""
 
     def fails(heard: object) -> None:
         raise ZeroDivisionError("of our own")
 
-    async def scene() -> None:
-        changes: list[str] = []
-        station = Station(
-            broker_access(broker.url, None, None), SIGNER, None, fails, lambda connected, text: changes.append(text)
-        )
+    changes: list[str] = []
+    station = Station(
+        broker_access(broker.url, None, None), SIGNER, None, fails, lambda connected, text: changes.append(text)
+    )
 
-        async def fight() -> None:
-            async with played_vehicle(broker.port, OPERATORS):
-                await until(lambda: station.tracker.rejected > 10)
-                ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
-                assert ack is not None and ack.accepted
-            assert "ZeroDivisionError: 'of our own'" in (station.tracker.rejected_text or "")
-            assert len(changes) == 1
+    async def fight() -> None:
+        async with played_vehicle(broker.port, OPERATORS):
+            await until(lambda: station.tracker.rejected > 10)
+            ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
+            assert ack is not None and ack.accepted
+        assert "ZeroDivisionError: 'of our own'" in (station.tracker.rejected_text or "")
+        assert len(changes) == 1
 
-        await until_first(station.run(), fight())
-
-    play(scene())
+    await until_first(station.run(), fight())
 
 
 def test_proofs_are_of_the_whole_message() -> None:

@@ -24,7 +24,7 @@ from companion.model.codec import to_json
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.analysis.synthetic_flight import record_flight
 from tests.broker import Broker, free_port, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, play, self_signed
+from tests.ground.monitor_rig import ANNA, OPERATORS, played, self_signed
 from tests.ground.vehicle import played_vehicle
 from tests.support import CATCH, Sandbox, sandbox_in
 
@@ -59,32 +59,30 @@ def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[in
     return code, lines[0]
 
 
-def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sandbox: Sandbox, tmp_path: Path) -> None:
+@played
+async def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sandbox: Sandbox, tmp_path: Path) -> None:
     keys = tmp_path / "operators.yaml"
     write_private(keys, operators_text([ANNA]).encode())
 
-    async def scene() -> None:
-        arguments = ("monitor", "--broker", broker.url, "--operators", keys, "--port", 0)
-        async with played_vehicle(broker.port, OPERATORS):
-            with sandbox.start(*arguments) as running:
-                await asyncio.to_thread(running.wait_for, "(Ctrl-C ends)\n")
-                out = running._text("out")
-                address = re.match(r"companion monitor: (http://127\.0\.0\.1:\d+/)#token=([\w-]{22})  ", out)
-                assert address is not None, out
-                async with aiohttp.ClientSession() as session:
-                    async with session.get(address[1]) as page:
-                        assert page.status == 200 and "<script" in await page.text()
-                    async with session.ws_connect(f"{address[1]}ws", origin=address[1].rstrip("/")) as ws:
-                        await ws.send_json({"kind": "token", "token": address[2]})
-                        assert (await ws.receive_json())["can_command"] is True
-                        running.signal(signal.SIGINT)
-                        async for _ in ws:
-                            pass
-                        assert ws.close_code == 1001
-                ended = await asyncio.to_thread(running.end)
-        assert (ended.code, ended.err) == (EXIT_OK, "")
-
-    play(scene())
+    arguments = ("monitor", "--broker", broker.url, "--operators", keys, "--port", 0)
+    async with played_vehicle(broker.port, OPERATORS):
+        with sandbox.start(*arguments) as running:
+            await asyncio.to_thread(running.wait_for, "(Ctrl-C ends)\n")
+            out = running._text("out")
+            address = re.match(r"companion monitor: (http://127\.0\.0\.1:\d+/)#token=([\w-]{22})  ", out)
+            assert address is not None, out
+            async with aiohttp.ClientSession() as session:
+                async with session.get(address[1]) as page:
+                    assert page.status == 200 and "<script" in await page.text()
+                async with session.ws_connect(f"{address[1]}ws", origin=address[1].rstrip("/")) as ws:
+                    await ws.send_json({"kind": "token", "token": address[2]})
+                    assert (await ws.receive_json())["can_command"] is True
+                    running.signal(signal.SIGINT)
+                    async for _ in ws:
+                        pass
+                    assert ws.close_code == 1001
+            ended = await asyncio.to_thread(running.end)
+    assert (ended.code, ended.err) == (EXIT_OK, "")
     sandbox.assert_nobody_left()
 
 
@@ -167,28 +165,26 @@ def test_a_log_is_the_records_that_the_vehicle_would_have_sent(log: Path) -> Non
     assert streams[0].wall_s == pytest.approx(1.7e9, abs=1.0)
 
 
-def test_logs_are_served_without_a_broker(log: Path, tmp_path: Path, sandbox: Sandbox) -> None:
-    async def scene() -> None:
-        with sandbox.start("monitor", log, log, "--port", 0) as running:
-            await asyncio.to_thread(running.wait_for, "(Ctrl-C ends)\n")
-            address = re.findall(r"http://\S+", running._text("out"))[0]
-            assert "#" not in address
-            async with aiohttp.ClientSession() as session:
-                async with session.ws_connect(f"{address}ws", origin=address.rstrip("/")) as ws:
-                    await ws.send_json({"kind": "token", "token": ""})
-                    hello = await ws.receive_json()
-                    assert hello["replay"] is True and hello["logs"] == [str(log), str(log)]
-                    assert hello["can_command"] is False and "replay" in hello["why_not"]
-                for number, status in ((0, 200), (1, 200), (2, 404)):
-                    async with session.get(f"{address}replay/{number}.json") as answer:
-                        assert answer.status == status
-                        if status == 200:
-                            assert answer.headers["Content-Encoding"] == "gzip"
-                            assert answer.content_type == "application/json"
-                            data = await answer.json()
-                            assert data["state"]["session"] == f"log-{number}"
-            running.signal(signal.SIGINT)
-            assert (await asyncio.to_thread(running.end)).code == EXIT_OK
-
-    play(scene())
+@played
+async def test_logs_are_served_without_a_broker(log: Path, tmp_path: Path, sandbox: Sandbox) -> None:
+    with sandbox.start("monitor", log, log, "--port", 0) as running:
+        await asyncio.to_thread(running.wait_for, "(Ctrl-C ends)\n")
+        address = re.findall(r"http://\S+", running._text("out"))[0]
+        assert "#" not in address
+        async with aiohttp.ClientSession() as session:
+            async with session.ws_connect(f"{address}ws", origin=address.rstrip("/")) as ws:
+                await ws.send_json({"kind": "token", "token": ""})
+                hello = await ws.receive_json()
+                assert hello["replay"] is True and hello["logs"] == [str(log), str(log)]
+                assert hello["can_command"] is False and "replay" in hello["why_not"]
+            for number, status in ((0, 200), (1, 200), (2, 404)):
+                async with session.get(f"{address}replay/{number}.json") as answer:
+                    assert answer.status == status
+                    if status == 200:
+                        assert answer.headers["Content-Encoding"] == "gzip"
+                        assert answer.content_type == "application/json"
+                        data = await answer.json()
+                        assert data["state"]["session"] == f"log-{number}"
+        running.signal(signal.SIGINT)
+        assert (await asyncio.to_thread(running.end)).code == EXIT_OK
     sandbox.assert_nobody_left()

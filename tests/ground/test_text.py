@@ -30,7 +30,7 @@ from companion.ground.station.text_monitor import _Screen
 from companion.ground.station.text_view import STALE_S, Notice, StationStatus, render, stale, status_line, status_word
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, play
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played
 from tests.ground.vehicle import flight, played_vehicle, state_of
 from tests.support import ROOT
 
@@ -218,84 +218,76 @@ def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
     assert screen._command("r", station) is CommandName.RESUME
 
 
-def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS) as vehicle, terminal_at(broker, tmp_path) as terminal:
-            await terminal.shows("FLYING")
-            for key, name in (("h", "hold"), ("L", "land"), ("a", "abort")):
-                terminal.press(key)
-                await terminal.shows(f"rig: {name}: {name}: done (anna)")
-            terminal.press("s")
-            await terminal.shows("start? press s again")
-            terminal.press("r")
-            await terminal.shows("resume? press r again")
-            terminal.press("r")
-            await terminal.shows("rig: resume: resume: done (anna)")
-            assert [heard.command.value for heard in vehicle.accepted] == ["hold", "land", "abort", "resume"]
-            vehicle.streams = False
-            await terminal.shows("NO DATA FOR")
-            vehicle.streams = True
-            await terminal.shows("FLYING")
-            assert terminal.settings != terminal.before
-            terminal.press("q")
-            assert await terminal.ended() == 0
-            assert terminal.settings == terminal.before
-
-    play(scene())
+@played
+async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:
+    async with played_vehicle(broker.port, OPERATORS) as vehicle, terminal_at(broker, tmp_path) as terminal:
+        await terminal.shows("FLYING")
+        for key, name in (("h", "hold"), ("L", "land"), ("a", "abort")):
+            terminal.press(key)
+            await terminal.shows(f"rig: {name}: {name}: done (anna)")
+        terminal.press("s")
+        await terminal.shows("start? press s again")
+        terminal.press("r")
+        await terminal.shows("resume? press r again")
+        terminal.press("r")
+        await terminal.shows("rig: resume: resume: done (anna)")
+        assert [heard.command.value for heard in vehicle.accepted] == ["hold", "land", "abort", "resume"]
+        vehicle.streams = False
+        await terminal.shows("NO DATA FOR")
+        vehicle.streams = True
+        await terminal.shows("FLYING")
+        assert terminal.settings != terminal.before
+        terminal.press("q")
+        assert await terminal.ended() == 0
+        assert terminal.settings == terminal.before
 
 
-def test_ctrl_c_ends_it(broker: Broker, tmp_path: Path) -> None:
-    async def scene() -> None:
-        async with terminal_at(broker, tmp_path, "--view-only") as terminal:
-            await terminal.shows("view only: this monitor was started with --view-only")
-            terminal.process.send_signal(signal.SIGINT)
-            assert await terminal.ended() == 0
-            assert terminal.settings == terminal.before
-
-    play(scene())
+@played
+async def test_ctrl_c_ends_it(broker: Broker, tmp_path: Path) -> None:
+    async with terminal_at(broker, tmp_path, "--view-only") as terminal:
+        await terminal.shows("view only: this monitor was started with --view-only")
+        terminal.process.send_signal(signal.SIGINT)
+        assert await terminal.ended() == 0
+        assert terminal.settings == terminal.before
 
 
-def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS, "one") as one,
-            played_vehicle(broker.port, OPERATORS, "two") as two,
-            terminal_at(broker, tmp_path) as terminal,
-        ):
-            await terminal.shows("n: next of one, two")
-            terminal.press("h")
-            await terminal.shows(": hold: hold: done (anna)")
-            terminal.press("nh")
-            await terminal.shows("two: hold: hold: done (anna)" if one.accepted else "one: hold: hold: done (anna)")
-            assert (len(one.accepted), len(two.accepted)) == (1, 1)
-
-    play(scene())
+@played
+async def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS, "one") as one,
+        played_vehicle(broker.port, OPERATORS, "two") as two,
+        terminal_at(broker, tmp_path) as terminal,
+    ):
+        await terminal.shows("n: next of one, two")
+        terminal.press("h")
+        await terminal.shows(": hold: hold: done (anna)")
+        terminal.press("nh")
+        await terminal.shows("two: hold: hold: done (anna)" if one.accepted else "one: hold: hold: done (anna)")
+        assert (len(one.accepted), len(two.accepted)) == (1, 1)
 
 
-def test_a_pipe_gets_a_line_a_second(broker: Broker) -> None:
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS):
-            process = await asyncio.create_subprocess_exec(
-                *(
-                    sys.executable,
-                    "-m",
-                    "companion",
-                    "monitor",
-                    "--text",
-                    "--view-only",
-                    "--broker",
-                    broker.url,
-                ),
-                cwd=ROOT,
-                stdout=asyncio.subprocess.PIPE,
-            )
-            assert process.stdout is not None
-            lines = [(await process.stdout.readline()).decode() for _ in range(4)]
-            process.send_signal(signal.SIGINT)
-            await process.communicate()
-            assert process.returncode == 0
-            assert lines[:2] == [f"no broker at {broker.url} yet, trying\n", f"connected to {broker.url}\n"]
-            for text in lines[2:]:
-                assert re.match(r"\d\d:\d\d:\d\d rig \| [A-Z .0-9s]+ \| .* \| last event ", text), text
-
-    play(scene())
+@played
+async def test_a_pipe_gets_a_line_a_second(broker: Broker) -> None:
+    async with played_vehicle(broker.port, OPERATORS):
+        process = await asyncio.create_subprocess_exec(
+            *(
+                sys.executable,
+                "-m",
+                "companion",
+                "monitor",
+                "--text",
+                "--view-only",
+                "--broker",
+                broker.url,
+            ),
+            cwd=ROOT,
+            stdout=asyncio.subprocess.PIPE,
+        )
+        assert process.stdout is not None
+        lines = [(await process.stdout.readline()).decode() for _ in range(4)]
+        process.send_signal(signal.SIGINT)
+        await process.communicate()
+        assert process.returncode == 0
+        assert lines[:2] == [f"no broker at {broker.url} yet, trying\n", f"connected to {broker.url}\n"]
+        for text in lines[2:]:
+            assert re.match(r"\d\d:\d\d:\d\d rig \| [A-Z .0-9s]+ \| .* \| last event ", text), text

@@ -25,7 +25,7 @@ from tests.ground.monitor_rig import (
     SIGNER,
     base_of,
     monitor_at,
-    play,
+    played,
     self_signed,
     until,
     viewer_of,
@@ -41,61 +41,53 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
         yield broker
 
 
-def test_a_viewer_is_greeted_and_told_what_is_known_and_then_sees_it_live(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS),
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            hello = await viewer.next()
-            assert hello["kind"] == "hello" and hello["can_command"] is True and hello["why_not"] is None
-            assert (hello["operator"], hello["replay"]) == ("anna", False)
-            stream = await viewer.until("stream")
-            later = await viewer.until("stream", lambda message: message["data"]["seq"] > stream["data"]["seq"])
-            assert later["vehicle"] == "rig" and later["age_s"] >= 0.0
-            newest = {message["kind"]: message for message in viewer.heard}
-            assert newest["broker"]["connected"] is True and broker.url in newest["broker"]["text"]
-            assert newest["state"]["data"]["presence"] == "flying"
-            assert newest["scene"]["data"]["mission_s"] == 21.0
-            assert newest["preflight"]["data"]["rows"][0]["id"] == "px4_link"
-            assert [line["text"] for line in newest["events"]["data"]["lines"]] == [
-                line.text for line in flight()[2].lines
-            ]
-
-    play(scene())
+@played
+async def test_a_viewer_is_greeted_and_told_what_is_known_and_then_sees_it_live(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS),
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        hello = await viewer.next()
+        assert hello["kind"] == "hello" and hello["can_command"] is True and hello["why_not"] is None
+        assert (hello["operator"], hello["replay"]) == ("anna", False)
+        stream = await viewer.until("stream")
+        later = await viewer.until("stream", lambda message: message["data"]["seq"] > stream["data"]["seq"])
+        assert later["vehicle"] == "rig" and later["age_s"] >= 0.0
+        newest = {message["kind"]: message for message in viewer.heard}
+        assert newest["broker"]["connected"] is True and broker.url in newest["broker"]["text"]
+        assert newest["state"]["data"]["presence"] == "flying"
+        assert newest["scene"]["data"]["mission_s"] == 21.0
+        assert newest["preflight"]["data"]["rows"][0]["id"] == "px4_link"
+        assert [line["text"] for line in newest["events"]["data"]["lines"]] == [line.text for line in flight()[2].lines]
 
 
-def test_a_silent_viewer_is_greeted_without_a_token(broker: Broker) -> None:
-    async def scene() -> None:
-        async with monitor_at(broker.url) as monitor, aiohttp.ClientSession() as session:
-            base = base_of(monitor)
-            async with session.ws_connect(f"{base}ws", origin=base.rstrip("/")) as ws:
-                hello = await ws.receive_json()
-                assert hello["kind"] == "hello" and hello["can_command"] is False
-
-    play(scene())
+@played
+async def test_a_silent_viewer_is_greeted_without_a_token(broker: Broker) -> None:
+    async with monitor_at(broker.url) as monitor, aiohttp.ClientSession() as session:
+        base = base_of(monitor)
+        async with session.ws_connect(f"{base}ws", origin=base.rstrip("/")) as ws:
+            hello = await ws.receive_json()
+            assert hello["kind"] == "hello" and hello["can_command"] is False
 
 
-def test_strange_hosts_and_origins_are_turned_away(broker: Broker) -> None:
-    async def scene() -> None:
-        async with monitor_at(broker.url) as monitor, aiohttp.ClientSession() as session:
-            base = base_of(monitor)
-            own = base.rstrip("/")
-            for path in ("", "ws", "replay/0.json"):
-                async with session.get(base + path, headers={"Host": "evil.example", "Origin": own}) as answer:
-                    assert answer.status == 403
-                    assert HEADERS.items() <= dict(answer.headers).items()
-            for origin in ("http://evil.example", "null", f"http://localhost:{monitor.port}", None):
-                with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
-                    await session.ws_connect(f"{base}ws", origin=origin)
-            async with session.get(base) as answer:
-                assert answer.status == 200 and HEADERS.items() <= dict(answer.headers).items()
-                assert answer.content_type == "text/html"
-            async with session.get(f"{base}..%2f..%2fweb.py") as answer:
-                assert answer.status in (403, 404)
-
-    play(scene())
+@played
+async def test_strange_hosts_and_origins_are_turned_away(broker: Broker) -> None:
+    async with monitor_at(broker.url) as monitor, aiohttp.ClientSession() as session:
+        base = base_of(monitor)
+        own = base.rstrip("/")
+        for path in ("", "ws", "replay/0.json"):
+            async with session.get(base + path, headers={"Host": "evil.example", "Origin": own}) as answer:
+                assert answer.status == 403
+                assert HEADERS.items() <= dict(answer.headers).items()
+        for origin in ("http://evil.example", "null", f"http://localhost:{monitor.port}", None):
+            with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+                await session.ws_connect(f"{base}ws", origin=origin)
+        async with session.get(base) as answer:
+            assert answer.status == 200 and HEADERS.items() <= dict(answer.headers).items()
+            assert answer.content_type == "text/html"
+        async with session.get(f"{base}..%2f..%2fweb.py") as answer:
+            assert answer.status in (403, 404)
 
 
 @pytest.mark.parametrize(
@@ -109,137 +101,108 @@ def test_strange_hosts_and_origins_are_turned_away(broker: Broker) -> None:
         ('{"kind":"what"}', 1008),
     ],
 )
-def test_a_viewer_that_talks_rubbish_is_sent_away(broker: Broker, text: str, code: int) -> None:
-    async def scene() -> None:
-        async with monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer, viewer_of(monitor) as other:
-            await viewer.until("broker")
-            await viewer.ws.send_str(text)
-            assert (await viewer.closed())[0] == code
-            await other.until("hello")
-
-    play(scene())
+@played
+async def test_a_viewer_that_talks_rubbish_is_sent_away(broker: Broker, text: str, code: int) -> None:
+    async with monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer, viewer_of(monitor) as other:
+        await viewer.until("broker")
+        await viewer.ws.send_str(text)
+        assert (await viewer.closed())[0] == code
+        await other.until("hello")
 
 
-def test_a_viewer_that_floods_is_sent_away(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
+@played
+async def test_a_viewer_that_floods_is_sent_away(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        await viewer.until("stream")
+        with contextlib.suppress(ConnectionError):
+            for _ in range(500):
+                await viewer.order("hold", "nobody")
+        code, reason = await viewer.closed()
+        assert code == 1008 and "messages a second" in reason
+        assert vehicle.commands_heard == 0
+
+
+@played
+async def test_a_viewer_that_does_not_keep_up_is_sent_away_and_nobody_else_misses_an_event(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        await viewer.until("events")
+        with idle_viewer(monitor):
+            await until(lambda: monitor.viewers == 2)
+            count = 0
+            while monitor.viewers == 2:
+                count += 1
+                assert count < 5000, "the idle viewer was never sent away"
+                await vehicle.say_events(str(count), *(["x" * 300] * 99))
+                got = await viewer.until("events")
+                assert got["data"]["lines"][0]["text"] == str(count)
+
+
+@played
+async def test_twenty_viewers_see_the_same_last_stream(broker: Broker) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        vehicle = await stack.enter_async_context(played_vehicle(broker.port, OPERATORS))
+        monitor = await stack.enter_async_context(monitor_at(broker.url))
+        viewers = [await stack.enter_async_context(viewer_of(monitor)) for _ in range(20)]
+        for viewer in viewers:
             await viewer.until("stream")
-            with contextlib.suppress(ConnectionError):
-                for _ in range(500):
-                    await viewer.order("hold", "nobody")
-            code, reason = await viewer.closed()
-            assert code == 1008 and "messages a second" in reason
-            assert vehicle.commands_heard == 0
-
-    play(scene())
-
-
-def test_a_viewer_that_does_not_keep_up_is_sent_away_and_nobody_else_misses_an_event(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            await viewer.until("events")
-            with idle_viewer(monitor):
-                await until(lambda: monitor.viewers == 2)
-                count = 0
-                while monitor.viewers == 2:
-                    count += 1
-                    assert count < 5000, "the idle viewer was never sent away"
-                    await vehicle.say_events(str(count), *(["x" * 300] * 99))
-                    got = await viewer.until("events")
-                    assert got["data"]["lines"][0]["text"] == str(count)
-
-    play(scene())
+        vehicle.streams = False
+        last = await vehicle.say_stream(phase="the last one")
+        texts = [
+            await viewer.until("stream", lambda message: message["data"]["phase"] == "the last one")
+            for viewer in viewers
+        ]
+        assert all(text == texts[0] for text in texts)
+        assert texts[0]["data"]["seq"] == last.seq
 
 
-def test_twenty_viewers_see_the_same_last_stream(broker: Broker) -> None:
-    async def scene() -> None:
-        async with contextlib.AsyncExitStack() as stack:
-            vehicle = await stack.enter_async_context(played_vehicle(broker.port, OPERATORS))
-            monitor = await stack.enter_async_context(monitor_at(broker.url))
-            viewers = [await stack.enter_async_context(viewer_of(monitor)) for _ in range(20)]
-            for viewer in viewers:
-                await viewer.until("stream")
-            vehicle.streams = False
-            last = await vehicle.say_stream(phase="the last one")
-            texts = [
-                await viewer.until("stream", lambda message: message["data"]["phase"] == "the last one")
-                for viewer in viewers
-            ]
-            assert all(text == texts[0] for text in texts)
-            assert texts[0]["data"]["seq"] == last.seq
-
-    play(scene())
+@played
+async def test_rubbish_at_the_broker_is_counted_and_not_passed_on(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
+        aiomqtt.Client("127.0.0.1", broker.port) as stranger,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        await viewer.until("events")
+        for payload in (b"{", b'{"v":2,"hack":"<img onerror=alert(1)>"}', b"\0" * 1000):
+            await stranger.publish(Topic.EVENTS.of("rig"), payload, qos=1, retain=True)
+        told = await viewer.until("broker", lambda message: message.get("rubbish") == 3)
+        assert "companion/rig/events" in told["rubbish_text"]
+        await vehicle.say_events("genuine")
+        assert (await viewer.until("events"))["data"]["lines"][0]["text"] == "genuine"
+        assert sum(message["kind"] == "events" for message in viewer.heard) == 2
 
 
-def test_rubbish_at_the_broker_is_counted_and_not_passed_on(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
-            aiomqtt.Client("127.0.0.1", broker.port) as stranger,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            await viewer.until("events")
-            for payload in (b"{", b'{"v":2,"hack":"<img onerror=alert(1)>"}', b"\0" * 1000):
-                await stranger.publish(Topic.EVENTS.of("rig"), payload, qos=1, retain=True)
-            told = await viewer.until("broker", lambda message: message.get("rubbish") == 3)
-            assert "companion/rig/events" in told["rubbish_text"]
-            await vehicle.say_events("genuine")
-            assert (await viewer.until("events"))["data"]["lines"][0]["text"] == "genuine"
-            assert sum(message["kind"] == "events" for message in viewer.heard) == 2
-
-    play(scene())
-
-
-def test_the_broker_may_come_and_go(tmp_path: Path) -> None:
-    async def scene() -> None:
-        with loopback_broker(tmp_path) as broker:
-            await asyncio.to_thread(broker.stop)
-            async with monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer:
-                told = await viewer.until("broker", lambda message: "refused" in message["text"])
-                assert told["connected"] is False and told["text"].startswith(f"no broker at {broker.url}, trying")
-                for number in range(2):
-                    await asyncio.to_thread(broker.start)
-                    await viewer.until("broker", lambda message: message["connected"])
-                    async with played_vehicle(broker.port, OPERATORS, session=f"session-{number}") as vehicle:
-                        session = vehicle.session
-                        await viewer.until("stream", lambda m, session=session: m["data"]["session"] == session)  # type: ignore[misc]
-                        await viewer.order("hold")
-                        ack = await viewer.until("ack")
-                        assert ack["data"]["session"] == session
-                        await asyncio.to_thread(broker.kill)
-                        await viewer.until("broker", lambda message: not message["connected"])
-                        await viewer.order("land")
-                        refused = await viewer.until("refused")
-                        assert refused["text"].startswith(f"no broker at {broker.url}")
-                        assert "pilot's switch" in refused["text"]
-
-    play(scene())
-
-
-def test_hostile_text_in_an_event_arrives_as_the_text_that_it_is(broker: Broker) -> None:
-    async def scene() -> None:
-        hostile = '<img src=x onerror="alert(1)">\u2028\x1b[2J'
-        async with (
-            played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            await viewer.until("events")
-            await vehicle.say_events(hostile)
-            await viewer.until("events")
-            async with viewer_of(monitor) as late:
-                assert (await late.until("events"))["data"]["lines"][0]["text"] == hostile
-
-    play(scene())
+@played
+async def test_the_broker_may_come_and_go(tmp_path: Path) -> None:
+    with loopback_broker(tmp_path) as broker:
+        await asyncio.to_thread(broker.stop)
+        async with monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer:
+            told = await viewer.until("broker", lambda message: "refused" in message["text"])
+            assert told["connected"] is False and told["text"].startswith(f"no broker at {broker.url}, trying")
+            for number in range(2):
+                await asyncio.to_thread(broker.start)
+                await viewer.until("broker", lambda message: message["connected"])
+                async with played_vehicle(broker.port, OPERATORS, session=f"session-{number}") as vehicle:
+                    session = vehicle.session
+                    await viewer.until("stream", lambda m, session=session: m["data"]["session"] == session)  # type: ignore[misc]
+                    await viewer.order("hold")
+                    ack = await viewer.until("ack")
+                    assert ack["data"]["session"] == session
+                    await asyncio.to_thread(broker.kill)
+                    await viewer.until("broker", lambda message: not message["connected"])
+                    await viewer.order("land")
+                    refused = await viewer.until("refused")
+                    assert refused["text"].startswith(f"no broker at {broker.url}")
+                    assert "pilot's switch" in refused["text"]
 
 
 @contextlib.contextmanager
@@ -270,34 +233,30 @@ def test_other_computers_command_over_tls_only(host: str, tls: bool, commands: b
     assert ("#token=" in monitor.url) is commands
 
 
-def test_the_page_over_tls(broker: Broker, tmp_path: Path) -> None:
+@played
+async def test_the_page_over_tls(broker: Broker, tmp_path: Path) -> None:
     cert, key = self_signed(tmp_path)
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server.load_cert_chain(cert, key)
     trusting = ssl.create_default_context(cafile=str(cert))
 
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS),
-            monitor_at(broker.url, serving=ServerSettings("127.0.0.1", 0, server)) as monitor,
-            viewer_of(monitor, ssl=trusting) as viewer,
-        ):
-            assert monitor.url.startswith("https://127.0.0.1:")
-            await viewer.until("stream")
-            await viewer.order("land")
-            await viewer.until("ack")
-
-    play(scene())
+    async with (
+        played_vehicle(broker.port, OPERATORS),
+        monitor_at(broker.url, serving=ServerSettings("127.0.0.1", 0, server)) as monitor,
+        viewer_of(monitor, ssl=trusting) as viewer,
+    ):
+        assert monitor.url.startswith("https://127.0.0.1:")
+        await viewer.until("stream")
+        await viewer.order("land")
+        await viewer.until("ack")
 
 
-def test_a_port_that_is_taken_is_said(broker: Broker) -> None:
-    async def scene() -> None:
-        async with monitor_at(broker.url) as monitor:
-            with pytest.raises(WebError, match=f"port {monitor.port} of 127.0.0.1 is in use"):
-                async with monitor_at(broker.url, serving=ServerSettings("127.0.0.1", monitor.port)):
-                    pass
-        with pytest.raises(WebError, match=r"--host 192\.0\.2\.7: cannot listen there"):
-            async with monitor_at(broker.url, serving=ServerSettings("192.0.2.7", 0)):
+@played
+async def test_a_port_that_is_taken_is_said(broker: Broker) -> None:
+    async with monitor_at(broker.url) as monitor:
+        with pytest.raises(WebError, match=f"port {monitor.port} of 127.0.0.1 is in use"):
+            async with monitor_at(broker.url, serving=ServerSettings("127.0.0.1", monitor.port)):
                 pass
-
-    play(scene())
+    with pytest.raises(WebError, match=r"--host 192\.0\.2\.7: cannot listen there"):
+        async with monitor_at(broker.url, serving=ServerSettings("192.0.2.7", 0)):
+            pass

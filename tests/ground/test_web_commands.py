@@ -17,7 +17,7 @@ from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import ATTEMPTS, NO_ANSWER, signer_of
 from companion.ground.station.vehicles import LIVE_S
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, play, token_of, viewer_of
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, played, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle
 
 pytestmark = pytest.mark.waits
@@ -30,167 +30,154 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @pytest.mark.parametrize("command", list(CommandName))
-def test_a_command_is_signed_judged_by_the_vehicle_and_its_answer_shown(broker: Broker, command: CommandName) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-            viewer_of(monitor) as other,
-        ):
-            await viewer.until("stream")
-            await viewer.order(command.value)
-            sent = await viewer.until("sent")
-            ack = await viewer.until("ack")
-            assert (sent["vehicle"], sent["command"]) == ("rig", command.value)
-            assert ack["data"]["nonce"] == sent["nonce"] == vehicle.accepted[0].nonce
-            assert ack["data"]["text"] == f"{command.value}: done"
-            assert vehicle.accepted[0].command is command and vehicle.accepted[0].operator == "anna"
-            assert (await other.until("ack"))["data"] == ack["data"]
-            assert not [message for message in other.heard if message["kind"] == "sent"]
+@played
+async def test_a_command_is_signed_judged_by_the_vehicle_and_its_answer_shown(
+    broker: Broker, command: CommandName
+) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+        viewer_of(monitor) as other,
+    ):
+        await viewer.until("stream")
+        await viewer.order(command.value)
+        sent = await viewer.until("sent")
+        ack = await viewer.until("ack")
+        assert (sent["vehicle"], sent["command"]) == ("rig", command.value)
+        assert ack["data"]["nonce"] == sent["nonce"] == vehicle.accepted[0].nonce
+        assert ack["data"]["text"] == f"{command.value}: done"
+        assert vehicle.accepted[0].command is command and vehicle.accepted[0].operator == "anna"
+        assert (await other.until("ack"))["data"] == ack["data"]
+        assert not [message for message in other.heard if message["kind"] == "sent"]
 
-    play(scene())
 
-
-def test_a_refusal_of_the_vehicle_reaches_the_page(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            vehicle.accepts = lambda command: (False, "nothing to resume: not holding")
-            await viewer.until("stream")
-            await viewer.order("resume")
-            ack = await viewer.until("ack")
-            assert ack["data"]["accepted"] is False
-            assert ack["data"]["text"] == "nothing to resume: not holding"
-
-    play(scene())
+@played
+async def test_a_refusal_of_the_vehicle_reaches_the_page(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        vehicle.accepts = lambda command: (False, "nothing to resume: not holding")
+        await viewer.until("stream")
+        await viewer.order("resume")
+        ack = await viewer.until("ack")
+        assert ack["data"]["accepted"] is False
+        assert ack["data"]["text"] == "nothing to resume: not holding"
 
 
 @pytest.mark.parametrize("command", ["hold", "start"])
-def test_no_answer_is_said_and_only_what_makes_things_safer_is_sent_again(broker: Broker, command: str) -> None:
+@played
+async def test_no_answer_is_said_and_only_what_makes_things_safer_is_sent_again(broker: Broker, command: str) -> None:
     tries = ATTEMPTS if command == "hold" else 1
 
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            vehicle.answers = False
-            await viewer.until("stream")
-            await viewer.order(command)
-            texts = [(await viewer.until("refused"))["text"] for _ in range(tries)]
-            assert all(text.startswith(NO_ANSWER) for text in texts)
-            assert [text[len(NO_ANSWER) :] for text in texts] == [
-                f" (sent again, {number} of {tries})" for number in range(2, tries + 1)
-            ] + [""]
-            nonces = [message["nonce"] for message in viewer.heard if message["kind"] == "sent"]
-            assert len(set(nonces)) == tries
-            assert [heard.nonce for heard in vehicle.accepted] == nonces
-
-    play(scene())
+    async with (
+        played_vehicle(broker.port, OPERATORS) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        vehicle.answers = False
+        await viewer.until("stream")
+        await viewer.order(command)
+        texts = [(await viewer.until("refused"))["text"] for _ in range(tries)]
+        assert all(text.startswith(NO_ANSWER) for text in texts)
+        assert [text[len(NO_ANSWER) :] for text in texts] == [
+            f" (sent again, {number} of {tries})" for number in range(2, tries + 1)
+        ] + [""]
+        nonces = [message["nonce"] for message in viewer.heard if message["kind"] == "sent"]
+        assert len(set(nonces)) == tries
+        assert [heard.nonce for heard in vehicle.accepted] == nonces
 
 
-def test_a_late_answer_ends_the_tries(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            vehicle.answers = False
-            await viewer.until("stream")
-            await viewer.order("land")
-            await viewer.until("refused")
-            vehicle.answers = True
-            ack = await viewer.until("ack")
-            assert ack["data"]["nonce"] == vehicle.accepted[-1].nonce
-            await viewer.order("hold")
-            await viewer.until("ack", lambda message: message["data"]["command"] == "hold")
-            assert sum(heard.command is CommandName.LAND for heard in vehicle.accepted) <= 2
-
-    play(scene())
+@played
+async def test_a_late_answer_ends_the_tries(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        vehicle.answers = False
+        await viewer.until("stream")
+        await viewer.order("land")
+        await viewer.until("refused")
+        vehicle.answers = True
+        ack = await viewer.until("ack")
+        assert ack["data"]["nonce"] == vehicle.accepted[-1].nonce
+        await viewer.order("hold")
+        await viewer.until("ack", lambda message: message["data"]["command"] == "hold")
+        assert sum(heard.command is CommandName.LAND for heard in vehicle.accepted) <= 2
 
 
-def test_a_newer_command_ends_the_tries_of_an_older_one(broker: Broker) -> None:
+@played
+async def test_a_newer_command_ends_the_tries_of_an_older_one(broker: Broker) -> None:
     """A HOLD that is sent again after a RESUME would hold once more."""
 
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-            vehicle.answers = False
-            await viewer.until("stream")
+    async with (
+        played_vehicle(broker.port, OPERATORS) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+        vehicle.answers = False
+        await viewer.until("stream")
+        await viewer.order("hold")
+        await viewer.until("sent")
+        await viewer.order("resume")
+        await viewer.until("refused", lambda message: message["command"] == "resume")
+        held = [message for message in viewer.heard if message["kind"] == "refused" and message["command"] == "hold"]
+        assert [message["text"] for message in held] == [NO_ANSWER]
+        assert [heard.command.value for heard in vehicle.accepted] == ["hold", "resume"]
+
+
+@played
+async def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
+        monitor_at(broker.url) as monitor,
+        viewer_of(monitor) as viewer,
+    ):
+
+        async def why_not(name: str) -> str:
+            await viewer.order("hold", name)
+            return str((await viewer.until("refused"))["text"])
+
+        await viewer.until("broker", lambda message: message["connected"])
+        assert "no vehicle 'other' is known" in await why_not("other")
+        assert "no command can be dated" in await why_not("rig")
+        await vehicle.say_stream()
+        await viewer.until("stream")
+        await asyncio.sleep(
+            LIVE_S
+        )  # as long as proven messages come in, a state that nobody has proven is not believed
+        await vehicle.say_state(commands=False, text="the broker is another computer")
+        await viewer.until("state", lambda message: not message["data"]["commands"])
+        assert "accepts no commands: the broker is another computer" in await why_not("rig")
+        await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
+        await viewer.until("state", lambda message: message["data"]["presence"] == "ended")
+        assert "has ended" in await why_not("rig")
+        assert vehicle.commands_heard == 0
+
+
+@played
+async def test_who_has_no_token_or_another_one_sees_everything_and_commands_nothing(broker: Broker) -> None:
+    async with played_vehicle(broker.port, OPERATORS) as vehicle, monitor_at(broker.url) as monitor:
+        for token in ("", "x", token_of(monitor)[:-1], token_of(monitor).swapcase()):
+            async with viewer_of(monitor, token) as viewer:
+                hello = await viewer.next()
+                assert hello["can_command"] is False and "#" in hello["why_not"]
+                await viewer.until("stream")
+                await viewer.order("land")
+                assert (await viewer.until("refused"))["text"] == hello["why_not"]
+        async with viewer_of(monitor, "") as viewer:
+            await viewer.ws.send_json({"kind": "token", "token": token_of(monitor)})
+            await viewer.until("hello", lambda message: message["can_command"])
             await viewer.order("hold")
-            await viewer.until("sent")
-            await viewer.order("resume")
-            await viewer.until("refused", lambda message: message["command"] == "resume")
-            held = [
-                message for message in viewer.heard if message["kind"] == "refused" and message["command"] == "hold"
-            ]
-            assert [message["text"] for message in held] == [NO_ANSWER]
-            assert [heard.command.value for heard in vehicle.accepted] == ["hold", "resume"]
-
-    play(scene())
+            await viewer.until("ack")
+        assert [command.command.value for command in vehicle.accepted] == ["hold"]
 
 
-def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
-            monitor_at(broker.url) as monitor,
-            viewer_of(monitor) as viewer,
-        ):
-
-            async def why_not(name: str) -> str:
-                await viewer.order("hold", name)
-                return str((await viewer.until("refused"))["text"])
-
-            await viewer.until("broker", lambda message: message["connected"])
-            assert "no vehicle 'other' is known" in await why_not("other")
-            assert "no command can be dated" in await why_not("rig")
-            await vehicle.say_stream()
-            await viewer.until("stream")
-            await asyncio.sleep(
-                LIVE_S
-            )  # as long as proven messages come in, a state that nobody has proven is not believed
-            await vehicle.say_state(commands=False, text="the broker is another computer")
-            await viewer.until("state", lambda message: not message["data"]["commands"])
-            assert "accepts no commands: the broker is another computer" in await why_not("rig")
-            await vehicle.say_state(presence=Presence.ENDED, outcome="completed")
-            await viewer.until("state", lambda message: message["data"]["presence"] == "ended")
-            assert "has ended" in await why_not("rig")
-            assert vehicle.commands_heard == 0
-
-    play(scene())
-
-
-def test_who_has_no_token_or_another_one_sees_everything_and_commands_nothing(broker: Broker) -> None:
-    async def scene() -> None:
-        async with played_vehicle(broker.port, OPERATORS) as vehicle, monitor_at(broker.url) as monitor:
-            for token in ("", "x", token_of(monitor)[:-1], token_of(monitor).swapcase()):
-                async with viewer_of(monitor, token) as viewer:
-                    hello = await viewer.next()
-                    assert hello["can_command"] is False and "#" in hello["why_not"]
-                    await viewer.until("stream")
-                    await viewer.order("land")
-                    assert (await viewer.until("refused"))["text"] == hello["why_not"]
-            async with viewer_of(monitor, "") as viewer:
-                await viewer.ws.send_json({"kind": "token", "token": token_of(monitor)})
-                await viewer.until("hello", lambda message: message["can_command"])
-                await viewer.order("hold")
-                await viewer.until("ack")
-            assert [command.command.value for command in vehicle.accepted] == ["hold"]
-
-    play(scene())
-
-
-def test_a_command_that_the_broker_does_not_let_pass_is_told_as_that(tmp_path: Path) -> None:
+@played
+async def test_a_command_that_the_broker_does_not_let_pass_is_told_as_that(tmp_path: Path) -> None:
     with loopback_broker(tmp_path) as broker:
         broker.stop()
         (tmp_path / "acl").write_text("topic read companion/#\nuser vehicle\ntopic readwrite companion/#\n")
@@ -200,22 +187,19 @@ def test_a_command_that_the_broker_does_not_let_pass_is_told_as_that(tmp_path: P
         )  # root alone sees this folder
         broker.start()
 
-        async def scene() -> None:
-            async with (
-                aiomqtt.Client("127.0.0.1", broker.port, username="vehicle") as client,
-                monitor_at(broker.url) as monitor,
-                viewer_of(monitor) as viewer,
-            ):
-                await viewer.until("broker", lambda message: message["connected"])
-                vehicle = PlayedVehicle(client, "rig", "s", OPERATORS)
-                await vehicle.say_all()
-                await vehicle.say_stream()
-                await viewer.until("stream")
-                await viewer.order("start")
-                refused = await viewer.until("refused")
-                assert refused["text"].startswith("the broker refused it: Not authorized")
-
-        play(scene())
+        async with (
+            aiomqtt.Client("127.0.0.1", broker.port, username="vehicle") as client,
+            monitor_at(broker.url) as monitor,
+            viewer_of(monitor) as viewer,
+        ):
+            await viewer.until("broker", lambda message: message["connected"])
+            vehicle = PlayedVehicle(client, "rig", "s", OPERATORS)
+            await vehicle.say_all()
+            await vehicle.say_stream()
+            await viewer.until("stream")
+            await viewer.order("start")
+            refused = await viewer.until("refused")
+            assert refused["text"].startswith("the broker refused it: Not authorized")
 
 
 def test_who_may_command_from_a_monitor(broker: Broker, tmp_path: Path) -> None:
@@ -241,19 +225,17 @@ def test_a_key_is_made_for_this_computer_alone(tmp_path: Path, monkeypatch: pyte
     assert isinstance(signer, Signer) and list(tmp_path.rglob("operators.yaml"))
 
 
-def test_nobody_commands_through_a_monitor_that_is_view_only(broker: Broker) -> None:
-    async def scene() -> None:
-        async with (
-            played_vehicle(broker.port, OPERATORS) as vehicle,
-            monitor_at(broker.url, "nobody shall") as monitor,
-            viewer_of(monitor, "") as viewer,
-        ):
-            assert "#" not in monitor.url
-            hello = await viewer.next()
-            assert (hello["can_command"], hello["operator"], hello["why_not"]) == (False, None, "nobody shall")
-            await viewer.until("stream")
-            await viewer.order("hold")
-            assert (await viewer.until("refused"))["text"] == "nobody shall"
-            assert vehicle.commands_heard == 0
-
-    play(scene())
+@played
+async def test_nobody_commands_through_a_monitor_that_is_view_only(broker: Broker) -> None:
+    async with (
+        played_vehicle(broker.port, OPERATORS) as vehicle,
+        monitor_at(broker.url, "nobody shall") as monitor,
+        viewer_of(monitor, "") as viewer,
+    ):
+        assert "#" not in monitor.url
+        hello = await viewer.next()
+        assert (hello["can_command"], hello["operator"], hello["why_not"]) == (False, None, "nobody shall")
+        await viewer.until("stream")
+        await viewer.order("hold")
+        assert (await viewer.until("refused"))["text"] == "nobody shall"
+        assert vehicle.commands_heard == 0

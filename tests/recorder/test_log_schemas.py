@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import select
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -158,35 +155,6 @@ def test_the_log_of_a_killed_recorder_opens_and_keeps_to_its_schemas(tmp_path: P
     log = FlightLog.read(path)
     assert not log.closed
     assert len(log.inputs) in counts
-
-
-FLIGHT = """
-import sys
-sys.path.insert(0, sys.argv[2])
-from pathlib import Path
-from tests.recorder.flights import config_json, offer, started, tethered
-recorder = started(Path(sys.argv[1]), config_json())
-print(recorder.process.pid, flush=True)
-print(offer(recorder, tethered(end_s=1.0)), flush=True)
-sys.stdin.read()
-"""
-
-
-def test_the_log_of_a_killed_flight_is_whole_and_keeps_to_its_schemas(tmp_path: Path) -> None:
-    path = tmp_path / "flight.mcap"
-    command = [sys.executable, "-c", FLIGHT, str(path), str(Path(__file__).parents[2])]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as flight:
-        assert flight.stdout is not None
-        recorder = os.pidfd_open(int(flight.stdout.readline()))
-        count = int(flight.stdout.readline())
-        flight.kill()
-    ended, _, _ = select.select([recorder], [], [], DEADLINE_S)
-    os.close(recorder)
-    assert ended, "the recorder did not end by itself"
-    found = view(path)
-    assert len(found.by_topic["/inputs"]) == count
-    check(found)
-    assert FlightLog.read(path).closed
 
 
 def test_protobuf_s_own_library_decodes_the_same(viewed: Viewed, flown: Path) -> None:

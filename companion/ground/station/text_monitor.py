@@ -20,10 +20,10 @@ from companion.ground.protocol.messages import Ack, CommandName, Topic
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import Failed, Sent, ack_text
 from companion.ground.station.station import Station
-from companion.ground.station.tasks import until_first
 from companion.ground.station.text_view import Notice, StationStatus, render, status_line
 from companion.ground.station.vehicles import ReceivedRecord, Vehicle
 from companion.runtime.console import terminal_console
+from companion.runtime.tasks import until_first
 
 PERIOD_S = 0.125
 LINE_PERIOD_S = 1.0

@@ -37,7 +37,6 @@ from companion.ground.station.command_sender import CommandSender, Failed, Sent
 from companion.ground.station.hub import GOING_AWAY, TOO_SLOW, VIEWERS_MAX, CloseReason, Hub, Outbox
 from companion.ground.station.replay_log import ReplayLog
 from companion.ground.station.station import Station
-from companion.ground.station.tasks import until_first
 from companion.ground.station.web_guard import (
     HEADERS,
     MESSAGE_MAX_BYTES,
@@ -49,6 +48,7 @@ from companion.ground.station.web_guard import (
     origin_allowed,
     same_token,
 )
+from companion.runtime.tasks import until_first
 
 PAGE = Path(__file__).parent / "page"
 TOKEN_WAIT_S = 1.0

@@ -78,11 +78,6 @@ class StreamBuilder:
         """Number of all events."""
 
     @property
-    def ticks_seen(self) -> bool:
-        """Whether there was a tick to build a `Stream` from."""
-        return self._newest is not None
-
-    @property
     def newest_outputs(self) -> Outputs | None:
         """Outputs of the newest tick."""
         return self._newest[1] if self._newest is not None else None
