@@ -28,7 +28,7 @@ from companion.runtime.console import tell
 USER = "companion"
 MISSION = "/etc/companion/mission.yaml"
 PROGRAM = "/opt/companion/.venv/bin/companion"
-"""Program in an image that is prepared elsewhere (--root); on the running system it is the program that runs."""
+"""Default of --program with --root (an image prepared on another computer); on the running system the default is this program."""
 _NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 _SERIAL = re.compile(r"[A-Za-z0-9._:+-]{1,64}")
 _HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _install(arguments: argparse.Namespace, root: Path) -> int:
-    settings, told = _settings(arguments, root)
+    settings, explanations = _settings(arguments, root)
     wanted = plan(settings)
     found = apply.pending_changes(root, wanted, load(root))
     live = root == Path("/")
@@ -114,10 +114,10 @@ def _install(arguments: argparse.Namespace, root: Path) -> int:
         if arguments.json:
             print(json.dumps(_as_json(wanted, found, live, done=False), indent=1))
         else:
-            print("\n".join([*told, *_shown(wanted, found, live)]))
+            print("\n".join([*explanations, *_shown(wanted, found, live)]))
         return EXIT_OK
     if not arguments.json:
-        print("\n".join([*told, *(line for _, line in _summary(wanted, found, live))]), flush=True)
+        print("\n".join([*explanations, *(line for _, line in _summary(wanted, found, live))]), flush=True)
     if not arguments.yes and not _agreed("Apply these changes?"):
         tell("companion install: cancelled; nothing was changed")
         return EXIT_ABORTED
@@ -188,7 +188,7 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
         raise ConfigError(
             [f"{vehicle or mission}: the service waits for an operator's START, but commands are not possible: {key}"]
         )
-    arm, force, told = choose_adapters(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
+    arm, force, explanations = choose_adapters(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
     return Settings(
         user=arguments.user,
         program=files["--program"],
@@ -197,7 +197,7 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
         arm_serial=arm,
         force_serial=force,
         at_boot=arguments.at_boot,
-    ), told
+    ), explanations
 
 
 def _seen_by_the_service(option: str, file: str, root: Path) -> str:

@@ -38,9 +38,9 @@ class GuardianClient:
         """Whether the guardian reported READY within the last second."""
         return not self._gone and self._ready_s is not None and self._clock() - self._ready_s < SILENT_S
 
-    def send_heartbeat(self, beat: Heartbeat) -> None:
+    def send_heartbeat(self, message: Heartbeat) -> None:
         """Send the heartbeat of one tick."""
-        self._send(heartbeat.pack(beat))
+        self._send(heartbeat.pack(message))
 
     def share_recorder(self, descriptor: int) -> None:
         """Send the descriptor of the recorder's channel, so that the guardian can log when this process cannot."""

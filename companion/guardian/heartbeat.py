@@ -61,26 +61,26 @@ class Heartbeat:
     """IPv4 address and UDP port of PX4, confirmed by the flight process; None if the link is not UDP."""
 
 
-def pack(beat: Heartbeat) -> bytes:
+def pack(heartbeat: Heartbeat) -> bytes:
     """Encode a heartbeat as a datagram."""
-    flags = _LIFTING * beat.lifting | _PILOT * beat.pilot | _GOODBYE * beat.goodbye
-    flags |= _MOCAP_REFUSED * beat.mocap_refused
-    host, port = _NO_PEER if beat.peer is None else (socket.inet_aton(beat.peer[0]), beat.peer[1])
+    flags = _LIFTING * heartbeat.lifting | _PILOT * heartbeat.pilot | _GOODBYE * heartbeat.goodbye
+    flags |= _MOCAP_REFUSED * heartbeat.mocap_refused
+    host, port = _NO_PEER if heartbeat.peer is None else (socket.inet_aton(heartbeat.peer[0]), heartbeat.peer[1])
     return _BEAT.pack(
         HEARTBEAT,
         flags,
-        beat.autopilot_system,
-        beat.own_system,
-        beat.own_component,
-        beat.local_port,
+        heartbeat.autopilot_system,
+        heartbeat.own_system,
+        heartbeat.own_component,
+        heartbeat.local_port,
         host,
         port,
-        beat.tick & 0xFFFFFFFF,
-        beat.t_s,
-        beat.origin_s,
-        beat.mission_t_s,
-        beat.pose_stamp_s,
-        *beat.position_world_m,
+        heartbeat.tick & 0xFFFFFFFF,
+        heartbeat.t_s,
+        heartbeat.origin_s,
+        heartbeat.mission_t_s,
+        heartbeat.pose_stamp_s,
+        *heartbeat.position_world_m,
     )
 
 

@@ -32,7 +32,7 @@ class Record:
     """One installation, including later changes to it."""
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
-    """By path on the vehicle's computer."""
+    """Entries by path on the vehicle's computer."""
     folders: tuple[str, ...] = ()
     """Folders that the installation created, outermost first."""
     users: tuple[str, ...] = ()

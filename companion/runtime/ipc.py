@@ -1,9 +1,8 @@
 """The local channel between the launcher and the flight process: short JSON messages on a SOCK_SEQPACKET pair.
 
-Flight to launcher: `status` (10 a second), `event`, `px4`, `command` (one that came over the air, and what it did), `ground` (how the
-way to the ground stations is), `started`, `refused`, `result`. Launcher to flight: `land`. The flight never
-waits for the launcher: a full channel loses the message. A launcher that is gone (end of file) means that nobody watches: the flight
-lands.
+Flight to launcher: `status` (10 a second), `event`, `px4`, `command` (a command from the ground, and its effect), `ground` (state of
+the connection to ground stations), `started`, `refused`, `result`. Launcher to flight: `land`. The flight never waits for the
+launcher: if the channel is full the message is lost. If the launcher is gone (end of file) the flight lands.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ MAX_MESSAGE_BYTES = 60_000
 
 
 def send(channel: socket.socket, message: Message) -> bool:
-    """Send without waiting; False: it was lost."""
+    """Send without waiting; return False if the message was lost."""
     try:
         channel.send(json.dumps(message).encode()[:MAX_MESSAGE_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
     except OSError:
@@ -26,10 +25,10 @@ def send(channel: socket.socket, message: Message) -> bool:
 
 
 def receive(channel: socket.socket) -> Message | None:
-    """One message that is there; None at the end of the channel.
+    """Return one message; None at the end of the channel.
 
     Raises:
-        BlockingIOError: nothing is there (non-blocking channel).
+        BlockingIOError: no message has arrived (non-blocking channel).
     """
     try:
         data = channel.recv(MAX_MESSAGE_BYTES + 1)

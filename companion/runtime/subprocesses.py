@@ -1,4 +1,4 @@
-"""Child processes: the signals that they inherit, ended for sure, and what can be said of one that ended by itself."""
+"""Child processes: default signals, termination, JSON lines from their pipes, and the reason of their exit."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class LaunchError(Exception):
 
 
 def use_default_signals() -> None:
-    """Undo which signals the parent left ignored or blocked, so that Ctrl-C and `kill -INT` work however we were started.
+    """Restore signals that the parent process left ignored or blocked, so that Ctrl-C and `kill -INT` always work.
 
     A shell without job control starts `companion ... &` with SIGINT ignored, and children inherit that. With SIGCHLD ignored, the
-    exit code of a child is lost. SIGHUP stays as it is: `nohup` means it. Does nothing in a thread other than the main one, which
-    cannot set handlers: there the program around it decides.
+    exit code of a child is lost. SIGHUP is left as it is, because `nohup` relies on it. Does nothing outside of the main thread,
+    which alone can set handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         return
@@ -41,7 +41,7 @@ def use_default_signals() -> None:
 
 
 def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None:
-    """End a child: wait, then SIGTERM, then SIGKILL; reaped in any case, its pipes closed."""
+    """End a child: wait, then send SIGTERM, then SIGKILL. The child is reaped and its pipes are closed."""
     for number in (0, signal.SIGTERM, signal.SIGKILL):  # 0 sends nothing
         process.send_signal(number)
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -66,19 +66,19 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file of the flight's folder, if it can be removed: the number of a process that is gone may become another's."""
+    """Remove a file of the flight's folder if possible: the id of an ended process may be assigned to another one."""
     with contextlib.suppress(OSError):
         path.unlink()
 
 
 @contextlib.contextmanager
 def scratch_folder(out: Path) -> Iterator[Path]:
-    """Make a new folder for temporary files in `out`, yield its absolute path, and remove it with all that children left in it.
+    """Create a folder for temporary files in `out`, yield its absolute path, and remove it with all its contents.
 
-    A folder that was there before is never taken, whatever its name: it would be removed.
+    The folder is always a new one: an existing folder would be removed with it.
 
     Raises:
-        LaunchError: it cannot be made.
+        LaunchError: the folder cannot be created.
     """
     try:
         path = Path(tempfile.mkdtemp(prefix=TMP_PREFIX, dir=out))
@@ -91,7 +91,7 @@ def scratch_folder(out: Path) -> Iterator[Path]:
 
 
 def how_it_ended(code: int) -> str:
-    """What a return code of `subprocess` says, for people."""
+    """Return text for a return code of `subprocess`."""
     if code >= 0:
         return f"ended with exit code {code}"
     try:
@@ -141,12 +141,12 @@ def _tail(path: Path) -> str:
 
 
 def holds_traceback(path: Path) -> bool:
-    """The end of a log shows an internal error."""
+    """Whether the end of a log shows an internal error."""
     return "Traceback (most recent call last)" in _tail(path)
 
 
 def last_line(path: Path) -> str:
-    """` (ValueError: what it said)`: the last line of a log, if there is one."""
+    """Return the last line of a log in the form ` (ValueError: text)`, or an empty string."""
     lines = _tail(path).split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return f" ({last[:_LINE_CHARACTERS]})" if last else ""

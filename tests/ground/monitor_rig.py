@@ -1,4 +1,4 @@
-"""The monitor's real server in the test's own event loop, and viewers of it over real sockets."""
+"""The monitor's real server in the test's event loop, and viewers connected over real sockets."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ P = ParamSpec("P")
 
 
 def played(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
-    """Run a test's coroutine; whatever it waits for has a deadline."""
+    """Decorate an async test: run its coroutine with a deadline."""
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -55,7 +55,7 @@ async def until(condition: Callable[[], bool]) -> None:
 async def monitor_at(
     url: str, signer: Signer | str = SIGNER, *, serving: ServerSettings | None = None, only: str | None = None
 ) -> AsyncIterator[Monitor]:
-    """The monitor of a broker, on a free port."""
+    """Run a monitor of a broker on a free port."""
     served: list[Monitor] = []
     listening = asyncio.Event()
 
@@ -86,14 +86,14 @@ def token_of(monitor: Monitor) -> str:
 
 
 class Viewer:
-    """A page, as far as the server can tell."""
+    """A WebSocket client that behaves as the page does."""
 
     def __init__(self, ws: aiohttp.ClientWebSocketResponse) -> None:
         self.ws = ws
         self.heard: list[dict[str, Any]] = []
 
     async def next(self) -> dict[str, Any]:
-        """The next message, whatever it is."""
+        """Return the next message."""
         message = await self.ws.receive(DEADLINE_S)
         assert message.type is aiohttp.WSMsgType.TEXT, (message.type, self.ws.close_code, message.extra)
         data: dict[str, Any] = json.loads(message.data)
@@ -101,7 +101,7 @@ class Viewer:
         return data
 
     async def until(self, kind: str, wanted: Callable[[dict[str, Any]], bool] = lambda message: True) -> dict[str, Any]:
-        """The next message of a kind that is wanted; what comes before it is in `heard`."""
+        """Return the next matching message of a kind; earlier ones are in `heard`."""
         while True:
             message = await self.next()
             if message["kind"] == kind and wanted(message):
@@ -111,7 +111,7 @@ class Viewer:
         await self.ws.send_json({"kind": "command", "vehicle": vehicle, "command": command})
 
     async def closed(self) -> tuple[int | None, str]:
-        """Close code and reason, whatever is said before."""
+        """Return the close code and reason, skipping messages before it."""
         while True:
             message = await self.ws.receive(DEADLINE_S)
             if message.type is aiohttp.WSMsgType.CLOSE:
@@ -122,7 +122,7 @@ class Viewer:
 
 @contextlib.asynccontextmanager
 async def viewer_of(monitor: Monitor, token: str | None = None, **settings: Any) -> AsyncIterator[Viewer]:
-    """A viewer; `token`: another one than the monitor's."""
+    """Connect a viewer, by default with the monitor's token."""
     base = base_of(monitor)
     async with (
         aiohttp.ClientSession() as session,
@@ -133,7 +133,7 @@ async def viewer_of(monitor: Monitor, token: str | None = None, **settings: Any)
 
 
 def self_signed(folder: Path) -> tuple[Path, Path]:
-    """A certificate for 127.0.0.1 and its key."""
+    """Return the files of a certificate for 127.0.0.1 and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "monitor")])
     now = datetime.datetime.now(datetime.UTC)

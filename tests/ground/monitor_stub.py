@@ -1,7 +1,7 @@
-"""A stand for the page: a web server that says to it what a test wants, and a flight to tell it about.
+"""A stub of the monitor: a web server that sends the page what a test wants, and a recorded flight.
 
-The flight is a real one, of the fast loop, in the records that a vehicle sends. The server is not the monitor's own (that has tests of
-its own): here a test decides what is said and when, and hears every word of the page.
+The flight is one of the fast loop, as the messages that a vehicle sends. The server is not the monitor's own, which has tests of its
+own: here the test decides what is sent and when, and receives every message of the page.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ Message = dict[str, Any]
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight as its telemetry."""
+    """A flight as telemetry."""
 
     scene: Scene
     streams: tuple[Stream, ...]
     events: Events
 
     def at(self, mission_t_s: float) -> Stream:
-        """The record at a time of the mission."""
+        """Return the record at a mission time."""
         return next(stream for stream in self.streams if stream.mission_t_s >= mission_t_s)
 
 
@@ -77,7 +77,7 @@ def flown() -> Flown:
 
 
 def sent_at(tick: int, t_s: float) -> Sent:
-    """The fast loop has no wires: times as they are over a good one."""
+    """Return plausible times: the fast loop has no wires."""
     return Sent(
         tick=tick,
         attitude_sent=True,
@@ -91,7 +91,7 @@ def sent_at(tick: int, t_s: float) -> Sent:
 
 
 def state(presence: Presence = Presence.FLYING, **changes: Any) -> State:
-    """What is said of the vehicle."""
+    """Return a state message of the vehicle."""
     usual = State(
         v=VERSION,
         vehicle=NAME,
@@ -108,7 +108,7 @@ def state(presence: Presence = Presence.FLYING, **changes: Any) -> State:
 
 
 def preflight() -> Preflight:
-    """Two rows."""
+    """Return two preflight rows."""
     rows = (
         PreflightRow("px4.link", "ok", "PX4 1.16.1 answers"),
         PreflightRow("battery", "warn", "82 %, 90 % wished for"),
@@ -117,12 +117,12 @@ def preflight() -> Preflight:
 
 
 def event(number: int, text: str, *, id_: str = "hold", severity: str = "warning", action: str = "hold") -> EventLine:
-    """One line."""
+    """Return one event line."""
     return EventLine(t_s=20.0 + number, mission_t_s=8.0 + number, id=id_, severity=severity, action=action, text=text)
 
 
 def ack(command: str, nonce: str, text: str, *, accepted: bool = True, operator: str = "anna") -> Ack:
-    """The vehicle's answer to a command."""
+    """Return the vehicle's answer to a command."""
     return Ack(
         v=VERSION,
         session=SESSION,
@@ -138,13 +138,13 @@ def ack(command: str, nonce: str, text: str, *, accepted: bool = True, operator:
     )
 
 
-def told(record: object, vehicle: str = NAME, **more: Any) -> Message:
-    """A record as the monitor passes it on."""
+def relayed(record: object, vehicle: str = NAME, **more: Any) -> Message:
+    """Return a record as the monitor sends it to the page."""
     return {"kind": type(record).__name__.lower(), "vehicle": vehicle, **more, "data": to_jsonable(record)}
 
 
 def hello(**changes: Any) -> Message:
-    """The monitor's first word: this page may command."""
+    """Return the monitor's first message: this page may command."""
     usual = {"kind": "hello", "version": "1", "can_command": True, "operator": "anna", "why_not": None}
     return {**usual, "replay": False, "logs": [], **changes}
 
@@ -152,11 +152,11 @@ def hello(**changes: Any) -> Message:
 BROKER: Message = {"kind": "broker", "connected": True, "text": "connected to mqtt://127.0.0.1:1883"}
 
 
-class Stand:
+class MonitorStub:
     """The server, in a thread of its own.
 
     Attributes:
-        greeting: said to every page that connects.
+        greeting: messages to every page that connects.
         replay: answer to ``/replay/N.json``.
     """
 
@@ -168,7 +168,7 @@ class Stand:
         self._change = threading.Condition()
         self._sockets: list[web.WebSocketResponse] = []
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="stand")
+        self._thread = threading.Thread(target=self._loop.run_forever, name="monitor stub")
         self._runner: web.AppRunner | None = None
 
     def __enter__(self) -> Self:
@@ -189,36 +189,36 @@ class Stand:
         return f"http://127.0.0.1:{self.port}/#token=secret"
 
     def start(self) -> None:
-        """Listen, on the same port as before."""
+        """Listen on the same port as before."""
         self._do(self._start())
 
     def stop(self) -> None:
-        """Gone, with all connections."""
+        """Close all connections and stop listening."""
         self._do(self._stop())
 
     def hang_up(self) -> None:
-        """Close every connection, and forget what was heard."""
+        """Close all connections and forget the received messages."""
         self._do(self._hang_up())
         with self._change:
             self._heard.clear()
 
-    def say(self, *messages: Message) -> None:
-        """To every page that is connected."""
-        self._do(self._say(messages))
+    def send(self, *messages: Message) -> None:
+        """Send messages to all connected pages."""
+        self._do(self._send(messages))
 
-    def heard(self, kind: str) -> list[Message]:
-        """Everything of a kind that pages have said."""
+    def received(self, kind: str) -> list[Message]:
+        """Return all received messages of a kind."""
         with self._change:
             return [message for message in self._heard if message["kind"] == kind]
 
-    def wait_heard(self, kind: str, count: int) -> list[Message]:
-        """Until so many of a kind were heard."""
+    def wait_received(self, kind: str, count: int) -> list[Message]:
+        """Wait for a number of messages of a kind."""
         with self._change:
             enough = self._change.wait_for(
                 lambda: sum(message["kind"] == kind for message in self._heard) >= count, DEADLINE_S
             )
             assert enough, (kind, count, self._heard)
-        return self.heard(kind)
+        return self.received(kind)
 
     def _do(self, work: Any) -> None:
         future: Future[None] = asyncio.run_coroutine_threadsafe(work, self._loop)
@@ -246,7 +246,7 @@ class Stand:
             await self._runner.cleanup()
             self._runner = None
 
-    async def _say(self, messages: Iterable[Message]) -> None:
+    async def _send(self, messages: Iterable[Message]) -> None:
         for message in messages:
             for socket in self._sockets:
                 await socket.send_json(message)
@@ -280,9 +280,10 @@ async def _index(request: web.Request) -> web.FileResponse:
 
 
 def retained(name: str = NAME, condition: Callable[[State], State] = lambda known: known) -> list[Message]:
-    """What a page is told of a vehicle when it connects."""
+    """Return the retained messages that a page receives when it connects."""
     flight = flown()
     known = condition(replace(state(), vehicle=name))
     return [
-        told(record, name) for record in (known, flight.scene, preflight(), replace(flight.events, lines=(), count=0))
+        relayed(record, name)
+        for record in (known, flight.scene, preflight(), replace(flight.events, lines=(), count=0))
     ]

@@ -1,4 +1,4 @@
-"""Headless Chromium with the page in it. The page's clock stands still until a test lets it run: nothing here waits for time."""
+"""Headless Chromium with the page. The page's clock stands still until a test advances it, so nothing waits for real time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from playwright.sync_api import sync_playwright
 from companion.ground.protocol.messages import VERSION, Events, Preflight, PreflightRow, Stream
 from tests.browser import ARGUMENTS
 from tests.browser import chromium as chromium_path
-from tests.ground.monitor_stub import NAME, SESSION, Message, Stand, told
+from tests.ground.monitor_stub import NAME, SESSION, Message, MonitorStub, relayed
 from tests.support import DEADLINE_S
 
 SIZES = {"desktop": (1440, 900), "small": (1024, 768), "tablet": (768, 1024)}
@@ -22,7 +22,7 @@ _marks = itertools.count()
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """The browser; without it the test is skipped with a reason."""
+    """Start the browser; skip the test if there is none."""
     path = chromium_path()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
@@ -31,15 +31,15 @@ def chromium() -> Iterator[Any]:
 
 
 class Page:
-    """The page as a person has it open.
+    """The page in one tab.
 
     Attributes:
-        shown: name of the vehicle that is looked at.
-        complaints: what the browser had to complain about: errors, violations of the content security policy.
+        shown: name of the displayed vehicle.
+        complaints: errors and warnings of the browser, including violations of the content security policy.
     """
 
-    def __init__(self, context: Any, stand: Stand | None, script: str) -> None:
-        self._stand = stand
+    def __init__(self, context: Any, stub: MonitorStub | None, script: str) -> None:
+        self._stub = stub
         self._number = itertools.count()
         self.shown = NAME
         self.complaints: list[str] = []
@@ -62,19 +62,16 @@ class Page:
         settle(self)
         self.tab.clock.pause_at(self.tab.evaluate("Date.now()") + 1000)
 
-    def open_anew(self, stand: Stand, *, size: str = "desktop", scheme: str = "dark") -> None:
-        """Load the page anew: nothing of what it knew or what was heard of it remains.
-
-        This takes a third of the computing time of a new tab.
-        """
-        stand.hang_up()
+    def open_anew(self, stub: MonitorStub, *, size: str = "desktop", scheme: str = "dark") -> None:
+        """Load the page anew, without any state of before. This takes a third of the CPU time of a new tab."""
+        stub.hang_up()
         self.shown = NAME
         self.complaints.clear()
         self.tab.mouse.move(0, 0)
         width, height = SIZES[size]
         self.tab.set_viewport_size({"width": width, "height": height})
         self.tab.emulate_media(color_scheme=scheme, reduced_motion="reduce")
-        self.tab.goto(stand.url.replace("#", f"?{next(self._number)}#"))
+        self.tab.goto(stub.url.replace("#", f"?{next(self._number)}#"))
         greeted(self)
         self.tab.clock.fast_forward(1000)
 
@@ -84,23 +81,23 @@ class Page:
         assert [text for text in self.complaints if not may or may not in text] == []
 
     def tell(self, *messages: Message) -> None:
-        """Let the stand say this, until the page has shown it."""
+        """Send messages through the stub and wait until the page has displayed them."""
         mark = f"mark {next(_marks)}"
         known = Preflight(VERSION, SESSION, (PreflightRow("mark", "ok", mark),))
-        assert self._stand is not None
-        self._stand.say(*messages, told(known, self.shown))
+        assert self._stub is not None
+        self._stub.send(*messages, relayed(known, self.shown))
         self.until("mark => document.getElementById('preflight-list').textContent.includes(mark)", mark)
 
     def run(self, seconds: float) -> None:
-        """Let the page's clock run on."""
+        """Advance the page's clock."""
         self.tab.clock.run_for(round(seconds * 1000))
 
     def until(self, expression: str, argument: object = None) -> None:
-        """Until something is true in the page."""
+        """Wait until a JavaScript expression is true in the page."""
         self.tab.wait_for_function(expression, arg=argument, polling=20)
 
     def text(self, selector: str) -> str:
-        """What is read there, in one line."""
+        """Return the text of an element in one line."""
         return " ".join(self.tab.locator(selector).inner_text().split())
 
     def until_text(self, selector: str, text: str) -> None:
@@ -117,21 +114,21 @@ class Page:
         self.tab.click(f"[data-command='{command}']")
 
     def enabled(self) -> set[str]:
-        """Commands that can be given."""
+        """Return the names of the enabled commands."""
         return set(
             self.tab.evaluate("[...document.querySelectorAll('[data-command]:enabled')].map((b) => b.dataset.command)")
         )
 
 
 def greeted(page: Page) -> None:
-    """Until the page knows whether it may command."""
+    """Wait until the page knows whether it may command."""
     page.until("() => document.querySelector('#operator').textContent || !document.querySelector('#badge-view').hidden")
 
 
 @contextmanager
 def watching(
     browser: Any,
-    source: Stand | str,
+    source: MonitorStub | str,
     *,
     size: str = "desktop",
     scheme: str = "dark",
@@ -140,24 +137,24 @@ def watching(
     script: str = "",
     settle: Callable[[Page], None] = greeted,
 ) -> Iterator[Page]:
-    """The page, opened.
+    """Open the page.
 
     Args:
-        browser: where.
-        source: the stand, or the address of a monitor.
+        browser: the browser.
+        source: the stub, or the address of a monitor.
         size: one of `SIZES`.
         scheme: ``dark`` or ``light``.
-        touch: it is a tablet.
-        may: nobody may have complained at the end, but of what contains this.
-        script: runs in the page before its own.
+        touch: emulate a touch screen.
+        may: complaints of the browser that contain this are allowed.
+        script: runs in the page before its own scripts.
         settle: waits until the page is ready; then its clock is stopped.
     """
     width, height = SIZES[size]
     context = browser.new_context(
         viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=touch, reduced_motion="reduce"
     )
-    stand = source if isinstance(source, Stand) else None
-    page = Page(context, stand, script)
+    stub = source if isinstance(source, MonitorStub) else None
+    page = Page(context, stub, script)
     try:
         page.open(source if isinstance(source, str) else source.url, settle)
         yield page
@@ -167,10 +164,10 @@ def watching(
 
 
 def playing(stream: Stream, **changes: Any) -> Callable[[], Message]:
-    """The record, newer each time than everything before: the page's clock stands, the vehicle's runs."""
+    """Return a function that returns the record with increasing times: the page's clock stands still, the vehicle's runs."""
     numbers = itertools.count(1)
-    return lambda: told(replace(stream, t_s=1000.0 + 100.0 * next(numbers), **changes))
+    return lambda: relayed(replace(stream, t_s=1000.0 + 100.0 * next(numbers), **changes))
 
 
 def events_of(*lines: Any, vehicle: str = NAME) -> Message:
-    return told(Events(v=VERSION, session=SESSION, count=len(lines), lines=tuple(lines)), vehicle)
+    return relayed(Events(v=VERSION, session=SESSION, count=len(lines), lines=tuple(lines)), vehicle)

@@ -16,7 +16,7 @@ from PIL import Image
 
 from companion.ground.protocol.messages import Presence
 from companion.model.codec import to_jsonable
-from tests.ground.monitor_stub import Stand, ack, event, flown, hello, preflight, retained, state, told
+from tests.ground.monitor_stub import MonitorStub, ack, event, flown, hello, preflight, relayed, retained, state
 from tests.ground.page_browser import Page, chromium, events_of, greeted, watching
 from tests.support import ROOT
 
@@ -25,35 +25,35 @@ NONCE = "0123456789abcdef" * 2
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture: name, size and scheme of the screen, and what happens before it is taken."""
+    """One picture: name, size and colour scheme of the screen, and the actions before it is taken."""
 
     name: str
     size: str
     scheme: str
-    act: Callable[[Page, Stand], None]
+    act: Callable[[Page, MonitorStub], None]
 
 
 def _fly(page: Page, until_s: float, **changes: object) -> None:
-    """The flight up to an instant; the last record with changes."""
+    """Send the flight up to a mission time, the last record with changes."""
     past = [stream for stream in flown().streams if stream.mission_t_s <= until_s]
     lines = [line for line in flown().events.lines if line.t_s <= past[-1].t_s]
-    messages = [told(stream) for stream in past]
+    messages = [relayed(stream) for stream in past]
     messages[-1]["data"] |= changes
     page.tell(*messages, events_of(*lines))
     page.run(0.2)
 
 
-def _flying(page: Page, stand: Stand) -> None:
+def _flying(page: Page, stub: MonitorStub) -> None:
     _fly(page, 8.5)
 
 
-def _holding(page: Page, stand: Stand) -> None:
-    page.tell(told(flown().streams[0]))
+def _holding(page: Page, stub: MonitorStub) -> None:
+    page.tell(relayed(flown().streams[0]))
     page.press("hold")
-    stand.wait_heard("command", 1)
+    stub.wait_received("command", 1)
     page.tell(
         {"kind": "sent", "vehicle": page.shown, "command": "hold", "nonce": NONCE},
-        told(ack("hold", NONCE, "stops on the planned path and holds")),
+        relayed(ack("hold", NONCE, "stops on the planned path and holds")),
     )
     page.tab.click("[data-preset='behind']")
     _fly(page, 8.5, action="hold")
@@ -62,12 +62,12 @@ def _holding(page: Page, stand: Stand) -> None:
     page.tell(events_of(*lines, asked))
 
 
-def _stale(page: Page, stand: Stand) -> None:
+def _stale(page: Page, stub: MonitorStub) -> None:
     _fly(page, 8.5)
     page.run(2.1)
 
 
-def _replayed(page: Page, stand: Stand) -> None:
+def _replayed(page: Page, stub: MonitorStub) -> None:
     script = (
         "t => { const s = document.getElementById('replay-time'); s.value = t; s.dispatchEvent(new Event('input')); }"
     )
@@ -84,18 +84,18 @@ REPLAY = Picture("monitor_replay", "desktop", "light", _replayed)
 
 
 def take(folder: Path) -> list[Path]:
-    """All pictures, as files."""
+    """Take all pictures and write them to files."""
     made = []
     with chromium() as browser:
         for picture in (*PICTURES, REPLAY):
-            with Stand(retained()) as stand:
+            with MonitorStub(retained()) as stub:
                 settle = greeted
                 if picture is REPLAY:
-                    stand.greeting = [hello(can_command=False, replay=True, logs=["flight.mcap"], why_not="a log")]
-                    stand.replay = [_log()]
+                    stub.greeting = [hello(can_command=False, replay=True, logs=["flight.mcap"], why_not="a log")]
+                    stub.replay = [_log()]
                     settle = _loaded
-                with watching(browser, stand, size=picture.size, scheme=picture.scheme, settle=settle) as page:
-                    picture.act(page, stand)
+                with watching(browser, stub, size=picture.size, scheme=picture.scheme, settle=settle) as page:
+                    picture.act(page, stub)
                     path = folder / f"{picture.name}.png"
                     _write(page.tab.screenshot(), path)
                     made.append(path)
@@ -103,7 +103,7 @@ def take(folder: Path) -> list[Path]:
 
 
 def _write(png: bytes, path: Path) -> None:
-    """With 256 colours, which is all that the page needs: a third of the bytes."""
+    """Write with 256 colours, enough for the page, at a third of the size."""
     picture = Image.open(io.BytesIO(png)).convert("RGB")
     picture.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 

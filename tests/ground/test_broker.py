@@ -1,4 +1,4 @@
-"""The security table: a real mosquitto with the files of `companion broker init`, and everybody who should not get in."""
+"""The security table: a real mosquitto with the files of `companion broker init`, and clients that must be refused."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ACK = Topic.ACK.of("tarot")
 
 @dataclass(frozen=True)
 class Site:
-    """A broker that runs, and the folder that it was made from."""
+    """A running broker and the folder that it was made from."""
 
     folder: Path
     broker: Broker
@@ -53,7 +53,7 @@ class Site:
 
 
 def for_tests(text: str, plain_port: int, tls_port: int) -> str:
-    """A profile on other ports of loopback; a broker that root starts stays root, or it could not read the files of the test."""
+    """Return a profile on other loopback ports; a broker that root starts stays root, so that it can read the test's files."""
     assert "listener 8883\n" in text
     assert "listener 1883 127.0.0.1\n" in text
     text = text.replace("listener 8883\n", f"listener {tls_port} 127.0.0.1\n")
@@ -83,7 +83,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 class Peer:
-    """A client of the broker: asks, and waits for the broker's word."""
+    """A client of the broker with blocking calls."""
 
     def __init__(
         self, port: int, login: Path | None = None, *, password: str | None = None, tls: ssl.SSLContext | None = None
@@ -113,7 +113,7 @@ class Peer:
         self._client.loop_stop()
 
     def connect(self, host: str = "127.0.0.1") -> int:
-        """The broker's reason code; with that of a refusal the connection is over."""
+        """Connect and return the broker's reason code; a refusal ends the connection."""
         self._client.connect(host, self._port, keepalive=30)
         self._client.loop_start()
         code = self._answer("connect", 0)
@@ -133,7 +133,7 @@ class Peer:
         return self._answer("publish", info.mid)
 
     def break_off(self) -> None:
-        """Close the socket without a word: the broker sends the will."""
+        """Close the socket without DISCONNECT, so that the broker publishes the will."""
         connected = self._client.socket()
         assert isinstance(connected, socket.socket)
         connected.shutdown(socket.SHUT_RDWR)
@@ -144,7 +144,7 @@ class Peer:
         return self._answer("disconnect", 0)
 
     def hear(self) -> tuple[str, bytes, bool]:
-        """The next message: (topic, payload, retained)."""
+        """Return the next message: (topic, payload, retained)."""
         return self._messages.get(timeout=DEADLINE_S)
 
     def _answer(self, kind: str, mid: int) -> int:
@@ -156,12 +156,12 @@ class Peer:
 
 
 def peer(site: Site, room: str, **settings: Any) -> Peer:
-    """Somebody with the login of a folder, over the plain listener."""
+    """Connect with the login of a folder, over the listener without TLS."""
     return Peer(site.plain_port, site.folder / room / "login.yaml", **settings)
 
 
 def logged(broker: Broker, pattern: str, after: int = 0) -> None:
-    """Wait until the broker's log has a line of this pattern, after so many characters."""
+    """Wait until the broker's log has a matching line after a given length."""
     deadline_s = time.monotonic() + DEADLINE_S
     while re.search(pattern, broker.log[after:]) is None:
         assert time.monotonic() < deadline_s, f"{pattern}\n{broker.log}"
@@ -210,7 +210,7 @@ def test_tls_refuses_a_broker_of_another_authority(site: Site, tmp_path: Path) -
 
 
 def tls_problem(site: Site, context: ssl.SSLContext, name: str) -> str:
-    """Shake hands with the broker by a name of it; what is wrong, or the version of TLS."""
+    """Make a TLS handshake with the broker under a host name; return the error, or the TLS version."""
     with socket.create_connection(("127.0.0.1", site.tls_port), DEADLINE_S) as plain:
         try:
             with context.wrap_socket(plain, server_hostname=name) as secure:
@@ -248,7 +248,7 @@ def reached(host: str, port: int) -> bool:
 
 
 def test_plain_listener_takes_nobody_from_elsewhere(site: Site) -> None:
-    """A plain remote connection: 127.0.0.2 is this computer by another address, as its address in the network is."""
+    """127.0.0.2 is another address of this computer, as its network address is."""
     with closing(socket.create_server(("0.0.0.0", 0))) as open_to_all:
         assert reached("127.0.0.2", open_to_all.getsockname()[1]), "the test itself: such a connection can be made"
     assert reached("127.0.0.1", site.plain_port)
@@ -287,7 +287,7 @@ def test_viewer_commanding_is_refused_and_logged(site: Site, qos: int) -> None:
 
 
 def test_viewers_will_commands_nothing(site: Site) -> None:
-    """A will is a message that the broker sends in somebody's name; an operator's shows that it is sent."""
+    """The broker publishes a will in the client's name; an operator's will shows that it does."""
     with peer(site, "vehicles/tarot") as vehicle, peer(site, "operators/anna") as anna:
         assert vehicle.subscribe(COMMAND) == 1
         bert = peer(site, "operators/bert")
@@ -341,7 +341,7 @@ def test_commands_are_heard_by_their_vehicle_alone(site: Site, room: str, topic:
 
 
 def test_broker_says_nothing_of_itself(site: Site) -> None:
-    """$SYS would tell a viewer who else is there."""
+    """$SYS would show a viewer who else is connected."""
     with peer(site, "viewers/wall") as wall, peer(site, "vehicles/tarot") as vehicle:
         wall.subscribe("$SYS/#")
         wall.subscribe(ACK)
@@ -371,11 +371,11 @@ SESSION, NOW_T_S = "f3a9", 60.0
 
 @dataclass
 class Attack:
-    """A message on the command topic of a broker that lets everybody publish."""
+    """A message on the command topic of a broker that lets anyone publish."""
 
     reason: Reason
     payload: Callable[[bytes, bytes], bytes]
-    """Of the operator's key and a genuine command."""
+    """Built from the operator's key and a genuine command."""
     retain: bool = False
 
 
@@ -432,7 +432,7 @@ def test_open_broker_lets_it_pass_and_the_vehicle_refuses(site: Site, tmp_path: 
 
 
 def test_supplied_profile_is_what_broker_init_writes() -> None:
-    """Made by `python -m companion.ground.broker.mosquitto_config configs/mosquitto`."""
+    """Written by `python -m tools.docs.mosquitto configs/mosquitto`."""
     folder = ROOT / "configs/mosquitto"
     assert {name: (folder / name).read_text() for name in example_files()} == example_files()
     assert {path.name for path in folder.iterdir()} == {*example_files(), LOOPBACK.name}

@@ -1,4 +1,4 @@
-"""`companion broker`: a folder whole or not at all, secrets where they belong, and what a broker lets a login do."""
+"""`companion broker`: a folder whole or not at all, private secrets, and the permissions of a login."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`companion command` with a real broker and a vehicle that judges."""
+"""`companion command` with a real broker and a vehicle that verifies commands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 @pytest.fixture
 def keys(tmp_path: Path) -> str:
-    """An operators file with anna alone."""
+    """An operators file with one operator, anna."""
     file = tmp_path / "operators.yaml"
     write_private(file, operators_text([ANNA]).encode())
     return str(file)
@@ -74,7 +74,7 @@ async def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, caps
 async def test_a_stranger_is_told_that_the_vehicle_does_not_have_the_key(
     broker: Broker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Another key of the same name: nothing of the vehicle is proven to it, so no command can be dated."""
+    """With another key under the same name no message is proven, so no command can be dated."""
     keys = tmp_path / "stranger.yaml"
     write_private(keys, operators_text([Operator("anna", b"x" * 32)]).encode())
 
@@ -137,7 +137,7 @@ async def test_several_vehicles_have_to_be_told_apart(
 async def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_quiet(
     name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is retained is known before anything is sent, however many there are."""
+    """All retained messages are known before a command is sent, however many there are."""
 
     async with played_vehicle(broker.port, OPERATORS, "one") as one:
         await leave_states(broker)
@@ -151,7 +151,7 @@ async def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_qu
 async def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
     name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A retained state of a vehicle may be forged: the one vehicle whose stream is proven is commanded, and the other is named."""
+    """A retained state may be forged: the command goes to the one vehicle with a proven stream, and the other is named."""
 
     async with played_vehicle(broker.port, OPERATORS, "rig") as vehicle:
         await leave_states(broker)
@@ -164,7 +164,7 @@ async def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
 
 
 async def leave_states(broker: Broker) -> None:
-    """Fifty retained states of vehicles that send nothing else; ``quiet-49`` flies by its state."""
+    """Publish fifty retained states of vehicles that send nothing else; ``quiet-49`` claims to fly."""
     async with aiomqtt.Client("127.0.0.1", broker.port) as client:
         for number in range(50):
             name = f"quiet-{number:02}"

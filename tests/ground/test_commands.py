@@ -1,4 +1,4 @@
-"""Who is believed: everything that a message on the command topic can be, and what the vehicle makes of it."""
+"""Verification of commands: every kind of message on the command topic, and the vehicle's verdict."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def reason_of(verdict: Verdict) -> Reason | None:
 def judged(
     payload: bytes, judge: Verifier | None = None, retained: bool = False, now_t_s: float = NOW_T_S
 ) -> Reason | None:
-    """Why it is refused, or None; text is fit for a log and a terminal."""
+    """Return the reason for a refusal, or None; its text must be fit for a log and a terminal."""
     verdict = (judge or verifier()).check(payload, retained, now_t_s)
     if isinstance(verdict, Refused):
         assert verdict.text.isprintable()
@@ -79,7 +79,7 @@ def test_genuine_command_is_accepted_as_it_was_made(name: CommandName) -> None:
 
 
 def test_json_of_another_hand_is_accepted() -> None:
-    """Spaces and order of the fields are the sender's: what they say is signed."""
+    """White space and field order are the sender's choice: the content is signed."""
     data = json.loads(encode(made()))
     payload = json.dumps(dict(reversed(data.items())), indent=1).encode()
     assert judged(payload) is None
@@ -177,7 +177,7 @@ def test_retained_is_refused_though_genuine() -> None:
 
 
 def test_unsigned_floods_do_not_stop_a_genuine_command() -> None:
-    """Whatever somebody without a key sends, all of an operator's commands pass: garbage, copies, old ones, foreign ones."""
+    """Whatever is sent without a key (garbage, copies, old or foreign commands), all commands of an operator pass."""
     judge = verifier()
     old = [encode(made(t_s=NOW_T_S - 60.0)) for _ in range(50)]
     first = encode(made(CommandName.START))
@@ -202,7 +202,7 @@ def test_freshness_at_its_edges(name: CommandName) -> None:
 
 
 def first_refusal_is_the_end(reasons: list[Reason | None]) -> bool:
-    """Accepted at most once, and never after it was refused."""
+    """Check that a command is accepted at most once, and never after a refusal."""
     return None not in reasons[1:]
 
 
@@ -216,7 +216,7 @@ def first_refusal_is_the_end(reasons: list[Reason | None]) -> bool:
 def test_a_command_is_accepted_once_at_most_and_never_after_its_first_refusal(
     times_t_s: list[float | None], name: CommandName, who: tuple[str, bytes], ahead_s: float, data: st.DataObject
 ) -> None:
-    """Whenever copies of it come: before the flight has begun, kept by the broker, with the clock's steps in any order."""
+    """Copies may arrive at any time: before the flight starts, retained, with clock steps in any order."""
     judge, payload = verifier(), encode(made(name, NOW_T_S + ahead_s, *who))
     reasons = []
     for t_s in times_t_s:
@@ -232,7 +232,7 @@ def test_a_command_is_accepted_once_at_most_and_never_after_its_first_refusal(
 def test_none_of_many_commands_is_accepted_after_its_first_refusal(
     made_at: list[tuple[CommandName, float]], data: st.DataObject
 ) -> None:
-    """Many commands, offered again and again in any order, beside floods that leave no room for their nonces."""
+    """Many commands are sent repeatedly in any order, next to floods that leave no room for their nonces."""
     judge, now_t_s = verifier(), NOW_T_S
     payloads = [encode(made(name, NOW_T_S + ahead_s)) for name, ahead_s in made_at]
     flood_s = data.draw(st.sampled_from([0.0, 40.0, 100.0]))
@@ -260,7 +260,7 @@ def test_a_start_that_was_from_the_future_is_not_accepted_when_its_time_has_come
 def test_a_resume_or_start_that_was_given_before_a_stop_is_refused_after_it(
     stop: CommandName, name: CommandName
 ) -> None:
-    """The network may turn their order, and two operators need not share a way to the vehicle."""
+    """The network may reorder them, and two operators may use different paths."""
     judge = verifier()
     assert judged(encode(made(stop, NOW_T_S, "bert", BERT)), judge) is None
     assert judged(encode(made(name, NOW_T_S - 0.5)), judge) is Reason.OVERTAKEN
@@ -308,7 +308,7 @@ def test_what_was_one_too_many_cannot_be_sent_again_later() -> None:
 @pytest.mark.parametrize("flood", CommandName)
 @pytest.mark.parametrize("ahead_s", [0.0, 60.0])
 def test_a_flood_of_one_command_leaves_room_for_every_other(flood: CommandName, ahead_s: float) -> None:
-    """A hung client: well signed, of one operator, as fast as it can."""
+    """A defective client sends well-signed commands of one operator as fast as it can."""
     judge = verifier()
     for _ in range(2 * REFUSED_MAX):
         judged(encode(made(flood, NOW_T_S + ahead_s)), judge)
@@ -320,7 +320,7 @@ def test_a_flood_of_one_command_leaves_room_for_every_other(flood: CommandName, 
 
 
 def test_a_flood_from_the_far_future_closes_its_own_dates_only() -> None:
-    """Those that found no room are refused when their date comes; what is dated now, or after them, is not."""
+    """Commands whose nonces were not kept are refused when their time comes; those for now or for later times are not."""
     judge, flood = verifier(), [encode(made(t_s=NOW_T_S + 60.0)) for _ in range(REFUSED_MAX + 2)]
     for payload in flood:
         judged(payload, judge)
@@ -394,7 +394,7 @@ def test_random_json_in_our_fields_is_refused(values: dict[str, Any]) -> None:
 
 
 def test_deep_json_is_refused_at_every_depth() -> None:
-    """At some depth the parser still goes down and the message that quotes it does not; wherever that is on this interpreter."""
+    """At some depth, which depends on the interpreter, the parser succeeds but quoting the data does not."""
     limit = sys.getrecursionlimit()
     try:
         for allowed in (limit, 400):
@@ -423,7 +423,7 @@ def test_flight_clock_follows_the_fastest_message() -> None:
 
 
 def test_flight_clock_forgets_what_was_long_ago() -> None:
-    """A vehicle whose clock goes slower than ours is followed."""
+    """A vehicle's clock that runs slower than the local one is followed."""
     clock = FlightClock()
     for number in range(4000):
         clock.add(number * 0.999, float(number))

@@ -1,4 +1,4 @@
-"""A broker that sends whatever it likes: no message ends the ground station, sets its clock, or keeps it from commanding."""
+"""A broker that sends anything: no message ends the ground station, sets its clock, or prevents commands."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def proven(stream: Stream, vehicle: str = "rig") -> bytes:
 
 
 def flying(t_s: float = 100.0) -> VehicleTracker:
-    """A ground station of anna that has heard one proven message, at 50 s of its own clock."""
+    """Return the tracker of anna's ground station after one proven message, at 50 s of the local clock."""
     watch = VehicleTracker(signer=SIGNER)
     assert watch.receive(STREAM, proven(stream_of(t_s)), False, 50.0) is not None
     return watch
@@ -81,7 +81,7 @@ def forged(watch: VehicleTracker) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("name", forged(VehicleTracker()))
 def test_a_forged_stream_makes_nobody_sign_for_a_time_that_has_not_come(name: str) -> None:
-    """Signed 60 s ahead it would be refused now and good for whoever kept a copy of it 60 s later."""
+    """A command signed 60 s ahead is refused now, but valid for whoever replays it 60 s later."""
     watch = flying()
     assert watch.receive(STREAM, forged(watch)[name], False, 50.1) is None
     known = watch.vehicles["rig"].proven
@@ -99,7 +99,7 @@ def test_a_copy_of_an_earlier_message_is_not_shown_as_new() -> None:
 
 
 def test_a_copy_of_the_newest_message_keeps_no_dead_link_alive() -> None:
-    """Sent again and again it would set the clock back, and every command would be refused as stale."""
+    """Sent repeatedly it would set the clock back, and every command would be refused as stale."""
     watch, copy = flying(), proven(stream_of(100.0))
     for k in range(1, 401):
         now_s = 50.0 + k / 20
@@ -141,7 +141,7 @@ def test_without_a_key_everything_is_shown() -> None:
 
 
 def test_an_answer_that_the_vehicle_did_not_prove_is_none() -> None:
-    """Else whoever reads the nonce on the way says "landing" and ends the tries."""
+    """Otherwise anyone who reads the nonce could answer "landing" and end the attempts."""
     ack = Ack(
         v=VERSION,
         session="s1",
@@ -183,7 +183,7 @@ HOSTILE = (
 
 @cache
 def genuine() -> dict[Topic, dict[str, Any]]:
-    """One good message of each topic, as data."""
+    """Return one valid message of each topic, as data."""
     config, _, events = flight()
     scene = scene_of(config, "s1", [(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], mission_s=21.0)
     ack = Ack(
@@ -211,7 +211,7 @@ def genuine() -> dict[Topic, dict[str, Any]]:
 
 
 def places(data: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Where in the data a value stands, containers included; of a list's elements the first two."""
+    """Yield the paths of all values and containers in the data; of a list only the first two elements."""
     yield path
     items = data.items() if isinstance(data, dict) else enumerate(data[:2]) if isinstance(data, list) else ()
     for key, value in items:
@@ -219,7 +219,7 @@ def places(data: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | 
 
 
 def spoiled(data: Any, path: tuple[str | int, ...], raw: str) -> bytes:
-    """The message with this JSON text at that place."""
+    """Return the message with a JSON text at one path."""
     if not path:
         return raw.encode()
     copy = json.loads(json.dumps(data))
@@ -248,7 +248,7 @@ def everything_hostile() -> Iterator[tuple[Topic, bytes]]:
 
 
 def test_no_message_raises_anywhere_in_a_ground_station() -> None:
-    """Every value at every place of every message, through the tracker, the page's hub and what the terminal shows."""
+    """Every value at every path of every message passes the tracker, the hub and the terminal display."""
     watch, signed = VehicleTracker(), VehicleTracker(signer=SIGNER)
     hub, outbox = Hub(watch, ""), Outbox()
     hub.add(outbox, 0.0)
@@ -322,7 +322,7 @@ async def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker:
 
 @played
 async def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> None:
-    """An error of our own while a message is handled costs that message, neither the connection nor the command."""
+    """An exception while a message is handled costs that message, neither the connection nor a command."""
 
     def fails(heard: object) -> None:
         raise ZeroDivisionError("of our own")

@@ -1,4 +1,4 @@
-"""What a ground station believes, and how it hands that to viewers; no sockets."""
+"""State of the vehicles and its distribution to viewers, without sockets."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def ack_of(nonce: str) -> Ack:
 
 
 def took(outbox: Outbox) -> list[Any]:
-    """What lies in an outbox that has something."""
+    """Return the content of an outbox."""
 
     async def take() -> list[str]:
         async with asyncio.timeout(10.0):
@@ -196,7 +196,7 @@ def test_everybody_gets_the_same_text_and_who_left_gets_nothing() -> None:
 
 @pytest.mark.parametrize("number", [b"NaN", b"Infinity", b"-Infinity", b'"nan"', b'"inf"', b"1e999", b"9" * 400])
 def test_what_browsers_cannot_read_is_not_taken(number: bytes) -> None:
-    """NaN is JSON to Python and to no browser."""
+    """Python reads NaN as JSON; browsers do not."""
     watch = VehicleTracker()
     payload = stream_of(progress=0.25).replace(b'"progress":0.25', b'"progress":' + number)
     assert watch.receive("companion/rig/stream", payload, False, 0.0) is None

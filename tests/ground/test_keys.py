@@ -1,4 +1,4 @@
-"""Files with secrets: made once, readable by their owner alone, and refused in one line that shows no secret."""
+"""Files with secrets: created once, readable by their owner alone, and refused in one line that shows no secret."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `companion monitor`: one line to open, one line for every mistake, logs that it plays."""
+"""The command `companion monitor`: it prints an address, reports every mistake in one line, and plays logs."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight's log, by the real recorder."""
+    """The log of a flight, written by the real recorder."""
     path = tmp_path_factory.mktemp("log") / "flight.mcap"
     record_flight(path, config=load_flight(CATCH).model_dump(mode="json"), end_s=8.0)
     return path
 
 
 def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    """Exit code and the one line."""
+    """Return the exit code and the one line."""
     code = cli.main(["monitor", *arguments])
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1, lines

@@ -53,7 +53,7 @@ def test_a_long_path_is_thinned_out_evenly(count: int) -> None:
 
 @pytest.mark.parametrize("topic", list(Topic))
 def test_schemas_in_the_docs_are_up_to_date(topic: Topic) -> None:
-    """Made by `python -m tools.docs.telemetry`."""
+    """Written by `python -m tools.docs.telemetry`."""
     assert schema_file(topic).read_text(encoding="utf-8") == schema_text(topic)
     jsonschema.Draft202012Validator.check_schema(schema_of(topic))
 

@@ -295,7 +295,7 @@ def tether(**values: Any) -> dict[str, Any]:
 
 
 def old(device: str, limit_s: float) -> Callable[[float], dict[str, Any]]:
-    """That device, so old in shares of the limit."""
+    """Return a row with a device's data at an age, as a share of its limit."""
     stamps = {
         "vehicle": ("position_stamp_s", "attitude_stamp_s", "imu_stamp_s"),
         "status": ("heartbeat_stamp_s",),

@@ -1,4 +1,4 @@
-"""`companion monitor --text`: what it shows, in a real terminal (a pty) and in a pipe."""
+"""`companion monitor --text`: its display in a real terminal (a pty) and in a pipe."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 def known(presence: Presence = Presence.FLYING, heard_s: float = 0.0, event: str = "caught", **values: Any) -> Vehicle:
-    """What is known of a vehicle that said this."""
+    """Return the tracked vehicle after it has sent these messages."""
     watch = VehicleTracker()
     events = flight()[2]
     lines = (replace(events.lines[0], text=event),)
@@ -160,13 +160,13 @@ class Terminal:
         os.write(self.ours, keys.encode())
 
     async def shows(self, text: str) -> None:
-        """Wait until something is drawn; what was there before does not count."""
+        """Wait until text is drawn; earlier output does not count."""
         while text not in plain(self._screen):
             self._screen += (await asyncio.to_thread(os.read, self.ours, 65536)).decode("utf-8", "replace")
         self._screen = ""
 
     async def ended(self) -> int:
-        """The exit code; what is still drawn is taken."""
+        """Return the exit code, reading what is still drawn."""
         drain = asyncio.ensure_future(asyncio.to_thread(self._drain))
         code = await asyncio.to_thread(self.process.wait)
         os.write(self._theirs, b"\x04")
@@ -198,7 +198,7 @@ async def terminal_at(broker: Broker, folder: Path, *more: str) -> AsyncIterator
 
 @pytest.mark.parametrize("after", [{"session": "s2"}, {"hold": 2}, {"vehicle": "second"}], ids=str)
 def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
-    """Vehicle, flight and hold together: if one of them is another one at the second press, it asks again."""
+    """If vehicle, flight or hold has changed at the second press, it asks again."""
     access = broker_access("mqtt://127.0.0.1", None, None)
     station = Station(access, SIGNER, None, lambda heard: None, lambda connected, text: None)
     screen = _Screen(Console())

@@ -1,4 +1,4 @@
-"""`companion monitor`'s server with a real broker, a vehicle that judges commands, and viewers over real sockets."""
+"""The server of `companion monitor` with a real broker, a vehicle that verifies commands, and viewers over real sockets."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ async def test_the_broker_may_come_and_go(tmp_path: Path) -> None:
 
 @contextlib.contextmanager
 def idle_viewer(monitor: Monitor) -> Iterator[None]:
-    """A viewer whose connection stands, and who reads nothing after the handshake."""
+    """Connect a viewer that reads nothing after the handshake."""
     with socket.socket() as idle:
         idle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         idle.connect(("127.0.0.1", monitor.port))

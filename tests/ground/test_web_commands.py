@@ -1,4 +1,4 @@
-"""Commands through the page: signed, judged by the vehicle, followed until they are answered."""
+"""Commands through the page: signed, verified by the vehicle, repeated until they are answered."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ async def test_a_late_answer_ends_the_tries(broker: Broker) -> None:
 
 @played
 async def test_a_newer_command_ends_the_tries_of_an_older_one(broker: Broker) -> None:
-    """A HOLD that is sent again after a RESUME would hold once more."""
+    """A HOLD that is repeated after a RESUME would hold again."""
 
     async with (
         played_vehicle(broker.port, OPERATORS) as vehicle,
@@ -216,7 +216,7 @@ def test_who_may_command_from_a_monitor(broker: Broker, tmp_path: Path) -> None:
 
 
 def test_a_key_is_made_for_this_computer_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No vehicle elsewhere would know it."""
+    """A vehicle on another computer would not know it."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     why_not = signer_of(broker_access("mqtts://192.0.2.1", None, None), None, None)
     assert "give a file: --operators" in str(why_not)

@@ -1,4 +1,4 @@
-"""A vehicle as a ground station knows it: a program at a real broker that sends real records, and judges commands as a vehicle does."""
+"""A vehicle for ground stations: it sends real records through a real broker, and verifies commands as a vehicle does."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.support import CATCH
 
 @lru_cache(maxsize=1)
 def flight() -> tuple[FlightConfig, tuple[Stream, ...], Events]:
-    """The records of a synthetic flight until shortly after the catch."""
+    """Return the records of a synthetic flight until shortly after the catch."""
     config = load_flight(CATCH)
     streams, events = replay(synthetic_flight(end_s=8.0), config, "session", 1.7e9)
     return config, tuple(streams), events
@@ -62,7 +62,7 @@ def state_of(name: str, session: str, **values: Any) -> State:
 
 
 class PlayedVehicle:
-    """Plays a flight again and again, 20 times a second on a clock of its own, until told otherwise."""
+    """Plays a flight repeatedly, 20 records a second by its own clock, until stopped."""
 
     def __init__(self, client: aiomqtt.Client, name: str, session: str, operators: Operators) -> None:
         self._client = client
@@ -76,10 +76,10 @@ class PlayedVehicle:
         self.refused: list[Refused] = []
         self.commands_heard = 0
         self.answers = True
-        """Acks are sent."""
+        """Send acks."""
         self.accepts: Callable[[Command], tuple[bool, str]] = lambda command: (True, f"{command.command.value}: done")
         self.streams = True
-        """The stream is sent."""
+        """Send the stream."""
         self.last_stream: Stream | None = None
 
     @property
@@ -101,7 +101,7 @@ class PlayedVehicle:
         await self.say(Topic.STATE, state_of(self.name, self.session, **values), retain=True)
 
     async def say_all(self) -> None:
-        """Everything that is retained."""
+        """Send all retained messages."""
         await self.say_state()
         await self.say(Topic.SCENE, self.scene(), retain=True)
         rows = (PreflightRow("px4_link", "ok", "3 ms"),)
@@ -125,7 +125,7 @@ class PlayedVehicle:
         return stream
 
     async def fly(self) -> None:
-        """Stream, and answer commands, until cancelled."""
+        """Send the stream and answer commands, until cancelled."""
         async with asyncio.TaskGroup() as both:
             both.create_task(self._stream())
             both.create_task(self._obey())
@@ -171,7 +171,7 @@ class PlayedVehicle:
 async def played_vehicle(
     port: int, operators: Operators, name: str = "rig", session: str = "session-1", *, quiet: bool = False
 ) -> AsyncIterator[PlayedVehicle]:
-    """A vehicle at a broker; `quiet`: it sends what it is asked to send, and nothing by itself."""
+    """Connect a vehicle to a broker; a `quiet` one sends only what it is asked to send."""
     async with aiomqtt.Client("127.0.0.1", port, protocol=aiomqtt.ProtocolVersion.V5) as client:
         vehicle = PlayedVehicle(client, name, session, operators)
         await client.subscribe(Topic.COMMAND.of(name), qos=1)

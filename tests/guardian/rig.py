@@ -1,4 +1,4 @@
-"""A guardian process on real sockets: beside it a child that plays the flight process, PX4's end of the wire, and a NatNet server."""
+"""A guardian process on real sockets, with a child as the flight process, PX4's end of the link, and a NatNet server."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ s.connect(("127.0.0.1", px4))
 print(flush=True)
 sys.stdin.read()
 """
-"""Holds PX4's port as the flight process does, and does nothing: the test speaks to the guardian in its name."""
+"""Holds PX4's port as the flight process does, and does nothing else: the test sends the heartbeats."""
 
 
 class Cameras:
-    """A NatNet server (unicast) that streams one still body at 100 Hz, in a thread."""
+    """A NatNet server (unicast) that streams one body at rest at 100 Hz, in a thread."""
 
     def __init__(self, body_id: int) -> None:
         self.position_m: Vec3 = POSITION_M
@@ -87,7 +87,7 @@ class Cameras:
 
 
 class Rig:
-    """One guardian with everything around it; `with` starts it and ends what is left by pid."""
+    """One guardian with its surroundings; used with `with`, which starts it and ends its processes."""
 
     def __init__(
         self, folder: Path, *, timeout_s: float = 0.2, disk_full: bool = False, address: str | None = None
@@ -180,7 +180,7 @@ class Rig:
         mocap_refused: bool = False,
         pose_age_s: float = 0.0,
     ) -> None:
-        """One tick of the flight process."""
+        """Send the heartbeat of one tick."""
         self.tick += 1
         t_s = time.monotonic() - self.origin_s
         beat = Heartbeat(
@@ -203,7 +203,7 @@ class Rig:
         self.beats.send(heartbeat.pack(beat))
 
     def beat_until_ready(self, **kind: bool) -> None:
-        """Ticks until the guardian says that it could take over; ends with a tick of this kind."""
+        """Send heartbeats until the guardian is ready; the last one has these values."""
 
         def ready() -> bool:
             self.beat(**kind)
@@ -216,7 +216,7 @@ class Rig:
         self.beat(**kind)
 
     def listen(self) -> None:
-        """Take in what went to launcher and recorder."""
+        """Read the messages to launcher and recorder."""
         self.messages += map(json.loads, self._arrived(self.channel))
         self.logged += map(read_packet, self._arrived(self.recorder))
 
@@ -227,24 +227,24 @@ class Rig:
 
     @property
     def events(self) -> list[str]:
-        """Ids of the guardian's events, as the launcher got them."""
+        """Ids of the guardian's events that the launcher received."""
         self.listen()
         return [message["id"] for message in self.messages if message["type"] == "event"]
 
     @property
     def log_ids(self) -> list[str]:
-        """Ids of the lines that the recorder got."""
+        """Ids of the lines that the recorder received."""
         self.listen()
         return [packet.source for packet in self.logged if isinstance(packet, LogLine)]
 
     @property
     def result(self) -> ipc.Message | None:
-        """The guardian's last word."""
+        """The guardian's final message."""
         self.listen()
         return next((message for message in self.messages if message["type"] == "guardian_result"), None)
 
     def come_down(self) -> None:
-        """From where it is to standing height, by motion capture and by PX4, slowly enough to be believed."""
+        """Lower motion capture and PX4's position to standing height, slowly enough to be plausible."""
         x, y, z = self.cameras.position_m
         while z > STANDING_M:
             z = max(STANDING_M, z - 0.05)
@@ -252,8 +252,8 @@ class Rig:
             time.sleep(0.02)
         self.peer.position_ned_m, self.peer.velocity_ned_m_s = (y, x, -STANDING_M), (0.0, 0.0, 0.0)
 
-    def land_as_told(self) -> None:
-        """PX4's part, once LAND was commanded: the mode, the floor, the disarm."""
+    def land(self) -> None:
+        """Play PX4 after LAND was commanded: mode, touchdown, disarm."""
         wait_until(lambda: bool(self.peer.commands(mavlink.MAV_CMD_NAV_LAND)), lambda: self.log.read_text())
         self.peer.custom_mode = LAND_MODE
         wait_until(lambda: "guardian_land" in self.events, lambda: self.log.read_text())

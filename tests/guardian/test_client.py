@@ -1,4 +1,4 @@
-"""The flight process's side: what it tells, and what it makes of what it hears."""
+"""The flight process's side of the guardian: messages sent and received."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
 
 @pytest.fixture(scope="module")
 def waiting() -> Outputs:
-    """What the core decides on the ground, in the first tick."""
+    """Return the core's outputs on the ground, in the first tick."""
     airframe = {"vehicle.airframe.hover_thrust": 0.5}
     config = load_flight(HOVER, overrides=[f"{key}={value}" for key, value in airframe.items()])
     return FlightCore(config).step(inputs())
@@ -198,7 +198,7 @@ def test_a_pilot_stays_one_and_a_pose_that_is_not_believed_is_not_passed_on(pair
 
 
 def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiting: Outputs) -> None:
-    """Whatever the outcome: rotors that turn are for the guardian to stop once this process is gone."""
+    """Whatever the outcome, the guardian must stop turning rotors once this process is gone."""
     client, guardian = pair
     guard = FlightGuard(client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
     guard.tick(inputs(armed=True), msgspec.structs.replace(waiting, phase_kind=PhaseKind.DONE))

@@ -1,4 +1,4 @@
-"""The datagrams between flight and guardian, the judgement of silence, and which poses are believed."""
+"""The datagrams between flight and guardian, the stall watch, and the pose filter."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_nothing_that_comes_in_raises(datagram: bytes) -> None:
     st.sampled_from([b"\x00\x00\x00\x00\x00\x00\xf8\x7f", b"\x00\x00\x00\x00\x00\x00\xf0\x7f"]),
 )
 def test_a_beat_that_is_not_finite_is_none(beat: Heartbeat, where: int, poison: bytes) -> None:
-    """NaN or infinity in any double, but for a pose that never was."""
+    """NaN or infinity in any double, except in the stamp of a pose that never arrived."""
     data = bytearray(heartbeat.pack(beat))
     start = len(data) - 8 * (1 + where % 7)
     data[start : start + 8] = poison

@@ -1,4 +1,4 @@
-"""The guardian's wires, each against a real other end, and what it says on them beside what MAVSDK says."""
+"""The guardian's wires, each with a real peer, and its messages compared with MAVSDK's."""
 
 from __future__ import annotations
 

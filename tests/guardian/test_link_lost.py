@@ -1,4 +1,4 @@
-"""The guardian against forged messages, a link that hangs up, and a flight process that does not die at once."""
+"""The guardian with forged messages, a lost link, and a flight process that does not die at once."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ if "companion.guardian" in sys.orig_argv:
 
 
 def install_hook(folder: Path, monkeypatch: pytest.MonkeyPatch, *, immortal: bool = False) -> Path:
-    """Count the rounds of the guardian's loop; `immortal`: SIGKILL takes its time, as with a process inside the kernel."""
+    """Count the rounds of the guardian's loop; `immortal` delays SIGKILL, as for a process inside the kernel."""
     hooks = folder / "hooks"
     hooks.mkdir()
     counts = folder / "counts.json"
@@ -68,7 +68,7 @@ def heartbeat(base_mode: int, custom_mode: int) -> bytes:
 
 
 class Px4Cable:
-    """PX4's end of a serial cable, under a name that stays, as /dev/serial/by-id has."""
+    """PX4's end of a serial cable, under a fixed name as in /dev/serial/by-id."""
 
     def __init__(self, name: Path) -> None:
         self._name = name
@@ -91,7 +91,7 @@ class Px4Cable:
             os.close(master)
 
     def hears(self, master: int, base_mode: int, custom_mode: int) -> list[int]:
-        """Send a HEARTBEAT; commands that have come in so far."""
+        """Send a HEARTBEAT; return the commands received so far."""
         try:
             os.write(master, heartbeat(base_mode, custom_mode))
             data = os.read(master, 65536)
@@ -114,7 +114,7 @@ def test_a_forged_disarmed_heartbeat_does_not_end_the_landing(tmp_path: Path) ->
         os.kill(rig.flight.pid, signal.SIGKILL)
         wait_until(forged_until_commanded, rig.log.read_text)
         assert rig.guardian.poll() is None, rig.log.read_text()
-        rig.land_as_told()
+        rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.events[-1] == "guardian_landed"
 
@@ -164,12 +164,12 @@ def test_nothing_is_opened_beside_a_flight_process_that_still_lives(
 def test_over_udp_it_lands_beside_a_killed_flight_process_that_does_not_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thread of it sleeps uninterruptibly in the kernel: it was waited for up to 30 s."""
+    """One of its threads is in uninterruptible sleep; the guardian once waited 30 s for it."""
     install_hook(tmp_path, monkeypatch, immortal=True)
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()
         wait_until(lambda: bool(rig.peer.commands(NAV_LAND)), rig.log.read_text)
-        rig.land_as_told()
+        rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
         assert rig.flight.poll() is None, "it has not ended"
         assert "the flight process was killed but has not ended" in rig.log.read_text()

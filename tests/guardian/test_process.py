@@ -1,4 +1,4 @@
-"""The guardian process for real: sockets, a process that it ends, PX4 and cameras at their ends of the wires."""
+"""The guardian process with real sockets, a flight process to kill, and peers for PX4 and motion capture."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, numb
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()
         os.kill(rig.flight.pid, number)
-        rig.land_as_told()
+        rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
         assert rig.flight.wait(DEADLINE_S) == -signal.SIGKILL
         ids = ["guardian_took_over", "guardian_land", "guardian_landed"]
@@ -102,14 +102,14 @@ def test_a_full_disk_under_its_log_does_not_cost_the_landing(tmp_path: Path) -> 
     with Rig(tmp_path, disk_full=True) as rig:
         rig.beat_until_ready()
         os.kill(rig.flight.pid, signal.SIGKILL)
-        rig.land_as_told()
+        rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.events == ["guardian_took_over", "guardian_land", "guardian_landed"]
         assert rig.result is not None and rig.result["landed"] is True
 
 
 def test_poses_go_on_as_the_flight_sent_them(tmp_path: Path) -> None:
-    """Frames, fields and time base; compared with the values on the cameras' side, not with the code that converts."""
+    """Frames, fields and time base are compared with the motion capture server's values, not with the converting code."""
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()
         rig.flight.kill()
@@ -132,7 +132,7 @@ def test_land_is_commanded_until_px4_lands(tmp_path: Path) -> None:
         rig.flight.kill()
         wait_until(lambda: len(rig.peer.commands(NAV_LAND)) >= 4, rig.log.read_text)
         wait_until(lambda: "guardian_refused" in rig.events, rig.log.read_text)
-        rig.land_as_told()
+        rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.events[-1] == "guardian_landed"
 
@@ -183,7 +183,7 @@ def test_a_hold_by_px4s_own_failsafe_is_no_pilot_and_is_landed(tmp_path: Path) -
         rig.beat_until_ready()
         rig.peer.custom_mode, rig.peer.system_status = HOLD_MODE, mavlink.MAV_STATE_CRITICAL
         rig.flight.kill()
-        rig.land_as_told()
+        rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
         assert "guardian_pilot" not in rig.events
 
@@ -200,7 +200,7 @@ def test_in_the_air_it_never_disarms_on_the_land_detectors_word_alone(tmp_path: 
 
 @pytest.mark.parametrize("contradicted", [False, True])
 def test_a_flipped_vehicle_is_disarmed_by_force_again_and_again(tmp_path: Path, contradicted: bool) -> None:
-    """Refused it is repeated; an attitude that motion capture contradicts stops no rotor."""
+    """A rejected command is repeated; an attitude that motion capture contradicts stops no rotor."""
     with Rig(tmp_path) as rig:
         rig.peer.acks[ARM_DISARM] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
         rig.beat_until_ready()

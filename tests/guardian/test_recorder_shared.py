@@ -1,4 +1,4 @@
-"""The recorder's channel in the guardian's hands: its lines are written, nothing is miscounted, and the flight ends it."""
+"""The recorder's channel shared with the guardian: its lines are logged, nothing is miscounted, and the flight closes the log."""
 
 from __future__ import annotations
 

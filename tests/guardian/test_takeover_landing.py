@@ -1,4 +1,4 @@
-"""The guardian's landing on simulated time, message by message: what it takes for true, and what it asks of PX4."""
+"""The guardian's landing on simulated time, message by message."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LAND_MODE = 4 << 16 | 6 << 24
 
 
 class Wire:
-    """PX4's end, in memory: keeps what was sent."""
+    """PX4's end of the link in memory, which keeps what was sent."""
 
     ready, lost = True, False
 
@@ -75,7 +75,7 @@ def beat(*, mocap_refused: bool = False, pose_stamp_s: float = START_S - 0.1) ->
 
 
 class Landing:
-    """A guardian in charge of a vehicle that PX4 lands."""
+    """A takeover landing of a vehicle that PX4 lands."""
 
     def __init__(self, last: Heartbeat) -> None:
         self.wire = Wire()
@@ -94,7 +94,7 @@ class Landing:
         mocap: bool = True,
         spoil: Callable[[Any], None] = lambda message: None,
     ) -> None:
-        """PX4 in LAND, armed, its land detector deaf, at rest at this height; `spoil` changes each message of its state."""
+        """Run with PX4 in LAND, armed, at rest at a height, without its land detector; `spoil` changes each state message."""
         q = attitude_ned_frd_from_enu_flu(attitude)
         for _ in range(round(duration_s / STEP_S)):
             self.t_s += STEP_S
@@ -170,7 +170,7 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
 
 
 def test_poses_that_the_flight_process_did_not_believe_are_neither_passed_on_nor_judged_by() -> None:
-    """It landed for dragged poses and died: the guardian fed them to PX4, and took them for the vehicle's place."""
+    """The flight process landed because of dragged poses and died; the guardian sent them to PX4 and used them."""
     landing = Landing(beat(mocap_refused=True, pose_stamp_s=START_S - 5.0))
     landing.run(10.0, attitude=ON_ITS_ROTORS)
     assert landing.wire.poses == []
@@ -183,7 +183,7 @@ def test_poses_that_the_flight_process_did_not_believe_are_neither_passed_on_nor
 
 
 def test_a_height_by_dead_reckoning_is_vouched_for_once_and_not_anew_in_each_round() -> None:
-    """PX4 gives its height up 4.5 s after the last pose: in the second round of 30 s it proves nothing."""
+    """PX4 drops its height 4.5 s after the last pose, so it proves nothing in the second attempt of 30 s."""
     landing = Landing(beat())
     landing.run(TIMEOUT_S + 1.0, height_m=2.0, mocap=False)
     assert not landing.zero_thrust

@@ -1,4 +1,4 @@
-"""A flight-only installation says in one line which extra a command needs; and flying needs none."""
+"""A flight-only installation reports in one line which extra a command needs; flying needs none."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_what_lacks_the_world_says_so(words: str, what: str | None) -> None:
     "module", ["companion.flight.main", "companion.guardian.process", "companion.recorder.main", "companion.cli.main"]
 )
 def test_no_process_of_a_flight_imports_an_extra(module: str) -> None:
-    """With all of them forbidden it starts all the same."""
+    """It starts with all extras forbidden."""
     program = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS!r})); import {module}"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr

@@ -1,4 +1,4 @@
-"""`companion install` in a scratch root: twice, undone, failed half way, changed by others in between."""
+"""`companion install` in a scratch root: twice, undone, failed half way, with changes by others."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MISSION = "/etc/companion/missions/hover.yaml"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """What a small system has before: the files of a flight, somebody's own udev rules, and one that is to be replaced."""
+    """A small system before the installation: files of a flight, foreign udev rules, and a file that will be replaced."""
     root = tmp_path / "root"
     for folder in ("missions", "vehicles", "controllers"):
         shutil.copytree(ROOT / "configs" / folder, root / "etc/companion" / folder)
@@ -45,7 +45,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def tree(root: Path) -> dict[str, tuple[str, int, bytes]]:
-    """Kind, mode and content of everything below."""
+    """Return kind, mode and content of all files below a folder."""
     found = {}
     for path in sorted(root.rglob("*")):
         status = path.lstat()
@@ -132,7 +132,7 @@ def test_installed_otherwise_and_undone_is_as_before_the_first_time(root: Path) 
 
 @pytest.mark.parametrize("obstacle", ["etc/security", "etc/systemd", "var", "var/lib/companion/installed.json"])
 def test_what_fails_half_way_is_put_back(root: Path, obstacle: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """A file where a folder is needed, or the other way round, at the start, in the middle and at the end."""
+    """A file where a folder is needed, or the reverse, at the start, in the middle and at the end."""
     path = root / obstacle
     if obstacle.endswith(".json"):
         path.mkdir(parents=True)
@@ -147,7 +147,7 @@ def test_what_fails_half_way_is_put_back(root: Path, obstacle: str, capsys: pyte
 
 
 class PowerLossError(BaseException):
-    """As by a loss of power: no handler runs that would put anything back."""
+    """A loss of power: no handler restores anything."""
 
 
 def fail_at_the_third_file(monkeypatch: pytest.MonkeyPatch, failure: BaseException) -> None:
@@ -241,7 +241,7 @@ def test_a_record_that_others_could_write_is_not_trusted(root: Path, capsys: pyt
 def test_keys_go_with_the_user_who_is_deleted_and_stay_with_one_who_stays(
     root: Path, tmp_path: Path, goes: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A user id that is free is given to the next user: no key of an operator may wait for that one."""
+    """A free user id is assigned to the next user, who must not find operator keys."""
     assert install(root) == EXIT_OK
     path = root / RECORD_PATH.lstrip("/")
     record = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""The files that are installed, as those who read them see them: systemd, udev, a shell."""
+"""The installed files as systemd, udev and a shell read them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PROGRAM = str(Path(sys.prefix) / "bin/companion")
 
 
 def value(text: str, key: str) -> str:
-    """Of the one line KEY=VALUE."""
+    """Return the value of the one line KEY=VALUE."""
     [found] = re.findall(rf"^{key}=(.*)$", text, flags=re.M)
     return str(found)
 
@@ -55,7 +55,7 @@ def test_udev_accepts_the_rules(tmp_path: Path) -> None:
 
 
 def test_every_rule_is_a_list_of_matches_and_assignments() -> None:
-    """udev(7): a rule that it does not understand is skipped, with a line in a log that nobody reads."""
+    """udev(7): an invalid rule is skipped with a line in a log."""
     term = r'[A-Z]+(\{[A-Za-z_]+\})?(==|!=|\+=|=)"[^"]*"'
     for line in templates.udev_rules("FT4THVLI", "A10M").splitlines():
         assert line.startswith("#") or re.fullmatch(rf"{term}(, {term})*", line), line
@@ -92,7 +92,7 @@ def test_the_limits_allow_what_the_processes_ask_for() -> None:
 
 
 def test_full_clock_is_set_and_what_was_is_put_back(tmp_path: Path) -> None:
-    """The service's own command lines, in a shell, on files that stand for /sys."""
+    """The service's own command lines, in a shell, on files that replace /sys."""
     before = {"policy0": "ondemand", "policy4": "schedutil"}
     for name, governor in before.items():
         (tmp_path / name).mkdir()
@@ -110,7 +110,7 @@ def test_full_clock_is_set_and_what_was_is_put_back(tmp_path: Path) -> None:
 
 
 def plug(sysfs: Path, tty: str, product: str, serial: str, vendor: str = "0403") -> None:
-    """As the kernel shows a USB serial port: the class has a link to the port, three folders below its USB device."""
+    """Create what the kernel shows for a USB serial port: the class links to the port, three folders below its USB device."""
     device = sysfs / f"devices/usb1/1-{tty}"
     port = device / f"1-{tty}:1.0/{tty}/tty/{tty}"
     port.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""A computer that is too busy is named as such, beside what it brought about."""
+"""A busy computer is reported next to the events that it causes."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_it_is_judged_when_something_happens_that_lateness_may_cause(message: di
 
 
 def test_a_process_that_has_ended_is_judged_by_its_last_sample() -> None:
-    """A device that does not open ends the flight process as it reports it."""
+    """The flight process ends when it reports a device that does not open."""
     reads = iter([{7: 1.0}, {7: 2.2}, {}])
     monitor = CpuContention({"flight process": 7}, lambda pid: next(reads))
     monitor.sample(10.0)

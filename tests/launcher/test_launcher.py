@@ -1,6 +1,4 @@
-"""What the user started outlives its children and leaves nothing behind: Ctrl-C at every stage, a killed launcher, worlds and
-flights that die.
-"""
+"""The launcher outlives its children and leaves nothing behind: Ctrl-C at every stage, a killed launcher, worlds and flights that die."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, 
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=1.0")
 IN_FLIGHT = "  hold\n"
-"""Shown when the vehicle has reached its height."""
+"""Printed when the vehicle has reached its height."""
 
 
 @pytest.fixture
@@ -53,7 +51,7 @@ def test_given_up_while_the_world_starts(sandbox: Sandbox) -> None:
 
 @contextmanager
 def motive_that_never_answers() -> Iterator[tuple[socket.socket, list[str]]]:
-    """Its socket, and the options that lead there: motion capture is the first device to be opened."""
+    """Return a silent server's socket and the options for it; motion capture is the first device to be opened."""
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as motive:
         motive.bind(("127.0.0.1", 0))
         motive.settimeout(DEADLINE_S)
@@ -88,7 +86,7 @@ def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signa
 
 @pytest.mark.waits
 def test_the_numbers_of_flight_and_guardian_are_there_for_as_long_as_they_live(sandbox: Sandbox) -> None:
-    """A number that is left behind may be another process's by the time that somebody signals it."""
+    """A process id that is left behind may belong to another process when it is used."""
     numbers = [sandbox.cwd / "out/flight.pid", sandbox.cwd / "out/guardian.pid"]
     with (
         motive_that_never_answers() as (motive, options),
@@ -151,7 +149,7 @@ def test_asked_to_land_in_flight_and_asked_again(sandbox: Sandbox) -> None:
 
 
 def assert_landed(log: FlightLog) -> None:
-    """Closed by the recorder; at its end the vehicle stands, disarmed."""
+    """Check that the recorder closed the log and that the vehicle stands disarmed at its end."""
     assert log.closed
     last = log.inputs[-1]
     assert last.status is not None and not last.status.armed
@@ -257,7 +255,7 @@ def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -
 
 @pytest.mark.flight
 def test_a_flight_process_that_hangs_in_the_air_is_ended_without_a_guardian(sandbox: Sandbox) -> None:
-    """Both hang: nothing is sent any more, PX4 lands by itself; the launcher notices, ends the processes and tells."""
+    """Flight and guardian hang: PX4 lands by itself; the launcher kills both and reports it."""
     with sandbox.start(*FLY) as running:
         running.wait_for(IN_FLIGHT)
         os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGSTOP)

@@ -1,4 +1,4 @@
-"""`companion fly --wait-for-start` where nobody could ever say `start`: exit 2, one line, nothing is started."""
+"""`companion fly --wait-for-start` without a way to send START: exit 2, one line, nothing is started."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from tests.recorder.viewers import Viewed, view
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight of the fast loop, catch included and then sent down, as the file that the recorder leaves."""
+    """The log of a flight of the fast loop with a catch and a commanded landing, written by the recorder."""
     config = load_sitl("configs/missions/catch.yaml")
     result = FastFlight(config, land_at_s=13.0).run()
     assert result.caught

@@ -1,4 +1,4 @@
-"""Flights for the recorder, and the recorder for flights."""
+"""Flights for tests of the recorder, and a recorder for flights."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ EPOCH_NS = 1_700_000_000_000_000_000
 
 
 def config_json() -> str:
-    """The effective configuration of a real mission."""
+    """Return the effective configuration of a real mission."""
     return load_flight("configs/missions/catch.yaml").model_dump_json()
 
 
 def flight_of(result: FastResult) -> Iterator[Row]:
-    """Rows of a flight of the fast loop; it has no wires, so times are as they are over a good one."""
+    """Yield the rows of a flight of the fast loop, with plausible times because it has no wires."""
     for i, o in zip(result.inputs, result.outputs, strict=True):
         t_s = i.t_s
         yield (
@@ -47,7 +47,7 @@ def flight_of(result: FastResult) -> Iterator[Row]:
 
 
 def tethered(end_s: float) -> Iterator[Row]:
-    """The synthetic flight up to this mission time, with a tether that comes near to its end."""
+    """Yield the synthetic flight up to a mission time, with a tether that becomes nearly taut."""
     for inputs, outputs, sent in synthetic_flight(end_s=end_s):
         slack_m = 0.8 + 0.7 * math.cos(outputs.mission_t_s)
         state = TetherState(
@@ -67,12 +67,12 @@ def tethered(end_s: float) -> Iterator[Row]:
 
 
 def started(path: Path, config: str) -> RecorderProcess:
-    """A recorder for a log."""
+    """Start a recorder."""
     return RecorderProcess.start(path, config_json=config, epoch_offset_ns=EPOCH_NS, deadline_s=DEADLINE_S)
 
 
 def offer(recorder: RecorderProcess, rows: Iterable[Row]) -> int:
-    """Hand ticks over, each as soon as there is room: faster than real time the channel would drop, as it must in flight."""
+    """Send ticks, each as soon as the channel has room: faster than real time it would drop some, as in flight."""
     count = 0
     for row in rows:
         select.select([], [recorder.client], [], DEADLINE_S)

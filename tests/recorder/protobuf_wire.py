@@ -1,4 +1,4 @@
-"""Protobuf messages decoded by the descriptors that a log carries with them: what a viewer does that has never heard of us.
+"""Decoder of protobuf messages by the descriptors in a log, as a viewer without generated code decodes them.
 
 Wire format and descriptor.proto as published (protobuf.dev: Encoding; field numbers of FileDescriptorSet and below). proto3 only.
 """
@@ -18,7 +18,7 @@ _DEFAULTS: dict[int, Any] = {1: 0.0, 2: 0.0, _BOOL: False, _STRING: "", _BYTES: 
 
 
 class WireError(ValueError):
-    """Bytes that are no message of that type."""
+    """The bytes are not a message of that type."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Descriptors:
                 self._take(file, package, message_number=4, enum_number=5)
 
     def decode(self, type_name: str, data: bytes) -> dict[str, Any]:
-        """The message as nested dicts; what is absent has its default, an absent message is None."""
+        """Return the message as nested dicts; an absent field has its default, an absent message is None."""
         fields = self._messages.get(type_name)
         if fields is None:
             raise WireError(f"{type_name}: not in the descriptor set, which has {sorted(self._messages)}")

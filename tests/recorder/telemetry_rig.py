@@ -1,4 +1,4 @@
-"""A recorder process with a broker, a flight that feeds it, and a ground station that hears it."""
+"""A recorder process with a broker, a flight that feeds it, and a ground station that listens."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ VEHICLE = "rig-7"
 
 
 class Listener:
-    """A ground station that keeps everything it hears."""
+    """A ground station that keeps all received messages."""
 
     def __init__(self, port: int, pattern: str = "companion/#", login_file: Path | None = None) -> None:
         self._client = mqtt.Client(CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
@@ -74,22 +74,22 @@ class Listener:
             self._changed.notify_all()
 
     def of(self, topic: Topic) -> list[bytes]:
-        """Everything that was heard on a topic."""
+        """Return all received messages of a topic."""
         with self._changed:
             return [payload for heard, payload, _ in self._heard if heard is topic]
 
     def forget(self, topic: Topic) -> None:
-        """What was heard so far."""
+        """Forget the messages so far."""
         with self._changed:
             self._heard = [heard for heard in self._heard if heard[0] is not topic]
 
     def retained(self) -> dict[Topic, bytes]:
-        """What the broker had kept."""
+        """Return the retained messages."""
         with self._changed:
             return {topic: payload for topic, payload, retained in self._heard if retained}
 
     def wait(self, topic: Topic, cls: type[M], wanted: Callable[[M], bool] = lambda _: True) -> M:
-        """The newest message, past or to come, that is wanted."""
+        """Return the newest matching message, received already or later."""
         deadline_s = time.monotonic() + DEADLINE_S
         with self._changed:
             while True:
@@ -101,12 +101,12 @@ class Listener:
                 self._changed.wait(left_s)
 
     def publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        """With QoS 1, until the broker has it."""
+        """Publish with QoS 1 and wait until the broker has it."""
         self._client.publish(topic, payload, qos=1, retain=retain).wait_for_publish(DEADLINE_S)
 
 
 class Flight:
-    """A recorder process and what a flight process says to it."""
+    """A recorder process and its flight."""
 
     def __init__(self, folder: Path, url: str | None, **settings: Any) -> None:
         self.config = config_of(folder, url, **settings)
@@ -121,14 +121,14 @@ class Flight:
         self._next = 0
 
     def fly(self, until: int) -> None:
-        """Ticks up to a number, faster than in reality: none may be dropped for that."""
+        """Send ticks up to a number, faster than real time; none may be dropped."""
         for row in ROWS[self._next : until]:
             select.select([], [self.recorder.client], [], DEADLINE_S)
             self.recorder.client.record(*row)
         self._next = until
 
     def wait(self, condition: Callable[[], bool], why: str) -> None:
-        """Tick on, some ticks each time, until it holds: the flight hears its recorder only while it ticks."""
+        """Send some ticks at a time until the condition holds: the flight reads the recorder's messages only in its ticks."""
 
         def tick() -> bool:
             self.fly(self._next + 1)
@@ -138,7 +138,7 @@ class Flight:
         wait_until(tick, lambda: f"{why}: {self.recorder.client.telemetry_status}")
 
     def begin(self, listener: Listener) -> None:
-        """Tick until the ground sees it: from then on everything is told as it happens."""
+        """Send ticks until the ground station sees the flight, so that later messages are received live."""
         self.wait(lambda: bool(listener.of(Topic.STREAM)), "the ground sees nothing")
 
     def finish(self) -> RecorderReport:
@@ -167,7 +167,7 @@ def flight_with(folder: Path, url: str | None, **settings: Any) -> Iterator[Flig
 
 
 def log_lines(path: Path) -> list[str]:
-    """Messages of the `/log` channel so far, by the mcap library's own reader."""
+    """Return the messages of the `/log` channel so far, read with the mcap library."""
     lines = []
     with path.open("rb") as file, contextlib.suppress(EndOfFile):
         for _, _, message in NonSeekingReader(file).iter_messages(topics=["/log"], log_time_order=False):

@@ -1,4 +1,4 @@
-"""The layouts for Foxglove and PlotJuggler show something: each of their paths is in the log of a real flight."""
+"""The layouts for Foxglove and PlotJuggler: each of their paths exists in the log of a real flight."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PANELS: dict[str, Any] = {
     "RosOut": foxglove.layouts.LogConfig,
     "StateTransitions": foxglove.layouts.StateTransitionsConfig,
 }
-"""Panel types as saved layouts name them -> their configuration by the SDK."""
+"""By panel type in saved layouts: its configuration class in the SDK."""
 
 
 @pytest.fixture(scope="module")

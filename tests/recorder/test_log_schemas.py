@@ -1,4 +1,4 @@
-"""Every channel of a log keeps to what it says of itself and to what the viewers document."""
+"""Every channel of a log conforms to its own schema and to the documentation of the viewers."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ PROTOBUF = {
 
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Viewed:
-    """A short flight of which every message is looked at."""
+    """A short flight of which every message is checked."""
     path = tmp_path_factory.mktemp("short") / "flight.mcap"
     return view(record(path, tethered(end_s=6.6), config_json=config_json(), plan_json="[[0, 0, 1], [0.5, 0, 1]]"))
 
 
 def check(viewed: Viewed, *, every: int = 1) -> None:
-    """JSON messages against their own schema, one in `every`; protobuf messages were decoded by theirs when they were read."""
+    """Check JSON messages against their own schema, one in `every`; protobuf messages were decoded with theirs."""
     for topic, (encoding, _, _, data) in viewed.schemas.items():
         messages = viewed.by_topic[topic]
         if encoding == "json":
@@ -127,7 +127,7 @@ def test_log_time_publish_time_and_header_are_the_wall_clock_of_the_tick(synthet
 
 
 def headers(data: Any) -> list[dict[str, int]]:
-    """Every `timestamp` of a protobuf message, nested ones too."""
+    """Return every `timestamp` of a protobuf message, including nested ones."""
     if isinstance(data, list):
         return [header for item in data for header in headers(item)]
     if not isinstance(data, dict):
@@ -173,7 +173,7 @@ def test_protobuf_s_own_library_decodes_the_same(viewed: Viewed, flown: Path) ->
 
 
 def plain(message: Any) -> Any:
-    """A message of protobuf's library as nested dicts, defaults included."""
+    """Return a message of the protobuf library as nested dicts, including defaults."""
     found: dict[str, Any] = {}
     for field in message.DESCRIPTOR.fields:
         value = getattr(message, field.name)

@@ -111,13 +111,13 @@ def recorder(tmp_path: Path) -> Iterator[RecorderProcess]:
 
 
 def rows(path: Path, topic: str) -> list[Any]:
-    """Messages by the mcap library's own reader, through the summary of the closed file."""
+    """Return messages read with the mcap library, through the summary of the closed file."""
     with path.open("rb") as file:
         return [(m.log_time, json.loads(m.data)) for _, _, m in make_reader(file).iter_messages(topics=[topic])]
 
 
 def readable_ticks(path: Path) -> list[int]:
-    """Ticks of a file that may lack its end, by the mcap library's streaming reader."""
+    """Return the ticks of a file that may lack its end, read with the mcap library's streaming reader."""
     ticks: list[int] = []
     with path.open("rb") as file:
         try:
@@ -318,7 +318,7 @@ def test_epoch_offset_is_the_wall_clock_at_zero_of_the_flight_clock() -> None:
 
 @pytest.fixture
 def channel() -> Iterator[tuple[RecorderClient, socket.socket]]:
-    """The flight's end, and the recorder's as a bare socket."""
+    """The flight's end of a channel, and the recorder's end as a bare socket."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     client = RecorderClient(ours)
     with theirs:

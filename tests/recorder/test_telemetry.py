@@ -1,4 +1,4 @@
-"""Telemetry as the ground sees it: the real recorder process, fed with a synthetic flight, and a real mosquitto."""
+"""Telemetry as a ground station receives it: the real recorder process with a synthetic flight, and a real mosquitto."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who gets through to the vehicle and who does not: commands, logins, certificates, ACLs, at the real recorder and a real mosquitto."""
+"""Access to the vehicle: commands, logins, certificates and ACLs with the real recorder and a real mosquitto."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def test_a_vehicle_that_hears_no_commands_says_why(
 
 
 def own_address() -> str:
-    """An address of this computer that is none of the vehicle file's loopback names; nothing is sent."""
+    """Return an address of this computer other than loopback; nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # TEST-NET-1: for documentation only
@@ -281,7 +281,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 def secure(site: Site, **but: str) -> dict[str, str]:
-    """What the vehicle file of `tarot` says of that broker."""
+    """Return the settings of the vehicle `tarot` for that broker."""
     mine = site.folder / "vehicles/tarot"
     files = {
         "login_file": mine / "login.yaml",

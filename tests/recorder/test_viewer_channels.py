@@ -1,4 +1,4 @@
-"""The viewers' channels: frames, poses, the picture, their rates; and that nothing of it can cost a tick."""
+"""The viewer channels: frames, poses, scene and rates; and that they never cost a tick."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAN = math.nan
 
 
 def written(path: Path, rows: Iterable[Row], *, config: str | None = None, plan: str | None = None) -> Viewed:
-    """Rows through the writer alone."""
+    """Write rows with the log writer alone."""
     log_file = LogFile(path)
     writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
     writer.metadata("companion", {"log_format": "1"})
@@ -46,13 +46,13 @@ def written(path: Path, rows: Iterable[Row], *, config: str | None = None, plan:
 
 
 def still(ticks: int = 1) -> list[Row]:
-    """The first ticks of a flight."""
+    """Return the first ticks of a flight."""
     rows = tethered(end_s=1.0)
     return [next(rows) for _ in range(ticks)]
 
 
 def moved(row: Row, position: Vec3, attitude: Quat, arm: tuple[float, float]) -> Row:
-    """The same tick somewhere else, by motion capture and PX4 alike."""
+    """Return the same tick at another pose, in motion capture and PX4."""
     inputs, outputs, sent = row
     assert inputs.mocap is not None and inputs.arm is not None and inputs.vehicle is not None
     inputs = replace(
@@ -73,7 +73,7 @@ def quat(message: dict[str, float]) -> Quat:
 
 
 def in_world(transforms: list[dict[str, Any]], frame: str) -> tuple[Vec3, Quat]:
-    """Where a frame is, by following its parents."""
+    """Return the position of a frame by following its parents."""
     position: Vec3 = (0.0, 0.0, 0.0)
     turn: Quat = (1.0, 0.0, 0.0, 0.0)
     by_child = {one["child_frame_id"]: one for one in transforms}
@@ -291,7 +291,7 @@ def test_without_a_pose_of_motion_capture_px4_s_is_shown(tmp_path: Path, changes
 
 
 def sick(rows: list[Row], chance: random.Random) -> Row:
-    """A tick with any of its fields absent or not finite, as deep as they go."""
+    """Yield ticks in which any field is absent or not finite, at every depth."""
 
     def spoil(record: Any) -> Any:
         if isinstance(record, float):
@@ -382,7 +382,7 @@ def test_geometry_is_taken_where_it_is_whole() -> None:
 
 
 def test_a_log_from_before_these_channels_is_read_as_ever(tmp_path: Path) -> None:
-    """The same records without any viewer's channel: what the reader gives back does not differ."""
+    """The reader returns the same for records without any viewer channel."""
     new = tmp_path / "new.mcap"
     written(new, tethered(end_s=1.0))
     old = tmp_path / "old.mcap"

@@ -1,7 +1,7 @@
 """A log as the two viewers read it: decoded messages, Foxglove's message paths, PlotJuggler's series.
 
 Sources: mcap.dev/spec; docs.foxglove.dev (custom schema encodings, message path syntax, SceneUpdate); PlotJuggler's DataLoadMCAP,
-JSON and protobuf parsers (3.x), whose way of naming series is repeated here.
+JSON and protobuf parsers (3.x), whose naming of series is repeated here.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Viewed:
 
     messages: tuple[Seen, ...]
     schemas: dict[str, tuple[str, str, str, bytes]]
-    """Topic -> message encoding, schema name, schema encoding, schema data; of every channel."""
+    """By topic: message encoding, schema name, schema encoding and schema data of every channel."""
 
     @cached_property
     def by_topic(self) -> dict[str, list[Seen]]:
@@ -55,7 +55,7 @@ class Viewed:
         return {name for message in self.messages for name in _numeric(message.topic, message.data)}
 
     def frames(self) -> set[str]:
-        """Coordinate frames that Foxglove learns of."""
+        """Coordinate frames known to Foxglove."""
         found: set[str] = set()
         for message in self.messages:
             if message.schema == "foxglove.FrameTransform":
@@ -67,7 +67,7 @@ class Viewed:
 
 
 def view(path: Path, *, whole: bool = True) -> Viewed:
-    """Read a log with the mcap library's own readers: through its summary, or (`whole` False) as far as it goes."""
+    """Read a log with the mcap library: through its summary, or (`whole` False) as far as it is readable."""
     messages: list[Seen] = []
     schemas: dict[str, tuple[str, str, str, bytes]] = {}
     descriptors: dict[bytes, Descriptors] = {}

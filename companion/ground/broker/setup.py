@@ -150,17 +150,17 @@ def _fill(folder: Path, later: Path, users: BrokerUsers, now: datetime.datetime)
         "server.key": server.key,
         "passwords": "".join(f"{name}:{password}\n" for name, password in logins.items()).encode(),
     }
-    everybody = operators_text(operators).encode() if operators else None
+    all_keys = operators_text(operators).encode() if operators else None
     own = {operator.name: operators_text([operator]).encode() for operator in operators}
-    rooms = [(f"vehicles/{name}", name, everybody) for name in users.vehicles]
-    rooms += [(f"operators/{name}", name, own[name]) for name in users.operators]
-    rooms += [(f"viewers/{name}", name, None) for name in users.viewers]
-    for room, name, keys in rooms:
-        (folder / room).mkdir(mode=0o700, parents=True)
-        files[f"{room}/login.yaml"] = f'username: "{name}"\npassword: "{logins[name]}"\n'.encode()
-        files[f"{room}/ca.pem"] = authority.certificate
+    computers = [(f"vehicles/{name}", name, all_keys) for name in users.vehicles]
+    computers += [(f"operators/{name}", name, own[name]) for name in users.operators]
+    computers += [(f"viewers/{name}", name, None) for name in users.viewers]
+    for subfolder, name, keys in computers:
+        (folder / subfolder).mkdir(mode=0o700, parents=True)
+        files[f"{subfolder}/login.yaml"] = f'username: "{name}"\npassword: "{logins[name]}"\n'.encode()
+        files[f"{subfolder}/ca.pem"] = authority.certificate
         if keys is not None:
-            files[f"{room}/operators.yaml"] = keys
+            files[f"{subfolder}/operators.yaml"] = keys
     for name, data in files.items():
         write_private(folder / name, data)
     _hash_passwords(folder / "passwords")
@@ -202,11 +202,11 @@ def _check_names(users: BrokerUsers) -> None:
         for name in names
         if pattern.fullmatch(name) is None or name in (".", "..")
     ]
-    everybody = [*users.vehicles, *users.operators, *users.viewers]
+    names = [*users.vehicles, *users.operators, *users.viewers]
     lines += [
         f"{name}: used twice; every vehicle and user needs a different name"
-        for name in sorted(set(everybody))
-        if everybody.count(name) > 1
+        for name in sorted(set(names))
+        if names.count(name) > 1
     ]
     if not users.vehicles:
         lines.append("--vehicle: expected the name of at least one")

@@ -141,7 +141,7 @@ class Connection(aiomqtt.Client):
         raise aiomqtt.MqttError("the connection ended")
 
     async def shut_down(self, *, with_will: bool = False) -> None:
-        """Close the connection in whatever state it is.
+        """Close the connection, in any state.
 
         Args:
             with_will: close without DISCONNECT, so that the broker publishes the last will.

@@ -86,7 +86,7 @@ class Vehicle:
     """Local monotonic clock."""
     received_s: float = 0.0
     clock: FlightClock = field(default_factory=FlightClock)
-    """For the age of the displayed data."""
+    """Estimate of the flight clock, for the age of the displayed data."""
     proven: ProvenState | None = None
     """None if no stream message was proven for this ground station's operator."""
 

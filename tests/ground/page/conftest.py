@@ -1,6 +1,6 @@
-"""One browser and one opened page for all tests that can share them: to start one takes seconds of computing time.
+"""One browser and one page for all tests that can share them, because starting one takes seconds of CPU time.
 
-They run in one worker, where no other test runs between them.
+These tests run in one worker, with no other test between them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.ground.monitor_stub import BROKER, Stand, hello, retained
+from tests.ground.monitor_stub import BROKER, MonitorStub, hello, retained
 from tests.ground.page_browser import Page, chromium, watching
 
 
@@ -21,29 +21,29 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="package")
-def opened(browser: Any) -> Iterator[tuple[Page, Stand]]:
-    """The page, with the stand that it is loaded from."""
-    with Stand(retained()) as stand, watching(browser, stand) as page:
-        yield page, stand
+def opened(browser: Any) -> Iterator[tuple[Page, MonitorStub]]:
+    """The shared page and its stub."""
+    with MonitorStub(retained()) as stub, watching(browser, stub) as page:
+        yield page, stub
 
 
 @pytest.fixture
-def stand(opened: tuple[Page, Stand]) -> Stand:
-    """The stand of `page`; it greets as usual."""
-    stand = opened[1]
-    stand.greeting = [hello(), BROKER, *retained()]
-    return stand
+def stub(opened: tuple[Page, MonitorStub]) -> MonitorStub:
+    """The stub of `page`, with its usual greeting."""
+    stub = opened[1]
+    stub.greeting = [hello(), BROKER, *retained()]
+    return stub
 
 
 @pytest.fixture
-def shared(opened: tuple[Page, Stand]) -> Iterator[Page]:
-    """The page for a test that loads it itself, by `Page.open_anew`."""
+def shared(opened: tuple[Page, MonitorStub]) -> Iterator[Page]:
+    """The page for a test that loads it itself with `Page.open_anew`."""
     yield opened[0]
     opened[0].check_complaints()
 
 
 @pytest.fixture
-def page(shared: Page, stand: Stand) -> Page:
+def page(shared: Page, stub: MonitorStub) -> Page:
     """The page, loaded anew for this test."""
-    shared.open_anew(stand)
+    shared.open_anew(stub)
     return shared

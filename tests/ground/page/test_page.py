@@ -1,4 +1,4 @@
-"""The page in a real browser: what a person sees and presses. The stand plays the monitor."""
+"""The page in a real browser: what the user sees. A stub replaces the monitor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,19 @@ import pytest
 from msgspec.structs import replace
 
 from companion.ground.protocol.messages import Presence, Stream
-from tests.ground.monitor_stub import BROKER, NAME, Message, Stand, ack, event, flown, hello, retained, state, told
+from tests.ground.monitor_stub import (
+    BROKER,
+    NAME,
+    Message,
+    MonitorStub,
+    ack,
+    event,
+    flown,
+    hello,
+    relayed,
+    retained,
+    state,
+)
 from tests.ground.page_browser import Page, events_of, playing, watching
 from tests.support import wait_until
 
@@ -21,41 +33,41 @@ HOSTILE = "<img src=x onerror='window.pwned = 1'><script>window.pwned = 1</scrip
 
 
 @pytest.fixture
-def stand_alone() -> Iterator[Stand]:
-    """A stand for a test that stops it: its page is opened for that test."""
-    with Stand(retained()) as stand:
-        yield stand
+def own_stub() -> Iterator[MonitorStub]:
+    """A stub for a test that stops it, with a page of its own."""
+    with MonitorStub(retained()) as stub:
+        yield stub
 
 
 @pytest.fixture(scope="module")
 def watched(browser: Any) -> Iterator[Page]:
-    """One page for all tests that let the vehicle tell something and look: to open one takes seconds of computing time."""
-    with Stand(retained()) as stand, watching(browser, stand) as page:
+    """One page for all tests that only send records and look, because opening one takes seconds of CPU time."""
+    with MonitorStub(retained()) as stub, watching(browser, stub) as page:
         yield page
 
 
 @pytest.fixture(scope="module")
 def newest() -> Callable[[Stream], Message]:
-    """Of the tests that share a page: each record is newer than those before."""
+    """Records for tests that share a page: each is newer than those before."""
     number = itertools.count(1)
-    return lambda stream: told(replace(stream, t_s=1000.0 + 100.0 * next(number)))
+    return lambda stream: relayed(replace(stream, t_s=1000.0 + 100.0 * next(number)))
 
 
 def in_flight(**changes: Any) -> Stream:
-    """Well after the catch, nothing wrong."""
+    """Return a record well after the catch, without problems."""
     return replace(flown().at(8.5), **changes)
 
 
-def test_the_page_says_its_token_first_and_hides_it(stand: Stand, page: Page) -> None:
-    wait_until(lambda: bool(stand.heard("token")), lambda: "the page sends no token")
-    assert stand.heard("token") == [{"kind": "token", "token": "secret"}]
+def test_the_page_says_its_token_first_and_hides_it(stub: MonitorStub, page: Page) -> None:
+    wait_until(lambda: bool(stub.received("token")), lambda: "the page sends no token")
+    assert stub.received("token") == [{"kind": "token", "token": "secret"}]
     assert page.tab.evaluate("location.hash") == ""
 
 
 def test_values_are_those_of_the_newest_record(page: Page) -> None:
     for mission_t_s in (1.5, 8.5, 14.0):
         stream = flown().at(mission_t_s)
-        page.tell(told(stream))
+        page.tell(relayed(stream))
         assert stream.tether is not None and stream.position_world_m is not None and stream.e_p_m is not None
         assert page.figure("tether") == f"{stream.tether.slack_m:.2f}"
         assert page.figure("height") == f"{stream.position_world_m[2]:.2f}"
@@ -74,16 +86,16 @@ def test_every_light_of_the_vehicle_is_shown_with_its_state(watched: Page, newes
 
 
 def test_pictures_change_with_the_flight(page: Page) -> None:
-    """Not what they show, but that the canvases are drawn at all, and again."""
+    """The canvases are drawn at all, and again; not what they show."""
 
     def pictures() -> list[str]:
         page.run(0.5)
         found: list[str] = page.tab.evaluate("[...document.querySelectorAll('canvas')].map((c) => c.toDataURL())")
         return found
 
-    page.tell(*[told(stream) for stream in flown().streams if stream.mission_t_s < 2.0])
+    page.tell(*[relayed(stream) for stream in flown().streams if stream.mission_t_s < 2.0])
     before = pictures()
-    page.tell(*[told(stream) for stream in flown().streams if 2.0 < stream.mission_t_s < 8.0])
+    page.tell(*[relayed(stream) for stream in flown().streams if 2.0 < stream.mission_t_s < 8.0])
     after = pictures()
     assert len(before) == 8 and all(one != other for one, other in zip(before, after, strict=True))
 
@@ -117,12 +129,12 @@ def test_figures_look_dead_when_they_are_old(page: Page, how: str) -> None:
         )
         return found
 
-    page.tell(told(in_flight()))
+    page.tell(relayed(in_flight()))
     alive = look()
     if how == "stale":
         page.run(1.0)
     else:
-        page.tell(told(state(Presence.ENDED, outcome="completed")))
+        page.tell(relayed(state(Presence.ENDED, outcome="completed")))
     assert all(one != other for one, other in zip(alive, look(), strict=True))
 
 
@@ -136,17 +148,17 @@ def test_a_record_that_was_long_on_its_way_is_old_when_it_comes(
 
 
 def test_a_backlog_does_not_look_alive(page: Page) -> None:
-    """Records that arrive at the vehicle's own pace, but all of them two seconds late."""
+    """Records arrive at the vehicle's own rate, but all of them two seconds late."""
     first = in_flight()
-    page.tell(told(first))
+    page.tell(relayed(first))
     page.run(2.1)
-    page.tell(told(replace(first, t_s=first.t_s + 0.1)))
+    page.tell(relayed(replace(first, t_s=first.t_s + 0.1)))
     assert page.body("stale") == "true"
     assert float(page.tab.get_attribute("#age", "data-age")) == pytest.approx(2.0, abs=0.01)
 
 
 def test_no_broker_is_stale_at_once(page: Page) -> None:
-    page.tell(told(in_flight()))
+    page.tell(relayed(in_flight()))
     page.tell({**BROKER, "connected": False, "text": "no broker at mqtt://127.0.0.1:1883, trying"})
     assert page.body("frame") == "bad"
     assert page.text("#stale").startswith("NO BROKER") and "mqtt://127.0.0.1:1883, trying" in page.text("#stale")
@@ -162,7 +174,7 @@ def test_no_broker_is_stale_at_once(page: Page) -> None:
     ],
 )
 def test_an_end_is_told_calmly(page: Page, known: Any, word: str, level: str) -> None:
-    page.tell(told(in_flight()), told(known))
+    page.tell(relayed(in_flight()), relayed(known))
     page.run(5.0)
     assert f"{page.text('#word')} {page.text('#why')}".startswith(word)
     assert (page.body("level"), page.body("stale"), page.body("old")) == (level, "false", "true")
@@ -171,14 +183,14 @@ def test_an_end_is_told_calmly(page: Page, known: Any, word: str, level: str) ->
 
 @pytest.mark.parametrize("presence", [Presence.LOST, Presence.SILENT])
 def test_a_vehicle_that_is_gone_is_framed_in_red_and_can_still_be_commanded(page: Page, presence: Presence) -> None:
-    page.tell(told(in_flight()), told(state(presence, text="the guardian may be landing it")))
+    page.tell(relayed(in_flight()), relayed(state(presence, text="the guardian may be landing it")))
     assert page.text("#stale").startswith(presence.value.upper())
     assert "the guardian may be landing it" in page.text("#stale")
     assert (page.body("frame"), page.enabled()) == ("bad", SAFE)
 
 
 def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) -> None:
-    page.tell(told(in_flight()), told(state(Presence.LOST, session="older")))
+    page.tell(relayed(in_flight()), relayed(state(Presence.LOST, session="older")))
     assert (page.text("#word"), page.body("stale")) == ("FLYING", "false")
 
 
@@ -220,13 +232,13 @@ def test_tether_slack_shows_in_its_colour(
 
 
 def test_the_catch_appears_among_the_events_and_is_read_out(page: Page) -> None:
-    page.tell(told(in_flight()))
+    page.tell(relayed(in_flight()))
     assert page.tab.locator("#event-list li").count() == 0
-    page.tell(told(flown().events))
+    page.tell(relayed(flown().events))
     assert "payload caught" in page.text("[data-event='catch']")
     assert page.tab.locator("#event-list li").first.get_attribute("data-event") == "touchdown"
     assert "payload caught" in page.tab.locator("#announce").text_content()
-    page.tell(told(flown().events))
+    page.tell(relayed(flown().events))
     assert page.tab.locator("#event-list li").count() == len(flown().events.lines)
 
 
@@ -243,29 +255,29 @@ def test_events_can_be_filtered(page: Page) -> None:
 def test_a_filter_that_leaves_nothing_says_so(page: Page) -> None:
     page.tab.click("[data-filter='critical']")
     assert page.text("#event-none") == "No events yet."
-    page.tell(told(flown().events))
+    page.tell(relayed(flown().events))
     assert page.tab.locator("#event-list li:visible").count() == 0
     assert page.text("#event-none") == "No events of this severity."
 
 
 def test_a_new_session_begins_with_nothing_of_the_old_one(page: Page) -> None:
-    page.tell(told(in_flight()), told(flown().events))
+    page.tell(relayed(in_flight()), relayed(flown().events))
     assert page.tab.locator("#event-list li").count() > 0
-    page.tell(told(state(session="new")), told(replace(flown().at(1.0), session="new", t_s=1.0)))
+    page.tell(relayed(state(session="new")), relayed(replace(flown().at(1.0), session="new", t_s=1.0)))
     assert page.tab.locator("#event-list li").count() == 0 and page.body("stale") == "false"
 
 
-def test_what_comes_from_outside_is_text(stand: Stand, page: Page) -> None:
+def test_what_comes_from_outside_is_text(stub: MonitorStub, page: Page) -> None:
     light = replace(in_flight().lights[0], text=HOSTILE, name=HOSTILE)
     page.tell(
-        told(state(mission=HOSTILE, text=HOSTILE)),
-        told(in_flight(phase=HOSTILE, lights=(light,), bent_by=(HOSTILE,), mode=HOSTILE)),
+        relayed(state(mission=HOSTILE, text=HOSTILE)),
+        relayed(in_flight(phase=HOSTILE, lights=(light,), bent_by=(HOSTILE,), mode=HOSTILE)),
         events_of(event(1, HOSTILE, id_=HOSTILE, action=HOSTILE)),
-        told(ack("hold", "f" * 32, HOSTILE, operator=HOSTILE)),
+        relayed(ack("hold", "f" * 32, HOSTILE, operator=HOSTILE)),
         {**BROKER, "rubbish": 3, "rubbish_text": HOSTILE},
     )
     page.tab.click("#control summary")
-    stand.say(told(state(), HOSTILE))
+    stub.send(relayed(state(), HOSTILE))
     page.until_text("#vehicle-select", HOSTILE)
     page.run(1.0)
     assert HOSTILE in page.text("#event-list .text") and HOSTILE in page.text("#light-list .text")
@@ -274,53 +286,53 @@ def test_what_comes_from_outside_is_text(stand: Stand, page: Page) -> None:
     assert page.tab.evaluate("[document.images.length, document.scripts.length, window.pwned ?? null]") == [0, 1, None]
 
 
-def test_several_vehicles(stand: Stand, page: Page) -> None:
-    page.tell(told(in_flight()))
+def test_several_vehicles(stub: MonitorStub, page: Page) -> None:
+    page.tell(relayed(in_flight()))
     assert not page.tab.is_visible("#vehicle-select")
-    page.tell(*retained("second"), told(in_flight(position_world_m=(0.0, 0.0, 1.77)), "second"))
+    page.tell(*retained("second"), relayed(in_flight(position_world_m=(0.0, 0.0, 1.77)), "second"))
     options = page.tab.locator("#vehicle-select option")
     assert [options.nth(k).text_content() for k in range(2)] == [f"{NAME} · FLYING", "second · FLYING"]
     assert page.figure("height") == "1.00"
     page.tab.select_option("#vehicle-select", "second")
     page.shown = "second"
     assert page.figure("height") == "1.77"
-    page.tell(told(state(Presence.LOST)))
+    page.tell(relayed(state(Presence.LOST)))
     assert options.nth(0).text_content() == f"⚠ {NAME} · LOST"
     assert page.text("#word") == "FLYING" and page.text("#notice").startswith(f"{NAME}: LOST")
     page.press("hold")
-    assert stand.wait_heard("command", 1) == [{"kind": "command", "vehicle": "second", "command": "hold"}]
+    assert stub.wait_received("command", 1) == [{"kind": "command", "vehicle": "second", "command": "hold"}]
 
 
-def test_a_restarted_monitor_is_found_again(browser: Any, stand_alone: Stand) -> None:
-    with watching(browser, stand_alone, may="WebSocket connection to") as page:
-        page.tell(told(in_flight()))
-        stand_alone.stop()
+def test_a_restarted_monitor_is_found_again(browser: Any, own_stub: MonitorStub) -> None:
+    with watching(browser, own_stub, may="WebSocket connection to") as page:
+        page.tell(relayed(in_flight()))
+        own_stub.stop()
         page.until_text("#stale", "NO CONNECTION")
         assert page.body("frame") == "bad" and page.enabled() <= SAFE
-        stand_alone.start()
+        own_stub.start()
         page.tab.clock.resume()
-        stand_alone.wait_heard("token", 2)
-        page.tell(told(in_flight(t_s=5000.0, position_world_m=(0.0, 0.0, 1.55))))
+        own_stub.wait_received("token", 2)
+        page.tell(relayed(in_flight(t_s=5000.0, position_world_m=(0.0, 0.0, 1.55))))
         page.until_text("[data-figure='height']", "1.55")
 
 
-def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, stand_alone: Stand) -> None:
-    with watching(browser, stand_alone, may="WebSocket connection to") as page:
-        page.tell(told(in_flight()))
-        stand_alone.stop()
+def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, own_stub: MonitorStub) -> None:
+    with watching(browser, own_stub, may="WebSocket connection to") as page:
+        page.tell(relayed(in_flight()))
+        own_stub.stop()
         page.until_text("#stale", "NO CONNECTION")
         page.press("hold")
         assert "NOT SENT" in page.text("#answers [data-for='hold']")
 
 
-def test_a_page_that_may_only_watch_says_why(stand: Stand, shared: Page) -> None:
-    stand.greeting[0] = hello(can_command=False, operator=None, why_not="this monitor was started with --view-only")
-    shared.open_anew(stand)
-    shared.tell(told(in_flight()))
+def test_a_page_that_may_only_watch_says_why(stub: MonitorStub, shared: Page) -> None:
+    stub.greeting[0] = hello(can_command=False, operator=None, why_not="this monitor was started with --view-only")
+    shared.open_anew(stub)
+    shared.tell(relayed(in_flight()))
     assert shared.enabled() == set()
     assert shared.text("#commands-why") == "this monitor was started with --view-only"
     assert shared.tab.is_visible("#badge-view")
     shared.tab.keyboard.press("Shift+H")
     shared.tell(hello())
     shared.press("abort")
-    assert [message["command"] for message in stand.wait_heard("command", 1)] == ["abort"]
+    assert [message["command"] for message in stub.wait_received("command", 1)] == ["abort"]

@@ -1,4 +1,4 @@
-"""The command buttons in a real browser: what is pressed arrives once, and what came of it is shown."""
+"""The command buttons in a real browser: a press sends one command, and its result is displayed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from companion.ground.protocol.messages import Presence
-from tests.ground.monitor_stub import NAME, Message, Stand, ack, flown, retained, state, told
+from tests.ground.monitor_stub import NAME, Message, MonitorStub, ack, flown, relayed, retained, state
 from tests.ground.page_browser import Page, playing
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
@@ -20,14 +20,14 @@ CHOOSE = """(name) => {
   select.value = name;
   select.dispatchEvent(new Event("change"));
 }"""
-"""Another vehicle is looked at, and the button that is pressed keeps the focus."""
+"""Selects another vehicle while the pressed button keeps the focus."""
 NO_ANSWER = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch"
 
 
 @pytest.fixture
 def page(page: Page) -> Page:
-    """The page, told of a flight."""
-    page.tell(told(flown().at(8.5)))
+    """The page during a flight."""
+    page.tell(relayed(flown().at(8.5)))
     return page
 
 
@@ -44,31 +44,31 @@ def answer(page: Page, command: str) -> tuple[str, str]:
     return output.get_attribute("data-state"), output.inner_text()
 
 
-def asked(stand: Stand, count: int) -> list[str]:
-    """The first commands that arrive; `count` of them and no more."""
-    heard = stand.wait_heard("command", count)
+def asked(stub: MonitorStub, count: int) -> list[str]:
+    """Return the names of the first `count` commands; there must be no more."""
+    heard = stub.wait_received("command", count)
     assert all(message["vehicle"] == NAME for message in heard)
     return [message["command"] for message in heard]
 
 
-def test_hold_then_land_arrive_and_their_answers_show(stand: Stand, page: Page) -> None:
+def test_hold_then_land_arrive_and_their_answers_show(stub: MonitorStub, page: Page) -> None:
     page.press("hold")
-    assert asked(stand, 1) == ["hold"]
+    assert asked(stub, 1) == ["hold"]
     assert answer(page, "hold") == ("wait", "sending …")
     page.tell(sent("hold"))
     assert answer(page, "hold") == ("wait", "sent, waiting for the vehicle …")
-    page.tell(told(ack("hold", NONCE, "holding at (1.00, 0.00, 1.00) m")))
+    page.tell(relayed(ack("hold", NONCE, "holding at (1.00, 0.00, 1.00) m")))
     assert answer(page, "hold") == ("done", "✓ holding at (1.00, 0.00, 1.00) m")
     page.press("land")
-    assert asked(stand, 2) == ["hold", "land"]
-    page.tell(sent("land", "b" * 32), told(ack("land", "b" * 32, "landing")))
+    assert asked(stub, 2) == ["hold", "land"]
+    page.tell(sent("land", "b" * 32), relayed(ack("land", "b" * 32, "landing")))
     assert answer(page, "land") == ("done", "✓ landing")
     assert answer(page, "hold")[0] == "done"
 
 
 def test_what_the_vehicle_refuses_is_red(page: Page) -> None:
     page.press("abort")
-    page.tell(sent("abort"), told(ack("abort", NONCE, "nothing to abort: on the ground", accepted=False)))
+    page.tell(sent("abort"), relayed(ack("abort", NONCE, "nothing to abort: on the ground", accepted=False)))
     assert answer(page, "abort") == ("no", "✗ nothing to abort: on the ground")
 
 
@@ -78,7 +78,7 @@ def test_no_answer_is_red_until_a_late_one_comes(page: Page) -> None:
     assert answer(page, "land") == ("no", NO_ANSWER)
     page.tell(sent("land", "c" * 32))
     assert answer(page, "land")[0] == "no" and "sent again (2)" in answer(page, "land")[1]
-    page.tell(told(ack("land", NONCE, "landing")))
+    page.tell(relayed(ack("land", NONCE, "landing")))
     assert answer(page, "land") == ("done", "✓ landing")
 
 
@@ -91,18 +91,18 @@ def test_a_monitor_that_says_nothing_is_no_answer_either(page: Page) -> None:
 
 
 def test_what_others_command_is_shown_with_their_name(page: Page) -> None:
-    page.tell(told(ack("hold", "d" * 32, "holding", operator="bert")))
+    page.tell(relayed(ack("hold", "d" * 32, "holding", operator="bert")))
     assert answer(page, "hold") == ("done", "✓ bert: holding")
 
 
-def test_a_double_click_sends_one_command(stand: Stand, page: Page) -> None:
+def test_a_double_click_sends_one_command(stub: MonitorStub, page: Page) -> None:
     page.tab.dblclick("[data-command='hold']")
     page.run(0.29)
     page.press("hold")
     page.press("land")
     page.run(0.02)
     page.press("hold")
-    assert asked(stand, 3) == ["hold", "land", "hold"]
+    assert asked(stub, 3) == ["hold", "land", "hold"]
 
 
 @pytest.mark.parametrize(
@@ -110,32 +110,34 @@ def test_a_double_click_sends_one_command(stand: Stand, page: Page) -> None:
     [state(Presence.ENDED, outcome="completed"), state(Presence.FLYING, commands=False, text="hears nothing")],
     ids=["ended", "hears no commands"],
 )
-def test_a_state_that_the_stream_contradicts_keeps_nobody_from_landing_it(stand: Stand, page: Page, lie: Any) -> None:
+def test_a_state_that_the_stream_contradicts_keeps_nobody_from_landing_it(
+    stub: MonitorStub, page: Page, lie: Any
+) -> None:
     """The stream is proven, the state is not."""
-    page.tell(told(replace(flown().at(8.55), proofs=("0" * 32,))), told(lie))
+    page.tell(relayed(replace(flown().at(8.55), proofs=("0" * 32,))), relayed(lie))
     assert page.enabled() == {"hold", "land", "abort"}
     page.press("land")
-    assert asked(stand, 1) == ["land"]
+    assert asked(stub, 1) == ["land"]
 
 
-def test_safety_does_not_wait_for_fresh_data(stand: Stand, page: Page) -> None:
+def test_safety_does_not_wait_for_fresh_data(stub: MonitorStub, page: Page) -> None:
     page.run(60.0)
     assert page.body("stale") == "true"
     for command in ("hold", "land", "abort"):
         page.press(command)
-    assert asked(stand, 3) == ["hold", "land", "abort"]
+    assert asked(stub, 3) == ["hold", "land", "abort"]
 
 
-def test_keys_command_too(stand: Stand, page: Page) -> None:
+def test_keys_command_too(stub: MonitorStub, page: Page) -> None:
     for key in ("h", "l", "Shift+L", "Control+Shift+H", "Shift+A"):
         page.tab.keyboard.press(key)
-    assert asked(stand, 2) == ["land", "abort"]
+    assert asked(stub, 2) == ["land", "abort"]
     page.tab.focus("[data-command='hold']")
     page.tab.keyboard.press("Enter")
-    assert asked(stand, 3)[2] == "hold"
+    assert asked(stub, 3)[2] == "hold"
 
 
-def test_start_needs_a_vehicle_that_waits_and_a_long_press(stand: Stand, page: Page) -> None:
+def test_start_needs_a_vehicle_that_waits_and_a_long_press(stub: MonitorStub, page: Page) -> None:
     assert "start" not in page.enabled() and "only while waiting" in page.text("[data-command='start']")
     news = playing(flown().streams[0], waits_for_start=True)
     page.tell(news())
@@ -143,10 +145,10 @@ def test_start_needs_a_vehicle_that_waits_and_a_long_press(stand: Stand, page: P
     _hold_down(page, "start", 0.7, news)
     _hold_down(page, "start", 0.9, news)
     page.press("hold")
-    assert asked(stand, 2) == ["start", "hold"]
+    assert asked(stub, 2) == ["start", "hold"]
 
 
-def test_resume_needs_a_hold_and_works_by_keyboard(stand: Stand, page: Page) -> None:
+def test_resume_needs_a_hold_and_works_by_keyboard(stub: MonitorStub, page: Page) -> None:
     news = playing(flown().at(8.5), action="hold")
     page.tell(news())
     assert "resume" in page.enabled()
@@ -156,14 +158,14 @@ def test_resume_needs_a_hold_and_works_by_keyboard(stand: Stand, page: Page) -> 
         page.run(0.3)
         page.tell(news())
     page.tab.keyboard.up("Enter")
-    assert asked(stand, 1) == ["resume"]
+    assert asked(stub, 1) == ["resume"]
     page.run(1.0)
     assert "resume" not in page.enabled() and page.body("stale") == "true"
 
 
 @pytest.mark.parametrize("change", ["another session", "another hold", "another vehicle"])
-def test_a_press_is_for_what_was_shown_when_the_button_went_down(stand: Stand, page: Page, change: str) -> None:
-    """Vehicle, flight and hold together: if one of them is another one after 0.8 s, nothing is sent."""
+def test_a_press_is_for_what_was_shown_when_the_button_went_down(stub: MonitorStub, page: Page, change: str) -> None:
+    """If vehicle, flight or hold has changed after 0.8 s, nothing is sent."""
     changes: dict[str, Message] = {"another session": {"session": "s2"}, "another hold": {"hold": 2}}
     after = changes.get(change, {})
     held = replace(flown().at(8.5), action="hold", hold=1)
@@ -183,28 +185,28 @@ def test_a_press_is_for_what_was_shown_when_the_button_went_down(stand: Stand, p
         assert "resume" in page.enabled()
     page.tab.mouse.up()
     page.press("land")
-    assert [message["command"] for message in stand.wait_heard("command", 1)] == ["land"]
+    assert [message["command"] for message in stub.wait_received("command", 1)] == ["land"]
 
 
-def test_a_long_press_ends_with_the_permission(stand: Stand, page: Page) -> None:
-    """It begins while it waits for START, and the data grows old under the finger."""
+def test_a_long_press_ends_with_the_permission(stub: MonitorStub, page: Page) -> None:
+    """The press begins while the vehicle waits for START, and the data becomes stale during it."""
     page.tell(playing(flown().streams[0], waits_for_start=True)())
     page.tab.hover("[data-command='start']")
     page.tab.mouse.down()
     page.run(2.0)
     page.tab.mouse.up()
     page.press("land")
-    assert asked(stand, 1) == ["land"]
+    assert asked(stub, 1) == ["land"]
 
 
 def test_a_vehicle_that_hears_no_commands_says_so(page: Page) -> None:
-    page.tell(told(state(commands=False, text="commands are disabled in the vehicle file")))
+    page.tell(relayed(state(commands=False, text="commands are disabled in the vehicle file")))
     assert page.enabled() == set()
     assert page.text("#commands-why") == "commands are disabled in the vehicle file"
 
 
 def _hold_down(page: Page, command: str, seconds: float, news: Callable[[], Message]) -> None:
-    """While the vehicle goes on sending."""
+    """Hold a button down while the vehicle keeps sending."""
     page.tab.hover(f"[data-command='{command}']")
     page.tab.mouse.down()
     for _ in range(round(seconds / 0.1)):

@@ -1,4 +1,4 @@
-"""How the page looks, measured: sizes, contrast, keyboard; and that its geometry is the controller's."""
+"""The page's appearance, measured: sizes, contrast, keyboard; and that its geometry is the controller's."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.config.loader import load_flight
 from companion.control.manipulator import Manipulator
 from companion.model.codec import to_jsonable
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from tests.ground.monitor_stub import BROKER, Stand, event, flown, hello, retained, told
+from tests.ground.monitor_stub import BROKER, MonitorStub, event, flown, hello, relayed, retained
 from tests.ground.page_browser import SIZES, Page, events_of, watching
 from tests.support import CATCH
 
@@ -26,30 +26,30 @@ LARGE_PX, LARGE_BOLD_PX = 24.0, 18.66
 
 
 @pytest.fixture(scope="module")
-def tablet(browser: Any) -> Iterator[tuple[Page, Stand]]:
-    """The page on a screen that is touched, and its stand."""
-    with Stand(retained()) as stand, watching(browser, stand, touch=True) as page:
-        yield page, stand
+def tablet(browser: Any) -> Iterator[tuple[Page, MonitorStub]]:
+    """The page on a touch screen, and its stub."""
+    with MonitorStub(retained()) as stub, watching(browser, stub, touch=True) as page:
+        yield page, stub
 
 
 @pytest.fixture
-def touched(tablet: tuple[Page, Stand]) -> Iterator[tuple[Page, Stand]]:
-    """Both, for a test that loads the page itself, by `Page.open_anew`."""
+def touched(tablet: tuple[Page, MonitorStub]) -> Iterator[tuple[Page, MonitorStub]]:
+    """Both, for a test that loads the page itself with `Page.open_anew`."""
     yield tablet
     tablet[0].check_complaints()
 
 
 @pytest.fixture(scope="module")
-def geometry(opened: tuple[Page, Stand]) -> Page:
+def geometry(opened: tuple[Page, MonitorStub]) -> Page:
     """The page for tests that only call its geometry."""
     return opened[0]
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_nothing_scrolls_sideways_and_safety_is_always_in_reach(touched: tuple[Page, Stand], size: str) -> None:
-    page, stand = touched
-    page.open_anew(stand, size=size)
-    page.tell(told(flown().at(8.5)), told(flown().events))
+def test_nothing_scrolls_sideways_and_safety_is_always_in_reach(touched: tuple[Page, MonitorStub], size: str) -> None:
+    page, stub = touched
+    page.open_anew(stub, size=size)
+    page.tell(relayed(flown().at(8.5)), relayed(flown().events))
     for down_px in (0, 100_000):
         page.tab.evaluate("y => window.scrollTo(0, y)", down_px)
         wide, shown = page.tab.evaluate("[document.documentElement.scrollWidth, innerWidth]")
@@ -68,22 +68,22 @@ def _assert_in_reach(page: Page, command: str) -> None:
     assert found == command
 
 
-def test_every_control_of_a_tablet_is_large_enough(touched: tuple[Page, Stand]) -> None:
-    page, stand = touched
-    page.open_anew(stand, size="tablet")
+def test_every_control_of_a_tablet_is_large_enough(touched: tuple[Page, MonitorStub]) -> None:
+    page, stub = touched
+    page.open_anew(stub, size="tablet")
     page.tell(*retained("second"))
-    page.tell(told(flown().at(8.5)))
+    page.tell(relayed(flown().at(8.5)))
     for control in page.tab.locator("button:visible, select:visible, summary:visible").all():
         box = control.bounding_box()
         assert box["height"] >= TOUCH_PX and box["width"] >= TOUCH_PX, control.inner_text()
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_every_plots_values_stand_beside_its_title(shared: Page, stand: Stand, size: str) -> None:
-    """Its head has room for one line; a second one is cut off."""
+def test_every_plots_values_stand_beside_its_title(shared: Page, stub: MonitorStub, size: str) -> None:
+    """The header has room for one line; a second one is cut off."""
     late = msgspec.structs.replace(flown().at(8.5).timing, lateness_ms=12.3, mocap_age_ms=16.5, whole_ms=10.4)
-    shared.open_anew(stand, size=size)
-    shared.tell(told(msgspec.structs.replace(flown().at(8.5), timing=late)))
+    shared.open_anew(stub, size=size)
+    shared.tell(relayed(msgspec.structs.replace(flown().at(8.5), timing=late)))
     cut = shared.tab.evaluate(
         "[...document.querySelectorAll('.plot header')].filter((h) => h.scrollHeight > h.clientHeight).map((h) => h.innerText)"
     )
@@ -91,11 +91,11 @@ def test_every_plots_values_stand_beside_its_title(shared: Page, stand: Stand, s
     assert shared.tab.locator(".plot header").count() >= 7
 
 
-def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stand: Stand) -> None:
-    """A finger may be on its way."""
+def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stub: MonitorStub) -> None:
+    """A finger may already be moving to a button."""
     for size in SIZES:
-        shared.open_anew(stand, size=size)
-        shared.tell(told(flown().at(8.5)))
+        shared.open_anew(stub, size=size)
+        shared.tell(relayed(flown().at(8.5)))
 
         def boxes() -> list[Any]:
             commands = ("hold", "land", "abort")
@@ -114,10 +114,10 @@ def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stand: S
 
 
 @pytest.mark.parametrize(("scheme", "stale"), list(itertools.product(("dark", "light"), (False, True))))
-def test_text_has_enough_contrast(shared: Page, stand: Stand, scheme: str, stale: bool) -> None:
-    shared.open_anew(stand, scheme=scheme)
+def test_text_has_enough_contrast(shared: Page, stub: MonitorStub, scheme: str, stale: bool) -> None:
+    shared.open_anew(stub, scheme=scheme)
     lines = [event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")]
-    shared.tell(told(flown().at(8.5)), events_of(*lines))
+    shared.tell(relayed(flown().at(8.5)), events_of(*lines))
     shared.tell({"kind": "refused", "vehicle": shared.shown, "command": "land", "text": "no answer"})
     shared.tab.click("#control summary")
     shared.tab.click("#preflight summary")
@@ -158,7 +158,7 @@ _CONTRAST = """([large, largeBold]) => {
 
 
 def test_everything_can_be_reached_by_keyboard_and_the_commands_first(page: Page) -> None:
-    page.tell(told(flown().at(8.5)))
+    page.tell(relayed(flown().at(8.5)))
     page.tab.keyboard.press("Tab")
     page.tab.keyboard.press("Enter")
     order = []
@@ -169,7 +169,7 @@ def test_everything_can_be_reached_by_keyboard_and_the_commands_first(page: Page
 
 
 def test_the_camera_moves_by_mouse_wheel_and_keys(page: Page) -> None:
-    page.tell(told(flown().at(8.5)))
+    page.tell(relayed(flown().at(8.5)))
 
     def picture() -> str:
         page.run(0.5)

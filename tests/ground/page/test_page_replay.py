@@ -1,4 +1,4 @@
-"""The page plays logs: the same view, scrubbed. In a real browser; once with the real monitor and the log of a flight."""
+"""Replay of logs on the page, in a real browser; once with the real monitor and the log of a flight."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from companion.model.codec import to_jsonable
 from companion.sitl_config.loader import load_sitl
 from tests.analysis.recorded import record
 from tests.broker import free_port
-from tests.ground.monitor_stub import Message, Stand, catch_flight, flown, hello, preflight, sent_at, state
+from tests.ground.monitor_stub import Message, MonitorStub, catch_flight, flown, hello, preflight, sent_at, state
 from tests.ground.page_browser import Page, watching
 from tests.support import CATCH, sandbox_in
 
@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
 
 def log_of(streams: tuple[Stream, ...] | None = None) -> Message:
-    """What the monitor makes of a log."""
+    """Return what the monitor makes of a log."""
     flight = flown()
     ended = state(Presence.ENDED, outcome="completed", commands=False)
     return {
@@ -37,32 +37,32 @@ def log_of(streams: tuple[Stream, ...] | None = None) -> Message:
     }
 
 
-def replays(stand: Stand) -> None:
-    """Let a stand offer two logs."""
-    stand.greeting = [hello(can_command=False, replay=True, logs=["first.mcap", "second.mcap"], why_not="a log")]
-    stand.replay = [log_of(), log_of(tuple(replace(s, phase="second log") for s in flown().streams))]
+def replays(stub: MonitorStub) -> None:
+    """Make a stub offer two logs."""
+    stub.greeting = [hello(can_command=False, replay=True, logs=["first.mcap", "second.mcap"], why_not="a log")]
+    stub.replay = [log_of(), log_of(tuple(replace(s, phase="second log") for s in flown().streams))]
 
 
 @pytest.fixture
-def stand() -> Iterator[Stand]:
-    """A stand for a test with a log, or none, of its own."""
-    with Stand() as stand:
-        replays(stand)
-        yield stand
+def stub() -> Iterator[MonitorStub]:
+    """A stub for a test with its own log, or none."""
+    with MonitorStub() as stub:
+        replays(stub)
+        yield stub
 
 
 @pytest.fixture(scope="module")
-def opened_log(browser: Any) -> Iterator[tuple[Page, Stand]]:
+def opened_log(browser: Any) -> Iterator[tuple[Page, MonitorStub]]:
     """One page for all tests that play the log."""
-    with Stand() as stand:
-        replays(stand)
-        with watching(browser, stand, settle=loaded) as page:
-            yield page, stand
+    with MonitorStub() as stub:
+        replays(stub)
+        with watching(browser, stub, settle=loaded) as page:
+            yield page, stub
 
 
 @pytest.fixture
-def page(opened_log: tuple[Page, Stand]) -> Page:
-    """The page at the beginning of the log, as it is after loading; it does not play."""
+def page(opened_log: tuple[Page, MonitorStub]) -> Page:
+    """The page at the beginning of the loaded log, not playing."""
     page = opened_log[0]
     if page.tab.get_attribute("#replay-play", "aria-label") == "Pause":
         page.tab.click("#replay-play")
@@ -74,7 +74,7 @@ def page(opened_log: tuple[Page, Stand]) -> Page:
 
 
 def loaded(page: Page) -> None:
-    """Until all of the log is there."""
+    """Wait until the log is loaded."""
     page.until("() => document.querySelectorAll('#replay-marks span').length === 3")
     page.until("() => document.getElementById('notice').hidden")
 
@@ -87,7 +87,7 @@ def scrub(page: Page, t_s: float) -> None:
 
 
 def shown_s(page: Page) -> float:
-    """Time in the log, as the page shows it."""
+    """Return the displayed time in the log."""
     match = re.match(r"(\d+):([\d.]+) / ", page.text("#replay-now"))
     assert match is not None
     return 60.0 * int(match[1]) + float(match[2])
@@ -162,25 +162,25 @@ def test_another_log_can_be_picked(page: Page) -> None:
     loaded(page)
 
 
-def test_nothing_can_be_commanded(opened_log: tuple[Page, Stand], page: Page) -> None:
+def test_nothing_can_be_commanded(opened_log: tuple[Page, MonitorStub], page: Page) -> None:
     assert not page.tab.is_visible("#commands")
     page.tab.keyboard.press("Shift+H")
     page.tab.keyboard.press("End")
-    assert page.text("#word") == "ENDED" and opened_log[1].heard("command") == []
+    assert page.text("#word") == "ENDED" and opened_log[1].received("command") == []
 
 
-def test_a_log_that_is_not_to_be_had_is_one_line(browser: Any, stand: Stand) -> None:
-    stand.replay = []
-    with watching(browser, stand, may="Failed to load resource", settle=lambda page: None) as page:
+def test_a_log_that_is_not_to_be_had_is_one_line(browser: Any, stub: MonitorStub) -> None:
+    stub.replay = []
+    with watching(browser, stub, may="Failed to load resource", settle=lambda page: None) as page:
         page.until_text("#notice", "first.mcap cannot be loaded: the monitor answers")
 
 
-def test_a_long_log_loads_in_pieces(browser: Any, stand: Stand) -> None:
-    """The page comes to its senses between the pieces: it shows how far it is, again and again."""
+def test_a_long_log_loads_in_pieces(browser: Any, stub: MonitorStub) -> None:
+    """The page updates between the pieces and shows the progress."""
     streams = flown().streams
     count = 6_000
     times = (streams[0].t_s + 0.05 * k for k in range(count))
-    stand.replay = [log_of(tuple(replace(streams[k * len(streams) // count], t_s=t) for k, t in enumerate(times)))]
+    stub.replay = [log_of(tuple(replace(streams[k * len(streams) // count], t_s=t) for k, t in enumerate(times)))]
     watch = """
         window.percents = new Set();
         new MutationObserver(() => {
@@ -188,7 +188,7 @@ def test_a_long_log_loads_in_pieces(browser: Any, stand: Stand) -> None:
           if (found) percents.add(found[1]);
         }).observe(document, { subtree: true, childList: true, characterData: true });
     """
-    with watching(browser, stand, settle=loaded, script=watch) as page:
+    with watching(browser, stub, settle=loaded, script=watch) as page:
         assert page.tab.evaluate("percents.size") >= 10
         page.tab.keyboard.press("End")
         assert shown_s(page) == pytest.approx(0.05 * (count - 1), abs=0.1)

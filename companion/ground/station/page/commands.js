@@ -4,7 +4,7 @@ import { byId, make, setData, setHidden, setText } from "./dom.js";
 
 const DOUBLE_MS = 300;
 const PRESS_MS = 800;
-const NO_ANSWER_MS = 2500; // the monitor itself gives up after 1.5 s and says so
+const NO_ANSWER_MS = 2500; // the monitor reports a missing answer after 1.5 s
 const FRESH_MS = 8000; // a button shows its result for this long
 const LIVE_S = 1; // same limit as in the monitor
 const SAFE = new Set(["hold", "land", "abort"]);
