@@ -43,9 +43,7 @@ class Heartbeat:
     goodbye: bool
     """This is the last heartbeat: the flight ends normally."""
     mocap_refused: bool
-    """The flight process rejects motion capture and lands without it. Its poses must not go to PX4 and must not be used to judge the
-    landing.
-    """
+    """The flight process rejects motion capture and lands without it: its poses must neither go to PX4 nor judge the landing."""
     autopilot_system: int
     """MAVLink system id of PX4."""
     own_system: int

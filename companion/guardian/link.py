@@ -55,7 +55,26 @@ class Wire(Protocol):
         """Close the transport."""
 
 
-class UdpWire:
+class _ChannelWire:
+    """A wire over a socket or serial port."""
+
+    ready = True
+    lost = False
+
+    def __init__(self, channel: Any) -> None:
+        self._channel = channel
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        return int(self._channel.fileno())
+
+    def close(self) -> None:
+        """Close the transport."""
+        with contextlib.suppress(OSError):
+            self._channel.close()
+
+
+class UdpWire(_ChannelWire):
     """UDP transport, bound where PX4 sends to (`udpin`) or sending to PX4 (`udpout`) from the port that the flight process used.
 
     PX4 keeps the first partner of a UDP link, so the port must stay the same. Once PX4's address is known the socket is connected to
@@ -70,10 +89,9 @@ class UdpWire:
             datagrams to the newest (measured, Linux 6.18).
     """
 
-    lost = False
-
     def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None, *, beside: bool = False) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        super().__init__(self._socket)
         self._remote: tuple[str, int] | None = None
         self._bound = local is not None
         self._connected = False
@@ -93,10 +111,6 @@ class UdpWire:
         except OSError:
             self._socket.close()
             raise
-
-    def fileno(self) -> int:
-        """Return the socket's descriptor."""
-        return self._socket.fileno()
 
     def send(self, data: bytes) -> None:
         """Send to PX4; do nothing before its address is known."""
@@ -125,10 +139,6 @@ class UdpWire:
                 found.append(data)
         return found
 
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
     def _is_from_px4(self, data: bytes, sender: tuple[str, int]) -> bool:
         """Whether the datagram identifies its sender as PX4."""
         if self._remote is not None and sender[0] != self._remote[0]:
@@ -150,19 +160,13 @@ class UdpWire:
             )
 
 
-class TcpWire:
+class TcpWire(_ChannelWire):
     """TCP client transport."""
 
-    ready = True
-
     def __init__(self, remote: tuple[str, int]) -> None:
-        self.lost = False
         self._socket = socket.create_connection(remote, _CONNECT_TIMEOUT_S)
+        super().__init__(self._socket)
         self._socket.setblocking(False)
-
-    def fileno(self) -> int:
-        """Return the socket's descriptor."""
-        return self._socket.fileno()
 
     def send(self, data: bytes) -> None:
         """Send what fits into the send buffer; the receiver resynchronises on the next message."""
@@ -180,47 +184,30 @@ class TcpWire:
         self.lost = not data
         return [data] if data else []
 
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
 
-
-class SerialWire:
+class SerialWire(_ChannelWire):
     """Serial transport, 8N1."""
-
-    ready = True
 
     def __init__(self, path: str, baud: int, flow_control: bool) -> None:
         import serial  # imported here because the other links do not need it
 
-        self.lost = False
         # exclusive: takes the same flock as the flight process
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, rtscts=flow_control, exclusive=True)
-        self._errors = (OSError, serial.SerialException)
-
-    def fileno(self) -> int:
-        """Return the port's descriptor."""
-        number: int = self._port.fileno()
-        return number
+        super().__init__(self._port)
 
     def send(self, data: bytes) -> None:
         """Write what the port takes."""
-        with contextlib.suppress(*self._errors):
+        with contextlib.suppress(OSError):
             self._port.write(data)
 
     def receive(self) -> list[bytes]:
         """Return the data that has arrived. A port that is readable without data (unplugged, hung up) is lost."""
         try:
             data = self._port.read(_MAX_BYTES)
-        except self._errors:
+        except OSError:  # serial.SerialException is one
             self.lost = True
             return []
         return [data] if data else []
-
-    def close(self) -> None:
-        """Close the port."""
-        with contextlib.suppress(*self._errors):
-            self._port.close()
 
 
 def address_problem(address: str) -> str | None:

@@ -7,9 +7,7 @@ import math
 from companion.model.types import Vec3
 
 AWAKE_STEP_MAX_S = 0.02
-"""One round of the guardian's loop (10 ms) counts as silence for at most this long: time in which the guardian itself was not scheduled
-is no evidence.
-"""
+"""Longest silence that one round of the guardian's loop (10 ms) adds: a time in which it was not scheduled is no evidence."""
 JUMP_M = 0.5
 SPEED_MAX_M_S = 4.0
 

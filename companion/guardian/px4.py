@@ -28,9 +28,7 @@ class Px4State:
         self._imu: tuple[float, Vec3] = (-math.inf, _ZERO)
 
     def take(self, t_s: float, message: Any) -> None:
-        """Update with one decoded message that arrived at `t_s` (flight clock). A state message with a value that is not finite is
-        ignored.
-        """
+        """Update with a decoded message that arrived at `t_s` (flight clock); ignore a state message with a non-finite value."""
         m = message
         match m.get_type():
             case "HEARTBEAT":

@@ -105,9 +105,7 @@ class TakeoverLanding:
         self.overturned = False
         """The vehicle was flipped or tipped over, and its rotors were commanded to stop."""
         self.landed: bool | None = None
-        """None while the landing runs. True: the vehicle stands and is disarmed (or stands, and PX4 does not answer). False: no landing
-        could be confirmed.
-        """
+        """None while the landing runs. True: on the ground and disarmed (or PX4 does not answer). False: no landing was confirmed."""
 
     @property
     def pose(self) -> MocapPose | None:

@@ -364,9 +364,7 @@ class Launcher:
         self._events.append({**stamps, **about, "text": text})
 
     def _await_recorder(self) -> None:
-        """Wait for the recorder to close the log of a flight process that was killed. It is no child of this process, so its pidfd is
-        polled.
-        """
+        """Wait for the recorder to close the log of a killed flight process; it is no child of this process, so poll its pidfd."""
         if self._recorder_pid is None or self._result is not None:
             return
         try:

@@ -169,9 +169,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run until the channel ends. The first line on stdout is {"ready": true}, the last the report. Return 0, or 1 if the log is
-    incomplete.
-    """
+    """Run until the channel ends; print {"ready": true} first and the report last. Return 1 if the log is incomplete, else 0."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     arguments = _arguments(argv)
     try:

@@ -279,9 +279,7 @@ class Uplink:
             self._slow_down(now_s)
 
     def _slow_down(self, now_s: float) -> None:
-        """Limit the processor time that a flood of invalid commands takes from the flight; excess messages wait at the broker and are
-        dropped there.
-        """
+        """Limit the processor time that a flood of invalid commands takes from the flight: unread messages wait at the broker."""
         if now_s - self._flood_began_s >= 1.0:
             self._flood_began_s, self._flood_before = now_s, self._session.refused
         many = self._session.refused - self._flood_before

@@ -328,9 +328,7 @@ class TelemetrySession:
         refusals.text = text
 
     def _report_refusals(self, now_s: float) -> None:
-        """Report the first refusal of a reason at once and count the following: an attack is visible, does not flood the log and
-        displaces no other event.
-        """
+        """Report the first refusal of a reason at once and count the following, so that an attack does not flood the log."""
         for reason, refusals in self._refusals.items():
             if not refusals.count or now_s - refusals.reported_s < REFUSAL_PERIOD_S:
                 continue

@@ -22,12 +22,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import foxglove
-from foxglove.channels import (
-    FrameTransformChannel,
-    FrameTransformsChannel,
-    PoseInFrameChannel,
-    SceneUpdateChannel,
-)
+from foxglove.channels import FrameTransformChannel, FrameTransformsChannel, PoseInFrameChannel, SceneUpdateChannel
 from foxglove.messages import (
     Color,
     Duration,
@@ -248,11 +243,7 @@ class _Trail:
 
 
 def _log_pose(
-    channel: PoseInFrameChannel,
-    stamp: Timestamp,
-    stamp_ns: int,
-    position: Sequence[float],
-    attitude: Sequence[float],
+    channel: PoseInFrameChannel, stamp: Timestamp, stamp_ns: int, position: Sequence[float], attitude: Sequence[float]
 ) -> None:
     if not _usable(position, attitude):
         return

@@ -145,9 +145,7 @@ def static_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestamp:
 
 
 def tether_colour(tether: TetherShape, slack_m: float, *, held: bool) -> Color:
-    """Return green for more slack than the margin, amber for less, red if the tether is taut, or taut or snagged by the tether monitor
-    (`held`).
-    """
+    """Return green for more slack than the margin, amber for less, red if taut or `held` (taut or snagged by the tether monitor)."""
     if held or slack_m <= tether.taut_slack_m:
         return TAUT
     return NEARLY_TAUT if slack_m < tether.margin_m else SLACK

@@ -296,10 +296,9 @@ def tether(**values: Any) -> dict[str, Any]:
 
 def old(device: str, limit_s: float) -> Callable[[float], dict[str, Any]]:
     """Return a row with a device's data at an age, as a share of its limit."""
-    stamps = {
-        "vehicle": ("position_stamp_s", "attitude_stamp_s", "imu_stamp_s"),
-        "status": ("heartbeat_stamp_s",),
-    }.get(device, ("stamp_s",))
+    stamps = {"vehicle": ("position_stamp_s", "attitude_stamp_s", "imu_stamp_s"), "status": ("heartbeat_stamp_s",)}.get(
+        device, ("stamp_s",)
+    )
     return lambda share: {f"{device}__{stamp}": IN_FLIGHT[0].t_s - share * limit_s for stamp in stamps}
 
 

@@ -270,16 +270,7 @@ async def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
 async def test_a_pipe_gets_a_line_a_second(broker: Broker) -> None:
     async with played_vehicle(broker.port, OPERATORS):
         process = await asyncio.create_subprocess_exec(
-            *(
-                sys.executable,
-                "-m",
-                "companion",
-                "monitor",
-                "--text",
-                "--view-only",
-                "--broker",
-                broker.url,
-            ),
+            *(sys.executable, "-m", "companion", "monitor", "--text", "--view-only", "--broker", broker.url),
             cwd=ROOT,
             stdout=asyncio.subprocess.PIPE,
         )

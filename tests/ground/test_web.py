@@ -20,16 +20,7 @@ from companion.ground.station.station import Station
 from companion.ground.station.web import Monitor, ServerSettings, WebError
 from companion.ground.station.web_guard import HEADERS, MESSAGE_MAX_BYTES
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import (
-    OPERATORS,
-    SIGNER,
-    base_of,
-    monitor_at,
-    played,
-    self_signed,
-    until,
-    viewer_of,
-)
+from tests.ground.monitor_rig import OPERATORS, SIGNER, base_of, monitor_at, played, self_signed, until, viewer_of
 from tests.ground.vehicle import flight, played_vehicle
 
 pytestmark = pytest.mark.waits
@@ -43,11 +34,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 @played
 async def test_a_viewer_is_greeted_and_told_what_is_known_and_then_sees_it_live(broker: Broker) -> None:
-    async with (
-        played_vehicle(broker.port, OPERATORS),
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with played_vehicle(broker.port, OPERATORS), monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer:
         hello = await viewer.next()
         assert hello["kind"] == "hello" and hello["can_command"] is True and hello["why_not"] is None
         assert (hello["operator"], hello["replay"]) == ("anna", False)

@@ -148,10 +148,7 @@ def test_nothing_is_opened_beside_a_flight_process_that_still_lives(
 ) -> None:
     install_hook(tmp_path, monkeypatch, immortal=True)
     cable = Px4Cable(tmp_path / "autopilot")
-    with (
-        cable.plugged() as master,
-        Rig(tmp_path, address=f"serial://{tmp_path / 'autopilot'}:921600") as rig,
-    ):
+    with cable.plugged() as master, Rig(tmp_path, address=f"serial://{tmp_path / 'autopilot'}:921600") as rig:
         rig.beat_until_ready()
         wait_until(lambda: "guardian_no_link" in rig.events, rig.log.read_text)
         assert "the killed flight process still holds the link" in rig.log.read_text()

@@ -23,11 +23,7 @@ from tests.support import HOVER, run_here, sandbox_in, set_options
 )
 @pytest.mark.parametrize("by_key", [False, True], ids=["by the option", "by the key"])
 def test_a_flight_that_would_wait_for_ever_is_refused(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    mqtt: dict[str, object],
-    why: str,
-    by_key: bool,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mqtt: dict[str, object], why: str, by_key: bool
 ) -> None:
     key = set_options(**{"mission.start.takeoff": "by_operator"}) if by_key else ["--wait-for-start"]
     with sandbox_in(tmp_path) as sandbox:

@@ -25,15 +25,7 @@ from companion.config.loader import load_flight
 from companion.ground.broker import setup as broker_setup
 from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import load_operators, new_key, write_private
-from companion.ground.protocol.messages import (
-    Ack,
-    CommandName,
-    Events,
-    Presence,
-    State,
-    Topic,
-    encode,
-)
+from companion.ground.protocol.messages import Ack, CommandName, Events, Presence, State, Topic, encode
 from companion.model.types import GroundCommand, OperatorCommand, SafetyAction
 from tests.broker import Broker, free_port, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running

@@ -34,9 +34,7 @@ DOMAIN = "companion command 2"
 AHEAD_MAX_S = 0.5
 """Largest lead of a command's time over the vehicle's clock."""
 REFUSED_MAX = 512
-"""Nonces of refused commands that are kept per operator and command name; beyond that a range of times is kept
-(`_History.add_refused`).
-"""
+"""Nonces of refused commands kept per operator and command name; beyond it a range of times is kept (`_History.add_refused`)."""
 ACKS_PER_S = 20
 """Limit of acks for refused commands, so that replayed commands cause no flood of acks."""
 _NOTHING = (float("inf"), float("-inf"))

@@ -288,9 +288,7 @@ class Command(Record, frozen=True, kw_only=True):
     operator: str
     command: CommandName
     t_ms: int
-    """The sender's estimate of the vehicle's flight clock, ms: `Stream.t_s` of the last proven message plus the time since. Wall clocks
-    need not agree.
-    """
+    """The vehicle's flight clock as estimated by the sender, ms: `Stream.t_s` of the last proven message plus the time since."""
     hold: int
     """`Stream.hold` that a `resume` ends; 0 in every other command."""
     nonce: str

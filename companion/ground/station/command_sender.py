@@ -18,9 +18,7 @@ from companion.ground.station.vehicles import Vehicle, VehicleTracker
 ANSWER_S = 1.5
 """Timeout for the vehicle's `Ack`."""
 ATTEMPTS = 3
-"""Attempts for a command that makes the flight safer, each with its own nonce. Others are sent once: an operator repeats a lost START
-himself.
-"""
+"""Attempts for a command that makes the flight safer, each with its own nonce. Other commands are sent once."""
 REPEATED = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
 FALLBACK_ADVICE = "use Ctrl-C or the pilot's switch"
 NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {FALLBACK_ADVICE}"

@@ -70,7 +70,7 @@ def status_word(vehicle: Vehicle, now_s: float) -> tuple[str, str]:
     if state is not None and state.session == vehicle.session:
         match state.presence:
             case Presence.ENDED:
-                return f"ENDED: {printable(state.outcome or 'outcome not known')}", "bold"
+                return f"ENDED: {printable(state.outcome or 'unknown outcome')}", "bold"
             case Presence.LOST:
                 return "LOST", _ALARM
             case Presence.SILENT:

@@ -28,17 +28,7 @@ from companion.ground.protocol.strict_json import NUMBER_MAX
 from companion.ground.telemetry.health import HealthEvaluator, Snapshot, WorstAges
 from companion.ground.telemetry.timings import WorstTimings, merge_timings
 from companion.model.flight_stage import Stage
-from companion.model.types import (
-    ControlLog,
-    Inputs,
-    Outputs,
-    Quat,
-    Reference,
-    SafetyAction,
-    Sent,
-    TetherState,
-    Vec3,
-)
+from companion.model.types import ControlLog, Inputs, Outputs, Quat, Reference, SafetyAction, Sent, TetherState, Vec3
 
 _TOUCHDOWN = Stage.TOUCHDOWN.value
 """On the ground the reference lies below the floor, which is no tracking error."""
