@@ -16,7 +16,7 @@ from companion.ground.protocol.messages import CommandName, Topic
 from companion.ground.station.command_sender import FALLBACK_ADVICE, Failed, Sent, ack_text, signer_of
 from companion.ground.station.link import BrokerRefused
 from companion.ground.station.station import Station
-from companion.ground.station.vehicles import LIVE_S, Vehicle
+from companion.ground.station.vehicles import LIVE_S
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import tell
 from companion.runtime.tasks import until_first
@@ -149,7 +149,10 @@ class _Commander:
     def _why_nobody(self, station: Station) -> str:
         if not station.link.connected:
             return station.link.text
-        there = [f"{name} ({_presence(vehicle)})" for name, vehicle in sorted(station.tracker.vehicles.items())]
+        there = [
+            f"{name} ({known.state.presence.value if known.state is not None else 'state unknown'})"
+            for name, known in sorted(station.tracker.vehicles.items())
+        ]
         whom = "a vehicle" if self._only is None else repr(self._only)
         return f"no message from {whom} at the broker within {FOUND_S:g} s" + (
             f"; known: {', '.join(there)}" if there else ""
@@ -164,7 +167,3 @@ class _Commander:
     def _end(self, code: int, text: str) -> None:
         self.code = code
         tell(f"companion command: {text}")
-
-
-def _presence(vehicle: Vehicle) -> str:
-    return vehicle.state.presence.value if vehicle.state is not None else "state unknown"

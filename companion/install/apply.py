@@ -102,7 +102,12 @@ def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
     found = pending_changes(root, plan, record)
     live = root == Path("/")
     old = record or Record()
-    if record is not None and record.complete and not found.to_do and not (live and _user_missing(user)):
+    if (
+        record is not None
+        and record.complete
+        and not found.to_do
+        and not (live and not (_user_exists(user) and _user_in_group(user)))
+    ):
         return False
     made = Record(
         entries=found.entries,
@@ -259,10 +264,6 @@ def _remove_folders(root: Path, folders: tuple[str, ...]) -> list[str]:
         except OSError:
             kept.append(folder)
     return kept
-
-
-def _user_missing(user: str) -> bool:
-    return not _user_exists(user) or not _user_in_group(user)
 
 
 def _user_exists(user: str) -> bool:

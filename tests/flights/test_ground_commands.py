@@ -194,9 +194,9 @@ def test_without_its_recorder_it_still_stands_down_on_ctrl_c(sandbox: Sandbox, t
             flying.wait_for("connected to")
             recorder = sandbox.pid_of("companion.recorder.main")
             os.kill(recorder, signal.SIGKILL)
-            flying.wait_for("no telemetry and no commands any more")
+            flying.wait_for("no telemetry, no commands")
             flying.signal(signal.SIGINT)
             ended = flying.end()
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, ended.out + ended.err
-    assert ended.out.count("no telemetry and no commands any more") == 1
+    assert ended.out.count("no telemetry, no commands") == 1

@@ -259,7 +259,10 @@ def test_check_of_the_loopback_profile_may_everything(tmp_path: Path, capsys: py
     assert rights(out) == dict.fromkeys((*PUBLISHED_TOPICS, "command"), ("yes", "yes"))
 
 
-def test_check_says_why_it_does_not_get_in(site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_says_why_it_does_not_get_in(
+    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.ground.broker.check.ANSWER_S", 1.0)
     login = str(site.folder / "operators/anna/login.yaml")
     other = tmp_path / "other.pem"
     other.write_bytes(make_authority(datetime.datetime.now(datetime.UTC)).certificate)
@@ -276,7 +279,7 @@ def test_check_says_why_it_does_not_get_in(site: Site, tmp_path: Path, capsys: p
         assert "3 " in told(tls, "--login", login, "--ca", str(other))
         assert "the broker's certificate is not trusted" in told(tls, "--login", login, "--ca", str(other))
         assert "does not use TLS" in told(f"mqtts://127.0.0.1:{made.plain_port}", "--ca", str(site.folder / "ca.pem"))
-        assert "the broker ended the connection" in told(f"mqtt://127.0.0.1:{made.tls_port}", "--login", login)
+        assert "for a port with TLS use mqtts://" in told(f"mqtt://127.0.0.1:{made.tls_port}", "--login", login)
     assert "Connection refused; check that the broker is running" in told(f"mqtt://127.0.0.1:{free_port()}")
     assert told("http://here").startswith("2 ")
     assert told(plain, "--vehicle", "#").startswith("2 --vehicle '#'")

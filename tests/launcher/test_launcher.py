@@ -1,4 +1,4 @@
-"""The launcher outlives its children and leaves nothing behind: Ctrl-C at every stage, a killed launcher, worlds and flights that die."""
+"""The launcher outlives its children and leaves nothing behind: Ctrl-C, a killed launcher, a world or flight that dies."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ import aiomqtt
 from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.connection import Connection, error_text, reason_code
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Topic, vehicle_of
+from companion.runtime.tasks import until_first
 
 ANSWER_S = 5.0
 """Timeout for each answer of the broker."""
@@ -56,17 +57,22 @@ def check(access: BrokerAccess, vehicle: str | None = None) -> CheckResult:
         CheckError: no connection, or no answer.
     """
     tls, ends = _probe(access)
-    try:
-        return asyncio.run(_try_topics(access, vehicle or f"check-{secrets.token_hex(4)}", tls, ends))
-    except aiomqtt.MqttError as error:
-        code = reason_code(error)
-        if code is None:
-            raise CheckError(f"{access.address}: {error_text(error)}") from None
-        login = "without a login" if access.username is None else f"as {access.username}"
-        raise CheckError(f"{access.address}: the broker refuses the connection {login}: {code}; see --login") from None
+    name = vehicle or f"check-{secrets.token_hex(4)}"
+    granted, written, found = asyncio.run(_try_topics(access, name))
+    received = {topic for _, topic in found}
+    rights = tuple(
+        TopicRights(
+            topic, topic in granted and (topic in received or (False if topic in written else None)), topic in written
+        )
+        for topic in Topic
+    )
+    return CheckResult(tls, ends, rights, tuple(sorted({vehicle for vehicle, _ in found} - {name})))
 
 
-async def _try_topics(access: BrokerAccess, name: str, tls: str | None, ends: str | None) -> CheckResult:
+async def _try_topics(access: BrokerAccess, name: str) -> tuple[set[Topic], set[Topic], list[tuple[str, Topic]]]:
+    """Return the topics that can be read, those that can be written, and vehicle and topic of each received message."""
+    granted: set[Topic] = set()
+    written: set[Topic] = set()
     found: list[tuple[str, Topic]] = []
 
     def on_message(topic: str, payload: bytes, retained: bool) -> None:
@@ -74,25 +80,34 @@ async def _try_topics(access: BrokerAccess, name: str, tls: str | None, ends: st
         if vehicle is not None:
             found.append(vehicle)
 
+    async def try_all() -> None:
+        for topic in Topic:
+            if await client.subscribe_topic(topic.of("+"), 1) is None:
+                granted.add(topic)
+        for topic in Topic:  # every receiver rejects an empty message
+            if await client.publish_message(topic.of(name), b"", qos=1) is None:
+                written.add(topic)
+        # The broker answers in order: all messages of these subscriptions arrive before this answer.
+        await client.unsubscribe([topic.of("+") for topic in Topic])
+
     identifier = f"companion-check-{secrets.token_hex(6)}"
     client = Connection(access, identifier, on_message, packet_max_bytes=2 * MESSAGE_MAX_BYTES, answer_s=ANSWER_S)
     try:
-        await client.open()
-        granted = {topic: await client.subscribe_topic(topic.of("+"), 1) is None for topic in Topic}
-        # Every receiver rejects an empty message.
-        written = {topic: await client.publish_message(topic.of(name), b"", qos=1) is None for topic in Topic}
-        # The broker answers in order: all messages of these subscriptions arrive before this answer.
-        await client.unsubscribe([topic.of("+") for topic in Topic])
+        try:
+            await client.open()
+        except aiomqtt.MqttError as error:
+            login = "without a login" if access.username is None else f"as {access.username}"
+            text = f"the broker refuses the connection {login}: {error_text(error)}; see --login"
+            if reason_code(error) is None:
+                text = f"the broker does not answer: {error_text(error)}; for a port with TLS use mqtts://"
+            raise CheckError(f"{access.address}: {text}") from None
+        try:
+            await until_first(client.wait_broken(), try_all())
+        except aiomqtt.MqttError as error:
+            raise CheckError(f"{access.address}: the broker ended the connection: {error_text(error)}") from None
     finally:
         await client.shut_down()
-    received = {topic for _, topic in found}
-    rights = tuple(
-        TopicRights(
-            topic, granted[topic] and (topic in received or (False if written[topic] else None)), written[topic]
-        )
-        for topic in Topic
-    )
-    return CheckResult(tls, ends, rights, tuple(sorted({vehicle for vehicle, _ in found} - {name})))
+    return granted, written, found
 
 
 def _probe(access: BrokerAccess) -> tuple[str | None, str | None]:
