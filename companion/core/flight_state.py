@@ -33,7 +33,7 @@ class Waiting:
     tare_start_s: float | None = None
     was_ready: bool = False
     """It had everything once: what it lost since may come back for as long as the operator waits."""
-    unready: str = "nothing has been looked at yet"
+    unready: str = "the inputs have not been checked yet"
     """Why it is not ready."""
     looked_s: float = 0.0
     """When estimate and place were judged last."""

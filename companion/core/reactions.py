@@ -16,8 +16,8 @@ HOLD_ABOVE_M = 0.3
 """Margin over standing height below which the vehicle lands instead of holding."""
 _BY_OPERATOR = (OPERATOR_LAND, OPERATOR_ABORT, notices.CALLED_OFF.id)
 _EXPIRED = {
-    notices.HOLD_EXPIRED.id: (notices.HOLD_EXPIRED, "nobody ended the hold"),
-    notices.RETRACT_EXPIRED.id: (notices.RETRACT_EXPIRED, "the way back took too long"),
+    notices.HOLD_EXPIRED.id: (notices.HOLD_EXPIRED, "no command has ended the hold in time; landing"),
+    notices.RETRACT_EXPIRED.id: (notices.RETRACT_EXPIRED, "the retract took too long; landing here"),
 }
 # Looking up members of an enum costs time in every tick.
 _HOLD, _RETRACT = SafetyAction.HOLD, SafetyAction.RETRACT
@@ -31,7 +31,7 @@ def supervise(t: Transition) -> None:
         _hold_on_ground(t)
     action = state.supervisor.action
     if action is _RETRACT and state.course is not None and state.course.left_s(i.t_s) <= 0.0:
-        t.report(notices.RETRACT_DONE, "back along the tether; landing")
+        t.report(notices.RETRACT_DONE, "retract complete; landing")
     if t.events or action is _HOLD or action is _RETRACT:
         _escalate(t)
 
@@ -92,7 +92,7 @@ def _hold_on_ground(t: Transition) -> None:
     """On the ground HOLD means not to lift. A flight that waits for its start does that already."""
     waits = t.parameters.waits_for_start and t.state.stage in (Stage.WAIT, Stage.READY)
     if not waits and not t.state.armed_by_others:
-        text = "a stop was asked for before take-off; it stays on the ground"
+        text = "hold commanded before take-off; the vehicle stays on the ground"
         t.report(notices.CALLED_OFF, text)
 
 
@@ -102,7 +102,7 @@ def _hold(t: Transition) -> None:
     if course is None or course.segment(t_s).kind is PhaseKind.LANDING:
         return
     if course.reference(t_s).position_world_m[2] < t.parameters.clearance_m + HOLD_ABOVE_M:
-        _land_instead(t, "too low to stay")
+        _land_instead(t, "too low to hold; landing")
     else:
         t.change(course=course.hold(t_s))
 
@@ -110,7 +110,7 @@ def _hold(t: Transition) -> None:
 def _retract(t: Transition) -> None:
     now, course = t.o.reference, t.state.course
     if now is None or course is None or course.segment(t.i.t_s).kind is PhaseKind.LANDING:
-        _land_instead(t, "landing already")
+        _land_instead(t, "already landing; no retract")
         return
     arm_rad = t.i.arm.angle_rad if t.i.arm is not None else now.arm_rad
     p = t.parameters

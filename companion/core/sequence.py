@@ -63,7 +63,7 @@ def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
     tare_start_s = t.state.waiting.tare_start_s
     assert tare_start_s is not None
     if i.t_s - tare_start_s < seq.TARE_S:
-        t.change_waiting(unready="the force sensor is still being weighed")
+        t.change_waiting(unready="the force sensor's tare is not complete")
         return
     wanders = t.state.waiting.settled.problem(i.t_s)
     if wanders is not None:
@@ -75,7 +75,7 @@ def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
     problems = _misplaced(t)
     if not problems:
         _is_ready(t)
-    elif was_ready:  # somebody moved it; they may put it back
+    elif was_ready:  # it was moved, and may be put back
         t.change_waiting(unready=problems[0])
     else:
         for problem in problems:
@@ -87,7 +87,9 @@ def _is_ready(t: Transition) -> None:
     if not t.parameters.waits_for_start:
         _take_off(t)
         return
-    t.change_waiting(was_ready=True, unready="it has become ready just now; say it again", looked_s=t.i.t_s)
+    t.change_waiting(
+        was_ready=True, unready="the vehicle has only just become ready; send the command again", looked_s=t.i.t_s
+    )
     _begin_tare(t)
     t.enter(Stage.READY)
 
@@ -189,7 +191,7 @@ def _stand_down(t: Transition, elapsed_s: float) -> AutopilotRequest:
     if not seq.is_armed(i.status) and i.t_s - t.state.arm_requested_s > ARMED_SHOWN_S:
         t.enter(Stage.DONE)
     elif not _left_to_pilot(t) and elapsed_s > seq.DISARM_TIMEOUT_S:
-        text = "PX4 did not disarm: its rotors may turn; disarm it by its switch or from a ground station"
+        text = "PX4 did not disarm: its rotors may turn; disarm it by the pilot's switch or from a ground station"
         t.report(notices.DISARM_REFUSED, text)
         t.enter(Stage.DONE)
     elif t.state.stage is Stage.STAND_DOWN:
@@ -225,7 +227,7 @@ def _fly(t: Transition, _: float) -> AutopilotRequest:
             t.enter(Stage.TOUCHDOWN)
             return _NONE
     if course.left_s(i.t_s) < -NO_TOUCHDOWN_S:
-        t.report(notices.NO_TOUCHDOWN, "no touchdown was felt")
+        t.report(notices.NO_TOUCHDOWN, f"no touchdown detected {NO_TOUCHDOWN_S:g} s after the plan's end; PX4 lands")
         t.finish(Outcome.ABORTED)
         t.enter(Stage.AUTOPILOT_LAND)
     return _NONE

@@ -128,9 +128,7 @@ class AutopilotLanding:
         if not heard:
             now, stands = now._watch_standing(i)
             if stands:
-                text = (
-                    "the vehicle stands, motion capture says; PX4 does not answer: go and disarm it by hand, with care"
-                )
+                text = "the vehicle stands by motion capture, but PX4 does not answer: approach with care and disarm it by hand"
                 return now, LandingStep(
                     request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=text
                 )

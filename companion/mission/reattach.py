@@ -31,7 +31,7 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     mode = i.status.mode.value.upper() if i.status is not None else "?"
     found = f"PX4 is armed and the companion has not armed it: {where}, in {mode}"
     if people_fly(i.status):
-        return True, f"{found}, which people choose: motion capture is passed on, nothing else is sent"
+        return True, f"{found}, which a pilot has chosen: only motion capture is sent to PX4"
     if stands:
-        return False, f"{found}, on the ground: it is disarmed, nothing lifts; find out who armed it, then start again"
-    return True, f"{found}: PX4 lands, the mission is not flown"
+        return False, f"{found}, on the ground: the companion disarms it; find out who armed it, then start again"
+    return True, f"{found}: PX4 lands; the mission is not flown"

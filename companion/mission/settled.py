@@ -66,6 +66,6 @@ class SettledEstimate:
         if not wrong:
             return None
         return (
-            f"PX4's estimate has not settled in the last {SETTLED_S:g} s: {', '.join(wrong)}; leave the vehicle alone on the floor, "
-            "and see that PX4 and Motive mean the same body and axes (EKF2_EV_DELAY, EKF2_EVP_NOISE, the rigid body's markers)"
+            f"PX4's estimate has not settled in the last {SETTLED_S:g} s: {', '.join(wrong)}; do not move the vehicle, "
+            "and check that PX4 and Motive use the same body and axes (EKF2_EV_DELAY, EKF2_EVP_NOISE, the rigid body's markers)"
         )

@@ -54,7 +54,7 @@ class ArmTracker:
 
 def arm_lost(a: ArmTracker, timeout_s: float) -> Values | None:
     """No joint state has arrived for longer than the timeout."""
-    return HOLDS if a.age_s > timeout_s else None
+    return (timeout_s,) if a.age_s > timeout_s else None
 
 
 def arm_read_failures(a: ArmTracker, failures_max: int) -> Values | None:
@@ -97,7 +97,7 @@ def servo_warm(a: ArmTracker, thresholds: Vec2) -> Values | None:
     if a.arm is None:
         return None
     hottest_c = max(a.arm.temperature_c)
-    return (hottest_c,) if thresholds[0] <= hottest_c < thresholds[1] else None
+    return (hottest_c, thresholds[0]) if thresholds[0] <= hottest_c < thresholds[1] else None
 
 
 def servo_hot(a: ArmTracker, thresholds: Vec2) -> Values | None:
@@ -105,7 +105,7 @@ def servo_hot(a: ArmTracker, thresholds: Vec2) -> Values | None:
     if a.arm is None:
         return None
     hottest_c = max(a.arm.temperature_c)
-    return (hottest_c,) if hottest_c >= thresholds[0] and hottest_c >= thresholds[1] else None
+    return (hottest_c, max(thresholds)) if hottest_c >= max(thresholds) else None
 
 
 def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:
@@ -123,7 +123,7 @@ def joint_rate(a: ArmTracker, rate_max_rad_s: float) -> Values | None:
         return None
     w1, w2 = a.arm.velocity_rad_s
     in_range = -rate_max_rad_s < w1 < rate_max_rad_s and -rate_max_rad_s < w2 < rate_max_rad_s
-    return None if in_range else (math.degrees(w1), math.degrees(w2))
+    return None if in_range else (math.degrees(w1), math.degrees(w2), math.degrees(rate_max_rad_s))
 
 
 def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, Vec2]]) -> Values | None:
@@ -195,7 +195,7 @@ class ForceTracker:
 
 def force_lost(f: ForceTracker, timeout_s: float) -> Values | None:
     """No sample has arrived for longer than the timeout."""
-    return HOLDS if f.age_s > timeout_s else None
+    return (timeout_s,) if f.age_s > timeout_s else None
 
 
 def force_overload(f: ForceTracker, force_max_n: float) -> Values | None:
@@ -214,4 +214,4 @@ def force_stuck(f: ForceTracker, _: None) -> Values | None:
 def force_drift(f: ForceTracker, drift_n: float) -> Values | None:
     """The mean force on an empty net exceeds the threshold."""
     x, y, z = f.mean_n
-    return (x, y, z) if x * x + y * y + z * z > drift_n**2 else None
+    return (x, y, z, drift_n) if x * x + y * y + z * z > drift_n**2 else None

@@ -84,7 +84,7 @@ class FlightTracker:
 
 def tilt(f: FlightTracker, tilt_max_rad: float) -> Values | None:
     """PX4's tilt exceeds the threshold."""
-    return (math.degrees(f.tilt_rad),) if f.tilt_rad > tilt_max_rad else None
+    return (math.degrees(f.tilt_rad), math.degrees(tilt_max_rad)) if f.tilt_rad > tilt_max_rad else None
 
 
 def crashed(f: FlightTracker, _: None) -> Values | None:
@@ -97,19 +97,20 @@ def too_fast(f: FlightTracker, speed_max_m_s: float) -> Values | None:
     if f.vehicle is None:
         return None
     vx, vy, _ = f.vehicle.velocity_world_m_s
-    return (math.hypot(vx, vy),) if vx * vx + vy * vy > speed_max_m_s * speed_max_m_s else None
+    fast = vx * vx + vy * vy > speed_max_m_s * speed_max_m_s
+    return (math.hypot(vx, vy), speed_max_m_s) if fast else None
 
 
 def climbs_too_fast(f: FlightTracker, climb_max_m_s: float) -> Values | None:
     """The vertical speed upward exceeds the threshold."""
     up_m_s = f.vehicle.velocity_world_m_s[2] if f.vehicle is not None else 0.0
-    return (up_m_s,) if up_m_s > climb_max_m_s else None
+    return (up_m_s, climb_max_m_s) if up_m_s > climb_max_m_s else None
 
 
 def sinks_too_fast(f: FlightTracker, sink_max_m_s: float) -> Values | None:
     """The vertical speed downward exceeds the threshold."""
     up_m_s = f.vehicle.velocity_world_m_s[2] if f.vehicle is not None else 0.0
-    return (-up_m_s,) if up_m_s < -sink_max_m_s else None
+    return (-up_m_s, sink_max_m_s) if up_m_s < -sink_max_m_s else None
 
 
 def geofence_left(f: FlightTracker, tolerance_m: float) -> Values | None:
@@ -132,24 +133,26 @@ def geofence_near(f: FlightTracker, tolerance_m: float) -> Values | None:
 def tracking_error(f: FlightTracker, thresholds: tuple[float, ...]) -> Values | None:
     """The tracking error exceeds all thresholds."""
     error_m = f.tracking_error_m
-    return (error_m,) if error_m is not None and error_m > max(thresholds) else None
+    limit_m = max(thresholds)
+    return (error_m, limit_m) if error_m is not None and error_m > limit_m else None
 
 
 def tracking_warn(f: FlightTracker, threshold_m: float) -> Values | None:
     """The tracking error exceeds the threshold."""
     error_m = f.tracking_error_m
-    return (error_m,) if error_m is not None and error_m > threshold_m else None
+    return (error_m, threshold_m) if error_m is not None and error_m > threshold_m else None
 
 
 def thrust_saturated(f: FlightTracker, saturated_max_s: float) -> Values | None:
     """The vertical force is limited, and has been for longer than the threshold."""
-    return (f.vertical_n,) if f.vertical_n is not None and f.saturated_s > saturated_max_s else None
+    found = f.vertical_n is not None and f.saturated_s > saturated_max_s
+    return (f.vertical_n, saturated_max_s) if found else None
 
 
 def tether_short(f: FlightTracker, slack_min_m: float) -> Values | None:
     """Less tether than the threshold would be left where the vehicle would come to rest after a fault."""
     t = f.tether
-    return (t.stop_slack_m,) if t is not None and t.stop_slack_m < slack_min_m else None
+    return (t.stop_slack_m, slack_min_m) if t is not None and t.stop_slack_m < slack_min_m else None
 
 
 def tether_taut(f: FlightTracker, _: None) -> Values | None:
@@ -167,13 +170,13 @@ def tether_snagged(f: FlightTracker, _: None) -> Values | None:
 def tether_near(f: FlightTracker, clearance_min_m: float) -> Values | None:
     """The tether is nearer to rotors or arm than the threshold."""
     t = f.tether
-    return (t.clearance_m,) if t is not None and t.clearance_m < clearance_min_m else None
+    return (t.clearance_m, clearance_min_m) if t is not None and t.clearance_m < clearance_min_m else None
 
 
 def tether_wound(f: FlightTracker, turns_max: float) -> Values | None:
     """The tether is wound by more turns than the threshold."""
     t = f.tether
-    return (abs(t.turns),) if t is not None and abs(t.turns) > turns_max else None
+    return (abs(t.turns), turns_max) if t is not None and abs(t.turns) > turns_max else None
 
 
 def tether_separated(f: FlightTracker, _: None) -> Values | None:

@@ -223,12 +223,12 @@ class MocapTracker:
 
 def mocap_lost(m: MocapTracker, timeout_s: float) -> Values | None:
     """No frame has arrived for longer than the timeout."""
-    return HOLDS if m.frame_age_s > timeout_s else None
+    return (timeout_s,) if m.frame_age_s > timeout_s else None
 
 
 def mocap_invalid(m: MocapTracker, timeout_s: float) -> Values | None:
     """Frames arrive, but none was believed for longer than the timeout, and the newest has no valid pose."""
-    return HOLDS if m.unbelieved(timeout_s) and m.frame is not None and not m.frame.tracking_valid else None
+    return (timeout_s,) if m.unbelieved(timeout_s) and m.frame is not None and not m.frame.tracking_valid else None
 
 
 def mocap_swapped(m: MocapTracker, timeout_s: float) -> Values | None:
@@ -260,19 +260,22 @@ def mocap_slow(m: MocapTracker, thresholds: Vec2) -> Values | None:
     """The rate is below the first threshold; the second is the timeout after which the stream is lost instead."""
     rate_hz = m.rate_hz
     slow = rate_hz is not None and rate_hz < thresholds[0] and not m.frame_age_s > thresholds[1]
-    return (rate_hz,) if slow else None
+    return (rate_hz, thresholds[0]) if slow else None
 
 
 def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
     """The latency exceeds the first threshold, and not the second."""
     latency_s = m.pose.latency_s if m.pose is not None else None
-    return (latency_s * 1e3,) if latency_s is not None and thresholds[0] < latency_s <= thresholds[1] else None
+    if latency_s is None or not thresholds[0] < latency_s <= thresholds[1]:
+        return None
+    return (latency_s * 1e3, thresholds[0] * 1e3)
 
 
 def mocap_too_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
     """The latency exceeds both thresholds."""
     latency_s = m.pose.latency_s if m.pose is not None else None
-    return (latency_s * 1e3,) if latency_s is not None and latency_s > max(thresholds) else None
+    limit_s = max(thresholds)
+    return (latency_s * 1e3, limit_s * 1e3) if latency_s is not None and latency_s > limit_s else None
 
 
 def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:
@@ -280,7 +283,7 @@ def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:
     if m.compared is None:
         return None
     apart_m = math.dist(m.compared[1].position_world_m, m.compared[0].position_world_m)
-    return (apart_m,) if apart_m > disagreement_m else None
+    return (apart_m, disagreement_m) if apart_m > disagreement_m else None
 
 
 def yaw_disagrees(m: MocapTracker, disagreement_rad: float) -> Values | None:
@@ -292,7 +295,7 @@ def yaw_disagrees(m: MocapTracker, disagreement_rad: float) -> Values | None:
     if abs(_dot(vehicle, pose)) >= math.cos(0.4 * disagreement_rad):
         return None
     turned_rad = _yaw_between(vehicle, pose)
-    return (math.degrees(turned_rad),) if turned_rad > disagreement_rad else None
+    return (math.degrees(turned_rad), math.degrees(disagreement_rad)) if turned_rad > disagreement_rad else None
 
 
 def _dot(a: Quat, b: Quat) -> float:

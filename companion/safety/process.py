@@ -29,12 +29,12 @@ class ProcessTracker:
 
 def loop_late(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
     """The tick is late by more than the first threshold, and not the second."""
-    return (p.gap_s * 1e3,) if thresholds[0] < p.gap_s <= thresholds[1] else None
+    return (p.gap_s * 1e3, thresholds[0] * 1e3) if thresholds[0] < p.gap_s <= thresholds[1] else None
 
 
 def loop_stalled(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
     """The tick is late by more than both thresholds."""
-    return (p.gap_s * 1e3,) if p.gap_s > thresholds[0] and p.gap_s > thresholds[1] else None
+    return (p.gap_s * 1e3, max(thresholds) * 1e3) if p.gap_s > max(thresholds) else None
 
 
 def recorder_drops(p: ProcessTracker, _: None) -> Values | None:

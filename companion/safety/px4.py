@@ -107,7 +107,7 @@ def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:
 
 def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:
     """PX4's state arrives later than at best by more than the threshold."""
-    return (p.lag_s * 1e3,) if p.lag_s > lag_max_s else None
+    return (p.lag_s * 1e3, lag_max_s * 1e3) if p.lag_s > lag_max_s else None
 
 
 def estimate_frozen(p: Px4Tracker, _: None) -> Values | None:
@@ -117,12 +117,12 @@ def estimate_frozen(p: Px4Tracker, _: None) -> Values | None:
 
 def vehicle_state_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
     """Position, attitude or IMU sample is older than the timeout."""
-    return HOLDS if p.state_age_s > timeout_s else None
+    return (timeout_s,) if p.state_age_s > timeout_s else None
 
 
 def heartbeat_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
     """No heartbeat has arrived for longer than the timeout."""
-    return HOLDS if p.heartbeat_age_s > timeout_s else None
+    return (timeout_s,) if p.heartbeat_age_s > timeout_s else None
 
 
 def pilot_took_over(p: Px4Tracker, _: None) -> Values | None:
@@ -136,7 +136,7 @@ def offboard_left(p: Px4Tracker, _: None) -> Values | None:
     status = p.left_offboard
     if status is None or people_chose(status):
         return None
-    return (status.mode.value.upper(), "; its failsafe acts" if failsafe_chose(status) else "")
+    return (status.mode.value.upper(), "; a failsafe of PX4 is active" if failsafe_chose(status) else "")
 
 
 def px4_disarmed(p: Px4Tracker, _: None) -> Values | None:
@@ -152,7 +152,7 @@ def px4_disarmed(p: Px4Tracker, _: None) -> Values | None:
 def battery_below(p: Px4Tracker, remaining_min: float) -> Values | None:
     """The remaining charge, 0 to 1, is below the threshold."""
     remaining = p.status.battery_remaining if p.status is not None else None
-    return (remaining,) if remaining is not None and remaining < remaining_min else None
+    return (remaining, remaining_min) if remaining is not None and remaining < remaining_min else None
 
 
 def battery_voltage(p: Px4Tracker, voltage_min_v: float | None) -> Values | None:

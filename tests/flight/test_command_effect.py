@@ -146,7 +146,7 @@ def test_a_hold_that_nobody_may_end_yet() -> None:
     for accepted, text in flown.effects[:2]:
         assert not accepted
         assert text.startswith("resume refused: 0.")
-        assert text.endswith("m off the reference")
+        assert text.endswith("m off the reference (limit 0.60 m)")
     assert flown.effects[2] == (True, "going on")
     assert [id_ for id_ in flown.ids if id_ in ("tracking_hold", "resume_refused")] == [
         *("tracking_hold", "resume_refused", "resume_refused"),

@@ -118,7 +118,7 @@ def test_given_up_before_arming(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("  wait\n")  # it weighs the net for a second
         running.signal(signal.SIGINT)
-        running.wait_for("landing was asked for")
+        running.wait_for("landing commanded")
         running.signal(signal.SIGINT)
         ended = running.end()
     sandbox.assert_nobody_left()
@@ -137,7 +137,7 @@ def test_asked_to_land_in_flight_and_asked_again(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for(IN_FLIGHT)
         running.signal(signal.SIGINT)
-        running.wait_for("landing was asked for")
+        running.wait_for("landing commanded")
         running.signal(signal.SIGTERM)
         ended = running.end()
     sandbox.assert_nobody_left()

@@ -358,7 +358,7 @@ def test_motion_capture_that_comes_back_slowly_is_reported_with_its_own_rate() -
 
     events = watched(VEHICLE, after_a_moment(lost_then_slow, ticks=1200), flying())
     assert [event.id for event in events] == ["mocap_lost", "mocap_slow"]
-    assert events[1].text == "motion capture comes at 29 Hz"
+    assert events[1].text == "motion capture arrives at 29 Hz (limit 50 Hz)"
 
 
 def test_fast_flight_and_a_gap_are_no_jump() -> None:
