@@ -63,7 +63,7 @@ def _react(t: Transition) -> None:
         return
     if state.stage in seq.BEFORE_ARMING and t.o.airborne:
         t.finish(Outcome.ABORTED)
-        t.enter_landing(seq.people_fly(t.i.status), float("-inf"))
+        t.enter_landing(seq.flown_by_pilot(t.i.status), float("-inf"))
     elif state.stage in seq.BEFORE_LIFT:
         if action.rank >= SafetyAction.LAND.rank:
             t.stand_down(Outcome.ABORTED if state.supervisor.cause in _BY_OPERATOR else Outcome.REFUSED)

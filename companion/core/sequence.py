@@ -284,7 +284,7 @@ def _done(_: Transition, __: float) -> AutopilotRequest:
 
 def _left_to_pilot(t: Transition) -> bool:
     """A pilot took over while PX4 was to be disarmed: from now on nothing is sent, and the pilot's own disarm is waited for."""
-    if not seq.people_fly(t.i.status):
+    if not seq.flown_by_pilot(t.i.status):
         return False
     if not any(event.id == PILOT_TOOK_OVER for event in t.events):
         text = "a pilot took over before PX4 was disarmed; nothing is sent any more"

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from companion.config.loader import FlightConfig
 from companion.flight.heartbeat import FlightGuard
-from companion.model.flight_stage import people_fly
+from companion.model.flight_stage import flown_by_pilot
 from companion.model.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, Outcome
 from companion.runtime import ipc
 from companion.runtime.clock import Clock
@@ -56,7 +56,7 @@ async def land_without_core(
         now = autopilot.status()
         if now is not None and not now.armed and clock() - start_s > STATUS_MIN_AGE_S:
             return Outcome.ABORTED
-        if people_fly(now):
+        if flown_by_pilot(now):
             start_s = clock()
         else:
             autopilot.request(AutopilotRequest.LAND)

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from companion.io.px4 import messages
-from companion.model.flight_stage import people_fly
+from companion.model.flight_stage import flown_by_pilot
 from companion.model.frames import attitude_enu_flu_from_ned_frd, euler_zyx_from_quat
 from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
 
@@ -72,7 +72,7 @@ class Px4State:
     @property
     def pilot(self) -> bool:
         """Whether PX4 is armed in a mode that a pilot selects."""
-        return people_fly(self.status())
+        return flown_by_pilot(self.status())
 
     def yaw_rad(self) -> float | None:
         """Return the heading in the world (ENU), or None if it is unknown."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from companion.model.flight_stage import in_offboard, is_armed, on_ground, people_chose
+from companion.model.flight_stage import chosen_by_pilot, in_offboard, is_armed, on_ground
 from companion.model.types import AutopilotRequest, FlightMode, Inputs
 from companion.safety.rotor_stop import (
     ESTIMATE_TRUSTED_S,
@@ -162,7 +162,7 @@ class AutopilotLanding:
         """A pilot takes over: a mode in which somebody steers; or, once PX4 was landing, any that only a pilot chooses."""
         mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
         now = self if self.was_landing or mode is not FlightMode.LAND else replace(self, was_landing=True)
-        chosen = i.status is not None and people_chose(i.status)
+        chosen = i.status is not None and chosen_by_pilot(i.status)
         return now, mode is FlightMode.MANUAL or (now.was_landing and chosen)
 
     def _watch_touchdown(self, i: Inputs) -> tuple[AutopilotLanding, bool]:

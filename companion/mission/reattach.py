@@ -6,7 +6,7 @@ before the companion does. The vehicle never takes off in this case.
 
 from __future__ import annotations
 
-from companion.model.flight_stage import on_ground, people_fly
+from companion.model.flight_stage import flown_by_pilot, on_ground
 from companion.model.types import Inputs
 from companion.safety.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
 
@@ -30,7 +30,7 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     where = "at an unknown height" if height_m is None else f"at a height of {height_m:.2f} m"
     mode = i.status.mode.value.upper() if i.status is not None else "?"
     found = f"PX4 is armed and the companion has not armed it: {where}, in {mode}"
-    if people_fly(i.status):
+    if flown_by_pilot(i.status):
         return True, f"{found}, which a pilot has chosen: only motion capture is sent to PX4"
     if stands:
         return False, f"{found}, on the ground: the companion disarms it; find out who armed it, then start again"

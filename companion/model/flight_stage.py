@@ -1,7 +1,7 @@
-"""The flight's sequence on top of the plan: wait, offboard, arm, spool up, fly the plan, touch down, disarm. Pure; time is an argument.
+"""The stages of a flight, their times, and what PX4's status says about the pilot. `companion.core.sequence` executes the stages.
 
 WAIT -> OFFBOARD -> ARM -> SPOOL -> PLAN -> TOUCHDOWN -> DISARM -> DONE
-WAIT <-> READY -> OFFBOARD, where people say when
+WAIT <-> READY -> OFFBOARD, if the operator starts the take-off
 in the air, at any time:  -> PLAN (a landing from here)  or  -> AUTOPILOT_LAND, both ending in DONE
 before SPOOL, at any time: -> STAND_DOWN -> DONE
 """
@@ -14,15 +14,15 @@ from companion.model.types import AutopilotStatus, FlightMode, LandedState
 
 WAIT_TIMEOUT_S = 15.0
 TARE_S = 1.0
-"""The force sensor is weighed for so long; a flight that waits for its start does so over and over."""
+"""Duration of the force sensor's tare. A flight that waits for its start repeats it."""
 LOOK_AGAIN_S = 0.1
-"""A flight that waits for its start judges estimate and place so often."""
+"""Period in which a flight that waits for its start judges estimate and place."""
 STREAM_BEFORE_OFFBOARD_S = 0.8
 OFFBOARD_TIMEOUT_S = 8.0
 ARM_TIMEOUT_S = 10.0
 SPOOL_S = 1.2
 SPOOL_SHARE = 0.7
-"""Share of hover thrust at the end of spooling up; the plan's first tick takes it from there."""
+"""Share of hover thrust at the end of spooling up; the plan begins with it."""
 SPOOL_TO_FULL_S = 0.4
 TOUCHDOWN_RAMP_S = 0.4
 DISARM_TIMEOUT_S = 8.0
@@ -47,44 +47,44 @@ class Stage(Enum):
 
 BEFORE_LIFT = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD, Stage.ARM})
 BEFORE_ARMING = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD})
-"""Whoever armed PX4 now, the companion did not."""
+"""If PX4 is armed in these stages, the companion has not armed it."""
 LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
 DISARMING = frozenset({Stage.DISARM, Stage.STAND_DOWN})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
-"""Stages in which PX4 must be in OFFBOARD, by the companion's belief."""
+"""Stages in which the companion commands, so PX4 must be in OFFBOARD."""
 PILOT_FLIES = "a pilot flies"
-"""Name of the phase in which nothing is sent because somebody else has the vehicle."""
-PEOPLE_CHOOSE = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
-"""Modes that only people choose, unless one of PX4's failsafes has: a pilot flies, and nothing is sent against a pilot."""
+"""Name of the phase in which nothing is sent because a pilot has the vehicle."""
+PILOT_MODES = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
+"""Modes that only a pilot chooses, or one of PX4's failsafes. While a pilot flies nothing is sent."""
 FAILSAFE_STATES = frozenset({5, 6, 8})
 """MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION: HEARTBEAT.system_status while one of PX4's failsafes acts."""
 
 
 def in_offboard(status: AutopilotStatus | None) -> bool:
-    """PX4 says that it is in OFFBOARD."""
+    """Return whether PX4 reports OFFBOARD."""
     return status is not None and status.mode is FlightMode.OFFBOARD
 
 
 def is_armed(status: AutopilotStatus | None) -> bool:
-    """PX4 says that it is armed."""
+    """Return whether PX4 reports that it is armed."""
     return status is not None and status.armed
 
 
 def on_ground(status: AutopilotStatus | None) -> bool:
-    """PX4's land detector says that the vehicle stands."""
+    """Return whether PX4's land detector reports that the vehicle stands."""
     return status is not None and status.landed is LandedState.ON_GROUND
 
 
 def failsafe_chose(status: AutopilotStatus) -> bool:
-    """One of PX4's failsafes acts, and the mode is one that it can choose. In MANUAL a pilot steers, failsafe or not."""
+    """Return whether a failsafe of PX4 is active and has chosen the mode. In MANUAL a pilot steers, failsafe or not."""
     return status.system_status in FAILSAFE_STATES and status.mode is not FlightMode.MANUAL
 
 
-def people_chose(status: AutopilotStatus) -> bool:
-    """PX4 is in a mode that only people choose, and no failsafe has chosen it."""
-    return status.mode in PEOPLE_CHOOSE and not failsafe_chose(status)
+def chosen_by_pilot(status: AutopilotStatus) -> bool:
+    """Return whether PX4 is in a mode that a pilot has chosen."""
+    return status.mode in PILOT_MODES and not failsafe_chose(status)
 
 
-def people_fly(status: AutopilotStatus | None) -> bool:
-    """PX4 is armed and in a mode that people chose: a pilot flies."""
-    return status is not None and status.armed and people_chose(status)
+def flown_by_pilot(status: AutopilotStatus | None) -> bool:
+    """Return whether a pilot flies: PX4 is armed and in a mode that a pilot has chosen."""
+    return status is not None and status.armed and chosen_by_pilot(status)

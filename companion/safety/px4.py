@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.model.flight_stage import failsafe_chose, people_chose
+from companion.model.flight_stage import chosen_by_pilot, failsafe_chose
 from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
@@ -128,13 +128,13 @@ def heartbeat_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
 def pilot_took_over(p: Px4Tracker, _: None) -> Values | None:
     """PX4 is in a mode that a pilot has chosen."""
     status = p.left_offboard
-    return (status.mode.value.upper(), "") if status is not None and people_chose(status) else None
+    return (status.mode.value.upper(), "") if status is not None and chosen_by_pilot(status) else None
 
 
 def offboard_left(p: Px4Tracker, _: None) -> Values | None:
     """PX4 is in another mode that it has chosen itself."""
     status = p.left_offboard
-    if status is None or people_chose(status):
+    if status is None or chosen_by_pilot(status):
         return None
     return (status.mode.value.upper(), "; a failsafe of PX4 is active" if failsafe_chose(status) else "")
 

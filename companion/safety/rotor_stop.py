@@ -1,9 +1,9 @@
 """When rotors may be stopped: the one rule for every request to disarm, in the flight process and in the guardian. Pure.
 
-Three cases, and no fourth:
+There are three cases:
 
 * **It stands.** PX4 is in OFFBOARD or LAND, so no pilot flies; every fresh height is near standing height; and the vehicle has
-  not moved. All of it without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses in the air, and for
+  not moved. All of this must hold without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses in the air, and for
   `FORCE_DISARM_S` by motion capture before FORCE_DISARM, which PX4 does not refuse.
 * **It is flipped.** Beyond `FLIPPED_TILT_RAD` by PX4's attitude, confirmed by motion capture, or by the accelerometer where
   motion capture does not see the body, for `FLIPPED_HOLD_S`. Then PX4's LAND drives it into the floor, so FORCE_DISARM follows
@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from companion.model.flight_stage import HEARTBEAT_FRESH_S, people_fly
+from companion.model.flight_stage import HEARTBEAT_FRESH_S, flown_by_pilot
 from companion.model.frames import tilt_rad
 from companion.model.types import FlightMode, Inputs, MocapPose, Vec3
 from companion.safety.touchdown import MOCAP_FRESH_S, STILL_M_S, Sinking
@@ -132,7 +132,7 @@ class RotorStop:
         pose_s = max(self.pose_s, i.mocap.stamp_s) if i.mocap is not None and i.mocap.tracking_valid else self.pose_s
         rest = self._rest(i, _low_and_still(i, pose, sinking.speed_m_s, self.low_m, pose_s))
         rest_s = t_s - rest[0] if rest is not None else -math.inf
-        flipped_since_s = _since(self.flipped_since_s, t_s, seems_flipped(i) and not people_fly(i.status))
+        flipped_since_s = _since(self.flipped_since_s, t_s, seems_flipped(i) and not flown_by_pilot(i.status))
         tipped_since_s = _since(self.tipped_since_s, t_s, self._lies_tilted(i, pose))
         return replace(
             self,

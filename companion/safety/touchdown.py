@@ -1,9 +1,9 @@
-"""Does the vehicle stand? Three sources that fail apart from one another, and two of them must say so. Pure; time is an argument.
+"""Touchdown detection: two of three independent sources must agree that the vehicle stands. Pure; time is an argument.
 
-* **Height**: PX4's estimate is near standing height and does not sink, though the reference has gone below it.
-* **Thrust**: far less than hovering takes is commanded, and motion capture sees no sinking: something else carries the vehicle.
-* **PX4**: its land detector says so (EXTENDED_SYS_STATE). In attitude control it waits for next to no thrust, which no law gives by
-  itself. So when one of the others stands alone, thrust is taken back step by step (`relief`), for as long as nothing sinks.
+* **Height**: PX4's estimate is near standing height and does not sink, although the reference is below it.
+* **Thrust**: much less than hover thrust is commanded, and motion capture sees no sinking: the floor carries the vehicle.
+* **PX4**: its land detector (EXTENDED_SYS_STATE). In attitude control it waits for almost zero thrust, which no control law gives by
+  itself. So when one of the other sources is alone, thrust is reduced gradually (`relief`) as long as the vehicle does not sink.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from dataclasses import dataclass, field, replace
 from companion.model.types import MocapPose, VehicleState
 
 HEIGHT_MARGIN_M = 0.12
-"""Above standing height: so low the height counts as standing."""
+"""Margin over standing height below which the height counts as standing."""
 STILL_M_S = 0.08
 REFERENCE_BELOW_M = 0.05
 HEIGHT_HOLD_S = 0.35
 THRUST_SHARE = 0.75
-"""Of hover thrust. A vehicle in the air that gets no more falls 0.2 m within 0.4 s."""
+"""Share of hover thrust. With this thrust a vehicle in the air falls 0.2 m within 0.4 s."""
 THRUST_HOLD_S = 0.2
 NEVER_ABOVE_M = 0.5
-"""Over standing height, by motion capture: there thrust and PX4 prove nothing, for the vehicle may hang on its tether."""
+"""Margin over standing height. Above it, by motion capture, thrust and PX4 prove nothing: the vehicle may hang on its tether."""
 ALONE_S = 0.4
-"""So long one source may wait for a second before it is put to the test."""
+"""Time for which one source may be alone before thrust is reduced."""
 RELIEF_S = 1.0
-"""From all of the thrust to none."""
+"""Time from full thrust to zero."""
 RELIEF_SINK_MAX_M_S = 0.15
-"""Sinks faster when thrust is taken back: it flew."""
+"""A vehicle that sinks faster while thrust is reduced is flying."""
 SINK_WINDOW_S = 0.15
 MOCAP_FRESH_S = 0.3
 
@@ -49,7 +49,7 @@ class HeightEvidence:
         return replace(self, since_s=t_s) if self.since_s is None else self
 
     def stands(self, t_s: float) -> bool:
-        """Whether it says that the vehicle stands."""
+        """Return whether the vehicle stands by this evidence."""
         return self.since_s is not None and t_s - self.since_s >= HEIGHT_HOLD_S
 
 
@@ -144,7 +144,7 @@ class Touchdown:
         return after._relieved(t_s, dt_s, sink_m_s, (low or carried) and below)
 
     def _relieved(self, t_s: float, dt_s: float, sink_m_s: float | None, seems_to_stand: bool) -> Touchdown:
-        """Less thrust while one source says that the vehicle stands, all of it at once when the vehicle does sink."""
+        """Reduce thrust while one source alone says that the vehicle stands; restore it at once when the vehicle sinks."""
         if not seems_to_stand or sink_m_s is None or sink_m_s > RELIEF_SINK_MAX_M_S:
             return replace(self, relief=1.0, alone_since_s=None)
         since_s = t_s if self.alone_since_s is None else self.alone_since_s

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from companion.core.flight_core import FlightCore
-from companion.model.flight_stage import PEOPLE_CHOOSE
+from companion.model.flight_stage import PILOT_MODES
 from companion.model.types import (
     AutopilotRequest,
     FlightMode,
@@ -75,7 +75,7 @@ def test_every_mode_landed_state_and_height(mode: FlightMode, landed: LandedStat
     assert f"{height[2]:.2f} m" in event.text and mode.value.upper() in event.text
     assert all(o.attitude is None for o in outputs), "no setpoint, with thrust or without"
     requests = {o.request for o in outputs}
-    if mode in PEOPLE_CHOOSE:
+    if mode in PILOT_MODES:
         assert requests == {AutopilotRequest.NONE}
         assert "people choose" in event.text
     elif stands:
