@@ -1,4 +1,4 @@
-"""Does motion capture move as the IMU says that the vehicle moves? Pure.
+"""Check that motion capture moves as the IMU measures. Pure.
 
 PX4 fuses the poses of motion capture, so its position agrees with them even when an attacker drags them away. The accelerometer does
 not: an observer of position, velocity and accelerometer bias integrates it, and each pose corrects the observer. The innovation, pose

@@ -1,11 +1,11 @@
-"""Is motion capture one stream? Two servers at one address, one of them forged, number their frames in two sequences. Pure."""
+"""Detect a second motion-capture server at the same address, perhaps a forged one, by its own sequence of frame numbers. Pure."""
 
 from __future__ import annotations
 
 from collections import deque
 
 STEPS_BACK_MAX = 2
-"""A server that is restarted starts its numbers anew: one step back, and perhaps another with a second restart."""
+"""A server that restarts begins its numbers again: one step back, and another with a second restart."""
 WINDOW_S = 1.0
 REORDERED_MAX = 8
 """A network may deliver a frame this many numbers behind the newest one."""
@@ -32,7 +32,7 @@ class StreamWatch:
 
         Args:
             number: frame number.
-            content: what the frame says of the body; compared with that of another frame with the same number.
+            content: pose of the body in the frame; compared with that of another frame with the same number.
             t_s: arrival time.
 
         Returns:
@@ -50,5 +50,5 @@ class StreamWatch:
         return self.two(t_s)
 
     def two(self, t_s: float) -> bool:
-        """Two streams were seen within the last WINDOW_S."""
+        """Return whether two streams were seen within the last WINDOW_S."""
         return len(self._back_s) > STEPS_BACK_MAX and t_s - self._back_s[0] <= WINDOW_S

@@ -18,34 +18,34 @@ from companion.safety.tether_shape import Clearance, steepest_slope
 
 _TWO_PI = 2.0 * math.pi
 _ABOVE_M = 0.05
-"""So near to a vertical the direction to it says nothing: winding is held."""
+"""Nearer than this to a vertical the direction to it is not defined, and the winding is held."""
 _DT_MAX_S = 0.05
 """A longer gap between two updates counts as this in filters."""
 
 
 def attachment_world_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> Vec3:
-    """Where the tether is tied to the vehicle, world frame."""
+    """Return where the tether is tied to the vehicle, world frame, m."""
     x, y, z = quat_rotate(attitude_wxyz, tether.attachment_body_m)
     return (position_world_m[0] + x, position_world_m[1] + y, position_world_m[2] + z)
 
 
 def distance_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> float:
-    """Straight distance from the anchor to the attachment point."""
+    """Return the straight distance from the anchor to the attachment point."""
     return math.dist(attachment_world_m(tether, position_world_m, attitude_wxyz), tether.anchor_world_m)
 
 
 def slack_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> float:
-    """Tether length left; 0 is taut, negative cannot be."""
+    """Return the tether length that is left, m; 0 if the tether is taut."""
     return tether.length_m - distance_m(tether, position_world_m, attitude_wxyz)
 
 
 def allowed_m(tether: Tether) -> float:
-    """Largest distance from the anchor that a plan may use."""
+    """Return the largest distance from the anchor that a plan may use, m."""
     return tether.length_m - tether.margin_m
 
 
 class Winding:
-    """Turns of a direction, counted from where it was first seen."""
+    """Turns of a direction, counted from the first one."""
 
     __slots__ = ("_last_rad", "turns")
 
@@ -54,7 +54,7 @@ class Winding:
         self.turns = 0.0
 
     def update(self, x: float, y: float) -> float:
-        """The direction as it is now; returns the turns. Too short a vector has no direction and changes nothing."""
+        """Take the direction (x, y), m, and return the turns. A vector shorter than `_ABOVE_M` changes nothing."""
         if x * x + y * y < _ABOVE_M * _ABOVE_M:
             return self.turns
         angle = math.atan2(y, x)
@@ -96,7 +96,7 @@ class TetherWatch:
 
     @property
     def windings(self) -> tuple[float, float]:
-        """Turns about the anchor's vertical, and of the line about the vehicle."""
+        """The turns about the anchor's vertical, and of the line about the vehicle."""
         return self._about_anchor.turns, self._about_vehicle.turns
 
     def update(
@@ -109,16 +109,16 @@ class TetherWatch:
         disturbance_world_n: Vec3 | None,
         tool_force_world_n: Vec3 | None,
     ) -> TetherState:
-        """One tick.
+        """Take a tick and return the tether's state.
 
         Args:
             t_s: flight clock.
             position_world_m: of the body's origin.
             velocity_world_m_s: of the body's origin.
             attitude_wxyz: body to world.
-            arm_rad: the paper's angles; None: unknown, the arm may be anywhere within its reach.
-            disturbance_world_n: everything that acts on the machine beside rotors and gravity; None: unknown, or on the ground.
-            tool_force_world_n: the part of it that acts on the net, tared; None: unknown.
+            arm_rad: the paper's angles; None if they are unknown: the arm may be anywhere within its reach.
+            disturbance_world_n: force on the vehicle beside rotors and gravity, N; None if unknown, or on the ground.
+            tool_force_world_n: the part of it that acts on the net, tared, N; None if unknown.
         """
         dt_s = 0.0
         if self._last_t_s is not None:

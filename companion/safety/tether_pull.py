@@ -1,4 +1,4 @@
-"""How hard the tether pulls, from the force that nothing else explains.
+"""Pull of the tether, estimated from the force that nothing else explains.
 
 The residual is the disturbance of the whole machine less the force at the net: a caught payload is in both and drops out. What is
 left are wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the
@@ -14,22 +14,22 @@ from companion.config.vehicle import Tether
 from companion.model.types import Vec3
 
 HORIZONTAL_N = 0.7
-"""Standard deviation of the horizontal residual without a tether: wind of a room, drag, tilt errors."""
+"""Standard deviation of the horizontal residual without a tether: air flow in the room, drag, tilt errors."""
 VERTICAL_N = 2.0
-"""Of the vertical residual: 7 % of the hover thrust."""
+"""Standard deviation of the vertical residual: 7 % of the hover thrust."""
 CERTAIN = 3.0
-"""A pull is believed beyond so many standard deviations of the fit."""
+"""A pull counts from this many standard deviations of the fit on."""
 RELEASE = 0.6
-"""It has ended when it falls below this share of what started it."""
+"""A pull ends when it falls below this share of its threshold."""
 SIDEWAYS_N = 6.0
-"""A horizontal residual of this size in any direction: held by something else than the anchor."""
+"""A horizontal residual of this size in any direction means that something other than the anchor holds the vehicle."""
 _FLAT, _STEEP = 1.0 / HORIZONTAL_N**2, 1.0 / VERTICAL_N**2
 """Weights of the fit."""
 GROWTH_S = 0.3
 GROWTH_N_PER_M = 10.0
-"""Slope of the pull over the range from which on it is a line that tightens."""
+"""From this slope of the pull over the range on, the line tightens."""
 GROWTH_SPREAD_M2 = 1e-6
-"""Variance of the range below which there is no slope to see."""
+"""Below this variance of the range no slope can be estimated."""
 
 
 class PullEstimate:
@@ -63,7 +63,7 @@ class PullEstimate:
         self.forget()
 
     def forget(self) -> None:
-        """As if nothing had been seen."""
+        """Start again."""
         self._f: Vec3 | None = None
         self._pull_s = self._side_s = 0.0
         self._range_mean = self._pull_mean = self._cov = self._var = 0.0
@@ -83,7 +83,7 @@ class PullEstimate:
         disturbance_world_n: Vec3 | None,
         tool_force_world_n: Vec3 | None,
     ) -> None:
-        """One tick; a unit vector from the attachment to the anchor, forces in the world frame."""
+        """Take a tick; `towards_anchor` is the unit vector from the attachment to the anchor, forces are in the world frame, N."""
         if disturbance_world_n is None:
             if self._f is not None:
                 self.forget()

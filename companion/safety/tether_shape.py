@@ -1,4 +1,4 @@
-"""How near the hanging line comes to rotors and arm.
+"""Clearance between the hanging tether and rotors and arm.
 
 A line that hangs still lies in the vertical plane through its two ends, below their chord, and above its own tangent at the vehicle:
 a hanging line is convex. So it is bounded by two rays from the attachment, the chord and the steepest tangent that its slack allows;
@@ -14,11 +14,11 @@ from companion.config.vehicle import Vehicle
 from companion.model.types import Vec2, Vec3
 
 _NEVER = 1.0
-"""How far a line is followed that never leaves the disk, m."""
+"""Length, m, up to which a line is followed that never leaves the disk."""
 
 
 def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float) -> Vec2:
-    """Unit direction (towards the anchor's vertical, up) of the hanging line at the vehicle.
+    """Return the unit direction (towards the anchor's vertical, up) of the hanging line at the vehicle.
 
     A parabola over the horizontal span h with the sag s has the length c + 8/3 s^2 h^2 / c^3 (c the chord, flat enough), so
     s = sqrt(3/8 slack c^3) / h, and the slope at its end is that of the chord less 4 s / h.
@@ -55,17 +55,17 @@ class Clearance:
         self._reach_m = self._l1 + self._l2 + self._net_m
         self._aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
         self.judges_arm = self._aside_m > 0.0
-        """False: tied in the arm's own plane, the line hangs into its sweep whatever is flown: a matter of building, not of flying."""
+        """False if the tether is tied in the arm's own plane: then it hangs into the arm's sweep in every flight."""
         self.needs_hanging = self.judges_arm or not self._below
-        """False: `least_m` has no use for the hanging direction."""
+        """False if `least_m` does not use the hanging direction."""
 
     def least_m(self, straight_body: Vec3, hanging_body: Vec3 | None, arm_rad: Vec2 | None) -> float:
-        """Least distance, negative if the line touches.
+        """Return the least distance, m, negative if the line touches.
 
         Args:
             straight_body: unit direction from the attachment to the anchor.
-            hanging_body: unit direction in which the line may leave when it hangs deepest; None: straight.
-            arm_rad: the paper's angles; None: the arm may be anywhere within its reach.
+            hanging_body: unit direction in which the line leaves when it hangs deepest; None if it is straight.
+            arm_rad: the paper's angles; None if they are unknown: the arm may be anywhere within its reach.
         """
         # Tied below the rotors the line comes nearest when it is straight, tied above them when it hangs deepest.
         nearest = straight_body if self._below or hanging_body is None else hanging_body
@@ -95,7 +95,7 @@ class Clearance:
         if off >= inner:
             at_s = 0.0 if off <= outer else (-b - math.sqrt(b * b - flat_2 * (c - outer * outer))) / flat_2
             return -pz - max(at_s * dz, out_s * dz)
-        # Through the middle, where there are no blades: what counts is how steeply it passes the ring's inner edge.
+        # Through the middle, where there are no blades: the distance depends on how steeply it passes the ring's inner edge.
         flat = math.sqrt(flat_2)
         if flat < 1e-6:
             return math.hypot(inner - off, pz) if dz > 0.0 else inner - off
@@ -103,13 +103,13 @@ class Clearance:
         return min(math.hypot(inner - off, pz), (-pz - max(in_s * dz, out_s * dz)) * flat)
 
     def _arm_reach_m(self, arm_rad: Vec2) -> float:
-        """Farthest point of arm and net from the shoulder."""
+        """Return the distance of the farthest point of arm and net from the shoulder, m."""
         l1, l2 = self._l1, self._l2
         net_m = math.sqrt(max(0.0, l1 * l1 + l2 * l2 + 2.0 * l1 * l2 * math.cos(arm_rad[1])))
         return max(l1, net_m + self._net_m)
 
     def _arm_m(self, d: Vec3, reach_m: float) -> float:
-        """Distance of a ray from the slab |y - y_shoulder| <= net radius, within `reach_m` of the shoulder, in its plane."""
+        """Return the distance of a ray from the slab |y - y_shoulder| <= net radius, within `reach_m` of the shoulder, in its plane."""
         px, py, pz = self._p
         sx, sy, sz = self._shoulder
         dx, dy, dz = d

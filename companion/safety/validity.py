@@ -69,7 +69,7 @@ def invalid(field: str) -> Callable[[InputFilter, None], Values | None]:
     return predicate
 
 
-# Chained comparisons: NaN fails them all. Written out: these run in every tick, and a call costs more than the comparisons.
+# Chained comparisons: NaN fails them all. They are written out because a call in every tick costs more than the comparisons.
 
 
 def _stamp(t_s: float) -> bool:

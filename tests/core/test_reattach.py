@@ -77,7 +77,7 @@ def test_every_mode_landed_state_and_height(mode: FlightMode, landed: LandedStat
     requests = {o.request for o in outputs}
     if mode in PILOT_MODES:
         assert requests == {AutopilotRequest.NONE}
-        assert "people choose" in event.text
+        assert "a pilot has chosen" in event.text
     elif stands:
         assert requests == {AutopilotRequest.NONE, AutopilotRequest.DISARM}
         first = next(o for o in outputs if o.request is AutopilotRequest.DISARM)
