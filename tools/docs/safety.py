@@ -73,24 +73,29 @@ def after(state: SafetyAction, event_id: str, asks: SafetyAction) -> SafetyActio
 
 
 def ladder_table() -> str:
-    """Every state x every event in the air: the state after it."""
+    """Every state x every event in the air: the state after it. Events with the same effect share a row."""
     states = list(SafetyAction)
-    rows = [
-        f"| event | {' | '.join(state.value for state in states)} |",
-        f"|---|{'---|' * len(states)}",
-    ]
     events = [(rule.id, rule.air) for rule in RULES if rule.air is not None]
     events += [(notice.id, notice.action) for notice in (RETRACT_DONE, NO_ROOM_TO_STAY)]
+    effects: dict[tuple[str, ...], list[str]] = {}
     for event_id, asks in events:
         cells = [after(state, event_id, asks) for state in states]
-        shown = ["" if cell is state else cell.value for cell, state in zip(cells, states, strict=True)]
-        rows.append(f"| `{event_id}` | {' | '.join(shown)} |")
-    late = SupervisorState(SafetyAction.HOLD, "before", 0.0), SupervisorState(SafetyAction.RETRACT, "before", 0.0)
-    for notice, key, start in ((HOLD_EXPIRED, "hold_max_s", late[0]), (RETRACT_EXPIRED, "retract_max_s", late[1])):
-        end = update(start, [], 2.0, _TIMES)
-        shown = [end.action.value if state is start.action else "" for state in states]
-        rows.append(f"| `{notice.id}`, after {_default(key)} s | {' | '.join(shown)} |")
-    return "\n".join(rows)
+        shown = tuple("" if cell is state else cell.value for cell, state in zip(cells, states, strict=True))
+        effects.setdefault(shown, []).append(f"`{event_id}`")
+    for notice, key, start in (
+        (HOLD_EXPIRED, "hold_max_s", SafetyAction.HOLD),
+        (RETRACT_EXPIRED, "retract_max_s", SafetyAction.RETRACT),
+    ):
+        end = update(SupervisorState(start, "before", 0.0), [], 2.0, _TIMES)
+        shown = tuple(end.action.value if state is start else "" for state in states)
+        effects.setdefault(shown, []).append(f"`{notice.id}`, after {_default(key)} s")
+    return "\n".join(
+        [
+            f"| {' | '.join(state.value for state in states)} | events |",
+            f"|{'---|' * len(states)}---|",
+            *(f"| {' | '.join(shown)} | {', '.join(ids)} |" for shown, ids in effects.items()),
+        ]
+    )
 
 
 def notices_table() -> str:
