@@ -36,10 +36,11 @@ from companion.analysis.metrics import lowpass_zero_phase
 from companion.config.controller import LAWS, PRESETS
 from companion.config.document import ConfigError
 from companion.control.manipulator import Manipulator
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.frames import quat_conjugate, quat_rotate
 from companion.model.types import Inputs, Outcome, Outputs, PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import TICK_S, FastFlight
+from sitl.fast.loop import FastFlight
 
 Array = npt.NDArray[np.float64]
 Gains = dict[str, Any]
@@ -203,7 +204,7 @@ def arm_impedance_error_nm(
     Every tick must have a control log and both states.
     """
     manipulator = Manipulator(config.vehicle.arm, config.vehicle.tool)
-    k = TICK_S / DESIRED_FORCE_TIME_S
+    k = TICK_PERIOD_S / DESIRED_FORCE_TIME_S
     lasting = np.zeros(3)
     e, e_rate, e_tau = [], [], []
     for i, o in zip(inputs, outputs, strict=True):
@@ -219,8 +220,8 @@ def arm_impedance_error_nm(
         e_rate.append(o.control.error_rate[6:8])
     rate = np.array(e_rate)
     spring = TARGET_KD_NMS * rate + TARGET_KP_NM * np.array(e)
-    slow = lowpass_zero_phase(np.hstack([rate, spring, np.array(e_tau)]), TICK_S, IMPEDANCE_LOWPASS_HZ)
-    inertial = TARGET_MD_KG_M2 * np.gradient(slow[:, 0:2], TICK_S, axis=0)
+    slow = lowpass_zero_phase(np.hstack([rate, spring, np.array(e_tau)]), TICK_PERIOD_S, IMPEDANCE_LOWPASS_HZ)
+    inertial = TARGET_MD_KG_M2 * np.gradient(slow[:, 0:2], TICK_PERIOD_S, axis=0)
     return inertial + slow[:, 2:4] - slow[:, 4:6], slow[:, 4:6]
 
 

@@ -14,9 +14,10 @@ import mujoco
 from benchmarks.measuring.latency import Latency
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import Inputs, Outcome, Reference
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import TICK_S, FastFlight, FastResult
+from sitl.fast.loop import FastFlight, FastResult
 from sitl.world.world import PHYSICS_DT_S, World
 from tests.support import CATCH
 
@@ -41,7 +42,7 @@ def measure(say: Callable[[str], None], repeats: int = REPEATS, mission: Path = 
         "tick_us": tick_us,
         "law_us": law_us(flight.config, result.inputs, repeats),
         "raw_step_us": raw_us,
-        "raw_tick_us": raw_us * TICK_S / PHYSICS_DT_S,
+        "raw_tick_us": raw_us * TICK_PERIOD_S / PHYSICS_DT_S,
     }
 
 

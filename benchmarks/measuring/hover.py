@@ -32,7 +32,7 @@ from benchmarks.measuring.late import alone_late
 from benchmarks.measuring.latency import RATE_HZ, Latency
 from benchmarks.soaking.processes import Usage, family, usage
 from benchmarks.soaking.verdict import ROLES as FLIGHT_ROLES
-from companion.core.flight_core import NOMINAL_DT_S
+from companion.model.constants import TICK_PERIOD_S
 from companion.runtime.realtime import FLIGHT_PRIORITY, realtime_permitted
 from tests.broker import loopback_broker
 from tests.support import ROOT
@@ -245,18 +245,18 @@ def late_alone(start_s: Array, late_s: Array, beside_start_s: Array, beside_late
     Returns:
         How late each of them was, s.
     """
-    late = {float(t): float(by) for t, by in zip(start_s, late_s, strict=True) if by > 2.0 * NOMINAL_DT_S}
-    beside = [float(t) for t, by in zip(beside_start_s, beside_late_s, strict=True) if by > NOMINAL_DT_S]
+    late = {float(t): float(by) for t, by in zip(start_s, late_s, strict=True) if by > 2.0 * TICK_PERIOD_S}
+    beside = [float(t) for t, by in zip(beside_start_s, beside_late_s, strict=True) if by > TICK_PERIOD_S]
     return [late[t] for t in alone_late(list(late), beside)]
 
 
 def _ticks(start_s: Array, late_s: Array) -> Figures:
     return {
         "lateness_ms": asdict(Latency.of(late_s)),
-        "later_than_one": int((late_s > NOMINAL_DT_S).sum()),
-        "later_than_two": int((late_s > 2.0 * NOMINAL_DT_S).sum()),
+        "later_than_one": int((late_s > TICK_PERIOD_S).sum()),
+        "later_than_two": int((late_s > 2.0 * TICK_PERIOD_S).sum()),
         "ticks": len(start_s),
-        "skipped": int(np.maximum(np.rint(np.diff(start_s) / NOMINAL_DT_S) - 1.0, 0.0).sum()),
+        "skipped": int(np.maximum(np.rint(np.diff(start_s) / TICK_PERIOD_S) - 1.0, 0.0).sum()),
     }
 
 

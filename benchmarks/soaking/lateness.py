@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
-from companion.core.flight_core import NOMINAL_DT_S
 from companion.flight.ticker import Ticker
+from companion.model.constants import TICK_PERIOD_S
 from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
@@ -54,11 +54,11 @@ class Minutes:
             self._close(self._begin_s)
             self._begin_s += MINUTE_S
         self._lateness_s.append(lateness_s)
-        self.missed += lateness_s > NOMINAL_DT_S
+        self.missed += lateness_s > TICK_PERIOD_S
 
     def finish(self) -> list[Minute]:
         """All minutes; the last one may be shorter, and is left out if it is much so."""
-        if self._begin_s is not None and len(self._lateness_s) > 0.5 * MINUTE_S / NOMINAL_DT_S:
+        if self._begin_s is not None and len(self._lateness_s) > 0.5 * MINUTE_S / TICK_PERIOD_S:
             self._close(self._begin_s)
         return self.done
 
@@ -96,7 +96,7 @@ def ticks_of_log(path: Path) -> Ticks:
             first_s = start_s if count == 0 else first_s
             last_s = start_s
             count += 1
-    wanted = round((last_s - first_s) / NOMINAL_DT_S) + 1 if count else 0
+    wanted = round((last_s - first_s) / TICK_PERIOD_S) + 1 if count else 0
     return Ticks(minutes.finish(), count, minutes.missed, max(0, wanted - count))
 
 
@@ -118,7 +118,7 @@ async def _tick_for_nothing(take: Callable[[float, float], None]) -> int:
     over = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, over.set)
     claim_realtime(FLIGHT_PRIORITY)
-    ticker = Ticker(NOMINAL_DT_S, flight_clock(0.0))
+    ticker = Ticker(TICK_PERIOD_S, flight_clock(0.0))
     parent = os.getppid()
     while not over.is_set() and os.getppid() == parent:
         tick = await ticker.next()

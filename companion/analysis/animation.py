@@ -18,7 +18,7 @@ from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, INK
 from companion.analysis.scene import FRONT, LINK, Camera, Pose, Scene, Shape
-from companion.control.manipulator import GRAVITY_M_S2
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import PhaseKind, Vec3
 
 WIDTH, HEIGHT = 960, 440

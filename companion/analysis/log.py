@@ -19,6 +19,7 @@ from zstandard import ZstdError
 
 from companion.analysis.timing import Stopwatch, Timing, timing_of
 from companion.model.codec import RecordError, from_json
+from companion.model.constants import GRADED_POSE_MAX_AGE_S
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import Inputs, Outputs, Sent
 
@@ -199,7 +200,7 @@ class Columns:
     t_s: Array
     mission_t_s: Array
     mocap_position_world_m: Array
-    """From valid frames with an age of `MOCAP_FRESH_S` or less."""
+    """From valid frames with an age of `GRADED_POSE_MAX_AGE_S` or less."""
     mocap_attitude_rad: Array
     """Roll, pitch, yaw (ZYX)."""
     mocap_age_s: Array
@@ -212,12 +213,9 @@ class Columns:
     lateness_s: Array
 
 
-MOCAP_FRESH_S = 0.1
-
-
 def _columns(log: FlightLog) -> Columns:
     def fresh(i: Inputs) -> bool:
-        return i.mocap is not None and i.mocap.tracking_valid and i.t_s - i.mocap.stamp_s <= MOCAP_FRESH_S
+        return i.mocap is not None and i.mocap.tracking_valid and i.t_s - i.mocap.stamp_s <= GRADED_POSE_MAX_AGE_S
 
     return Columns(
         t_s=log.column(lambda i, o, s: i.t_s),

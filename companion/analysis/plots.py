@@ -17,7 +17,7 @@ from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, DASHED, INK, dress, mark_catch, new_figure, write_png
 from companion.analysis.timing import end_s
-from companion.control.manipulator import GRAVITY_M_S2
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 from companion.model.types import Outputs, PhaseKind
 

@@ -21,6 +21,7 @@ from companion.config.base import (
 )
 from companion.config.computer import Computer
 from companion.config.ground import Ground
+from companion.model.constants import GRAVITY_M_S2
 
 
 class Airframe(Model):
@@ -356,7 +357,7 @@ class Vehicle(Model):
         if carried_kg >= self.airframe.mass_kg:
             text = f"{self.airframe.mass_kg:g} kg is the whole machine, but arm and tool alone weigh {carried_kg:g} kg"
             problems.append((("airframe", "mass_kg"), text))
-        if self.airframe.thrust_max_n <= 9.81 * self.airframe.mass_kg:
+        if self.airframe.thrust_max_n <= GRAVITY_M_S2 * self.airframe.mass_kg:
             text = f"{self.airframe.thrust_max_n:g} N do not lift {self.airframe.mass_kg:g} kg"
             problems.append((("airframe", "thrust_max_n"), text))
         refuse("vehicle", problems)

@@ -18,9 +18,10 @@ from companion.control.arm_inertia import ArmInertia
 from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.impedance import Impedance
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
 from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
 

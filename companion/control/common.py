@@ -9,7 +9,6 @@ import math
 from typing import Protocol
 
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.thrust import (
     ForceLimits,
     TiltFilter,
@@ -19,6 +18,7 @@ from companion.control.thrust import (
     saturate_force,
 )
 from companion.control.types import PlantState
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad
 from companion.model.types import IDENTITY_QUAT, Quat, Reference, Vec2, Vec3, Vec8
 

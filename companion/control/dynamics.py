@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import GRAVITY_M_S2
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Quat, Vec2, Vec3, Vec8
 
 Mat2 = tuple[Vec2, Vec2]

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 
-from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.types import PlantState
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_z_component
 from companion.model.types import Inputs, LandedState, Quat, Vec3
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Arm, Tool
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import Quat, Vec2, Vec3
-
-GRAVITY_M_S2 = 9.81
 
 
 class Manipulator:

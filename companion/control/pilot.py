@@ -9,10 +9,11 @@ from companion.control.arm_hold import hold_torque_nm
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.factory import build_controller
 from companion.control.hover import HoverThrust, off_the_ground
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.manipulator import Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
 from companion.control.types import Controller, PlantState
 from companion.model.codec import Record
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
 from companion.model.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2, Vec3
 

@@ -16,10 +16,10 @@ import math
 from companion.config.controller import PscConfig
 from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
-from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.model_based import ModelBasedLaw
 from companion.control.thrust import collective_n
 from companion.control.types import PlantState, Wrench
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
 from companion.model.types import Reference, Vec2, Vec3, Vec8
 

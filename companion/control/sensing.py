@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Tool
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.manipulator import Manipulator
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate
 from companion.model.types import ForceSample, Quat, Vec2, Vec3, VehicleState
 

@@ -18,6 +18,7 @@ from companion.core.transition import Parameters, event_of
 from companion.mission.plan import Plan
 from companion.mission.reattach import found_armed
 from companion.model import flight_stage as seq
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
 from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference
 from companion.safety import notices
@@ -28,7 +29,6 @@ from companion.safety.monitors import Monitors
 from companion.safety.situation import Situation
 from companion.safety.tether import TetherWatch
 
-NOMINAL_DT_S = 0.005
 _DT_MIN_S, _DT_MAX_S = 0.001, 0.05
 # Looking up members of an enum costs time in every tick.
 _PLAN, _SPOOL, _TOUCHDOWN = Stage.PLAN, Stage.SPOOL, Stage.TOUCHDOWN
@@ -118,7 +118,7 @@ class FlightCore:
         """Time since the tick before, limited."""
         last_s, self._last_t_s = self._last_t_s, t_s
         if last_s is None:
-            return NOMINAL_DT_S
+            return TICK_PERIOD_S
         return max(_DT_MIN_S, min(_DT_MAX_S, t_s - last_s))
 
     # -- observation -----------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ import traceback
 from pathlib import Path
 
 from companion.config.loader import FlightConfig
-from companion.core.flight_core import NOMINAL_DT_S, FlightCore
+from companion.core.flight_core import FlightCore
 from companion.flight.command_effect import effect_of
 from companion.flight.command_queue import GivenUp, Operator
 from companion.flight.fallback_landing import land_without_core, unflown
@@ -29,6 +29,7 @@ from companion.flight.ticker import Ticker
 from companion.guardian.client import GuardianClient
 from companion.io.devices import Devices, open_devices
 from companion.io.protocols import DeviceError
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
 from companion.model.types import (
     AutopilotRequest,
@@ -80,7 +81,7 @@ class Flight:
         self._clock = clock
         self._core = FlightCore(config)
         self._missed = 0
-        self._period_s = NOMINAL_DT_S
+        self._period_s = TICK_PERIOD_S
         self._phase = ""
         """The phase last reported to the launcher."""
         self._ground: str | None = None

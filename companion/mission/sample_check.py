@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.manipulator import Manipulator
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import PhaseKind, Quat, Reference, Vec2, Vec3
 from companion.safety.governor import BODY_TOP_M, SafeSet

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.observations import EstimatorReport, Observations
 from companion.model.rows import Row
@@ -75,7 +76,6 @@ HOVER = Check(
 )
 CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, HOVER)
 
-GRAVITY_M_S2 = 9.81
 RATE_GOOD_HZ, RATE_MIN_HZ = 80.0, 40.0
 ACCURACY_MAX_M = 0.1
 COVER_S = 0.6

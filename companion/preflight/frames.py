@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate, wrap_rad, yaw_from_quat
 from companion.model.observations import Observations
 from companion.model.rows import Row
@@ -92,7 +93,6 @@ CHECKS = (
 
 SAMPLES_MIN: Final = 20
 GRAVITY_MAX_DEG: Final = 5.0
-GRAVITY_M_S2: Final = 9.81
 GRAVITY_TOLERANCE_M_S2: Final = 0.5
 HEIGHT_GOOD_M: Final = 0.03
 TILT_MAX_DEG: Final = 3.0

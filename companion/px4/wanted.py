@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.flight_stage import SPOOL_S
 from companion.model.rows import Level
 
-GRAVITY_M_S2 = 9.81
 HOVER = "MPC_THR_HOVER"
 RADIO = "COM_RC_IN_MODE"
 NO_RADIO = 4

@@ -115,7 +115,11 @@ class TelemetryThread:
 
             self._counts = telemetry_link.Counts()
             recorder = telemetry_link.RecorderSide(
-                self._flight, self._packets, self._recorder_state, lambda: self._ending, self._counts
+                flight=self._flight,
+                packets=self._packets,
+                state=self._recorder_state,
+                ending=lambda: self._ending,
+                counts=self._counts,
             )
             try:
                 telemetry_link.run(self._config_json, self.session, self._simulated, recorder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import GRAVITY_M_S2
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 from companion.model.types import ControlLog, Inputs, TetherState, VehicleState
 from companion.safety.governor import BODY_TOP_M

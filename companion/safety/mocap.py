@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Safety
-from companion.control.manipulator import GRAVITY_M_S2
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
 from companion.model.types import Inputs, MocapPose, Quat, Vec2, VehicleState
 from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck, RemoteClock

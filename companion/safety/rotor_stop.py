@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.flight_stage import HEARTBEAT_FRESH_S, flown_by_pilot
 from companion.model.frames import tilt_rad
 from companion.model.types import FlightMode, Inputs, MocapPose, Vec3
@@ -41,7 +42,7 @@ STATE_FRESH_S = 0.3
 FLIPPED_TILT_RAD = math.radians(70.0)
 FLIPPED_HOLD_S = 0.3
 TIPPED_HOLD_S = 0.5
-_UPRIGHT_MIN_M_S2 = 9.81 * math.cos(FLIPPED_TILT_RAD)
+_UPRIGHT_MIN_M_S2 = GRAVITY_M_S2 * math.cos(FLIPPED_TILT_RAD)
 """Specific force along body z; anything that stands or hovers less tilted feels more."""
 Places = dict[str, Vec3]
 """Position in the world by each source, "mocap" and "PX4"."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from collections import deque
 
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_multiply, quat_normalize, wrap_rad, yaw_from_quat
 from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 from sitl.autopilot.types import Estimate, Fusion, ImuSample
 
-GRAVITY_M_S2 = 9.81
 VISION_FUSED_TIMEOUT_S = 0.55
 POSITION_VALID_TIMEOUT_S = 4.5
 _HISTORY_S = 0.3

@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 from enum import Enum, auto
 
+from companion.model.constants import STANDARD_GRAVITY_M_S2
 from companion.model.types import Vec3
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
-from sitl.autopilot.position_control import GRAVITY_M_S2, PositionControl, heading_rad
+from sitl.autopilot.position_control import PositionControl, heading_rad
 from sitl.autopilot.setpoints import PositionTarget
 from sitl.autopilot.smoothing import Smoothing
 from sitl.autopilot.types import AttitudeTarget, Estimate
@@ -184,7 +185,7 @@ class Navigator:
         real = self._params.real
         speed = real("MPC_TKO_SPEED")
         if self.phase is Phase.RAMPUP:
-            start = -GRAVITY_M_S2 / real("MPC_Z_VEL_P_ACC")
+            start = -STANDARD_GRAVITY_M_S2 / real("MPC_Z_VEL_P_ACC")
             share = (t_s - self._ramp_since_s) / max(real("MPC_TKO_RAMP_T"), 1e-3)
             return start + min(1.0, share) * (speed - start)
         return speed if self._state is NavState.TAKEOFF else None

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from companion.model.constants import STANDARD_GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, wrap_rad
 from companion.model.types import Quat, Vec3
 from sitl.autopilot.params import Params
 from sitl.autopilot.setpoints import PositionTarget
 from sitl.autopilot.types import AttitudeTarget, Estimate
-
-GRAVITY_M_S2 = 9.80665
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,13 +111,13 @@ class PositionControl:
     def _thrust_attitude(self, push: list[float], yaw_rad: float) -> tuple[Quat, float]:
         """Convert an acceleration setpoint to attitude and thrust: hover thrust gives 1 g, vertical has priority over horizontal."""
         gains = self._gains
-        up = max(GRAVITY_M_S2 - push[2], 1e-3)
+        up = max(STANDARD_GRAVITY_M_S2 - push[2], 1e-3)
         horizontal = math.hypot(push[0], push[1])
         limit = up * math.tan(gains.tilt_rad)
         scale = limit / horizontal if horizontal > limit else 1.0
         ax, ay = push[0] * scale, push[1] * scale
         norm = math.sqrt(ax * ax + ay * ay + up * up)
-        thrust = gains.hover * norm / GRAVITY_M_S2
+        thrust = gains.hover * norm / STANDARD_GRAVITY_M_S2
         thrust = max(gains.thrust_min, min(gains.thrust_max, thrust))
         return attitude_from_up((ax / norm, ay / norm, -up / norm), yaw_rad), thrust
 
@@ -132,7 +131,9 @@ class PositionControl:
             error = speed - velocity[i]
             if i == 2 and ((thrust >= gains.thrust_max and error < 0) or (thrust <= gains.thrust_min and error > 0)):
                 continue
-            self._integral[i] = max(-GRAVITY_M_S2, min(GRAVITY_M_S2, self._integral[i] + rates[i] * error * dt_s))
+            self._integral[i] = max(
+                -STANDARD_GRAVITY_M_S2, min(STANDARD_GRAVITY_M_S2, self._integral[i] + rates[i] * error * dt_s)
+            )
 
     def _next_yaw(self, dt_s: float, estimate: Estimate, target: PositionTarget) -> float:
         if target.yaw_rad is not None:

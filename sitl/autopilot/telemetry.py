@@ -10,6 +10,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.model.constants import STANDARD_GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.modes import NavState
@@ -172,7 +173,7 @@ def scaled_imu(stub: Px4Stub) -> Message | None:
     imu = stub.imu
     if imu is None:
         return None
-    accel = (_i16(value / 9.80665 * 1e3) for value in imu.accel_frd_m_s2)
+    accel = (_i16(value / STANDARD_GRAVITY_M_S2 * 1e3) for value in imu.accel_frd_m_s2)
     gyro = (_i16(value * 1e3) for value in imu.gyro_frd_rad_s)
     return mavlink.MAVLink_scaled_imu_message(_ms(stub), *accel, *gyro, 0, 0, 0, int(_TEMPERATURE_C * 100))
 

@@ -15,8 +15,9 @@ from companion.analysis import metrics
 from companion.analysis.log import FlightLog
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.manipulator import Manipulator
 from companion.mission.plan import Plan
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Outcome, PhaseKind, SafetyAction
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, row_of, with_world

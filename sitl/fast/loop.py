@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from companion.core.flight_core import FlightCore
 from companion.io.dynamixel.registers import WATCHDOG_ERROR
 from companion.io.px4.delta_velocity import DeltaVelocity
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.frames import (
     attitude_enu_flu_from_ned_frd,
     attitude_ned_frd_from_enu_flu,
@@ -59,7 +60,6 @@ from sitl.servo.from_config import plugged_in, servos_of
 from sitl.world.plant import MocapFrame, Plant, battery_voltage_v
 from sitl.world.world import Layout, Snapshot, Truth
 
-TICK_S = 0.005
 LINK_DELAY_S = 0.002
 """Time from sending a setpoint to its arrival at PX4."""
 POSITION_PERIOD_S = 1.0 / 124.0
@@ -157,7 +157,7 @@ class FastFlight:
         if world.faults:
             self.plant.faults = self.faults
         self._guardian = FastGuardian(vehicle, self.px4) if world.faults else None
-        self._link = FastLink(self.faults, self.plant.world, self.px4, TICK_S)
+        self._link = FastLink(self.faults, self.plant.world, self.px4, TICK_PERIOD_S)
         self._goal_s = 0.0
         hover = set_hover_thrust(self.px4, world, self.plant.world)
         if vehicle.airframe.hover_thrust is None:
@@ -197,7 +197,7 @@ class FastFlight:
         period = tick = 0
         while world.t_s < limit_s:
             period += 1
-            due_s = period * TICK_S - 1e-9
+            due_s = period * TICK_PERIOD_S - 1e-9
             while world.t_s < due_s:
                 plant.step(px4.armed)
                 for frame in plant.take_mocap():
@@ -235,8 +235,8 @@ class FastFlight:
         period_s = world.t_s
         while px4.armed and not world.crashed and world.t_s < end_s:
             self.plant.step(px4.armed)
-            if world.t_s >= period_s + TICK_S - 1e-9:
-                period_s += TICK_S
+            if world.t_s >= period_s + TICK_PERIOD_S - 1e-9:
+                period_s += TICK_PERIOD_S
                 result.after.append(world.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
@@ -263,8 +263,8 @@ class FastFlight:
                 landing = guardian.take_over(world.t_s)
             if landing is not None:
                 landing.step(world.t_s, poses)
-            if world.t_s >= period_s + TICK_S - 1e-9:
-                period_s += TICK_S
+            if world.t_s >= period_s + TICK_PERIOD_S - 1e-9:
+                period_s += TICK_PERIOD_S
                 result.after.append(world.snapshot())
         result.guardian_landed = landing.landed if landing is not None else False
 

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import (
     quat_conjugate,
     quat_from_euler_zyx,
@@ -67,7 +68,6 @@ _TAPS_WORLD: Final[tuple[Vec3, ...]] = (
     (-0.6, -0.6, 0.5),
 )
 """Directions of the taps, in turn."""
-GRAVITY_M_S2: Final = 9.81
 
 
 class Wrench(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Airframe, Vehicle
+from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.world import World
 
 PAYLOAD_RADIUS_M = 0.035
@@ -78,7 +79,7 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     return f"""
 <mujoco model="{vehicle.name}">
   <compiler angle="radian" eulerseq="ZYX" inertiafromgeom="auto"/>
-  <option timestep="{timestep_s}" gravity="0 0 -9.81" integrator="implicitfast" cone="pyramidal"/>
+  <option timestep="{timestep_s}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast" cone="pyramidal"/>
   <size memory="2M"/>
   <worldbody>
     <geom name="floor" type="plane" size="20 20 1" contype="2" conaffinity="1"/>

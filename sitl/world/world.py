@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from companion.config.vehicle import Vehicle
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.handling import Wrench
@@ -204,7 +205,7 @@ class World:
     @property
     def weight_n(self) -> float:
         """Weight of the vehicle without payload."""
-        return 9.81 * float(self.model.body_subtreemass[self._base])
+        return GRAVITY_M_S2 * float(self.model.body_subtreemass[self._base])
 
     @property
     def hover_command(self) -> float:
@@ -321,7 +322,7 @@ class World:
         d = self.data
         target = d.xpos[self._net] + d.qvel[0:3] * _THROW_LEAD_S + np.array([0.0, aside_m, 0.0])
         arrival = np.array(self._config.throw_velocity_m_s)
-        gravity = np.array([0.0, 0.0, -9.81])
+        gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
         velocity = arrival - gravity * _THROW_LEAD_S
         q, v = ball.q, ball.v
         d.qpos[q : q + 3] = target - velocity * _THROW_LEAD_S - 0.5 * gravity * _THROW_LEAD_S**2

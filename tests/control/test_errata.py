@@ -18,8 +18,9 @@ from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.impedance import Impedance
-from companion.control.manipulator import GRAVITY_M_S2, Manipulator
+from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import IDENTITY_QUAT, Reference, Vec3
 
 Array = npt.NDArray[np.float64]

@@ -8,8 +8,8 @@ from functools import cache
 import pytest
 
 from companion.control.hover import SHARE_MAX, HoverThrust
-from companion.control.manipulator import GRAVITY_M_S2
 from companion.control.types import PlantState
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl

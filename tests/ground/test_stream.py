@@ -10,10 +10,8 @@ import jsonschema
 import msgspec
 import pytest
 
-from companion.analysis import log
 from companion.analysis.timing import timing_of
 from companion.config.loader import load_flight
-from companion.core import flight_core as core
 from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     MESSAGE_MAX_BYTES,
@@ -24,7 +22,6 @@ from companion.ground.protocol.messages import (
     decode,
     encode,
 )
-from companion.ground.telemetry import stream as snapshot
 from companion.ground.telemetry.health import DEVICE_NAMES
 from companion.ground.telemetry.stream import TEXT_MAX, StreamBuilder, replay
 from companion.model.codec import Record
@@ -78,11 +75,6 @@ def stream_of(*rows: Row) -> Stream:
 def light_of(stream: Stream, name: str) -> tuple[HealthLevel, str]:
     found = {health.name: health for health in stream.lights}
     return found[name].light, found[name].text
-
-
-def test_constants_are_those_of_loop_and_metrics() -> None:
-    assert snapshot.PERIOD_S == core.NOMINAL_DT_S
-    assert snapshot.MOCAP_FRESH_S == log.MOCAP_FRESH_S
 
 
 def test_a_message_is_the_tick_that_it_is_made_of() -> None:

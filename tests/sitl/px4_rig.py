@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Mapping
 
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from companion.model.types import Quat, Vec3
 from sitl.autopilot.autopilot import Px4Stub, gains_from_params
@@ -17,7 +18,6 @@ from sitl.autopilot.mavlink import MavlinkServer
 from sitl.autopilot.params import Params, Value
 from sitl.autopilot.types import ImuSample, RotorCommands
 
-GRAVITY_M_S2 = 9.81
 PERIOD_S = 0.004
 VISION_PERIOD_S = 0.012
 

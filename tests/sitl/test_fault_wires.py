@@ -13,11 +13,12 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import AutopilotStatus, FlightMode, LandedState, VehicleState
 from companion.sitl_config.faults import Fault
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.link import FastLink
-from sitl.fast.loop import TICK_S, FastFlight
+from sitl.fast.loop import FastFlight
 from sitl.faults.processes import inject_process_fault
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
@@ -113,11 +114,11 @@ def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
 
 
 def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: FastFlight) -> None:
-    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_S)
+    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
     arrived: list[tuple[float, float]] = []
     flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
     for tick in range(40):
-        world.t_s = t_s = round(tick * TICK_S, 4)
+        world.t_s = t_s = round(tick * TICK_PERIOD_S, 4)
         link.deliver_due()
         link.send(lambda sent_s=t_s: arrived.append((sent_s, world.t_s)))  # type: ignore[misc]
         state, heard = link.receive(*at_rest(t_s))
@@ -132,7 +133,7 @@ def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: 
 
 
 def test_over_a_dead_link_nothing_comes_and_the_last_word_stays(flight: FastFlight) -> None:
-    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_S)
+    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
     last = link.receive(*at_rest(0.0))
     flight.faults.active["link_loss"] = Fault(kind="link_loss", t_s=0.0)
     world.t_s = 1.0

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.model import frames
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Quat, Vec3
 from sitl.autopilot.cascade import MIX_PITCH, MIX_ROLL, MIX_YAW, Cascade, CascadeGains
-from sitl.autopilot.estimator import GRAVITY_M_S2, Estimator
+from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.types import AttitudeTarget, ImuSample
 
 angles = st.floats(-math.pi, math.pi)

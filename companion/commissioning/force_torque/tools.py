@@ -13,9 +13,9 @@ from companion.commissioning.force_torque import fit as ft_fit
 from companion.commissioning.force_torque.watch import FtSensor, arm_angles, pose_rad, until_loaded
 from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import GRAVITY_M_S2
 from companion.io.dynamixel.registers import usb_latency_ms
 from companion.io.protocols import DeviceError
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.observations import ForceStream, Observations
 from companion.model.rows import Row
 from companion.model.types import IDENTITY_QUAT, ArmState, ForceSample, Vec2, VehicleState

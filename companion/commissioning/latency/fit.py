@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate
 from companion.model.types import Quat
 from companion.preflight.hand_test.motion import ImuAt, PoseAt, mean_attitude, rotation_vector, turned
@@ -44,7 +45,7 @@ _SLOW_S: Final = 0.10
 """Half the width of the moving mean that separates the slow part."""
 _COARSE_S, _FINE_S = 0.004, 0.0005
 _POLYNOMIAL_POSITION, _POLYNOMIAL_ROTATION = 3, 1
-_GRAVITY: Final = np.array([0.0, 0.0, 9.81])
+_GRAVITY: Final = np.array([0.0, 0.0, GRAVITY_M_S2])
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from companion.ground.protocol.messages import (
 from companion.ground.protocol.strict_json import NUMBER_MAX
 from companion.ground.telemetry.health import HealthEvaluator, Snapshot, WorstAges
 from companion.ground.telemetry.timings import WorstTimings, merge_timings
+from companion.model.constants import GRADED_POSE_MAX_AGE_S, TICK_PERIOD_S
 from companion.model.flight_stage import Stage
 from companion.model.types import ControlLog, Inputs, Outputs, Quat, Reference, SafetyAction, Sent, TetherState, Vec3
 
@@ -34,10 +35,6 @@ _TOUCHDOWN = Stage.TOUCHDOWN.value
 """On the ground the reference lies below the floor, which is no tracking error."""
 WAITS_FOR_START = Stage.READY.value
 """`Outputs.phase` of a flight that is ready and waits for START."""
-PERIOD_S = 0.005
-"""Period of the control loop: a tick that begins later than this is missed (`companion.core.flight_core.NOMINAL_DT_S`)."""
-MOCAP_FRESH_S = 0.1
-"""An older pose is stale and not graded (`companion.analysis.log.MOCAP_FRESH_S`)."""
 TEXT_MAX = 300
 """Characters of an event's text, so that `EVENTS_KEPT` of them always fit into one message."""
 _TEXT_MAX_BYTES = 1600
@@ -77,7 +74,7 @@ class StreamBuilder:
         before = self._newest
         self._newest = (inputs, outputs, sent)
         self._ages.add_tick(inputs, sent.lateness_s)
-        self._missed += sent.lateness_s > PERIOD_S
+        self._missed += sent.lateness_s > TICK_PERIOD_S
         mocap = inputs.mocap
         fresh = mocap is not None and (
             before is None or before[0].mocap is None or before[0].mocap.stamp_s != mocap.stamp_s
@@ -279,7 +276,12 @@ def _every_second(records: list[Stream]) -> list[Stream]:
 def _pose(i: Inputs, o: Outputs) -> tuple[str | None, Vec3 | None, Quat | None, float]:
     """Return the source, position, attitude and age (s) of the vehicle's pose."""
     mocap = i.mocap
-    if mocap is not None and mocap.tracking_valid and o.mocap_trusted and i.t_s - mocap.stamp_s <= MOCAP_FRESH_S:
+    if (
+        mocap is not None
+        and mocap.tracking_valid
+        and o.mocap_trusted
+        and i.t_s - mocap.stamp_s <= GRADED_POSE_MAX_AGE_S
+    ):
         age_s = i.t_s - mocap.stamp_s + (mocap.latency_s or 0.0)
         return "mocap", mocap.position_world_m, mocap.attitude_wxyz, age_s
     if i.vehicle is not None:
