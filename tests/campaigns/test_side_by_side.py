@@ -31,7 +31,7 @@ from companion.model.types import Event, Inputs, Outputs, SafetyAction, Sent, Se
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, GROUND_S, LANDED_S, record_flight, synthetic_flight
 
 Row = tuple[Inputs, Outputs, Sent]
-ROWS = list(synthetic_flight(rate_hz=100.0))
+ROWS = list(synthetic_flight(rate_hz=50.0))
 IN_WORLD = CONFIG | {"vehicle": CONFIG["vehicle"] | {"devices": {"arm": {"port": "/dev/pts/4"}}}}
 VERSIONS = {"version_companion": "0.1.0", "version_git": "abc", "version_numpy": "2"}
 
@@ -265,7 +265,7 @@ def test_flights_of_different_laws_alone_are_said_to_be_comparable() -> None:
             {"config": configured(vehicle__devices={"arm": {"port": "/dev/ttyUSB0"}})},
             "Flown in different places: A in the simulated world, B on the vehicle.",
         ),
-        ({"rows": ROWS[::2]}, "Different rates of the control loop: A 100 Hz, B 50 Hz."),
+        ({"rows": ROWS[::2]}, "Different rates of the control loop: A 50 Hz, B 25 Hz."),
     ],
 )  # fmt: skip
 def test_whatever_else_differs_is_said_on_top(changes: dict[str, Any], caution: str) -> None:
@@ -311,7 +311,7 @@ def test_without_a_catch_in_one_of_them_they_are_aligned_at_the_take_off_and_it_
 
 
 def test_a_flight_that_never_took_off_is_aligned_at_its_start() -> None:
-    comparison = compare([made("A"), made("B", rows=ROWS[:100], outcome="refused")])
+    comparison = compare([made("A"), made("B", rows=ROWS[:50], outcome="refused")])
     assert (comparison.align, comparison.zeros_s) == ("start", (0.0, 0.0))
     assert "No take-off in B." in comparison.notes
     with pytest.raises(NotAlignable, match="no take-off"):
@@ -375,7 +375,7 @@ def test_whatever_a_log_holds_is_text_on_the_page(tmp_path: Path) -> None:
 
     def shout(i: Inputs, o: Outputs, s: Sent) -> Row:
         event = Event(t_s=i.t_s, id=evil, severity=Severity.WARNING, action=SafetyAction.HOLD, text=evil)
-        return i, replace(o, events=(*o.events, event) if i.tick == 750 else o.events), s
+        return i, replace(o, events=(*o.events, event) if i.tick == 375 else o.events), s
 
     config = configured(mission__name=evil, controller__preset=evil, controller__note=evil, sources__overrides=[evil])
     config[evil] = {evil: evil}
