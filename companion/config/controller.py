@@ -28,11 +28,11 @@ class AdaptiveConfig(Model):
     inertia_md: Positive8
     """M_d: kg and kg m^2."""
     lambda_gain: Positive8
-    """Lambda."""
+    """Lambda of the paper."""
     phi: Positive8
     """Phi, 1/s."""
     damping_kd: Positive8
-    """K_d."""
+    """K_d of the paper."""
     stiffness_kp: Positive8
     """K_p; must equal (K_d - M_d Phi) Phi (gain_cond)."""
     row_weights_s: NonNegative8
@@ -44,31 +44,31 @@ class AdaptiveConfig(Model):
     """Leakage of H, 1/s."""
     epsilon: Positive
     boundary_layer: Positive
-    """varpi."""
+    """varpi of the paper."""
     rho_max: Positive
     acceleration_cap: NonNegative
     """Largest ||S chi_dd|| that may enter rho; 0 switches H_3 off."""
     acceleration_lowpass_hz: Positive
     force_lowpass_hz: Positive
     desired_force_time_s: Positive | None = None
-    """T_d of F_d = lowpass(F_ext); absent: F_d = 0, as in the paper."""
+    """T_d of F_d = lowpass(F_ext). If it is absent, F_d = 0 as in the paper."""
     force_feedforward_xyz: NonNegative3 = (0.0, 0.0, 0.0)
     """Share of the measured F_ext that the base carries directly, per world axis."""
     base_compliance_xyz: NonNegative3 = (0.0, 0.0, 0.0)
     """Share of the measured F_ext that enters e_tau on the base rows (0: as in the paper)."""
     disturbance_time_xyz_s: NonNegative3 = (0.0, 0.0, 0.0)
-    """Time constant of the disturbance observer, per world axis: what pushes the base beside the forces asked for and fed forward is
-    estimated and taken back; 0: off, as in the paper."""
+    """Time constant of the disturbance observer, per world axis. It estimates and compensates the forces on the base that are neither
+    commanded nor fed forward. 0 switches it off, as in the paper."""
     disturbance_lag_s: NonNegative = 0.1
-    """From the force asked for to the force given, for the observer."""
+    """Lag from the commanded to the actual force that the observer assumes."""
     disturbance_max_n: NonNegative = 6.0
     """Bound of the observer's estimate, per axis."""
     feedforward_lead_s: NonNegative = 0.0
-    """The reference's horizontal acceleration is fed forward this long ahead (a + lead times jerk): the attitude loop is late by it."""
+    """Lead of the feedforward of the reference's horizontal acceleration (a + lead times jerk), for the delay of the attitude loop."""
     arm_inertia_nominal: bool = False
-    """Feed the arm's own nominal inertia and Coriolis torque forward in place of M_d; vehicle and coupling stay unknown."""
+    """Feed the arm's nominal inertia and Coriolis torque forward in place of M_d. Vehicle and coupling stay unknown."""
     arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the vehicle file's `arm.joint_friction_nm` that is fed forward along the wanted joint rate."""
+    """Share of the vehicle file's `arm.joint_friction_nm` that is fed forward along the reference joint rate."""
     lateral_force_max_n: Positive = 12.0
     attitude_filter_rad_s: Positive = 30.0
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
@@ -93,10 +93,10 @@ class AdaptiveConfig(Model):
 
 
 class _ComparisonConfig(Model):
-    """What the two comparison laws have in common with each other and with the adaptive one."""
+    """Settings that the two comparison laws share."""
 
     desired_force_time_s: Positive | None = None
-    """T_d of F_d = lowpass(F_ext) on the joint rows; absent: F_d = 0, the arm sags under a carried payload."""
+    """T_d of F_d = lowpass(F_ext) on the joint rows. If it is absent, F_d = 0 and the arm sags under a carried payload."""
     force_lowpass_hz: Positive
     lateral_force_max_n: Positive = 12.0
     attitude_filter_rad_s: Positive = 30.0
@@ -115,15 +115,15 @@ class CscConfig(_ComparisonConfig):
     inertia_md: Positive8
     """M_d: kg and kg m^2."""
     damping_kd: Positive8
-    """K_d. On the attitude rows: how PX4's attitude loop is expected to damp, not a command."""
+    """K_d. On the attitude rows it describes the damping of PX4's attitude loop and commands nothing."""
     stiffness_kp: Positive8
-    """K_p. On the attitude rows: how PX4's attitude loop is expected to turn, not a command."""
+    """K_p. On the attitude rows it describes the stiffness of PX4's attitude loop and commands nothing."""
     external_xyz: NonNegative3 = (1.0, 1.0, 1.0)
     """Share of the measured F_ext, per world axis, that the base's impedance answers and the model cancels."""
     desired_force_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Share of F_d that the base carries (0: the base, too, gives way to a carried payload)."""
+    """Share of F_d that the base carries. With 0 the base also gives way to a carried payload."""
     model_mass_scale: Positive = 1.0
-    """Masses and inertias of the model against the vehicle file's; for studies of a wrong model."""
+    """Factor on the masses and inertias of the vehicle file, for studies of a wrong model."""
 
 
 class PscConfig(_ComparisonConfig):
@@ -133,13 +133,13 @@ class PscConfig(_ComparisonConfig):
     law: Literal["psc"]
     preset: str
     position_kp_xyz: Positive3
-    """1/s^2."""
+    """Position gain per world axis, 1/s^2."""
     position_kd_xyz: Positive3
-    """1/s."""
+    """Velocity gain per world axis, 1/s."""
     position_ki_xyz: NonNegative3
-    """1/s^3; 0: no integral part."""
+    """Integral gain per world axis, 1/s^3; 0 switches the integral part off."""
     integral_max_m_s2: NonNegative = 1.5
-    """Largest acceleration that the integral part may ask for, per axis."""
+    """Largest acceleration of the integral part, per axis."""
     arm_inertia_md: Positive2
     """M_d of the joints, kg m^2."""
     arm_damping_kd: Positive2
@@ -147,9 +147,9 @@ class PscConfig(_ComparisonConfig):
     payload_time_s: Positive
     """Time constant of the payload's mass estimate."""
     payload_max_kg: NonNegative = 1.0
-    """Bound of the estimate; 0 switches it off."""
+    """Upper bound of the estimate; 0 switches it off."""
     thrust_lag_s: NonNegative = 0.05
-    """From the thrust commanded to the thrust given, for the estimate."""
+    """Lag from the commanded to the actual thrust that the estimate assumes."""
 
 
 ControllerConfig: TypeAlias = Annotated[AdaptiveConfig | CscConfig | PscConfig, Field(discriminator="law")]

@@ -16,22 +16,22 @@ from companion.config.controller import PRESETS
 Duration = Annotated[float, Field(gt=0, le=600)]
 Delay = Annotated[float, Field(ge=0, le=600)]
 POINTS_APART_M = 0.01
-"""Consecutive points of a path must lie so far apart."""
+"""Smallest distance between consecutive points of a path."""
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
 class Takeoff(Model):
-    """Straight up from where the machine stands."""
+    """Climb vertically from where the vehicle stands."""
 
     type: Literal["takeoff"]
     name: Name | None = None
     height_m: Positive
-    """Height of the body's origin above the floor at the end."""
+    """Final height of the body origin above the floor."""
     duration_s: Duration
 
 
 class Hold(Model):
-    """Stay."""
+    """Hover in place."""
 
     type: Literal["hold"]
     name: Name | None = None
@@ -39,19 +39,19 @@ class Hold(Model):
 
 
 class Line(Model):
-    """Straight to a point, from rest to rest by minimum snap; the arm may move on the way."""
+    """Fly straight to a point, from rest to rest with minimum snap; the arm may move on the way."""
 
     type: Literal["line"]
     name: Name | None = None
     to_m: Vector3
     duration_s: Duration | None = None
-    """Absent: the least that the limits allow."""
+    """If it is absent, the shortest duration that the limits allow."""
     arm_deg: Vector2 | None = None
-    """Where the arm goes meanwhile; absent: it stays."""
+    """Final joint angles. If they are absent the arm keeps its pose."""
     arm_delay_s: Delay | None = None
-    """From the start of the line to the start of the arm's move; absent: 0."""
+    """Time from the start of the line to the start of the arm's motion; 0 if it is absent."""
     arm_duration_s: Duration | None = None
-    """Absent: until the end of the line."""
+    """Duration of the arm's motion. If it is absent the motion ends with the line."""
 
     @model_validator(mode="after")
     def _arm_moves_within_the_line(self) -> Self:
@@ -73,28 +73,28 @@ class Line(Model):
 
 
 class Path(Model):
-    """Through points without a stop, from rest to rest by minimum snap; the arm stays."""
+    """Fly through points without a stop, from rest to rest with minimum snap; the arm keeps its pose."""
 
     type: Literal["path"]
     name: Name | None = None
     through_m: Annotated[tuple[Vector3, ...], Field(min_length=1, max_length=30)]
-    """The last point is where it ends; where it begins is not among them."""
+    """Points in order up to the end of the path, without its start."""
     duration_s: Duration | None = None
-    """Absent: the least that the limits allow."""
+    """If it is absent, the shortest duration that the limits allow."""
 
 
 class ArmMove(Model):
-    """The vehicle stays, the arm moves."""
+    """Move the arm while the vehicle hovers in place."""
 
     type: Literal["arm"]
     name: Name | None = None
     arm_deg: Vector2
     duration_s: Duration | None = None
-    """Absent: the least that the limits allow."""
+    """If it is absent, the shortest duration that the limits allow."""
 
 
 class Land(Model):
-    """Straight down until touchdown."""
+    """Descend vertically until touchdown."""
 
     type: Literal["land"]
     name: Name | None = None
@@ -105,22 +105,22 @@ Phase = Annotated[Takeoff | Hold | Line | Path | ArmMove | Land, Field(discrimin
 
 
 class Start(Model):
-    """Where the machine stands before take-off; checked against what is measured."""
+    """Pose of the vehicle before take-off, which the measured pose must match."""
 
     position_m: Vector2
     """x, y."""
     tolerance_m: Positive = 0.15
-    """Also for the height, which is airframe.ground_clearance_m of the vehicle."""
+    """Tolerance of the position and of the height, which is the vehicle's airframe.ground_clearance_m."""
     yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     yaw_tolerance_deg: Positive = 15.0
     arm_deg: Vector2
     arm_tolerance_deg: Positive = 10.0
     takeoff: Literal["at_once", "by_operator"] = "at_once"
-    """at_once: as soon as everything is ready; by_operator: then it waits on the ground until a person commands `start`."""
+    """at_once: take off as soon as everything is ready. by_operator: wait on the ground until an operator commands `start`."""
 
 
 class Limits(Model):
-    """What no planned motion may exceed."""
+    """Limits of the planned motion."""
 
     speed_max_m_s: Positive
     acceleration_max_m_s2: Positive
@@ -129,11 +129,11 @@ class Limits(Model):
     arm_acceleration_max_deg_s2: Positive
     arm_jerk_max_deg_s3: Positive = 600.0
     thrust_share_max: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """Share of airframe.thrust_max_n that the plan may need, with the largest payload on board."""
+    """Largest share of airframe.thrust_max_n that the plan may need with the largest payload."""
 
 
 class Catch(Model):
-    """The payload that is thrown into the net: for checks and reports, unknown to the controller."""
+    """The expected payload, for checks and reports; the controller does not know it."""
 
     expected_at_m: Vector2
     """x, y of the vehicle when the payload arrives."""
@@ -145,9 +145,9 @@ class ControllerChoice(Model):
 
     law: Literal["adaptive", "csc", "psc"] = "adaptive"
     preset: Literal["paper", "recommended", "tuned"] | None = None
-    """Absent, and no file: the law's default (recommended, or tuned)."""
+    """If neither preset nor file is given, the law's default: recommended or tuned."""
     file: str | None = None
-    """Relative to the mission file."""
+    """Path of a controller file, relative to the mission file."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -165,13 +165,13 @@ class Mission(Model):
     schema_version: Literal[1]
     name: Name
     vehicle: str
-    """Vehicle file, relative to this one."""
+    """Path of the vehicle file, relative to this file."""
     controller: ControllerChoice = ControllerChoice()
     start: Start
     limits: Limits
     catch: Catch | None = None
     repeat: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Everything between take-off and landing is flown so often."""
+    """How often the phases between take-off and landing are flown."""
     phases: Annotated[tuple[Phase, ...], Field(min_length=2, max_length=200)]
 
     @model_validator(mode="after")

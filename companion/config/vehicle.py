@@ -30,59 +30,59 @@ class Airframe(Model):
     mass_kg: Positive
     """Whole machine, arm and net included, ready to fly, without payload."""
     inertia_kg_m2: Positive3 = (0.045, 0.045, 0.075)
-    """Of the base without arm and tool, about the body's x, y, z at its origin: for the laws that are built on a model, and for the
+    """Moments of inertia of the base without arm and tool about the body's x, y, z at its origin; used by the model-based laws and the
     simulated airframe. The default is the Tarot 650's."""
     rotor_arm_m: Positive = 0.325
-    """Distance of each of the four rotors from the body's z axis, in the X layout (45 deg from the body's x axis): for the simulated
-    airframe and PX4's CA_ROTOR parameters there. The default is the Tarot 650's."""
+    """Distance of each of the four rotors from the body's z axis, in the X layout (45 deg from the body's x axis); used by the
+    simulated airframe and its CA_ROTOR parameters in PX4. The default is the Tarot 650's."""
     yaw_torque_per_thrust_m: Positive = 0.025
-    """Yaw torque of one rotor over its thrust, N m/N: for the simulated airframe and PX4's CA_ROTOR parameters there. The default is
-    the Tarot 650's."""
+    """Yaw torque of one rotor divided by its thrust, N m/N; used by the simulated airframe and its CA_ROTOR parameters in PX4. The
+    default is the Tarot 650's."""
     thrust_max_n: Positive
-    """All rotors at full command, at the voltage of a charged battery."""
+    """Thrust of all rotors at full command with a charged battery."""
     hover_thrust: Fraction | None = None
-    """Normalised thrust that holds `mass_kg`; absent: PX4's MPC_THR_HOVER is read and used."""
+    """Normalised thrust that holds `mass_kg`. If it is absent, PX4's MPC_THR_HOVER is used."""
     hover_thrust_adapt: bool = True
-    """Go on estimating it in flight, from thrust sent, IMU and force sensor; false: it stays what it was at the start."""
+    """Estimate the hover thrust in flight from the thrust sent, the IMU and the force sensor. If false it stays constant."""
     tilt_max_deg: Annotated[float, Field(gt=0, le=45)] = 20.0
-    """No attitude setpoint leans further than this."""
+    """Largest tilt of an attitude setpoint."""
     ground_clearance_m: Positive
-    """Height of the body origin above the floor when standing on the landing gear."""
+    """Height of the body origin above the floor when the vehicle stands on its landing gear."""
     radius_m: Positive = 0.45
-    """Horizontal reach around the body origin, rotor disks included."""
+    """Horizontal radius around the body origin, rotor disks included."""
     payload_max_kg: NonNegative = 0.4
-    """Largest payload that a mission which expects none (no `catch:`) is checked with."""
+    """Payload that the check of a mission without `catch:` assumes."""
 
 
 class Joint(Model):
-    """One servo and its joint, in the paper's angle."""
+    """One servo and its joint; angles as in the paper."""
 
     servo_id: Annotated[int, Field(ge=0, le=252)]
     sign: Literal[-1, 1]
-    """Direction of the servo's counts against the joint angle."""
+    """1 if the servo's counts increase with the joint angle, -1 if they decrease."""
     zero_count: Annotated[int, Field(ge=-1048575, le=1048575)]
-    """Present position (register 132) at joint angle 0."""
+    """Present Position (register 132) at joint angle 0."""
     angle_deg: Span
-    """Walls of the joint."""
+    """Joint limits, lower and upper."""
     torque_max_nm: Annotated[float, Field(gt=0, le=3.0)]
     velocity_max_deg_s: Positive = 300.0
 
 
 class Arm(Model):
-    """The 2R arm: link 1 from the shoulder, link 2 carries sensor and net."""
+    """The 2R arm. Link 1 begins at the shoulder, link 2 carries sensor and net."""
 
     shoulder_body_m: Vector3
     link_lengths_m: Positive2
-    """Shoulder to elbow, elbow to the net's centre."""
+    """Shoulder to elbow, and elbow to the centre of the net."""
     link_masses_kg: Positive2
     """Link 1 with the elbow servo, link 2 without sensor and net."""
     link_com_m: Positive2
-    """From the link's own joint outwards."""
+    """Distance of each link's centre of mass from its joint."""
     torque_per_amp_nm_a: Positive = 1.3
     joint_armature_kg_m2: NonNegative = 0.008
-    """Inertia of rotor and gears of one servo, felt at the joint: for the laws that are built on a model, and for the simulated arm."""
+    """Inertia of a servo's rotor and gears at the joint; used by the model-based laws and the simulated arm."""
     joint_friction_nm: NonNegative = 0.04
-    """Dry friction of one joint; for laws that feed it forward."""
+    """Dry friction of one joint, for laws with friction feedforward."""
     joints: tuple[Joint, Joint]
 
 
@@ -90,9 +90,9 @@ class Tool(Model):
     """Force-torque sensor and net at the end of link 2."""
 
     sensor_mass_kg: NonNegative
-    """The part of sensor and mount on the arm's side; not felt by the sensor."""
+    """Mass of sensor and mount on the arm's side, which the sensor does not measure."""
     net_mass_kg: NonNegative
-    """Everything on the tool side of the sensor; its weight is taken out of the reading."""
+    """Mass of everything on the tool side of the sensor; its weight is subtracted from the readings."""
     net_radius_m: Positive
     sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
     """Sensor frame in the frame of link 2 (x outwards along the link, y along the joint axis), ZYX roll, pitch, yaw."""
@@ -105,35 +105,35 @@ class Tether(Model):
     length_m: Positive
     attachment_body_m: Vector3 = (0.0, 0.0, 0.0)
     margin_m: NonNegative = 0.25
-    """Slack that is kept: no planned point, and no point at which the machine could stop, comes nearer to the taut sphere."""
+    """Smallest slack at every planned point and at every point where the vehicle could stop."""
     load_rating_n: Positive = 300.0
-    """Working load of the whole chain, anchor to attachment; must hold the rotors at full command."""
+    """Working load of the whole tether from anchor to attachment; it must hold the rotors at full command."""
     weight_n_per_m: NonNegative = 0.1
-    """What hangs from the machine is lifted by it."""
+    """Weight per length; the vehicle carries the part that hangs from it."""
     react_time_s: NonNegative = 0.18
-    """From a fault to PX4's mode LAND; 0.07 to 0.18 s were measured with the guardian."""
+    """Time from a fault to PX4's LAND mode; 0.07 to 0.18 s were measured with the guardian."""
     stop_deceleration_m_s2: Positive = 2.0
-    """The governor brakes the reference this fast. Stopping distances assume this or PX4's LAND, whichever is slower at that speed."""
+    """Deceleration of the reference by the governor. Stopping distances assume the slower of this and PX4's LAND at that speed."""
     turns_max: Positive = 1.5
-    """Turns about the anchor's vertical, and of the line about the vehicle, either way."""
+    """Largest number of turns about the anchor's vertical, and of the tether about the vehicle, in either direction."""
     taut_slack_m: NonNegative = 0.05
-    """Taut when less than this is left."""
+    """The tether is taut below this slack."""
     pull_min_n: Positive = 2.0
-    """No pull below this is believed, however clear it looks."""
+    """Smallest pull that is detected."""
     pull_filter_s: Positive = 0.1
     """Time constant of the low-pass of the force that rotors, gravity and tool do not explain."""
     pull_time_s: NonNegative = 0.8
-    """A pull that lasts shorter is a blow."""
+    """A shorter pull is a blow."""
     separation_m: Positive = 0.3
-    """Farther than the length by this without a pull: the tether holds the machine no more."""
+    """Distance beyond the length without a pull at which the tether is considered separated."""
     rotor_inner_radius_m: NonNegative = 0.15
-    """No blade sweeps nearer to the body's z axis; the line may hang down within."""
+    """Radius around the body's z axis without rotor blades, where the tether may hang down."""
     clearance_min_m: NonNegative = 0.01
-    """Between line and rotor disk or arm sweep."""
+    """Smallest distance between the tether and the rotor disks or the space swept by the arm."""
 
 
 class Room(Model):
-    """The flying volume; everything that moves stays inside it."""
+    """The flying volume; everything that moves stays inside."""
 
     x_m: Span
     y_m: Span
@@ -144,11 +144,11 @@ class AutopilotDevice(Model):
     """PX4 over MAVLink."""
 
     address: str
-    """MAVSDK connection: udpin://0.0.0.0:14540, serial:///dev/ttyAMA0:921600, ..."""
+    """MAVSDK connection, such as udpin://0.0.0.0:14540 or serial:///dev/ttyAMA0:921600."""
     discovery_timeout_s: Positive = 10.0
     setpoint_path: Literal["direct", "offboard"] = "direct"
-    """How SET_ATTITUDE_TARGET leaves: direct (MAVSDK's MavlinkDirect: only when the flight loop sends), or offboard (MAVSDK's Offboard
-    plugin: its thread repeats the last setpoint at 20 Hz, also while the flight loop hangs)."""
+    """How SET_ATTITUDE_TARGET is sent: direct (MAVSDK's MavlinkDirect, only when the flight loop sends) or offboard (MAVSDK's Offboard
+    plugin, whose thread repeats the last setpoint at 20 Hz, also while the flight loop hangs)."""
 
 
 ANY_INTERFACE = "0.0.0.0"
@@ -160,16 +160,16 @@ class MocapDevice(Model):
     server: str
     """Address of the Motive machine."""
     interface: str = ANY_INTERFACE
-    """Local address that receives: this computer's on the camera network. `fly` and `check` refuse 0.0.0.0 (all) without `--sitl`."""
+    """This computer's address on the camera network. `fly` and `check` refuse 0.0.0.0 (all networks) without `--sitl`."""
     transport: Literal["multicast", "unicast"] = "multicast"
     multicast_group: str = "239.255.42.99"
     command_port: Annotated[int, Field(gt=0, le=65535)] = 1510
     data_port: Annotated[int, Field(gt=0, le=65535)] = 1511
     natnet_version: Literal["3.0", "4.1"] | None = None
-    """Refuse a server that speaks another; absent: take what the server says, if it is one of the two."""
+    """Version that the server must speak. If it is absent, both are accepted."""
     rigid_body_id: Annotated[int, Field(ge=0)]
     up_axis: Literal["y", "z"] = "z"
-    """Motive's streaming setting."""
+    """Up axis in Motive's streaming settings."""
     rate_hz: Positive = 200.0
     """Expected frame rate."""
 
@@ -180,7 +180,7 @@ class ArmDevice(Model):
     port: str
     baud: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 3000000
     watchdog_ms: Annotated[int, Field(ge=20, le=2540)] = 100
-    """Bus watchdog (register 98), a multiple of 20 ms: the servos let go when the bus falls silent."""
+    """Bus watchdog (register 98), a multiple of 20 ms; the servos release torque after this time without an instruction."""
 
     @model_validator(mode="after")
     def _watchdog_steps(self) -> Self:
@@ -202,7 +202,7 @@ class ForceDevice(Model):
 
 
 class Devices(Model):
-    """Addresses of everything on a wire."""
+    """Addresses of the devices."""
 
     autopilot: AutopilotDevice
     mocap: MocapDevice
@@ -211,105 +211,106 @@ class Devices(Model):
 
 
 class Safety(Model):
-    """Limits after which the companion reacts by itself, and how. What each of them does: docs/safety.md."""
+    """Limits of the safety rules, and how the vehicle reacts. The rules: docs/safety.md."""
 
     preflight_s: Annotated[float, Field(ge=1, le=60)] = 5.0
-    """So long are all devices watched before anything is armed."""
+    """Time for which all devices are observed before arming."""
 
     # Motion capture
     mocap_timeout_s: Positive = 0.12
-    """Oldest mocap pose; beyond it the arm folds and PX4 lands on its own estimate."""
+    """Max age of a mocap pose; beyond it the arm folds and PX4 lands on its own estimate."""
     mocap_rate_min_hz: Positive = 50.0
-    """Fewer poses in a second are told."""
+    """Rate of poses below which a warning is raised."""
     mocap_latency_warn_s: Positive = 0.05
-    """Mid-exposure to transmission, by Motive's clock; beyond `mocap_timeout_s` a pose is as good as none."""
+    """Time from mid-exposure to transmission on Motive's clock above which a warning is raised; beyond `mocap_timeout_s` the pose is
+    ignored."""
     mocap_jump_m: Positive = 0.10
-    """Further from where PX4's velocity says it should be than this, a pose is not believed."""
+    """Largest distance of a pose from the position predicted with PX4's velocity; a pose beyond it is ignored."""
     mocap_jump_deg: Positive = 20.0
-    """The same for its attitude, beside what the rates explain."""
+    """Largest change of a pose's attitude beyond what the angular rates explain."""
     mocap_frozen_s: Positive = 0.10
-    """New frames with the very same pose for this long, while the vehicle moves."""
+    """Time with new frames but an identical pose while the vehicle moves."""
     mocap_inertial_m: Positive = 0.025
     """Largest distance between a pose and the position predicted by the IMU; above it PX4 lands without motion capture. Sound flights
     with 10 m/s2 of vibration reached 0.0084. 0.015 finds drags that begin at 0.2 m/s or faster, 0.025 at 0.3 m/s, 0.04 at 0.5 m/s."""
     mocap_inertial_s: NonNegative = 0.05
     """Hold time of `mocap_inertial_m`."""
     estimate_disagreement_m: Positive = 0.30
-    """Between PX4's position and mocap."""
+    """Largest distance between PX4's position and mocap."""
     yaw_disagreement_deg: Positive = 15.0
-    """Between PX4's yaw and mocap's."""
+    """Largest difference between PX4's yaw and mocap's."""
 
     # PX4 and battery
     vehicle_timeout_s: Positive = 0.25
-    """Oldest attitude or position from PX4."""
+    """Max age of PX4's attitude and position."""
     link_lag_max_s: Positive = 0.07
-    """What PX4 says may be so much older than at the best of times; beyond it nobody can steer over this link."""
+    """Largest delay of PX4's messages above their smallest delay; beyond it the link is too slow for control."""
     heartbeat_timeout_s: Positive = 2.5
     battery_min: Fraction = 0.2
     battery_warn: Fraction = 0.3
     battery_voltage_min_v: Positive | None = 13.2
-    """Under load; 3.3 V per cell of a 4S battery. null: not watched."""
+    """Lowest voltage under load; 3.3 V per cell of a 4S battery. null disables the rule."""
 
     # Arm and force sensor
     arm_timeout_s: Positive = 0.10
-    """Oldest joint state; beyond it the vehicle lands."""
+    """Max age of the joint state; beyond it the vehicle lands."""
     arm_read_failures_max: Annotated[int, Field(ge=1)] = 5
-    """Consecutive bus cycles without an answer."""
+    """Largest number of consecutive bus cycles without an answer."""
     servo_warn_c: Positive = 65.0
     servo_max_c: Positive = 75.0
-    """The servos shut themselves down at 80."""
+    """The servos shut down at 80."""
     servo_overload_s: Positive = 1.0
-    """A joint at its torque limit for this long."""
+    """Longest time of a joint at its torque limit."""
     joint_jump_deg: Positive = 15.0
-    """Between two reads, beside what the joint's largest speed explains."""
+    """Largest change between two reads beyond what the joint's largest speed explains."""
     joint_rate_max_deg_s: Positive = 700.0
-    """No servo of this kind turns faster, not even when it is driven."""
+    """Joint rate that no servo of this kind reaches, even when it is driven from outside."""
     joint_wall_warn_deg: Positive = 3.0
     joint_wall_max_deg: Positive = 10.0
-    """Beyond a joint's wall."""
+    """Angle beyond a joint limit."""
     servo_current_max_a: Positive = 2.3
-    """No command asks for more; the stall current."""
+    """Largest commanded current: the stall current."""
     force_timeout_s: Positive = 0.25
-    """Oldest force sample; beyond it the law flies on without force, and says so."""
+    """Max age of a force sample; beyond it the law continues without force and a warning is raised."""
     force_stuck_s: Positive = 0.25
-    """New samples with the very same values for this long; then the law flies on without force."""
+    """Time with new but identical samples after which the law continues without force."""
     force_drift_n: Positive = 1.5
-    """Lasting force on the net before anything was caught."""
+    """Largest lasting force on the net before the catch."""
 
     # The flight itself
     loop_late_s: Positive = 0.05
-    """A control tick that comes later than this is told."""
+    """Delay of a control tick above which a warning is raised."""
     loop_stalled_s: Positive = 0.3
-    """A control tick that comes later than this lands the vehicle."""
+    """Delay of a control tick above which the vehicle lands."""
     command_state_age_max_s: Positive = 0.10
-    """Nothing is sent to PX4 that was computed from an older attitude."""
+    """Max age of the attitude from which a setpoint was computed; an older one is not sent to PX4."""
     thrust_slew_max_per_s: Positive = 100.0
-    """Normalised thrust; far above what a catch asks for."""
+    """Largest rate of the normalised thrust, far above that of a catch."""
     tilt_abort_deg: Annotated[float, Field(gt=0, le=80)] = 40.0
     tracking_error_warn_m: Positive = 0.45
     tracking_error_hold_m: Positive = 0.6
     tracking_error_abort_m: Positive = 0.8
     thrust_saturated_s: Positive = 1.0
-    """More of the time at the upper thrust limit than below it, by this much."""
+    """Longest surplus of time at the upper thrust limit over time below it."""
     speed_max_m_s: Positive = 2.0
-    """Horizontal; a mission's limits must stay below."""
+    """Largest horizontal speed; a mission's limits must stay below."""
     climb_max_m_s: Positive = 1.5
     sink_max_m_s: Positive = 1.5
     geofence_tolerance_m: NonNegative = 0.10
-    """The rotors may lean out of the room by this much: a mission may use it to the full, and no flight is exact."""
+    """Distance by which the rotors may leave the room: a mission may use all of it, and tracking has errors."""
     tether_stop_slack_min_m: NonNegative = 0.10
-    """Tether left where the vehicle would come to rest."""
+    """Smallest slack where the vehicle would come to rest."""
 
     # Reactions
     guardian_timeout_s: Positive = 0.1
-    """The flight process silent for this long while the rotors turn: the guardian ends it, takes the link over and lands."""
+    """Time without a heartbeat of the flight process, with turning rotors, after which the guardian kills it, takes over and lands."""
     hold_max_s: Positive = 20.0
-    """A HOLD that nobody ended by then becomes a landing."""
+    """Longest HOLD; then the vehicle lands."""
     retract_max_s: Positive = 12.0
-    """A RETRACT that has not arrived by then becomes a landing where it is."""
+    """Longest RETRACT; then the vehicle lands where it is."""
     retract_speed_m_s: Positive = 0.3
     retract_slack_m: Positive = 0.6
-    """So much tether is to be free at the end of a RETRACT."""
+    """Slack at the end of a RETRACT."""
     land_speed_m_s: Positive = 0.35
     fold_arm_deg: Vector2 = (165.0, 140.0)
 
@@ -344,7 +345,7 @@ class Vehicle(Model):
         for index, (joint, angle_deg) in enumerate(zip(self.arm.joints, self.safety.fold_arm_deg, strict=True)):
             low_deg, high_deg = joint.angle_deg
             if not low_deg <= angle_deg <= high_deg:
-                text = f"{angle_deg:g} deg is outside the joint's walls, {low_deg:g} to {high_deg:g} deg"
+                text = f"{angle_deg:g} deg is outside the joint limits, {low_deg:g} to {high_deg:g} deg"
                 problems.append((("safety", "fold_arm_deg", index), text))
         for axis, own in enumerate(self.airframe.inertia_kg_m2):
             others = sum(self.airframe.inertia_kg_m2) - own

@@ -1,4 +1,4 @@
-"""SITL knobs: what is true in the simulated world, whatever the companion believes. Set as `--set world.KEY=VALUE`."""
+"""The truth of the simulated world, which the flight does not know. Set as `--set world.KEY=VALUE`."""
 
 from __future__ import annotations
 
@@ -41,22 +41,21 @@ SignedAxes = Annotated[tuple[SignedAxis, SignedAxis, SignedAxis], AfterValidator
 
 
 class Push(Model):
-    """A known force on the net's centre."""
+    """A force on the centre of the net."""
 
     t_s: NonNegative
-    """On the world's mission clock: seconds since the rotors were armed."""
+    """Time since arming."""
     duration_s: Positive
     force_world_n: Vector3
 
 
 class Servo(Model):
-    """What is true of one servo and its joint, whatever the vehicle file says. Without a word it comes out of its box, with the vehicle
-    file's id and baud rate."""
+    """True settings of one servo and its joint. The defaults are the factory settings, with id and baud rate of the vehicle file."""
 
     id: Annotated[int, Field(ge=0, le=252)] | None = None
-    """Register 7; null: the vehicle file's. Two servos may have the same: then their answers collide."""
+    """Register 7; null for the id of the vehicle file. The answers of two servos with the same id collide."""
     baud: Literal[9600, 57600, 115200, 1000000, 2000000, 3000000, 4000000] | None = None
-    """Register 8; null: the vehicle file's."""
+    """Register 8; null for the baud rate of the vehicle file."""
     firmware: Annotated[int, Field(ge=0, le=255)] = 48
     return_delay_us: Annotated[int, Field(ge=0, le=508, multiple_of=2)] = 500
     operating_mode: Literal[0, 3, 5] = 3
@@ -65,11 +64,11 @@ class Servo(Model):
     current_limit_counts: Annotated[int, Field(ge=0, le=1193)] = 1193
     position_limit_counts: tuple[Annotated[int, Field(ge=0, le=4095)], Annotated[int, Field(ge=0, le=4095)]] = (0, 4095)
     connected: bool = True
-    """Its plug is in."""
+    """Whether its plug is connected."""
     reversed: bool = False
-    """Mounted the other way round: its counts run against the vehicle file's sign."""
+    """Whether its counts run against the sign in the vehicle file."""
     zero_error_deg: float = 0.0
-    """The joint's zero is so much further in the direction of the joint angle than the vehicle file says."""
+    """True zero of the joint minus the zero in the vehicle file, in the direction of the joint angle."""
     torque_per_amp_error: RelativeError = 0.0
     """Relative error of the vehicle file's torque constant against the truth."""
 
@@ -78,23 +77,23 @@ class World(Model):
     """The simulated world."""
 
     payload_kg: Annotated[float, Field(ge=0, le=2)] = 0.2
-    """0: nothing is thrown."""
+    """Mass of the payload; 0 if nothing is thrown."""
     seed: Annotated[int, Field(ge=0)] = 1
     catch_at_m: Vector2 = (0.0, 0.0)
-    """Where the vehicle is when the payload arrives in the net; thrown on its first pass in the direction of +x, at most 0.5 m
+    """x, y of the vehicle when the payload arrives in the net. It is thrown on the first pass in the direction of +x, at most 0.5 m
     to the left or right."""
     throw_velocity_m_s: Vector3 = (-2.0, 0.15, -1.5)
     """Velocity of the payload on arrival, world frame."""
     throws: Annotated[int, Field(ge=1, le=1000)] = 1
-    """More than one: the payload is taken out of the net `keep_s` after it was caught, and thrown again on the next such pass."""
+    """Number of throws. The payload is removed from the net `keep_s` after a catch and thrown again on the next pass."""
     keep_s: Positive = 6.0
     hover_thrust_error: RelativeError = 0.0
     """Relative error of MPC_THR_HOVER against the truth."""
     rotor_lag_s: Positive = 0.04
     setpoint_delay_s: NonNegative = 0.010
-    """From MAVLink arrival to the attitude loop, beside the wire's own time."""
+    """Delay from the arrival of a setpoint to the attitude loop, in addition to the link's."""
     arm_delay_s: NonNegative = 0.0
-    """Goal currents take effect that much later than written, beside the wire's own time."""
+    """Delay from the writing of a goal current to its effect, in addition to the bus's."""
     mocap_rate_hz: Positive = 200.0
     mocap_latency_s: NonNegative = 0.005
     mocap_noise_m: NonNegative = 0.0002
@@ -102,59 +101,59 @@ class World(Model):
     gyro_noise_rad_s: NonNegative = 0.01
     accel_noise_m_s2: NonNegative = 0.15
     accel_vibration_m_s2: NonNegative = 0.0
-    """Amplitude of the vibration of armed rotors on each axis of the accelerometer, as its raw samples have it; PX4 sends means."""
+    """Amplitude of the rotors' vibration in the raw samples of each accelerometer axis; PX4 sends means."""
     accel_vibration_hz: Positive = 120.0
     force_noise_n: NonNegative = 0.05
     force_bias_n: Vector3 = (1.2, -0.8, 2.5)
     force_scale: Positive = 1.0
-    """The force sensor's readings are larger than the truth by this."""
+    """Factor between the force sensor's readings and the true force."""
     net_weight_kg: Annotated[float, Field(ge=0, le=5)] = 0.0
-    """Somebody hangs it on the net's centre while the force sensor is being read, and takes it off when that ends."""
+    """Mass that hangs from the centre of the net while the force sensor is read, for its calibration."""
     net_weight_t_s: NonNegative = 8.0
-    """From the first reading until it hangs there."""
+    """Time from the first reading until the mass hangs there."""
     joint_friction_nm: NonNegative = 0.04
     joint_damping_nms: NonNegative = 0.02
     servos: tuple[Servo, Servo] | None = None
-    """Null: both as `Servo` says without a word."""
+    """null for the defaults of `Servo`."""
     arm_hand: bool = False
-    """A hand holds the arm whenever it is limp, and moves it as `companion arm zero` asks: on whenever the servos' lights go on."""
+    """Whether the arm is held while it has no torque, and moved as `companion arm zero` asks: on whenever the servos' LEDs go on."""
     wind_m_s: Vector3 = (0.0, 0.0, 0.0)
     mass_error: RelativeError = 0.0
     """Relative error of the vehicle file's base mass against the truth."""
     link_mass_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
-    """Relative error of the vehicle file's link masses against the truth; the base's mass stays as it is."""
+    """Relative error of the vehicle file's link masses against the truth; the base's mass does not change."""
     battery_start: Fraction = 1.0
     battery_life_s: Positive = 900.0
-    """Of a full battery, from arming on."""
+    """Time from arming until a full battery is empty."""
     push: Push | None = None
-    """For tests of the impedance."""
+    """A push on the net, for tests of the impedance."""
     natnet_version: Literal["3.0", "4.1"] = "4.1"
     mocap_axes: SignedAxes = ("x", "y", "z")
-    """What the streamed x, y and z truly are, "-y" and so on; a left-handed set is what a badly configured server may stream."""
+    """True axes of the streamed x, y and z, such as "-y". A left-handed set stands for a misconfigured server."""
     mocap_body_yaw_deg: float = 0.0
-    """The rigid body's zero is off: its streamed yaw is larger than the true one by this."""
+    """Error of the rigid body's streamed yaw."""
     mocap_body_tilt_deg: Vector2 = (0.0, 0.0)
-    """The same for roll and pitch."""
+    """Errors of its streamed roll and pitch."""
     mocap_other_id: Annotated[int, Field(ge=0)] | None = None
-    """Streaming id of another rigid body, which lies on the floor of the room."""
+    """Streaming id of another rigid body, which lies on the floor; null if there is none."""
     hand: bool = False
-    """A hand carries the machine through the guided hand test, rotors off, again and again."""
+    """Whether the vehicle is carried through the guided hand test, rotors off, again and again."""
     hand_t_s: NonNegative = 20.0
-    """World time at which it first does."""
+    """World time at which the first test begins."""
     hand_taps: Annotated[int, Field(ge=0, le=100)] = 0
-    """More than none: the hand only lifts and holds the machine, and another one taps its frame so often a round."""
+    """Taps on the frame per round. Above 0 the vehicle is only lifted and held, for the measurement of the latency."""
     hand_tap_n: Positive = 30.0
-    """Peak of a tap's force."""
+    """Peak force of a tap."""
     px4_params: Px4Params = Field(default={})
-    """Parameters of PX4 that somebody has spoiled after it was set up, by name."""
+    """PX4 parameters by name that override those of a set-up vehicle."""
     faults: tuple[Fault, ...] = ()
 
     def servo(self, joint: int) -> Servo:
-        """The servo of joint 0 or 1."""
+        """Return the servo of joint 0 or 1."""
         return Servo() if self.servos is None else self.servos[joint]
 
     def overridden_px4_params(self) -> dict[str, float | int]:
-        """`px4_params` in PX4's types."""
+        """Return `px4_params` in PX4's types."""
         return {
             name: int(value) if isinstance(PX4_DEFAULTS[name], int) else value
             for name, value in self.px4_params.items()

@@ -200,7 +200,7 @@ BAD_VEHICLE = [
     ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "4.1", got 3.0 (put it in quotes)']),
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: the first must be below the second, got [2.2, -2.2]"]),
     ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: 0.26 m on 0.2 m"]),
-    ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint's walls, -10 to 150 deg"]),
+    ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole machine, but arm and tool alone weigh 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2, the sum of the other two, as of every rigid body, got 0.05"]),
