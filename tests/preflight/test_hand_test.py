@@ -82,7 +82,7 @@ def felt_otherwise(course: Iterable[HandSample], turn: Callable[[Vec3], Vec3]) -
     return turned
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
     measured = result(samples(f"seed={seed}"))
     assert not failed(hand_test_evaluation.rows(measured, "z"))
@@ -91,7 +91,7 @@ def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
     assert hand_test_evaluation.best_axes(measured) == IDENTITY
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_biased_imu_and_slow_motion_capture_pass(seed: int) -> None:
     knobs = ("mocap_rate_hz=60", "mocap_noise_m=0.001", "mocap_noise_deg=0.3", "mocap_latency_s=0.03", f"seed={seed}")
     course = []
