@@ -1,4 +1,4 @@
-"""The base of every configuration model: frozen, unknown keys refused, no NaN, no silent conversions."""
+"""Base of all configuration models: frozen, with unknown keys, NaN and implicit conversions refused."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Location = tuple[str | int, ...]
-"""Keys and indices from a model down to the value meant."""
+"""Keys and indices from a model down to a value."""
 
 
 class Model(BaseModel):
@@ -18,7 +18,7 @@ class Model(BaseModel):
 
 
 def refuse(title: str, problems: list[tuple[Location, str]]) -> None:
-    """Raise what a model validator found, each problem at its own place, so that the user is shown the right line.
+    """Raise the problems that a model validator has found, each at its own location, so that messages name the right line.
 
     Raises:
         ValidationError: if there is any problem. Pydantic adds the model's own place in the document in front.

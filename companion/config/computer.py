@@ -1,4 +1,4 @@
-"""Section `computer:` of the vehicle file: what the flight process may have of the computer on board."""
+"""Section `computer:` of the vehicle file: the flight process on the onboard computer."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def _each_once(cpus: tuple[int, ...]) -> tuple[int, ...]:
 
 
 class Computer(Model):
-    """The computer on board; whether it has these cores is a row of the preflight, because the file is read elsewhere, too."""
+    """The onboard computer. The preflight checks whether it has these cores, because the file is also read on other computers."""
 
     cpus: Annotated[tuple[Cpu, ...], AfterValidator(_each_once), Field(json_schema_extra={"uniqueItems": True})] = ()
-    """Cores of the flight process, numbered from 0; launcher, guardian, recorder and simulated world keep off them. Empty: all share
-    all."""
+    """Cores reserved for the flight process, numbered from 0; launcher, guardian, recorder and simulated world use the others. If it is
+    empty, all processes share all cores."""
     lock_memory: bool = True
-    """Keep the flight process in memory, where that is permitted; false: the system may drop and reload its pages."""
+    """Lock the memory of the flight process, where that is permitted. If false, the system may page it out."""

@@ -1,4 +1,4 @@
-"""What was read, before any model looks at it: plain data, and where each piece of it was written."""
+"""A configuration file before validation: plain data and the origin of each value."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Data: TypeAlias = "bool | int | float | str | list[Data] | dict[str, Data] | Non
 
 
 LINE_MAX = 1000
-"""Characters of one line for the user; what is cut off is the end of what the user wrote there."""
+"""Largest length of a message; longer ones are cut off."""
 
 
 class ConfigError(Exception):
-    """The user's input is not usable. `lines` holds one clear line per problem, the most important one first."""
+    """The input is invalid. `lines` holds one message per problem, the most important one first."""
 
     def __init__(self, lines: Sequence[str]) -> None:
         self.lines = tuple(map(_shown, lines))
@@ -24,7 +24,7 @@ class ConfigError(Exception):
 
 
 def _shown(line: str) -> str:
-    """Keys and values are quoted as they were written: nothing in them may break the line, steer the terminal or flood it."""
+    """Escape and shorten a message: quoted keys and values must not break the line or control the terminal."""
     if not line.isprintable():
         line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
     return line if len(line) <= LINE_MAX else line[: LINE_MAX - 3] + "..."
@@ -32,7 +32,7 @@ def _shown(line: str) -> str:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Origin:
-    """Where a value was written: a place in a file (line and column count from 1), or an option of the command line (line 0)."""
+    """Origin of a value: file, line and column, counted from 1, or a command-line option, with line 0."""
 
     source: str
     line: int = 0
@@ -43,12 +43,12 @@ class Origin:
 
 
 RANK_KEY, RANK_VALUE, RANK_MISSING = range(3)
-"""Importance of a problem: a misspelt key is the cause of the missing one."""
+"""Order of importance: a misspelt key comes first, because it causes the missing one."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """One line for the user."""
+    """One message for the user."""
 
     rank: int
     origin: Origin
@@ -59,12 +59,12 @@ class Problem:
 
 
 def problem_lines(problems: Sequence[Problem]) -> list[str]:
-    """Every problem once, the most important first, in the order of the file."""
+    """Return each problem once, the most important first, otherwise in the order of the file."""
     return [str(problem) for problem in sorted(set(problems))]
 
 
 def key_path(location: Location) -> str:
-    """`phases[2].duration_s` of ("phases", 2, "duration_s")."""
+    """Return a location as text: `phases[2].duration_s` for ("phases", 2, "duration_s")."""
     text = ""
     for step in location:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
@@ -73,20 +73,20 @@ def key_path(location: Location) -> str:
 
 @dataclass(slots=True)
 class Document:
-    """A document as read and overridden. Mutable: overrides act on it; nothing outside the configuration's loading sees it."""
+    """A file as read and overridden. It is mutable for the overrides, and used only while a configuration is loaded."""
 
     source: str
-    """File, as the user wrote it."""
+    """Path of the file as the user gave it."""
     data: dict[str, Data]
     values: dict[Location, Origin] = field(default_factory=dict)
-    """Where values stand; a location that is not in here stands where its nearest parent stands."""
+    """Origins of values; a location that is not listed has the origin of its nearest parent."""
     keys: dict[Location, Origin] = field(default_factory=dict)
-    """Where keys stand."""
+    """Origins of keys."""
     problems: list[Problem] = field(default_factory=list)
-    """Found on reading, beside what models find."""
+    """Problems found while reading; validation adds its own."""
 
     def origin(self, location: Location) -> Origin:
-        """Where the value at a location was written."""
+        """Return the origin of the value at a location."""
         for end in range(len(location), -1, -1):
             found = self.values.get(location[:end])
             if found is not None:
@@ -94,11 +94,11 @@ class Document:
         return Origin(self.source)
 
     def key_origin(self, location: Location) -> Origin:
-        """Where the key of a location was written."""
+        """Return the origin of the key of a location."""
         return self.keys.get(location) or self.origin(location)
 
     def replace(self, location: Location, value: Data, origin: Origin) -> None:
-        """Put a value from the command line at a location whose parent exists."""
+        """Set a value from the command line; its parent must exist."""
         parent: Data = self.data
         for step in location[:-1]:
             parent = _child(parent, step)
@@ -116,7 +116,7 @@ class Document:
             origins[location] = origin
 
     def get(self, location: Location) -> Data:
-        """The value at a location.
+        """Return the value at a location.
 
         Raises:
             KeyError, IndexError: if there is none.

@@ -1,4 +1,4 @@
-"""What pydantic found, in one line per problem: place, key, what was expected, what was found, what was probably meant.
+"""Pydantic's errors as one message per problem: origin, key, expected and found value, and a suggestion.
 
 Expectations and known keys are read from the model's own JSON schema, so that they cannot differ from what is checked.
 """
@@ -30,9 +30,9 @@ UNITS = {
     "kg": "kg", "g": "g", "lb": "lb", "lbs": "lb", "n": "N", "kn": "kN", "lbf": "lbf", "nm": "N m", "nms": "N m s", "nm_a": "N m/A",
     "hz": "Hz", "khz": "kHz", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "c": "degC", "kgf": "kgf",
 }  # fmt: skip
-"""Unit suffixes a person may write behind a key, known here or not."""
+"""Units by the suffix of a key, including units that no key uses."""
 MANY_OPTIONS = 12
-"""More of them are not listed in a line."""
+"""Largest number of options that a message lists."""
 
 
 @functools.cache
@@ -42,11 +42,11 @@ def _schema_of(model: type[Model]) -> _Node:
 
 
 def validate(model: type[M], document: Document) -> M | None:
-    """Build a model from a document; problems are appended to `document.problems` and the answer is None.
+    """Build a model from a document. If there are problems, append them to `document.problems` and return None.
 
     Args:
-        model: what the document describes.
-        document: read and overridden.
+        model: the model to build.
+        document: the document after overrides.
     """
     schema = _schema_of(model)
     found = [
@@ -114,7 +114,7 @@ def _value_problem(
 
 
 def _problem(rank: int, origin: Origin, at: Location, text: str) -> Problem:
-    """One line; the key is left out where the option that caused it has just named it."""
+    """Return a problem; its text leaves out the key if the command-line option already names it."""
     key = key_path(at)
     if not key or (not origin.line and origin.source.endswith(f".{key}")):
         return Problem(rank, origin, text)
@@ -122,7 +122,7 @@ def _problem(rank: int, origin: Origin, at: Location, text: str) -> Problem:
 
 
 def describe(node: _Node | None, schema: _Node) -> str:
-    """What a JSON schema node accepts, in words."""
+    """Describe the values that a node of a JSON schema accepts."""
     node = _resolve(node or {}, schema)
     if "const" in node:
         return _show(node["const"])
@@ -149,7 +149,7 @@ def describe(node: _Node | None, schema: _Node) -> str:
 
 
 def nearest(word: str, known: list[str]) -> str | None:
-    """The known word that was most likely meant, if any is near."""
+    """Return the known word most similar to `word`, or None if none is similar."""
     close = difflib.get_close_matches(word.lower(), known, n=1, cutoff=0.6)
     return close[0] if close else None
 
@@ -169,7 +169,7 @@ def _plural(item: str) -> str:
 
 
 def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[str, str | None]:
-    """Text about an unknown key, and the known key that was meant."""
+    """Return the message about an unknown key, and the known key that was probably meant."""
     key = str(at[-1])
     known = list((parent or {}).get("properties", {}))
     stem, unit = split_unit(key)
@@ -188,7 +188,7 @@ def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[st
 
 
 def split_unit(key: str) -> tuple[str, str | None]:
-    """`duration_ms` -> ("duration", "ms"); the longest known suffix wins; no unit: (key, None)."""
+    """Split a key at its longest unit suffix: ("duration", "ms") for `duration_ms`. Without a unit, return (key, None)."""
     parts = key.split("_")
     for count in (3, 2, 1):
         suffix = "_".join(parts[-count:]).lower()
@@ -198,7 +198,7 @@ def split_unit(key: str) -> tuple[str, str | None]:
 
 
 def _hint(value: Data, node: _Node | None) -> str:
-    """What to do about a value of the wrong kind."""
+    """Suggest how to correct a value of the wrong type; empty if there is no suggestion."""
     wanted = node or {}
     options = wanted.get("enum", [])
     if options:
@@ -220,7 +220,7 @@ def _did_you_mean(word: str, options: list[str]) -> str:
 
 
 def _show(value: object) -> str:
-    """A value as YAML would have it, shortened."""
+    """Return a value in YAML notation, shortened."""
     if isinstance(value, float) and value != value:
         return ".nan"
     if isinstance(value, float) and value in (float("inf"), float("-inf")):
@@ -259,7 +259,7 @@ def _step(node: _Node, step: str | int) -> _Node | None:
 
 
 def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | None, _Node | None]:
-    """From pydantic's location to the document's (which has no union tags), the schema node there and its parent's."""
+    """Convert pydantic's location to the document's, which has no union tags; also return its schema node and its parent's."""
     node: _Node | None = _resolve(schema, schema)
     parent: _Node | None = None
     at: list[str | int] = []
@@ -278,7 +278,7 @@ def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | 
 def _booleans(
     node: _Node | None, data: Data, at: Location, root: _Node | None = None
 ) -> Iterator[tuple[Location, _Node | None, Data]]:
-    """Every true/false that stands where the schema wants something else: JSON equality would let `true` pass for the constant 1."""
+    """Yield each true or false where the schema expects a constant: in JSON `true` equals the constant 1."""
     root = root if root is not None else node or {}
     node = _resolve(node, root) if node is not None else None
     if node is not None and "discriminator" in node and isinstance(data, dict):

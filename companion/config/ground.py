@@ -1,4 +1,4 @@
-"""Section `ground:` of the vehicle file: who may watch and command it from the ground."""
+"""Section `ground:` of the vehicle file: telemetry and commands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LOOPBACK = re.compile(r"localhost|127\.\d{1,3}\.\d{1,3}\.\d{1,3}|::1")
 
 
 class BrokerAddress(Model):
-    """A broker's URL taken apart."""
+    """Parts of a broker's URL."""
 
     host: str
     port: Annotated[int, Field(gt=0, le=65535)]
@@ -23,7 +23,7 @@ class BrokerAddress(Model):
 
     @property
     def loopback(self) -> bool:
-        """It is on this computer."""
+        """Whether the broker runs on this computer."""
         return _LOOPBACK.fullmatch(self.host) is not None
 
     def __str__(self) -> str:
@@ -32,10 +32,10 @@ class BrokerAddress(Model):
 
 
 def broker_address(url: str) -> BrokerAddress:
-    """Take a broker's URL apart.
+    """Parse a broker's URL.
 
     Raises:
-        ValueError: it is none; says what was expected.
+        ValueError: not a broker's URL.
     """
     match = _URL.fullmatch(url)
     if match is None:
@@ -63,22 +63,22 @@ def _a_station(address: str) -> str:
 
 
 class Mqtt(Model):
-    """The broker that telemetry goes to and commands come from."""
+    """The MQTT broker for telemetry and commands."""
 
     url: Annotated[str, AfterValidator(_a_broker)] = "mqtt://127.0.0.1:1883"
-    """mqtt://HOST:PORT, or mqtts://HOST:PORT with TLS. A flight waits for no broker."""
+    """mqtt://HOST:PORT, or mqtts://HOST:PORT with TLS. A flight does not wait for its broker."""
     login_file: str | None = None
-    """YAML file with `username` and `password`, readable by its owner alone; absent: none."""
+    """YAML file with `username` and `password`, readable only by its owner. If it is absent, no login is used."""
     ca_file: str | None = None
-    """Certificate (PEM) of the authority that signed the broker's; absent: the system's authorities."""
+    """Certificate (PEM) of the authority that signed the broker's certificate. If it is absent, the system's authorities are used."""
     commands: bool = True
-    """Hear signed commands. Never over a plain connection to another computer."""
+    """Accept signed commands. Over a connection to another computer without TLS they are never accepted."""
     operators_file: str | None = None
-    """Who may command: YAML file of operators and their keys; absent: that of this user on this computer."""
+    """YAML file of the operators and their keys. If it is absent, the file of this user on this computer is used."""
 
     @property
     def address(self) -> BrokerAddress:
-        """The URL taken apart."""
+        """Return the parts of `url`."""
         return broker_address(self.url)
 
 
@@ -86,15 +86,16 @@ class Ground(Model):
     """Ground stations."""
 
     topic: str | None = None
-    """Name of the vehicle in topics; absent: the vehicle's name."""
+    """Name of the vehicle in topics. If it is absent, the vehicle's name is used."""
     mqtt: Mqtt | None = Mqtt()
-    """null: no telemetry, no commands over MQTT."""
+    """null disables telemetry and commands over MQTT."""
     qgroundcontrol: Annotated[str, AfterValidator(_a_station)] | None = None
-    """MAVLink is forwarded to and from here: udpout://HOST:14550; absent: not forwarded."""
+    """Address with which MAVLink is exchanged, udpout://HOST:14550. If it is absent, nothing is forwarded."""
     qgroundcontrol_while_armed: bool = False
-    """Forward while PX4 is armed too what may stop rotors or change the flight: forced disarm, parameters, missions, files."""
+    """While PX4 is armed, also forward messages that can stop the rotors or change the flight: forced disarm, parameters,
+    missions, files."""
     qgroundcontrol_console: bool = False
-    """Forward SERIAL_CONTROL, which is PX4's console, while PX4 is disarmed."""
+    """Forward SERIAL_CONTROL (PX4's console) while PX4 is disarmed."""
 
     @model_validator(mode="after")
     def _speakable(self) -> Self:
@@ -104,5 +105,5 @@ class Ground(Model):
 
 
 def topic_name(topic: str | None, vehicle_name: str) -> str:
-    """Name of a vehicle in topics: what MQTT does not allow becomes '-'."""
+    """Return the name of a vehicle in topics, with '-' for characters that MQTT does not allow."""
     return topic or (re.sub(r"[^A-Za-z0-9_.-]", "-", vehicle_name)[:40] or "vehicle")

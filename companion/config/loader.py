@@ -1,4 +1,4 @@
-"""From files and command line to one checked, frozen `FlightConfig`."""
+"""Loads the configuration of a flight from its files and the command line."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PRESET_DIRECTORY = Path(__file__).parent / "presets"
 
 
 class Sources(Model):
-    """Where the parts of a `FlightConfig` were written; for messages and for the log."""
+    """Origins of the parts of a `FlightConfig`, for messages and for the log."""
 
     mission: str
     vehicle: str
@@ -48,7 +48,7 @@ class Sources(Model):
 
 
 class FlightConfig(Model):
-    """Everything that a flight is configured by. `model_validate_json(config.model_dump_json())` gives an equal one."""
+    """The effective configuration of a flight."""
 
     mission: Mission
     vehicle: Vehicle
@@ -69,15 +69,15 @@ def load_flight(
 
     Args:
         mission_path: mission file.
-        vehicle_path: vehicle file instead of the one that the mission names.
-        controller_law: law instead of the one that the mission names (a key of `PRESETS`).
-        preset: built-in preset of that law, or of the mission's, instead of the mission's choice.
+        vehicle_path: vehicle file in place of the mission's.
+        controller_law: control law in place of the mission's (a key of `PRESETS`).
+        preset: built-in preset of that law in place of the mission's.
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Those of the section `world`
             are not read: they belong to the simulated world (`companion.sitl_config`).
-        hardware: the vehicle file's addresses are used: no SITL replaces them. Then each must name one network.
+        hardware: the addresses of the vehicle file are used, not those of SITL; then `devices.mocap.interface` must name one network.
 
     Raises:
-        ConfigError: one line per problem of all files together.
+        ConfigError: one message per problem of all files.
     """
     parsed = parse_overrides(overrides)
     lines: list[str] = []
@@ -125,7 +125,7 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
     """Read and check a vehicle file alone, with the `vehicle.` overrides.
 
     Raises:
-        ConfigError: one line per problem.
+        ConfigError: one message per problem.
     """
     lines: list[str] = []
     vehicle = check_document(Vehicle, read_document(path), "vehicle", parse_overrides(overrides), lines)
@@ -149,7 +149,7 @@ def logged_flight(config_json: str) -> FlightConfig:
 def check_document(
     model: type[M], document: Document, section: Section, overrides: list[Override], lines: list[str]
 ) -> M | None:
-    """Override and validate a document; one line per problem is appended to `lines`.
+    """Override and validate a document; one message per problem is appended to `lines`.
 
     Returns:
         The model, or None if the document has a problem.
@@ -159,7 +159,7 @@ def check_document(
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
-    """Motion capture must not be taken from every network that this computer is on: any sender there could claim Motive's address."""
+    """Refuse motion capture on all networks: any sender there could claim Motive's address."""
     interface = vehicle.devices.mocap.interface
     if interface != ANY_INTERFACE:
         return []
@@ -172,7 +172,7 @@ def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
 
 
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:
-    """The same for a controller file, whose law says which model it is."""
+    """Override and validate a controller file; its law selects the model."""
     _override(document, "controller", overrides, lines)
     law = _value(document, ("law",))
     if isinstance(law, str) and law in LAWS:
@@ -205,13 +205,13 @@ def _validated(model: type[M], document: Document, lines: list[str]) -> M | None
 def _open_named(
     mission_file: Document, location: Location, given: str | Path | None, lines: list[str]
 ) -> Document | None:
-    """The document at `given`, else the one that the mission names; relative to the file that names it."""
+    """Read the file `given`, or else the one that the mission names, relative to the mission file."""
     if given is not None:
         path, shown, where = Path(given), str(given), ""
     else:
         named = _value(mission_file, location)
         if not isinstance(named, str):
-            return None  # missing or not text: said when the mission was checked
+            return None  # missing or not text: reported by the check of the mission
         origin = mission_file.origin(location)
         base = Path(mission_file.source).parent if origin.line else Path()
         shown = os.path.normpath(base / named)
@@ -224,7 +224,7 @@ def _open_named(
 
 
 def _controller_choice(mission_file: Document) -> ControllerChoice | None:
-    """The choice of a mission that is wrong elsewhere, so that the controller's own problems are told too."""
+    """Return the controller choice of a mission with other problems, so that problems of the controller file are reported too."""
     try:
         return ControllerChoice.model_validate(_value(mission_file, ("controller",)) or {})
     except ValidationError:

@@ -1,4 +1,4 @@
-"""`--set section.key[index].key=value`: one value of one document replaced from the command line, before anything is validated."""
+"""`--set section.key[index].key=value` replaces one value of a file from the command line, before validation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _EXAMPLE = "expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One parsed `--set`."""
+    """A parsed `--set` option."""
 
     section: Section
     location: Location
@@ -33,7 +33,7 @@ def parse_overrides(texts: Iterable[str]) -> list[Override]:
     """Parse `--set` options.
 
     Raises:
-        ConfigError: one line per option that cannot be understood.
+        ConfigError: one message per invalid option.
     """
     overrides: list[Override] = []
     lines: list[str] = []
@@ -48,10 +48,10 @@ def parse_overrides(texts: Iterable[str]) -> list[Override]:
 
 
 def apply_overrides(document: Document, section: Section, overrides: Iterable[Override]) -> None:
-    """Put the overrides of one section into its document, in the order given; the document notes where each value came from.
+    """Apply the overrides of one section to its document, in the order given; the document records their origins.
 
     Raises:
-        ConfigError: one line per override that names a place which is not there. Keys are judged later, by the model.
+        ConfigError: one message per override of a location that does not exist. Keys are checked later, by the model.
     """
     lines: list[str] = []
     for override in overrides:
@@ -95,7 +95,7 @@ def _parse(text: str) -> Override:
 
 
 def _make_way(document: Document, override: Override) -> None:
-    """Create mappings on the way that the file left to their defaults; refuse indices that are not there."""
+    """Create the parent mappings that the file leaves to their defaults; refuse indices that do not exist."""
     value: Data = document.data
     for depth, step in enumerate(override.location):
         last = depth == len(override.location) - 1

@@ -1,4 +1,4 @@
-"""YAML as people mean it: the 1.2 core schema, nothing that wins silently, and the place of every value.
+"""Strict YAML: the 1.2 core schema, no duplicate keys, and the origin of every value.
 
 PyYAML speaks YAML 1.1, where `1e3` is text, `on` is true, `12:30` is 750 and a duplicate key overwrites the first. Here the scalars are
 those of YAML 1.2's core schema (section 10.3.2); duplicate keys, aliases and tags are refused.
@@ -49,7 +49,7 @@ class StrictLoader(yaml.SafeLoader):
         self._depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Compose one node, refusing aliases and bottomless nesting before they cost anything."""
+        """Compose one node; refuse aliases and deep nesting early."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         mark: Any = event.start_mark
         if isinstance(event, yaml.AliasEvent):
@@ -127,7 +127,7 @@ def parse_value(text: str, origin: Origin) -> Data:
 
 
 def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
-    """Text to plain data. `fixed`: the one origin of everything (an override), instead of places in a file."""
+    """Convert text to plain data. `fixed` is the origin of all values (an override) in place of lines in a file."""
 
     def origin(mark: yaml.Mark | None) -> Origin:
         if fixed is not None or mark is None:
@@ -157,7 +157,7 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
 
 
 class _Builder:
-    """Composed nodes to plain data, noting places and collecting what is refused."""
+    """Converts composed nodes to plain data, with their origins and problems."""
 
     def __init__(self, document: Document, origin: Callable[[yaml.Mark | None], Origin]) -> None:
         self._document = document
@@ -168,7 +168,7 @@ class _Builder:
         self._document.problems.append(Problem(rank, self._at(mark), where + text))
 
     def build(self, node: yaml.Node, location: Location) -> Data:
-        """Data of one node and all below it."""
+        """Return the data of a node and its children."""
         self._document.values[location] = self._at(node.start_mark)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, location)
@@ -216,7 +216,7 @@ class _Builder:
 
 
 def _is_unicode(text: str) -> bool:
-    """False: an escape like "\\uD800" left half of a UTF-16 pair, which no JSON and no terminal takes."""
+    """Return False if an escape such as "\\uD800" left half of a UTF-16 pair, which JSON and terminals reject."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -225,7 +225,7 @@ def _is_unicode(text: str) -> bool:
 
 
 def _scalar(text: str) -> Data:
-    """A plain scalar by YAML 1.2's core schema."""
+    """Resolve a plain scalar by YAML 1.2's core schema."""
     if _NULL.fullmatch(text):
         return None
     if _BOOL.fullmatch(text):
@@ -248,7 +248,7 @@ def _scalar(text: str) -> Data:
 
 
 def _syntax(error: yaml.MarkedYAMLError) -> str:
-    """PyYAML's message in one line, in the words of someone who edits a file."""
+    """Return PyYAML's message as one line for the user."""
     problem = error.problem or "syntax error"
     if "'\\t'" in problem:
         return "a tab; indent with spaces"

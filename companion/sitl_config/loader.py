@@ -1,4 +1,4 @@
-"""From files and command line to the configuration of a flight in the simulated world."""
+"""Loads the configuration of a flight in the simulated world from its files and the command line."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from companion.sitl_config.world import World
 
 
 class SitlConfig(FlightConfig):
-    """A flight's configuration and the truth of the world that it is flown in. The flight itself is given `flight` alone."""
+    """A flight's configuration and the truth of its simulated world. The flight process and the core are given `flight`."""
 
     world: World = World()
 
     @property
     def flight(self) -> FlightConfig:
-        """The configuration without the world."""
+        """Return the configuration without the world."""
         return FlightConfig(**{name: getattr(self, name) for name in FlightConfig.model_fields})
 
 
@@ -34,7 +34,7 @@ def load_sitl(
     """Read, override and check everything; arguments as for `load_flight`, with overrides of `world.` as well.
 
     Raises:
-        ConfigError: one line per problem of all files and of the world.
+        ConfigError: one message per problem of all files and of the world.
     """
     lines: list[str] = []
     flight = world = None
@@ -55,7 +55,7 @@ def load_world(overrides: Sequence[str] = ()) -> World:
     """Return the simulated world of the `world.` overrides; there is no file of it.
 
     Raises:
-        ConfigError: one line per problem.
+        ConfigError: one message per problem.
     """
     lines: list[str] = []
     world = check_document(World, Document("world", {}), "world", parse_overrides(overrides), lines)
