@@ -1,4 +1,4 @@
-"""Everything that is promised of timing and cost, measured beside something bare: one command, one page.
+"""Measures every promised figure of timing and cost, beside a bare reference, and writes them on one page.
 
     python -m benchmarks                      # everything: 14 minutes, 10 of them a hover
     python -m benchmarks --quick              # the hover lasts one minute
@@ -39,9 +39,9 @@ ROOT = Path(__file__).parents[1]
 OUT = ROOT / "build" / "benchmarks"
 PAGE = ROOT / "docs" / "benchmarks.md"
 DEADLINE_S = {"core": 300.0, "joints": 120.0, "setpoint": 900.0, "hover": 1500.0}
-"""Of each part, in the order in which they run: the longest comes last."""
+"""Deadline of each part, in the order in which they run."""
 LAND_S = 400.0
-"""What a part may take to end in order: its flight lands."""
+"""Time that a part has to end after Ctrl-C: its flight lands first."""
 SAMPLES, QUICK_SAMPLES = 4000, 1000
 VERSIONS = ("companion", "git", "python", "mavsdk", "pymavlink", "dynamixel-sdk", "mujoco")
 
@@ -106,7 +106,7 @@ def run_part(name: str, folder: Path, quick: bool) -> int:
 
 
 def measure(name: str, out: Path, quick: bool) -> dict[str, Any]:
-    """Run a part in a process of its own; its entry in the results, with why it failed if it did."""
+    """Run a part in a separate process and return its entry in the results, with the reason if it failed."""
     folder = out / name
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -139,7 +139,7 @@ def measure(name: str, out: Path, quick: bool) -> dict[str, Any]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """A part that still runs ends in order, however often Ctrl-C is pressed meanwhile; one that cannot is killed."""
+    """End a part that still runs, and ignore further Ctrl-C meanwhile; kill it after `LAND_S`."""
     if process.poll() is not None:
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -155,7 +155,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def read_results(out: Path) -> dict[str, Any]:
-    """What an earlier run has left; nothing: no parts."""
+    """Return the results of an earlier run; no parts if there are none."""
     try:
         found: dict[str, Any] = json.loads((out / "results.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -164,7 +164,7 @@ def read_results(out: Path) -> dict[str, Any]:
 
 
 def write_results(results: Mapping[str, Any], out: Path) -> None:
-    """Both files, each whole or not at all."""
+    """Write both result files, each of them atomically."""
     tables = tables_of(results)
     rows = [
         {**asdict(row), "ratios": row.ratios, "verdict": row.verdict.strip("*")}
@@ -176,7 +176,7 @@ def write_results(results: Mapping[str, Any], out: Path) -> None:
 
 
 def tables_of(results: Mapping[str, Any]) -> Sequence[Any]:
-    """The tables of all parts."""
+    """Return the tables of all parts."""
     parts: Mapping[str, Any] = results["parts"]
     return sections(
         {name: {"not_measured": part["failed"]} if part["failed"] else part["figures"] for name, part in parts.items()}
@@ -190,7 +190,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def about() -> dict[str, Any]:
-    """Date, computer, versions."""
+    """Return date, computer and versions."""
     found = versions()
     if "git" in found:
         found["git"] = found["git"][:12] + found["git"][40:]  # and "-dirty"

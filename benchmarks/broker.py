@@ -1,4 +1,4 @@
-"""What a broker, its absence, and what is done to it cost the control loop: one flight, one condition after the other.
+"""Measures what an MQTT broker costs the control loop, absent, healthy and disturbed: one flight, one condition after the other.
 
     python -m benchmarks.broker                    # 3 rounds of 8 conditions, 16 s each: 9 minutes of hovering
     python -m benchmarks.broker --rounds 1 --slot 10 --json FILE
@@ -31,7 +31,7 @@ from rich.console import Console
 
 from benchmarks.measuring.hovering import END_TIMEOUT_S, MISSION, NoFlight, await_hover, start_hover
 from benchmarks.report import number, print_table, write_json
-from benchmarks.soaking.lateness import tick_for_nothing
+from benchmarks.soaking.lateness import run_idle_ticks
 from companion.analysis.log import FlightLog
 from companion.config.ground import topic_name
 from companion.config.loader import load_flight
@@ -39,7 +39,7 @@ from companion.model.constants import TICK_PERIOD_S
 from tests.broker import LOOPBACK, Broker, free_port
 
 SETTLE_S = 3.0
-"""From one condition to the next; not counted."""
+"""Time between two conditions, not counted."""
 P99_RATIO_MAX = 1.25
 P99_MORE_MAX_MS = 0.5
 NO_BROKER = "no broker"
@@ -47,7 +47,7 @@ NO_BROKER = "no broker"
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """A condition that was met between two times of the wall clock."""
+    """A condition with its beginning and end on the wall clock."""
 
     condition: str
     begin_s: float
@@ -59,7 +59,7 @@ Row = dict[str, Any]
 
 
 class Conditions:
-    """What can be done to the broker; each of them leaves nothing behind."""
+    """The conditions of the broker; each of them cleans up behind itself."""
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.port = free_port()
@@ -73,22 +73,22 @@ class Conditions:
             "broker": self.plain,
             "killed, restarted": self.killed,
             "slow": self.slow,
-            "retained rubbish": lambda s: self.loaded("rubbish", s),
+            "retained garbage": lambda s: self.loaded("garbage", s),
             "20 viewers": lambda s: self.loaded("viewers", s),
             "1,000 commands/s": lambda s: self.loaded("noise", s),
         }
 
     def nothing(self, seconds: float) -> None:
-        """Nobody listens on the port."""
+        """No broker listens on the port."""
         time.sleep(seconds)
 
     def plain(self, seconds: float) -> None:
-        """A broker, and nobody else."""
+        """A broker without other clients."""
         with self._broker():
             time.sleep(seconds)
 
     def killed(self, seconds: float) -> None:
-        """Killed and started again, over and over."""
+        """A broker that is killed and restarted again and again."""
         end_s = time.monotonic() + seconds
         with self._broker():
             while time.monotonic() < end_s:
@@ -98,7 +98,7 @@ class Conditions:
                 self.broker.start()
 
     def slow(self, seconds: float) -> None:
-        """It gets a twentieth of the time: its socket fills up, and is emptied in bursts."""
+        """A broker that runs for a twentieth of the time: its socket fills up and is emptied in bursts."""
         end_s = time.monotonic() + seconds
         with self._broker():
             while time.monotonic() < end_s:
@@ -108,7 +108,7 @@ class Conditions:
                 time.sleep(0.1)
 
     def loaded(self, load: str, seconds: float) -> None:
-        """A broker that others use."""
+        """A broker under load from other clients."""
         with self._broker():
             command = [sys.executable, "-m", "benchmarks.brokering.load", load, self.broker.url, self._vehicle]
             process = subprocess.Popen(command)
@@ -130,7 +130,7 @@ class Conditions:
 
 
 def fly(rounds: int, slot_s: float, folder: Path, console: Console) -> tuple[list[Slot], int]:
-    """Hover while one condition follows the other; when each was met, and the flight's exit code."""
+    """Hover through all conditions; return when each of them applied, and the flight's exit code."""
     config = load_flight(MISSION)
     conditions = Conditions(folder, topic_name(config.vehicle.ground.topic, config.vehicle.name))
     order = random.Random(1)
@@ -165,7 +165,7 @@ def fly(rounds: int, slot_s: float, folder: Path, console: Console) -> tuple[lis
 
 
 def judge(slots: list[Slot], folder: Path) -> list[Row]:
-    """Lateness by condition, of the flight and of the empty loop."""
+    """Return the lateness of flight and empty loop by condition."""
     log = folder / "flight/flight.mcap"
     offset_s = int(FlightLog.read(log, ticks_max=1000).metadata["companion"]["epoch_offset_ns"]) * 1e-9
     starts, lateness = [], []
@@ -198,7 +198,7 @@ def _within(ticks: Any, slots: list[Slot]) -> Any:
 
 
 def run_empty_loop(path: Path) -> None:
-    """Tick for nothing, then write wall clock (s) and lateness (ms) of each tick."""
+    """Run an empty loop, then write wall clock (s) and lateness (ms) of each tick."""
     offset_s = time.time() - time.monotonic()
     starts, lateness = array("d"), array("d")
 
@@ -206,12 +206,12 @@ def run_empty_loop(path: Path) -> None:
         starts.append(offset_s + start_s)
         lateness.append(1e3 * lateness_s)
 
-    tick_for_nothing(take)
+    run_idle_ticks(take)
     np.save(path, np.array([starts, lateness]))
 
 
 def problems_of(rows: list[Row], code: int, summary: dict[str, Any]) -> list[str]:
-    """What is not as it must be."""
+    """Return the limits that were not met."""
     found = [] if code == 4 else [f"the flight ended with exit code {code}, 4 (landed on demand) was expected"]
     if summary["recorder"]["dropped"]:
         found.append(f"recorder: {summary['recorder']['dropped']} dropped")
@@ -223,7 +223,7 @@ def problems_of(rows: list[Row], code: int, summary: dict[str, Any]) -> list[str
 
 
 def said(summary: dict[str, Any]) -> list[str]:
-    """What the flight warned of: the machine is held up as a whole now and then, and the empty loop with it."""
+    """Return the flight's warnings; some come from stalls of the whole computer, which delay the empty loop too."""
     asked_for = ("operator_land", "ground")
     return [
         event["text"] for event in summary["events"] if event["severity"] != "info" and event["id"] not in asked_for

@@ -1,4 +1,4 @@
-"""Throws damaged input at every wire of the companion and watches what comes of it.
+"""Feeds damaged input to every wire of the companion and reports what fails.
 
     python -m benchmarks.fuzz                                     # every target, 1,000,000 inputs each
     python -m benchmarks.fuzz natnet yaml --inputs 20000 --jobs 2
@@ -33,13 +33,13 @@ from benchmarks.report import print_table
 
 REGRESSIONS = Path(__file__).parents[1] / "tests" / "regressions" / "fuzz"
 _STUCK_S = 180.0
-"""Without progress: a call that is stuck outside of Python, which no CPU limit inside can end."""
+"""Time without progress after which a process is killed: a call outside of Python hangs."""
 _POLL_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What came of one target."""
+    """Result of one target."""
 
     target: str
     inputs: int
@@ -50,7 +50,7 @@ class Row:
 
 
 class Worker:
-    """A process that feeds a range of inputs; its index is visible from outside even if it dies."""
+    """A process that feeds a range of inputs; its present index stays readable if it dies."""
 
     def __init__(self, name: str, seed: int, first: int, last: int, until_s: float) -> None:
         self.name, self.seed, self.first = name, seed, first
@@ -63,7 +63,7 @@ class Worker:
         self._seen, self._seen_s = first, time.monotonic()
 
     def stretch(self) -> Stretch | None:
-        """What it saw, once it is done, dead or stuck."""
+        """Return its result once it is done, dead or hung, else None."""
         if self.result.poll():
             try:
                 stretch: Stretch = self.result.recv()
@@ -106,7 +106,7 @@ def _work(name: str, seed: int, first: int, last: int, until_s: float, index: An
 
 
 def fuzz(name: str, inputs: int, seed: int, jobs: int, progress: Progress, until_s: float = math.inf) -> Row:
-    """One target, its inputs shared out over processes, until the deadline on the monotonic clock."""
+    """Fuzz one target in several processes, until a deadline on the monotonic clock."""
     total = max(jobs, round(inputs * target_class(name).share))
     bounds = [total * k // jobs for k in range(jobs + 1)]
     start_s = time.monotonic()
@@ -138,7 +138,7 @@ def fuzz(name: str, inputs: int, seed: int, jobs: int, progress: Progress, until
 
 
 def save(finding: Finding, folder: Path = REGRESSIONS) -> Path | None:
-    """Keep the input as a file; None if the finding is not one of a single input."""
+    """Save the input as a file and return its path, or None if the finding does not belong to one input."""
     if finding.index is None:
         return None
     path = folder / f"{finding.target}-{finding.seed}-{finding.index}.bin"
@@ -162,7 +162,7 @@ def cells(row: Row) -> dict[str, str]:
 
 
 def again(name: str, seed: int, index: int) -> int:
-    """One input alone."""
+    """Feed one input and print the finding."""
     with target_class(name)() as target:
         data = target.make(generator(name, seed, index))
         found = feed_watched(target, data)

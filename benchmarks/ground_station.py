@@ -1,10 +1,10 @@
-"""What a MAVLink ground station costs the flight: setpoints and motion capture on their way to PX4, with and without one.
+"""Measures what a MAVLink ground station costs the flight: delays of setpoints and motion capture to PX4, with and without one.
 
     python -m benchmarks.ground_station [--seconds 4] [--rounds 5] [--json FILE]
 
-Three processes beside the relay: the flight's side (asyncio at 200 Hz through `MavsdkAutopilot` and `GroundStation`), a room that sends
-pose datagrams and plays PX4 (600 telemetry messages a second), and the ground station. The first two claim real-time priority, as a
-flight does, where that is permitted. The conditions take turns, so that what else the machine does falls on all of them. Both figures
+Three processes beside the relay: the flight's side (asyncio at 200 Hz through `MavsdkAutopilot` and `GroundStation`), a process that
+sends pose datagrams and plays PX4 (600 telemetry messages a second), and the ground station. The first two claim real-time priority, as
+a flight does, where that is permitted. The conditions take turns, so that what else the machine does falls on all of them. Both figures
 are taken where PX4 is: time between two SET_ATTITUDE_TARGETs, and pose datagram sent to VISION_POSITION_ESTIMATE received.
 """
 
@@ -51,7 +51,7 @@ from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 RATE_HZ = 200.0
 FLOOD_HZ = 1000.0
-CONDITIONS = ("off", "absent", "present", "flood", "rubbish", "forged")
+CONDITIONS = ("off", "absent", "present", "flood", "invalid", "forged")
 _DEADLINE_S = 30.0
 _POSE = struct.Struct("<d")
 _LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.2)
@@ -60,19 +60,19 @@ _WARM_UP_S = 1.0
 
 @dataclass(slots=True)
 class Samples:
-    """Of one condition, in s."""
+    """Samples of one condition, in s."""
 
     period_s: list[float] = field(default_factory=list)
     vision_s: list[float] = field(default_factory=list)
     tell_s: list[float] = field(default_factory=list)
     to_px4: int = 0
-    """Messages of the ground station that reached PX4."""
+    """Number of messages of the ground station that reached PX4."""
     relay_cpu: float = 0.0
-    """Share of a core."""
+    """CPU time of the relay as a share of a core."""
 
 
-def room(parent: Connection, autopilot_port: int, mocap_port: int) -> None:
-    """PX4 and motion capture; runs until told to stop, then reports what arrived."""
+def px4_and_mocap(parent: Connection, autopilot_port: int, mocap_port: int) -> None:
+    """Play PX4 and motion capture until told to stop, then send what arrived to the parent."""
     out, into = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
     into.robust_parsing = True
     beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16, 4, 3)
@@ -127,14 +127,14 @@ def room(parent: Connection, autopilot_port: int, mocap_port: int) -> None:
 
 
 def ground(parent: Connection, port: int, condition: str) -> None:
-    """The ground station: heartbeats, and whatever the condition floods with."""
+    """Play the ground station: heartbeats, and the flood of the condition."""
     encoder = mavlink.MAVLink(None, srcSystem=1 if condition == "forged" else 255, srcComponent=1)
     station = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
     beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(station)
     noise = {
         "flood": mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1).pack(encoder),
         "forged": mavlink.MAVLink_attitude_quaternion_message(1, 0.0, 1.0, *[0.0] * 5).pack(encoder),
-        "rubbish": bytes(range(256)),
+        "invalid": bytes(range(256)),
     }.get(condition)
     partner: Any = None
     beat_s, due_s = 0.0, time.monotonic()
@@ -156,7 +156,7 @@ def ground(parent: Connection, port: int, condition: str) -> None:
 
 
 def _said(tick: int, t_s: float) -> tuple[Inputs, Outputs]:
-    """What a busy flight has to tell: an event and a phase every quarter of a second, each with the values."""
+    """Return a tick of a busy flight: an event and a phase every quarter of a second, each with the values."""
     events: tuple[Event, ...] = ()
     if tick % VALUES_EVERY == 0:
         text = "tether: 0.12 m of slack where the machine could stop, want 0.30 m"
@@ -222,7 +222,7 @@ def _cpu_s(pid: int) -> float:
 
 
 async def flight(port: int, mocap: socket.socket, address: str | None, seconds: float, into: Samples) -> None:
-    """The flight's side of one run."""
+    """Run the flight's side once."""
     device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
     loop = asyncio.get_running_loop()
     async with MavsdkAutopilot(device, time.monotonic, forwarding=address is not None) as autopilot:
@@ -254,14 +254,14 @@ async def flight(port: int, mocap: socket.socket, address: str | None, seconds: 
 
 
 def run(condition: str, seconds: float, into: Samples) -> None:
-    """One condition once."""
+    """Measure one condition once."""
     spawn = multiprocessing.get_context("spawn")
     port, ground_port = free_udp_port(), free_udp_port()
     mocap = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     mocap.bind(("127.0.0.1", 0))
     mocap.setblocking(False)
     here, there = spawn.Pipe()
-    processes = [(here, spawn.Process(target=room, args=(there, port, mocap.getsockname()[1])))]
+    processes = [(here, spawn.Process(target=px4_and_mocap, args=(there, port, mocap.getsockname()[1])))]
     if condition not in ("off", "absent"):
         ours, theirs = spawn.Pipe()
         processes.append((ours, spawn.Process(target=ground, args=(theirs, ground_port, condition))))
@@ -285,7 +285,7 @@ def run(condition: str, seconds: float, into: Samples) -> None:
 
 
 def figures(rounds: list[list[float]], scale: float) -> dict[str, float] | None:
-    """Median over the rounds of each round's percentile, and the largest of all; None: no samples."""
+    """Return the median over the rounds of each percentile, and the overall maximum; None without samples."""
     ordered = [sorted(samples) for samples in rounds if samples]
     if not ordered:
         return None
@@ -297,7 +297,7 @@ def figures(rounds: list[list[float]], scale: float) -> dict[str, float] | None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit 0: measured; 1: it could not be, said in one line."""
+    """Return 0 if measured, 1 if not, with the reason in one line."""
     parser = argparse.ArgumentParser(description="What a MAVLink ground station costs the flight.")
     parser.add_argument(
         "--seconds", type=float, default=4.0, help="of each condition in each round (default %(default)s)"

@@ -1,4 +1,4 @@
-"""Kill and hang the flight process at the catch, over real wires, and read from the world's clock how the guardian lands the vehicle.
+"""Kills and hangs the flight process at the catch, over real wires, and measures how the guardian lands the vehicle.
 
     python -m benchmarks.guardian --repeat 5            # all four kinds, 20 flights, some 12 minutes
     python -m benchmarks.guardian --kind hold_gil --json table.json
@@ -31,13 +31,13 @@ LOG_END_S = 0.3
 
 
 REPORTED = ("last_setpoint_s", "vision_gap_s", "vision_back_s", "land_s", "disarmed_s", "drift_m", "worst_tilt_deg")
-"""Figures of the world's report; times in s since the fault, on the world's clock. None: it never happened."""
+"""Figures of the world's report; times in s since the fault, on the world's clock, or None if it never happened."""
 
 Row = dict[str, Any]
 
 
 def fly(kind: str, seed: int, after_catch_s: float, folder: Path) -> Row:
-    """One flight with one fault."""
+    """Fly once with one fault."""
     fault = json.dumps([{"kind": kind, "after": "catch", "t_s": after_catch_s}])
     config = load_sitl(MISSION, overrides=[f"world.faults={fault}", f"world.seed={seed}"])
     folder.mkdir(parents=True)

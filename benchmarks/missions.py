@@ -1,4 +1,4 @@
-"""Random missions: the mission check accepts or refuses them, and what it accepts is flown in the fast closed loop.
+"""Checks random missions, and flies the accepted ones in the fast closed loop.
 
     python -m benchmarks.missions --count 2000 --jobs 2 --json missions.json
 
@@ -60,7 +60,7 @@ class Row:
 
     @property
     def failures(self) -> list[str]:
-        """Which claims it breaks."""
+        """Claims that the mission violates."""
         if self.refused:
             return [f"says not how to change it: {line}" for line in self.refused if "; " not in line or "\n" in line]
         found = []
@@ -74,7 +74,7 @@ class Row:
 
 
 def drawn(number: int, phases_max: int = 4) -> SitlConfig:
-    """Mission `number`: machine, room, tether, wind and phases, some of them beyond what can be flown."""
+    """Return mission `number` with random vehicle, room, tether, wind and phases, some of them infeasible."""
     rng = random.Random(number)
     data: Data = json.loads(load_sitl(BASE).model_dump_json())
     vehicle, mission, world = data["vehicle"], data["mission"], data["world"]
@@ -131,7 +131,7 @@ def drawn(number: int, phases_max: int = 4) -> SitlConfig:
 
 
 def _point(rng: random.Random, vehicle: Data) -> list[float]:
-    """Anywhere in the middle, or near to where the tether or a wall ends what is allowed, on either side of it."""
+    """Return a point in the middle of the room, or close to the limit of the tether or of a wall, on either side of it."""
     (half_x, half_y, top), tether = (vehicle["room"][key][1] for key in ("x_m", "y_m", "z_m")), vehicle["tether"]
     point = [rng.uniform(-0.6, 0.6) * half_x, rng.uniform(-0.6, 0.6) * half_y, rng.uniform(0.75, 0.55 + 0.4 * top)]
     kind = rng.choice(["middle", "tether", "wall", "wall"])
@@ -161,7 +161,7 @@ def _wind(rng: random.Random) -> list[float]:
 
 
 def fly(number: int, phases_max: int = 4) -> Row:
-    """Check mission `number`, and fly it if it was accepted."""
+    """Check mission `number` and fly it if it is accepted."""
     config = drawn(number, phases_max)
     row = Row(number=number, refused=check_mission(config.mission, config.vehicle))
     if row.refused:
@@ -179,7 +179,7 @@ def fly(number: int, phases_max: int = 4) -> Row:
 
 
 def margins_m(config: SitlConfig, result: FastResult) -> tuple[float, float]:
-    """Least slack beyond the margin, and least distance of what moves from walls and ceiling, by the world's truth, in the air."""
+    """Return the true minimum in flight of the slack beyond the margin, and of the distance to walls and ceiling."""
     vehicle, room = config.vehicle, config.vehicle.room
     manipulator = Manipulator(vehicle.arm, vehicle.tool)
     reach_m, net_reach_m = vehicle.airframe.radius_m, vehicle.tool.net_radius_m
@@ -198,13 +198,13 @@ def margins_m(config: SitlConfig, result: FastResult) -> tuple[float, float]:
 
 
 def _what(line: str) -> str:
-    """The kind of a refusal: what is left without names and numbers."""
+    """Return the kind of a refusal: its text without names and numbers."""
     text = line.partition("phase '")[2].partition("' ")[2] or line.partition("': ")[2]
     return text.partition(" at t = ")[0][:60]
 
 
 def summary(rows: list[Row]) -> Data:
-    """Counts, and the nearest misses."""
+    """Return counts and minimum margins."""
     flown = [row for row in rows if not row.refused]
     return {
         "missions": len(rows),

@@ -1,4 +1,4 @@
-"""The same flights on the stub and on a real PX4 (SITL), side by side: what differs, in figures.
+"""Flies the same flights on the stub and on a real PX4 (SITL) and tabulates the differences.
 
     PX4_SITL=.../build/px4_sitl_default python -m benchmarks.px4 --keep flights/px4           # 36 flights, half an hour
     python -m benchmarks.px4 --keep flights/px4 --table                                       # only what lies there
@@ -30,12 +30,12 @@ MISSION = ROOT / "configs/missions/catch.yaml"
 AUTOPILOTS = ("stub", "px4")
 TIMEOUT_S = 300.0
 LIKE_THE_STUB = 0.25
-"""By so much the position error after the catch may differ."""
+"""Largest relative difference of the position error after the catch."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is flown."""
+    """A flight with its expected outcome."""
 
     name: str
     overrides: tuple[str, ...]
@@ -56,7 +56,7 @@ CASES = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One flight; None: not known, or it never happened. Times `*_s` of faults are since the fault."""
+    """One flight. Times `*_s` of faults count from the fault; None means unknown, or that it never happened."""
 
     case: str
     autopilot: str
@@ -65,9 +65,9 @@ class Row:
     outcome: str
     as_it_must: bool
     e_p_before_m: float | None
-    """Root mean square before the catch."""
+    """RMS position error before the catch."""
     e_p_m: float | None
-    """Root mean square after the catch."""
+    """RMS position error after the catch."""
     e_q_deg: float | None
     e_alpha_deg: float | None
     latency_p50_ms: float | None
@@ -77,17 +77,17 @@ class Row:
     last_setpoint_s: float | None = None
     vision_gap_s: float | None = None
     mode: str | None = None
-    """The first one after OFFBOARD."""
+    """First mode after OFFBOARD."""
     mode_s: float | None = None
     failsafe_s: float | None = None
     disarmed_s: float | None = None
     drift_m: float | None = None
-    """From where the fault met it to where it stands, horizontally."""
+    """Horizontal distance from the position at the fault to the final position."""
     worst_tilt_deg: float | None = None
 
 
 def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
-    """One flight, unless it lies there already."""
+    """Fly once, unless the folder holds the flight already."""
     if (folder / "summary.json").exists():
         return
     command = [
@@ -107,7 +107,7 @@ def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
 
 
 def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
-    """What a flight's folder tells; None: it was not flown."""
+    """Read a flight's folder; return None if it was not flown."""
     if not (folder / "summary.json").exists():
         return None
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
@@ -135,14 +135,14 @@ def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
 
 
 def _course_of(course: list[Any]) -> dict[str, Any]:
-    """The world's own word (`sitl.faults.Sample`)."""
+    """Return drift and tilt from the world's true course (`sitl.faults.injector.Sample`)."""
     (_, begin_m, *_), (_, end_m, *_) = course[0], course[-1]
     tilts_rad = [tilt_rad for _, _, tilt_rad, *_ in course]
     return {"drift_m": math.dist(begin_m[:2], end_m[:2]), "worst_tilt_deg": math.degrees(max(tilts_rad))}
 
 
 def _modes_of(folder: Path) -> str:
-    """The modes that the companion heard of while armed."""
+    """Return the modes that the companion received while armed."""
     try:
         statuses = [inputs.status for inputs in FlightLog.read(folder / "flight.mcap").inputs]
     except LogError:
@@ -165,7 +165,7 @@ def _after_fault_of_the_stub(witness: dict[str, Any]) -> dict[str, Any]:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Two tables for docs/px4.md: flights without and with a fault; spreads over the runs."""
+    """Return two tables for docs/px4.md, flights without and with a fault, with the spread over the runs."""
     versions = sorted({row.version or "?" for row in rows if row.autopilot == "px4"})
     lines = [
         f"PX4 {' and '.join(versions)}; each cell: smallest to largest of the runs.",
@@ -238,7 +238,7 @@ def _spread(values: Sequence[float | None], scale: float, digits: int) -> str:
 
 
 def verdicts(rows: Sequence[Row]) -> list[str]:
-    """What is not as it must be, one line each."""
+    """Return one line for each flight or figure that is not as expected."""
     found = [f"{row.case} on the {row.autopilot}, run {row.run}: {row.outcome}" for row in rows if not row.as_it_must]
     for case in CASES:
         errors = {

@@ -1,4 +1,4 @@
-"""What a real PX4's own log (ULog) says of a flight: modes, arming, what reached it and when, on PX4's clock.
+"""Reads a flight from a real PX4's own log (ULog): modes, arming, and when messages reached PX4.
 
 PX4's clock begins with `sitl.px4.hil_link.CLOCK_ORIGIN_S` at its first sample: times here are world times. Needs `pyulog`.
 """
@@ -40,7 +40,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """From now on PX4 is in this mode, armed or not."""
+    """A change of PX4's mode or arming state."""
 
     t_s: float
     mode: str
@@ -50,17 +50,17 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class AfterFault:
-    """What PX4 saw of a fault: seconds since it was planted, None for what never happened."""
+    """PX4's reaction to a fault; times in s since the fault, None for what never happened."""
 
     last_setpoint_s: float | None
-    """Of those of before: the last SET_ATTITUDE_TARGET before the longest pause, or before another mode flew."""
+    """Last SET_ATTITUDE_TARGET before the longest pause, or before the mode changed."""
     vision_gap_s: float | None
-    """The longest pause between two vision poses that begins within two seconds."""
+    """Longest pause between two vision poses that begins within two seconds of the fault."""
     mode: str | None
-    """The first mode that is not OFFBOARD."""
+    """First mode other than OFFBOARD."""
     mode_s: float | None
     failsafe_s: float | None
-    """PX4's own failsafe, not somebody's command."""
+    """Time of PX4's own failsafe."""
     disarmed_s: float | None
 
 
@@ -71,7 +71,7 @@ class Px4Log:
     changes: tuple[Change, ...]
     vision_s: Array
     setpoint_s: Array
-    """SET_ATTITUDE_TARGET while in OFFBOARD; in PX4's own modes its position controller."""
+    """Times of attitude setpoints: SET_ATTITUDE_TARGET in OFFBOARD, the position controller's in PX4's own modes."""
     estimate_s: Array
     position_ned_m: Array
     """vehicle_local_position, N x 3, at `estimate_s`."""
@@ -115,7 +115,7 @@ class Px4Log:
         )
 
     def after(self, fault_s: float) -> AfterFault:
-        """What came of a fault at this world time."""
+        """Return PX4's reaction to a fault at this world time."""
         later = [change for change in self.changes if change.t_s > fault_s]
         left = next((change for change in later if change.mode != "OFFBOARD"), None)
         until_s = left.t_s if left is not None else math.inf
@@ -131,13 +131,13 @@ class Px4Log:
         )
 
     def modes(self) -> str:
-        """The modes that flew, in order: `OFFBOARD, LAND`."""
+        """Return the modes in order, such as `OFFBOARD, LAND`."""
         flown = [change.mode for change in self.changes if change.armed]
         return ", ".join(mode for i, mode in enumerate(flown) if i == 0 or mode != flown[i - 1])
 
 
 def newest(flight: Path) -> Path:
-    """The log of the flight itself in the folder of a flight: PX4 writes one at every start.
+    """Return the newest PX4 log in a flight's folder; PX4 writes one at every start, and the last is the flight's.
 
     Raises:
         Px4Error: there is none.
@@ -151,7 +151,7 @@ def newest(flight: Path) -> Path:
 
 
 def _times(topic: dict[str, Any] | None, origin_s: float) -> Array:
-    """World times of a topic; `origin_s` is PX4's clock at world time 0."""
+    """Return the world times of a topic; `origin_s` is PX4's clock at world time 0."""
     if topic is None:
         return np.zeros(0)
     return np.asarray(topic["timestamp"], float) * 1e-6 - origin_s
@@ -168,7 +168,7 @@ def _changes(status: dict[str, Any], origin_s: float) -> Iterable[Change]:
 
 
 def _last_before_pause(times_s: Array, fault_s: float, until_s: float) -> float | None:
-    """The last one before the longest pause that begins within the window, relative to the fault."""
+    """Return the last time before the longest pause that begins within the window, relative to the fault."""
     inside = times_s[(times_s > fault_s - 0.1) & (times_s < min(until_s, fault_s + _EVENT_WINDOW_S))]
     if not len(inside):
         return None

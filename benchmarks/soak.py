@@ -1,4 +1,4 @@
-"""An hour in the air over real wires: does anything grow, is anything missed?
+"""Flies for an hour over real wires, and checks that memory and lateness do not grow and that nothing is missed.
 
     python -m benchmarks.soak                             # 60 minutes: configs/missions/soak.yaml, 150 catches
     python -m benchmarks.soak --minutes 3 --json FILE --plot FILE.png
@@ -44,16 +44,16 @@ from companion.mission.plan import Plan
 MISSION = Path(__file__).parents[1] / "configs/missions/soak.yaml"
 SAMPLE_S = 1.0
 PSS_EVERY = 10
-"""Samples; the kernel walks all pages of a process for it, and the process may have to wait meanwhile."""
+"""Samples between two readings of PSS, for which the kernel walks all pages and may delay the process."""
 BATTERY_MARGIN = 5.0
-"""The battery lives so many times as long as the flight: what is asked here is not when it is empty."""
+"""Battery life as a multiple of the flight, so that the battery does not end it."""
 START_S, END_S = 60.0, 900.0
-"""How long the flight may take beside its mission: to start, and to grade a long log."""
+"""Time for starting the flight, and for grading its long log."""
 _HEARD = re.compile(r"heard (\d+) (?:heart)?beats, (\d+) missed, silent for (\d+) ms")
 
 
 def repetitions(minutes: float) -> tuple[int, float]:
-    """How often the mission's phases fit into the time, 2 at least, and how long that flight is planned to take, s."""
+    """Return how many repetitions of the mission fit into the time (2 at least), and their planned duration, s."""
     once, twice = (_planned_s(count) for count in (1, 2))
     count = max(2, min(1000, 1 + int((60.0 * minutes - once) / (twice - once))))
     return count, _planned_s(count)
@@ -67,7 +67,7 @@ def _planned_s(count: int) -> float:
 def fly(
     minutes: float, nice: int | None, lift_by: int, overrides: Sequence[str], folder: Path, console: Console
 ) -> int:
-    """Fly, and leave samples and logs in the folder; the flight's exit code."""
+    """Fly, write samples and logs to the folder, and return the flight's exit code."""
     count, planned_s = repetitions(minutes)
     folder.mkdir(parents=True)
     settings = [
@@ -104,7 +104,7 @@ def _watch(
     samples: Any,
     console: Console,
 ) -> None:
-    """A line of memory and CPU time a second, until the flight process has ended and its log is graded."""
+    """Write memory and CPU time once a second until the flight has ended and its log is graded."""
     begun_s = next_s = time.monotonic()
     number = 0
     pids: dict[str, int] = {}
@@ -146,7 +146,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def judge(folder: Path, console: Console) -> dict[str, Any]:
-    """Everything that the flight in the folder shows."""
+    """Return every figure of the flight in the folder."""
     flown = folder / "flight"
     samples = [Sample(**json.loads(line)) for line in (folder / "samples.jsonl").read_text().splitlines()]
     summary = json.loads((flown / "summary.json").read_text())
@@ -186,7 +186,7 @@ def judge(folder: Path, console: Console) -> dict[str, Any]:
 
 
 def problems_of(result: dict[str, Any], growth: Sequence[Growth], ticks: Ticks, empty: Sequence[Minute]) -> list[str]:
-    """What is not as it must be."""
+    """Return the limits that were not met."""
     found = [] if result["outcome"] == "completed" else [f"outcome {result['outcome']}"]
     for name in ("throws", "catches", "catches_noticed"):
         if result[name] != result["repetitions"]:
@@ -205,7 +205,7 @@ def problems_of(result: dict[str, Any], growth: Sequence[Growth], ticks: Ticks, 
 
 
 def show(result: dict[str, Any], folder: Path, plot: Path | None, console: Console) -> None:
-    """Tables, counts, and the plot."""
+    """Print tables and counts, and draw the plot."""
     flight = [Minute(**row) for row in result["lateness"]]
     empty = read_minutes(result["empty_loop"]["minutes"])
     print_tables(console, [Growth(**row) for row in result["growth"]], flight, empty)

@@ -1,4 +1,4 @@
-"""Tunes the gains of one law on the fast closed loop; every law by the same cost, the same flights and the same budget.
+"""Tunes the gains of one law in the fast closed loop; every law has the same cost, flights and budget.
 
     python -m benchmarks.tune csc --budget 150 --out mine.yaml
 
@@ -45,25 +45,25 @@ from sitl.fast.loop import FastFlight
 Array = npt.NDArray[np.float64]
 Gains = dict[str, Any]
 Costs = tuple[float, ...]
-"""Of each flight of a point, in the order flown."""
+"""Costs of the flights of a point, in order."""
 Job = tuple[tuple[float, ...], Costs]
-"""A point, and the costs of the best one so far (empty: none)."""
+"""A point, and the costs of the best one so far, or an empty tuple."""
 Evaluate = Callable[[Iterable[Job]], Iterable[Costs | None]]
 
 MISSION = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
 ARM_WEIGHT_M_NM, ACTIVITY_WEIGHT_M_NM, FAILURE_COST = 0.1, 0.5, 10.0
 TARGET_MD_KG_M2, TARGET_KD_NMS, TARGET_KP_NM = 0.1, 0.7, 1.225
-"""The arm's target impedance of the paper (tab:control_parameters, joint rows)."""
+"""Target impedance of the arm in the paper (tab:control_parameters, joint rows)."""
 DESIRED_FORCE_TIME_S = 0.5
 IMPEDANCE_LOWPASS_HZ = 10.0
 SLOW = {"setpoint_delay_s": 0.05, "rotor_lag_s": 0.05, "arm_delay_s": 0.006}
-"""World of the flights with slow wires."""
+"""World of the flights with slow communication."""
 RANDOM_POINTS, BATCH, FIRST_STEP, RACE_MARGIN = 20, 4, 0.15, 1.1
 
 
 @dataclass(frozen=True, slots=True)
-class Knob:
-    """One number that is searched, on a logarithmic scale."""
+class Parameter:
+    """One parameter of the search, on a logarithmic scale."""
 
     name: str
     low: float
@@ -72,35 +72,35 @@ class Knob:
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """What is searched in a law, and the gains that a point stands for."""
+    """The search space of a law, and the gains of a point."""
 
-    knobs: tuple[Knob, ...]
+    parameters: tuple[Parameter, ...]
     start: tuple[float, ...]
     gains: Callable[[Gains, Sequence[float]], Gains]
-    """From the law's default preset and a point to the whole configuration."""
+    """Returns the configuration, given the law's default preset and a point."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grade:
-    """One flight after the catch."""
+    """Figures of one flight after the catch."""
 
     e_p_m: float
     arm_nm: float
     rigid_nm: float
-    """What arm_nm would be if the arm had not moved off its reference."""
+    """Value of arm_nm for an arm that does not move off its reference."""
     activity_nm: float
     completed: bool
 
     @property
     def cost(self) -> float:
-        """See the module's text."""
+        """Cost as defined in the module's docstring."""
         if not self.completed:
             return FAILURE_COST
         return self.e_p_m + ARM_WEIGHT_M_NM * self.arm_nm + ACTIVITY_WEIGHT_M_NM * self.activity_nm
 
 
 def adaptive_gains(base: Gains, point: Sequence[float]) -> Gains:
-    """Target impedance as in the preset; K_p of the base rows follows Phi (gain_cond)."""
+    """Return gains with the preset's target impedance; K_p of the base rows follows Phi (gain_cond)."""
     lambda_xy, lambda_z, phi_xy, phi_z, lambda_arm, rho_max, arm_weight, nu, observer_xy, observer_z, lead, attitude = (
         point
     )
@@ -122,7 +122,7 @@ def adaptive_gains(base: Gains, point: Sequence[float]) -> Gains:
 
 
 def csc_gains(base: Gains, point: Sequence[float]) -> Gains:
-    """Natural frequency and damping ratio of the base rows, the three gains of the arm rows."""
+    """Return gains, given natural frequency and damping ratio of the base rows, and three gains of the arm rows."""
     w_xy, d_xy, w_z, d_z, md, kd, kp, attitude = point
     m = base["inertia_md"]
     k_d, k_p = base["damping_kd"], base["stiffness_kp"]
@@ -135,7 +135,7 @@ def csc_gains(base: Gains, point: Sequence[float]) -> Gains:
 
 
 def psc_gains(base: Gains, point: Sequence[float]) -> Gains:
-    """Natural frequency, damping ratio and integral part of the vehicle, the three gains of the arm, the estimator's time constant."""
+    """Return gains, given frequency, damping and integral of the vehicle, three gains of the arm, and the estimator's time constant."""
     w_xy, d_xy, i_xy, w_z, d_z, i_z, md, kd, kp, time_s, attitude = point
     return base | {
         "position_kp_xyz": [w_xy**2, w_xy**2, w_z**2],
@@ -149,22 +149,22 @@ def psc_gains(base: Gains, point: Sequence[float]) -> Gains:
     }
 
 
-_ARM = (Knob("arm_md", 0.005, 0.3), Knob("arm_kd", 0.1, 3.0), Knob("arm_kp", 0.4, 10.0))
-_ATTITUDE = Knob("attitude_filter_rad_s", 20.0, 120.0)
+_ARM = (Parameter("arm_md", 0.005, 0.3), Parameter("arm_kd", 0.1, 3.0), Parameter("arm_kp", 0.4, 10.0))
+_ATTITUDE = Parameter("attitude_filter_rad_s", 20.0, 120.0)
 TUNABLES: dict[str, Tunable] = {
     "adaptive": Tunable(
         (
-            Knob("lambda_xy", 2.0, 30.0),
-            Knob("lambda_z", 4.0, 60.0),
-            Knob("phi_xy", 0.7, 6.0),
-            Knob("phi_z", 0.7, 8.0),
-            Knob("lambda_arm", 0.2, 3.0),
-            Knob("rho_max", 0.5, 20.0),
-            Knob("arm_weight", 0.01, 1.0),
-            Knob("nu", 1.0, 50.0),
-            Knob("observer_xy_s", 0.2, 5.0),
-            Knob("observer_z_s", 0.2, 5.0),
-            Knob("lead_s", 0.01, 0.4),
+            Parameter("lambda_xy", 2.0, 30.0),
+            Parameter("lambda_z", 4.0, 60.0),
+            Parameter("phi_xy", 0.7, 6.0),
+            Parameter("phi_z", 0.7, 8.0),
+            Parameter("lambda_arm", 0.2, 3.0),
+            Parameter("rho_max", 0.5, 20.0),
+            Parameter("arm_weight", 0.01, 1.0),
+            Parameter("nu", 1.0, 50.0),
+            Parameter("observer_xy_s", 0.2, 5.0),
+            Parameter("observer_z_s", 0.2, 5.0),
+            Parameter("lead_s", 0.01, 0.4),
             _ATTITUDE,
         ),
         (8.0, 20.0, 2.0, 3.0, 1.0, 6.0, 0.1, 10.0, 1.0, 1.0, 0.1, 30.0),
@@ -172,10 +172,10 @@ TUNABLES: dict[str, Tunable] = {
     ),
     "csc": Tunable(
         (
-            Knob("w_xy", 1.0, 6.0),
-            Knob("d_xy", 0.4, 2.0),
-            Knob("w_z", 1.5, 15.0),
-            Knob("d_z", 0.4, 2.0),
+            Parameter("w_xy", 1.0, 6.0),
+            Parameter("d_xy", 0.4, 2.0),
+            Parameter("w_z", 1.5, 15.0),
+            Parameter("d_z", 0.4, 2.0),
             *_ARM,
             _ATTITUDE,
         ),
@@ -184,10 +184,10 @@ TUNABLES: dict[str, Tunable] = {
     ),
     "psc": Tunable(
         (
-            *(Knob("w_xy", 1.0, 6.0), Knob("d_xy", 0.4, 2.0), Knob("i_xy", 0.05, 10.0)),
-            *(Knob("w_z", 1.5, 15.0), Knob("d_z", 0.4, 2.0), Knob("i_z", 0.05, 30.0)),
+            *(Parameter("w_xy", 1.0, 6.0), Parameter("d_xy", 0.4, 2.0), Parameter("i_xy", 0.05, 10.0)),
+            *(Parameter("w_z", 1.5, 15.0), Parameter("d_z", 0.4, 2.0), Parameter("i_z", 0.05, 30.0)),
             *_ARM,
-            Knob("payload_time_s", 0.03, 1.0),
+            Parameter("payload_time_s", 0.03, 1.0),
             _ATTITUDE,
         ),
         (2.6, 0.85, 1.0, 4.5, 0.9, 3.0, 0.03, 0.7, 1.225, 0.15, 30.0),
@@ -199,7 +199,7 @@ TUNABLES: dict[str, Tunable] = {
 def arm_impedance_error_nm(
     config: SitlConfig, inputs: Sequence[Inputs], outputs: Sequence[Outputs]
 ) -> tuple[Array, Array]:
-    """dI of the joint rows against the fixed target, and e_tau, both low-passed, N m, (ticks, 2).
+    """Return dI of the joint rows against the fixed target, and e_tau, both low-passed, N m, shape (ticks, 2).
 
     Every tick must have a control log and both states.
     """
@@ -226,7 +226,7 @@ def arm_impedance_error_nm(
 
 
 def fly(config: SitlConfig) -> Grade:
-    """One flight in the fast loop, graded from the catch to the landing."""
+    """Fly once in the fast loop and grade the flight from the catch to the landing."""
     result = FastFlight(config).run()
     completed = result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
     rows = [
@@ -256,12 +256,12 @@ def fly(config: SitlConfig) -> Grade:
 
 
 def rms(rows: Array) -> float:
-    """Root of the mean squared row norm."""
+    """Return the root of the mean squared row norm."""
     return float(np.sqrt(np.mean(np.sum(rows * rows, axis=1))))
 
 
 def configuration(law: str, gains: Gains, payload_kg: float, seed: int) -> SitlConfig:
-    """The mission with these gains, checked as a file would be."""
+    """Return the mission with these gains, validated like a file."""
     flight = load_sitl(MISSION, controller_law=law)
     wires = SLOW if seed % 2 == 0 else {}
     world = flight.world.model_copy(update={"payload_kg": payload_kg, "seed": seed, **wires})
@@ -270,7 +270,7 @@ def configuration(law: str, gains: Gains, payload_kg: float, seed: int) -> SitlC
 
 
 def evaluate(law: str, base: Gains, payloads_kg: Sequence[float], seeds: Sequence[int], job: Job) -> Costs | None:
-    """Cost of each flight of a point; None: it was given up against the best's costs."""
+    """Return the cost of each flight of a point, or None if the point was abandoned against the best one."""
     point, best = job
     gains = rounded(TUNABLES[law].gains(base, point))
     costs: list[float] = []
@@ -287,7 +287,7 @@ def evaluate(law: str, base: Gains, payloads_kg: Sequence[float], seeds: Sequenc
 
 
 def rounded(gains: Gains) -> Gains:
-    """Six significant digits: what is written is what was flown."""
+    """Round to six significant digits, so that the written gains are those that were flown."""
 
     def one(value: Any) -> Any:
         if isinstance(value, list | tuple):
@@ -300,10 +300,10 @@ def rounded(gains: Gains) -> Gains:
 def search(
     tunable: Tunable, budget: int, seed: int, run: Evaluate, tell: Callable[[int, float, Sequence[float]], None]
 ) -> tuple[tuple[float, ...], float]:
-    """Best point and its cost after `budget` points, the first of them the start point."""
+    """Return the best point and its cost after `budget` points, the first of which is the start point."""
     rng = np.random.default_rng(seed)
-    low = np.log([knob.low for knob in tunable.knobs])
-    high = np.log([knob.high for knob in tunable.knobs])
+    low = np.log([parameter.low for parameter in tunable.parameters])
+    high = np.log([parameter.high for parameter in tunable.parameters])
     best = tunable.start
     [costs] = run([(best, ())])
     assert costs is not None
@@ -330,7 +330,7 @@ def search(
 
 
 def controller_yaml(law: str, gains: Gains, preset: str, command: str, cost: float, words: str) -> str:
-    """A controller file."""
+    """Return a controller file as text."""
     lines = [
         "# yaml-language-server: $schema=../schema/controller.schema.json",
         "#",
@@ -357,7 +357,7 @@ WORDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit 0: tuned; 2: bad input."""
+    """Return 0, or 2 on bad input."""
     parser = argparse.ArgumentParser(description="Tune one law on the fast closed loop.")
     parser.add_argument("law", choices=list(TUNABLES))
     parser.add_argument("--budget", type=int, default=150, help="points to try (%(default)s)")
@@ -384,7 +384,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run: Evaluate = partial(pool.map, partial(evaluate, a.law, base, payloads_kg, seeds))
 
         def tell(done: int, cost: float, point: Sequence[float]) -> None:
-            named = ", ".join(f"{knob.name} {value:.3g}" for knob, value in zip(tunable.knobs, point, strict=True))
+            named = ", ".join(
+                f"{parameter.name} {value:.3g}" for parameter, value in zip(tunable.parameters, point, strict=True)
+            )
             print(f"{done:4d}/{a.budget}  cost {cost:.5f}  {named}", file=sys.stderr, flush=True)
             if a.out is not None:
                 a.out.write_text(found(done, cost, point), encoding="utf-8")
@@ -401,7 +403,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def show(law: str, payloads_kg: Sequence[float], seeds: Sequence[int], pool: ProcessPoolExecutor) -> None:
-    """A line per preset and payload: means over the seeds."""
+    """Print a line per preset and payload with means over the seeds."""
     print("law/preset payload_kg  e_p_m  arm_nm  rigid_nm  activity_nm  cost  failed")
     for preset in PRESETS[law]:
         gains = load_sitl(MISSION, controller_law=law, preset=preset).controller.model_dump(mode="json")

@@ -1,8 +1,8 @@
-"""What is done to a broker beside a flight, each in a process of its own: viewers, one person who looks, noise, rubbish.
+"""Loads on a broker beside a flight, each in a separate process: viewers, one browser, noise, retained garbage.
 
-python -m benchmarks.brokering.load viewers|person|noise|rubbish URL VEHICLE
+python -m benchmarks.brokering.load viewers|person|noise|garbage URL VEHICLE
 
-The load is niced: viewers and attackers sit on other computers, and here it is the flight that is measured.
+The load is niced, because viewers and attackers would run on other computers.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from tests.browser import ARGUMENTS
 VIEWERS = 20
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 NOISE_PER_S = 1000
-RUBBISH = 2000
+GARBAGE = 2000
 _NICE = 10
 _URL = re.compile(rb"http://[^\s]+")
 
 
 async def viewers(url: str, vehicle: str) -> None:
-    """`companion monitor` with 20 pages open."""
+    """Run `companion monitor` with 20 open pages."""
     del vehicle
     async with _monitor(url) as address, aiohttp.ClientSession() as session, asyncio.TaskGroup() as group:
         for _ in range(VIEWERS):
@@ -43,7 +43,7 @@ async def viewers(url: str, vehicle: str) -> None:
 
 
 async def person(url: str, vehicle: str) -> None:
-    """`companion monitor` with its page open in a browser; where there is none, one WebSocket. Prints what looks, and what it saw."""
+    """Run `companion monitor` with its page in a browser, else with one WebSocket; print which, and what it showed."""
     del vehicle
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     async with _monitor(url) as address:
@@ -71,7 +71,7 @@ async def person(url: str, vehicle: str) -> None:
 
 @contextlib.asynccontextmanager
 async def _monitor(url: str) -> AsyncIterator[str]:
-    """`companion monitor` on a free port; the address of its page, token and all."""
+    """Run `companion monitor` on a free port and yield the address of its page with the token."""
     command = [sys.executable, "-m", "companion", "monitor", "--broker", url, "--port", "0"]
     process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE, env=_unbuffered())
     assert process.stdout is not None
@@ -98,7 +98,7 @@ async def _view(session: aiohttp.ClientSession, address: str) -> None:
 
 
 async def noise(url: str, vehicle: str) -> None:
-    """1,000 messages a second on the command topic: random bytes, and commands whose signature is wrong."""
+    """Send 1,000 messages a second to the command topic: random bytes, and commands with a wrong signature."""
     topic = Topic.COMMAND.of(vehicle)
     wrong = {
         "v": 1,
@@ -126,12 +126,12 @@ async def noise(url: str, vehicle: str) -> None:
             print(f"  {sent / (loop.time() - begun_s):.0f} commands a second", flush=True)
 
 
-async def rubbish(url: str, vehicle: str) -> None:
-    """Retained messages of others, and rubbish retained on the vehicle's own topics; then stay."""
+async def garbage(url: str, vehicle: str) -> None:
+    """Retain messages on other topics and garbage on the vehicle's own topics, then stay connected."""
     async with _client(url) as client:
         for topic in Topic:
             await client.publish(topic.of(vehicle), secrets.token_bytes(1000), qos=1, retain=True)
-        for number in range(RUBBISH):
+        for number in range(GARBAGE):
             await client.publish(f"companion/{number}/state", secrets.token_bytes(1000), qos=0, retain=True)
         await asyncio.Event().wait()
 
@@ -154,7 +154,7 @@ async def _until_ended(load: Callable[[str, str], Awaitable[None]], url: str, ve
         await task
 
 
-LOADS = {"viewers": viewers, "person": person, "noise": noise, "rubbish": rubbish}
+LOADS = {"viewers": viewers, "person": person, "noise": noise, "garbage": garbage}
 
 if __name__ == "__main__":
     os.nice(_NICE)

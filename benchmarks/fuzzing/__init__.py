@@ -1,1 +1,1 @@
-"""What `benchmarks/fuzz.py` and `tests/fuzz` throw at the edges: how bytes are damaged, and one module per wire."""
+"""Damaged input for `benchmarks.fuzz` and `tests/fuzz`: how bytes are damaged, and one module per wire."""

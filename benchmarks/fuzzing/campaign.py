@@ -1,4 +1,4 @@
-"""Runs inputs through a target and watches: exceptions, endless calls, memory, open files."""
+"""Feeds inputs to a target and detects exceptions, endless calls, and growth of memory or open files."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from types import FrameType
 from typing import ClassVar, Self
 
 CPU_LIMIT_S = 5.0
-"""Of one input, CPU time of this process: a loaded machine does not make a call endless."""
+"""Limit of one input in CPU time, so that a loaded computer does not count as an endless call."""
 FINDINGS_MAX = 5
-"""Of one process; then it stops."""
+"""Number of findings after which a process stops."""
 MEMORY_SHARE, MEMORY_BYTES = 0.05, 5 * 2**20
-"""The resident set may grow by the larger of the two from 10 % of the inputs, or of the time, to the end."""
+"""Largest growth of the resident set, as share or in bytes, from 10 % of the inputs or of the time to the end."""
 _WARM_UP_SHARE = 0.1
 _TELL_EVERY = 64
 
 
 class Wrong(AssertionError):
-    """A call returned, but not what it promises."""
+    """A call returned a wrong result."""
 
 
 class Endless(BaseException):
-    """A call does not return. Not an Exception: the code under test may catch those."""
+    """A call does not return. It is no Exception, because the code under test may catch those."""
 
 
 class Target(ABC):
-    """One wire of the companion. An input is bytes that hold everything: fed alone it does the same as among a million others."""
+    """One wire of the companion. An input is self-contained: fed alone it has the same effect as among a million others."""
 
     name: ClassVar[str]
     share: ClassVar[float] = 1.0
-    """Of the inputs asked for; less than 1 where every input passes a real device driver."""
+    """Share of the requested inputs; less than 1 where every input passes a real device driver."""
 
     @abstractmethod
     def make(self, rng: Random) -> bytes:
-        """The next input."""
+        """Return the next input."""
 
     @abstractmethod
     def feed(self, data: bytes) -> None:
-        """Let the companion read it, then something valid. Whatever is raised is a finding."""
+        """Let the companion read the input, then valid data. Every exception is a finding."""
 
     @abstractmethod
     def __enter__(self) -> Self: ...
@@ -59,12 +59,12 @@ class Target(ABC):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An input that the companion did not bear."""
+    """An input that made the companion fail."""
 
     target: str
     seed: int
     index: int | None
-    """None: not one input, the run as a whole."""
+    """Index of the input; None if the finding concerns the whole run."""
     text: str
     data: bytes = b""
 
@@ -75,12 +75,12 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """What one process saw of a range of inputs."""
+    """Result of one process for a range of inputs."""
 
     inputs: int
     duration_s: float
     slowest_s: float
-    """CPU and waiting of the slowest input, wall clock."""
+    """Wall time of the slowest input."""
     slowest_index: int
     memory_bytes: tuple[int, int]
     """Resident set after 10 % of the inputs, or of the time, and at the end."""
@@ -88,7 +88,7 @@ class Stretch:
 
 
 def generator(target: str, seed: int, index: int) -> Random:
-    """The generator of one input."""
+    """Return the random generator of one input."""
     return Random(zlib.crc32(target.encode()) << 96 | (seed & 0xFFFFFFFF) << 64 | index)
 
 
@@ -155,7 +155,7 @@ def run(
 
 
 def feed_watched(target: Target, data: bytes, cpu_limit_s: float = CPU_LIMIT_S) -> str | None:
-    """Feed one input; what was wrong, None if nothing was."""
+    """Feed one input; return the finding, or None."""
     try:
         with _cpu_limit(cpu_limit_s):
             target.feed(data)
@@ -195,7 +195,7 @@ def _open_files() -> int:
 
 
 def one_line(text: str, what: str) -> None:
-    """Check a text that people are shown.
+    """Check a text that is shown to the user.
 
     Raises:
         Wrong: it is empty, more than one line, or holds what a terminal would obey.

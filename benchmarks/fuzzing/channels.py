@@ -1,4 +1,4 @@
-"""Channels between the companion's own processes: the guardian's heartbeat, and what the recorder tells the flight process."""
+"""Channels between the companion's processes: the guardian's heartbeat, and messages from recorder to flight process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BEAT = Heartbeat(
 
 
 class ChannelsTarget(Target):
-    """First byte of an input: 0 for a beat, 1 for a word of the recorder; the rest is the datagram."""
+    """The first byte of an input is 0 for a heartbeat or 1 for a recorder message; the rest is the datagram."""
 
     name: ClassVar[str] = "channels"
 
@@ -75,7 +75,7 @@ class ChannelsTarget(Target):
                 raise Wrong("a valid command behind it is not heard")
 
     def _hear(self, data: bytes) -> None:
-        """The recorder says something; the flight hears it in its next tick."""
+        """Send a recorder message; the flight reads it in its next tick."""
         self._theirs.send(data)
         self._client.record(*_TICK)
         self._theirs.recv(2**20)

@@ -21,7 +21,7 @@ _MISSION = _ROOT / "configs/missions/catch.yaml"
 _VEHICLE = _ROOT / "configs/vehicles/tarot650_2r.yaml"
 _CONTROLLERS = sorted((_ROOT / "configs/controllers").glob("*.yaml"))
 _MEMORY = Path("/dev/shm")
-"""A file per input: a million of them are too slow for a disk."""
+"""Folder for one file per input, in memory because a disk is too slow for a million of them."""
 _READ, _VALUE, _OVERRIDE, _AS_VEHICLE, _AS_MISSION, _AS_CONTROLLER = range(6)
 """First byte of an input: how the rest is read."""
 _LINE_MAX = 3000
@@ -34,7 +34,7 @@ _TOKENS = (
 
 
 class YamlTarget(Target):
-    """See `_READ` and its like for the first byte."""
+    """Configuration text; the first byte of an input selects how the rest is read."""
 
     name: ClassVar[str] = "yaml"
 

@@ -1,4 +1,4 @@
-"""Servo bus: the real dynamixel-sdk and the arm edge's own bus code, behind a serial port in memory or a real pty.
+"""Servo bus: the real dynamixel-sdk and the arm driver's bus code, behind a serial port in memory or a real pty.
 
 In memory the port answers what the input says and time is simulated, so that a read that waits for ever is seen at once.
 """
@@ -27,10 +27,10 @@ _WATCHDOG_MS = 100
 _WATCHDOG = _WATCHDOG_MS // dxl.WATCHDOG_UNIT_MS
 _SIZE_MAX_BYTES = 2500
 _READ_LIMIT_S = 1.0
-"""Of simulated time, for one cycle: both servos' answers, or noise that never ends."""
+"""Limit of simulated time for one cycle."""
 _OPEN_LIMIT_S = 30.0
 _LATE_WRITE = "SerialTimeoutException: Write timeout"
-"""pyserial says so too when the process was not scheduled between writing and looking at the time."""
+"""pyserial raises this also if the process was not scheduled between writing and reading the time."""
 _REPLACE, _BEFORE, _BEHIND, _SILENCE = range(4)
 _READ, _OPEN, _BABBLE = range(3)
 """First byte of an input: answers to a flight's read; damage to the answers while the bus is opened; a line that never falls silent."""
@@ -51,14 +51,14 @@ def arm_config() -> Arm:
 
 
 class MemorySerial:
-    """What `ServoPort` uses of a pyserial port. A reader that waits lets time pass; bytes take the time of the wire."""
+    """The part of a pyserial port that `ServoPort` uses. Waiting advances simulated time; bytes take the time of the wire."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
         self.limit_s = math.inf
         self.answer: Callable[[bytes], bytes] = lambda sent: b""
         self.babble = b""
-        """Said again and again once the answers are read."""
+        """Bytes that repeat without end after the answers."""
         self._waiting = bytearray()
 
     def write(self, sent: list[int]) -> int:
@@ -79,10 +79,10 @@ class MemorySerial:
         self._waiting.clear()
 
     def set_low_latency_mode(self, on: bool) -> None:
-        """There is no latency timer, as on a pty."""
+        """Do nothing: as on a pty there is no latency timer."""
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing."""
 
 
 class MemoryPort(dxl.ServoPort):
@@ -133,7 +133,7 @@ class DynamixelTarget(Target):
         return bytes((_READ,)) + self._answers(rng)
 
     def _answers(self, rng: Random) -> bytes:
-        """Damaged answers; every third is damage within packets whose CRC fits."""
+        """Return damaged answers; in every third the CRC is valid."""
         if rng.random() < 0.67:
             return mutated(rng, self._corpus, _SIZE_MAX_BYTES)
         sealed = b""
@@ -143,7 +143,7 @@ class DynamixelTarget(Target):
         return sealed
 
     def _damage(self, rng: Random) -> bytes:
-        """Which exchange (of about 70), what is done to the answer, and with what."""
+        """Return the number of the exchange (of about 70), the kind of damage, and the bytes to use."""
         data = self._answers(rng)[: rng.choice((20, 255))]
         return bytes((rng.randrange(70), rng.randrange(4), len(data))) + data
 
@@ -169,7 +169,7 @@ class DynamixelTarget(Target):
         self._check_that_it_goes_on()
 
     def _read(self) -> None:
-        """A cycle of the bus thread."""
+        """Run one cycle of the bus thread."""
         arm, line = self._arm, self._line
         failures = arm._failures
         line.limit_s = line.now_s + _READ_LIMIT_S
@@ -236,7 +236,7 @@ class DynamixelTarget(Target):
 
 
 class DynamixelWireTarget(Target):
-    """An input is noise on the line, before a read of the whole edge on a real pty and in the middle of one."""
+    """An input is noise on a real pty, before or during a read by the driver."""
 
     name: ClassVar[str] = "dynamixel-wire"
     share: ClassVar[float] = 0.01
@@ -293,7 +293,7 @@ def _servos() -> ServoLine:
 
 
 def _parse_program(program: bytes) -> dict[int, list[tuple[int, bytes]]]:
-    """Damage per exchange; what is cut off counts as far as it goes."""
+    """Return the damage per exchange; a truncated program counts as far as it goes."""
     damage: dict[int, list[tuple[int, bytes]]] = {}
     at = 0
     while at + 3 <= len(program):
@@ -304,12 +304,12 @@ def _parse_program(program: bytes) -> dict[int, list[tuple[int, bytes]]]:
 
 
 def _block(position_count: int, watchdog: int) -> bytes:
-    """Indirect data of one servo, as `companion.io.dynamixel.registers.BLOCK` lays it out."""
+    """Return the indirect data of one servo, in the layout of `companion.io.dynamixel.registers.BLOCK`."""
     return dxl._BLOCK.pack(position_count, 0, -7, 35, 12, watchdog)
 
 
 def _corpus() -> list[bytes]:
-    """Answers to a cycle's read, and everything else that a servo may say."""
+    """Return answers to the read of a cycle, and every other kind of packet."""
     pairs = [
         b"".join(status(servo_id, error, _block(1000 * k, watchdog)) for k, servo_id in enumerate(IDS))
         for error, watchdog in ((0, _WATCHDOG), (0, 0xFF), (ALERT, _WATCHDOG), (4, _WATCHDOG), (0, 0))

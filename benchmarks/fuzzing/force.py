@@ -1,4 +1,4 @@
-"""Force-torque sensor: bytes through a real pty into the read handler of an edge that an emulated sensor has opened."""
+"""Force-torque sensor: bytes through a real pty into the read handler of a driver that runs with an emulated sensor."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from companion.io.force_torque.rft import RATE_CODES, Command, Wrench
 from sitl.force_torque import ForceTorqueServer
 
 _SIZE_MAX_BYTES = 3000
-"""A pty holds 4095."""
+"""A pty buffers 4095 bytes."""
 _DEADLINE_S = 20.0
 _ASKED = (Command.PRODUCT_NAME, Command.FIRMWARE_VERSION, Command.SET_RATE, Command.GET_RATE)
 _MARK_N = 20.0
-"""Force of the last valid packet behind an input; the two before it carry another."""
+"""Force of the last valid packet after an input; the two before it carry another one."""
 
 
 class ForceTarget(Target):
-    """An input is what comes over the line."""
+    """An input is the bytes on the line."""
 
     name: ClassVar[str] = "force"
 
@@ -123,7 +123,7 @@ def _wrench(force_n: float) -> bytes:
 
 
 def _corpus() -> list[bytes]:
-    """Every kind of response, alone and streamed; commands too, which a wrong cable echoes."""
+    """Return every kind of response, alone and streamed, and commands, which a wrong cable echoes."""
     awkward = Wrench(
         force_n=(0x55AA / 50, -0x55AB / 50, 0x5555 / 50),
         torque_nm=(-0x5556 / 2000, 0x55AA / 2000, 0x55AA / 2000),

@@ -1,4 +1,4 @@
-"""MAVLink: what MAVSDK hands over becomes the companion's records; and damaged datagrams at the port of a live edge."""
+"""MAVLink: conversion of MAVSDK's messages to the companion's records, and damaged datagrams at the port of a running driver."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DEADLINE_S = 30.0
 
 
 class MemoryWire(UdpWire):
-    """What waits in the guardian's socket, without the socket."""
+    """The guardian's receive queue, without a socket."""
 
     def __init__(self) -> None:
         self.waiting: list[bytes] = []
@@ -41,7 +41,7 @@ class MemoryWire(UdpWire):
 
 
 class MavlinkTarget(Target):
-    """An input is a datagram. It passes the guardian's parser and records, and the converters behind MAVSDK's MavlinkDirect."""
+    """An input is a datagram for the guardian's parser and records, and for the converters behind MAVSDK's MavlinkDirect."""
 
     name: ClassVar[str] = "mavlink"
 
@@ -55,7 +55,7 @@ class MavlinkTarget(Target):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """There is nothing to close."""
+        """Do nothing."""
 
     def make(self, rng: Random) -> bytes:
         return damaged_datagram(rng, self._corpus)
@@ -108,7 +108,7 @@ class MavlinkTarget(Target):
 
 
 class MavlinkWireTarget(Target):
-    """An input is a datagram from the autopilot's address to the port of an edge that flies."""
+    """An input is a datagram from the autopilot's address to the port of a running driver."""
 
     name: ClassVar[str] = "mavlink-wire"
     share: ClassVar[float] = 0.02
@@ -166,13 +166,13 @@ class MavlinkWireTarget(Target):
 
 
 def damaged_datagram(rng: Random, messages_: list[bytes]) -> bytes:
-    """Damaged messages; in half of them length and checksum fit the damage, so that the content counts."""
+    """Return damaged messages; in half of them length and checksum are valid, so that the content counts."""
     data = mutated(rng, messages_, _SIZE_MAX_BYTES)
     return sealed(data) if rng.random() < 0.5 else data
 
 
 def sealed(data: bytes) -> bytes:
-    """One MAVLink 2 message with the payload of `data`, length and checksum made to fit, if its id is known."""
+    """Return a MAVLink 2 message with the payload of `data` and valid length and checksum, if its id is known."""
     if len(data) < _HEADER_BYTES:
         return data
     number = int.from_bytes(data[7:10], "little")
@@ -187,7 +187,7 @@ def sealed(data: bytes) -> bytes:
 
 
 def corpus() -> list[bytes]:
-    """Everything that the edge listens to, and more of what PX4 says. First an armed heartbeat in OFFBOARD."""
+    """Return every message that the driver handles, and others of PX4. The first is an armed heartbeat in OFFBOARD."""
     speaker = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     said = [
         _heartbeat(6 << 16),
@@ -218,7 +218,7 @@ def _heartbeat(custom_mode: int) -> Any:
 
 
 def _fields_json(message: Any) -> str:
-    """The fields as MAVSDK's MavlinkDirect passes them on."""
+    """Return the fields as JSON, as MAVSDK's MavlinkDirect delivers them."""
     fields = message.to_dict()
     fields["message_name"] = fields.pop("mavpackettype")
     return json.dumps(fields)

@@ -17,7 +17,7 @@ _RANDOM_BYTES_MAX = 400
 
 
 def mutated(rng: Random, corpus: Sequence[bytes], size_max: int) -> bytes:
-    """One of the corpus, damaged by one to four steps; every twentieth is random bytes, every fiftieth is untouched.
+    """Return a message of the corpus, damaged by one to four steps; every twentieth is random bytes, every fiftieth is undamaged.
 
     Args:
         rng: draws everything.

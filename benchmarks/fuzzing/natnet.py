@@ -1,4 +1,4 @@
-"""NatNet: datagrams through a real UDP socket into the datagram handler of an edge that a real server has opened."""
+"""NatNet: datagrams through a real UDP socket into the datagram handler of a driver that runs with an emulated server."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _DATAGRAM_MAX_BYTES = 60_000
 _DELIVERY_DEADLINE_S = 20.0
 _FRESH = 0x80
-"""Bit of an input's first byte: the edge has not met a server yet. The bits below choose the version."""
+"""Bit of an input's first byte: the driver knows no server yet. The lower bits select the version."""
 
 
 class NatNetTarget(Target):
-    """First byte of an input: version and state of the edge; the rest is the datagram."""
+    """The first byte of an input is the version and the state of the driver; the rest is the datagram."""
 
     name: ClassVar[str] = "natnet"
 
@@ -63,7 +63,7 @@ class NatNetTarget(Target):
 
 
 class _Rig:
-    """An edge, and a socket that stands for its server's."""
+    """A driver, and a socket in place of its server's."""
 
     def __init__(self, version: NatNetVersion) -> None:
         self.version = version
@@ -169,11 +169,11 @@ class _Rig:
         self.sender.sendto(datagram, self.socket.getsockname())
 
     def _wait(self) -> bool:
-        """False: nothing came."""
+        """Wait for a datagram; return False if none arrived."""
         return bool(select.select([self.socket], [], [], _DELIVERY_DEADLINE_S)[0])
 
     def _take_what_waits(self) -> None:
-        """The last frames of the server that opened the edge."""
+        """Read the last frames of the server that the driver connected to."""
         while select.select([self.socket], [], [], 0.0)[0]:
             self.edge._drain(self.socket)
 
@@ -183,7 +183,7 @@ class _Rig:
 
 
 def _corpus(version: NatNetVersion) -> list[bytes]:
-    """Every kind of datagram that a server sends, and those that only a client should."""
+    """Return every kind of datagram of a server and of a client."""
     names = {1: "quad", 7: "net"}
     bodies = [BodyPose(7, (3.0, 2.0, 0.1), (0.5, 0.5, 0.5, 0.5)), BodyPose(_BODY_ID, (1.0, -2.0, 1.5), _UPRIGHT)]
     lost = [BodyPose(_BODY_ID, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), valid=False)]
@@ -214,7 +214,7 @@ def _corpus(version: NatNetVersion) -> list[bytes]:
 
 
 def _full_frame(version: NatNetVersion) -> bytes:
-    """Two elements in every section, skeletons, assets, force plates and devices included."""
+    """Return a frame with two elements in every section."""
 
     def section(parts: list[bytes]) -> bytes:
         content = b"".join(parts)
@@ -234,7 +234,7 @@ def _full_frame(version: NatNetVersion) -> bytes:
 
 
 def _all_definitions(version: NatNetVersion) -> bytes:
-    """Payload of NAT_MODELDEF with one description of every type."""
+    """Return a NAT_MODELDEF payload with one description of every type."""
     body = b"quad\0" + struct.pack("<Ii3fI", 1, -1, 0.0, 0.0, 0.0, 1) + struct.pack("<3fI", 0.0, 0.0, 0.0, 0)
     names = struct.pack("<I", 2) + b"Fx\0Fy\0"
     descriptions = [

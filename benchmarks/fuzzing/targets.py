@@ -1,4 +1,4 @@
-"""Every target by name. A target's module is imported when it is wanted: the wires need different drivers."""
+"""The targets by name. A target's module is imported on demand, because the wires need different drivers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES: Final = tuple(_CLASSES)
 
 
 def target_class(name: str) -> type[Target]:
-    """The class of a target.
+    """Return the class of a target.
 
     Raises:
         KeyError: there is none of that name.

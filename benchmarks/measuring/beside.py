@@ -1,4 +1,4 @@
-"""What runs beside a flight, each in a process of its own, for the same minutes.
+"""Loops that run beside a flight, each in a separate process.
 
 python -m benchmarks.measuring.beside empty FILE          # ticks for nothing until SIGTERM; start and lateness of each, s, as .npy
 python -m benchmarks.measuring.beside plain FILE          # the same on asyncio's own event loop
@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measuring.wires import bare_mavsdk
-from benchmarks.soaking.lateness import tick_for_nothing
+from benchmarks.soaking.lateness import run_idle_ticks
 
 
 def empty(path: Path, *, plain: bool) -> None:
-    """An empty loop; `plain`: on asyncio's own event loop.
+    """Run an empty loop, with `plain` on asyncio's own event loop.
 
     Rows of the array: `time.monotonic` at the start of each tick, and how late it was."""
     starts_s, lateness_s = array("d"), array("d")
@@ -30,12 +30,12 @@ def empty(path: Path, *, plain: bool) -> None:
         starts_s.append(start_s)
         lateness_s.append(late_s)
 
-    tick_for_nothing(take, plain=plain)
+    run_idle_ticks(take, plain=plain)
     np.save(path, np.array([starts_s, lateness_s]))
 
 
 def bare(path: Path, frames: int) -> None:
-    """The bare loop, and the process at the other end of its wires."""
+    """Run the bare loop and the process at the other end of its wires."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     inside, wire = bare_mavsdk(frames)
     path.write_text(json.dumps({"inside": asdict(inside), "wire": asdict(wire)}), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Joint read -> current write, by nothing but dynamixel-sdk."""
+"""Joint read to current write with dynamixel-sdk alone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring.far_end import stand_apart
+from benchmarks.measuring.far_end import prepare_far_end
 from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
 from companion.launcher.sitl_process import SitlProcess
 from companion.runtime.event_loop import run
@@ -23,15 +23,15 @@ _RETURN_DELAY_ADDRESS = 9
 _BAUD_BPS = 3_000_000
 _SERVO_IDS = (1, 2)
 FAILED_MAX = 0.1
-"""Share of cycles without an answer up to which the others count; a computer that is held up as a whole misses some."""
+"""Largest share of cycles without an answer; a computer that stalls as a whole misses some."""
 
 
 def _servos(parent: Connection) -> None:
-    """Two emulated servos on a pty until the parent says stop."""
+    """Serve two emulated servos on a pty until the parent ends it."""
     from sitl.servo.bus import ServoBus
     from sitl.servo.model import ServoModel
 
-    stand_apart()
+    prepare_far_end()
 
     async def serve() -> None:
         async with ServoBus([ServoModel(servo_id, baud_bps=_BAUD_BPS) for servo_id in _SERVO_IDS]) as bus:
@@ -43,28 +43,28 @@ def _servos(parent: Connection) -> None:
 
 @dataclass(frozen=True, slots=True)
 class BusCycles:
-    """Sync read, then sync write, by nothing but dynamixel-sdk."""
+    """Cycles of sync read and sync write with dynamixel-sdk alone."""
 
     command_ms: Latency
-    """Read done -> write done."""
+    """Time from the end of the read to the end of the write."""
     cycle_ms: Latency
-    """Read begun -> write done."""
+    """Time from the start of the read to the end of the write."""
     failed: int
-    """Cycles without an answer; they do not count."""
+    """Number of cycles without an answer, which are not counted."""
     request_bytes: int
-    """On the wire in one cycle: the read's packet, the answers of all servos, the write's packet."""
+    """Bytes of one cycle on the wire: read packet, answers of all servos, write packet."""
     answer_bytes: int
     write_bytes: int
     baud_bps: int = _BAUD_BPS
 
     @property
     def wire_ms(self) -> float:
-        """What one cycle takes on the wire at the least: every byte is sent one after the other, 10 bits each."""
+        """Shortest time of one cycle on the wire, with 10 bits per byte."""
         return 1e4 * (self.request_bytes + self.answer_bytes + self.write_bytes) / self.baud_bps
 
 
 def bare_dynamixel(cycles: int) -> BusCycles:
-    """Against two emulated servos, and nothing else in their process."""
+    """Measure against two emulated servos in their own process."""
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe()
     bus = spawn.Process(target=_servos, args=(there,))
@@ -82,7 +82,7 @@ def bare_dynamixel(cycles: int) -> BusCycles:
 
 
 def bare_dynamixel_in_world(cycles: int, mission: Path, folder: Path) -> BusCycles:
-    """The same against the servo bus that a flight meets: that of a simulated world, whose process has more to do.
+    """Measure against the servo bus of a simulated world, as a flight uses it.
 
     Args:
         cycles: how many.
@@ -157,7 +157,7 @@ def _bus_cycles(path: str, cycles: int) -> BusCycles:
 
 
 def _counted(port: Any) -> tuple[list[int], list[int]]:
-    """From now on: the length of everything that is written to a port, and of everything read from it."""
+    """Record the lengths of all writes to a port and of all reads from it from now on."""
     sent: list[int] = []
     received: list[int] = []
     write, read = port.writePort, port.readPort

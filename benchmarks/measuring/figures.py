@@ -1,4 +1,4 @@
-"""What was measured beside what, and whether it is as it must be: computed from the figures, never typed."""
+"""Rows of figures with their references, targets and verdicts, computed from the measurements."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Target:
 
     at_most: float
     of: Sequence[str] = P50_P99
-    """Which figures."""
+    """Statistics that the limit applies to."""
     ratio: bool = True
-    """The limit is for the ratio to what was measured beside; False: for the figure itself."""
+    """Whether the limit applies to the ratio to the reference, or to the figure itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,19 +25,19 @@ class Row:
     """One line of a table."""
 
     what: str
-    """With its unit."""
+    """What was measured, with its unit."""
     beside: str
-    """Name of what was measured beside; empty: nothing."""
+    """Name of the reference; empty if there is none."""
     figures: Mapping[str, float]
-    """By statistic (p50, p99, ...); a single figure is `value`. Empty: not measured."""
+    """Figures by statistic (p50, p99, ...), or a single `value`; empty if not measured."""
     beside_figures: Mapping[str, float] = field(default_factory=dict)
     target: Target | None = None
     why_not: str = ""
-    """Why a figure is missing, one line."""
+    """Reason for a missing figure, in one line."""
 
     @property
     def ratios(self) -> dict[str, float]:
-        """Of every statistic that both have, to one that is not 0."""
+        """Ratios of the statistics that both have, where the reference is not 0."""
         return {
             name: value / self.beside_figures[name]
             for name, value in self.figures.items()
@@ -46,7 +46,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """`MET`, `NOT_MET`, `NOT_MEASURED`, or empty: there is no target."""
+        """`MET`, `NOT_MET`, `NOT_MEASURED`, or empty without a target."""
         if self.target is None:
             return "" if self.figures else NOT_MEASURED
         judged = self.ratios if self.target.ratio else self.figures
@@ -62,14 +62,14 @@ class Section:
 
     title: str
     how: Sequence[str]
-    """What was done, a paragraph each."""
+    """Explanation, one string per paragraph."""
     statistics: Sequence[str]
     """Columns, in order."""
     rows: Sequence[Row]
 
 
 def problems(sections: Sequence[Section]) -> list[str]:
-    """Rows that have a target and do not meet it, or were not measured, one line each."""
+    """Return one line for each row that has a target and did not meet it or was not measured."""
     found = []
     for row in (row for section in sections for row in section.rows):
         if row.target is not None and row.verdict != MET:
@@ -79,7 +79,7 @@ def problems(sections: Sequence[Section]) -> list[str]:
 
 
 def figure(value: float) -> str:
-    """Three digits that count; whole numbers as they are."""
+    """Format a figure with three significant digits, whole numbers in full."""
     if value == round(value):
         return f"{value:.0f}"
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

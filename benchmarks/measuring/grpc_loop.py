@@ -1,4 +1,4 @@
-"""The bare loop over MAVSDK 3, which speaks gRPC with a server of its own. In an environment of its own: MAVSDK 4 has the same name.
+"""The bare loop over MAVSDK 3, which uses a gRPC server. It runs in a separate environment, because MAVSDK 4 has the same name.
 
 python -m benchmarks.measuring.grpc_loop PORT DESCRIPTOR FRAMES
 
@@ -24,7 +24,7 @@ from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 
 async def loop(port: int, mocap: socket.socket, frames: int) -> list[float]:
-    """As `receive_and_send`, by asyncio, which is how MAVSDK 3 is used."""
+    """Do as `receive_and_send`, with asyncio, as MAVSDK 3 requires."""
     from mavsdk import System
     from mavsdk.offboard import Attitude
 
@@ -59,7 +59,7 @@ async def loop(port: int, mocap: socket.socket, frames: int) -> list[float]:
 
 
 def _claim_for(server_pid: int) -> None:
-    """Its server is half of it, and is to have the same priority where that is permitted."""
+    """Claim the same priority for MAVSDK's server, where that is permitted."""
     with contextlib.suppress(OSError):
         for thread in map(int, os.listdir(f"/proc/{server_pid}/task")):
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(FLIGHT_PRIORITY))

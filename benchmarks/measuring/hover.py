@@ -25,7 +25,7 @@ from benchmarks.measuring.hovering import (
     START_TIMEOUT_S,
     NoFlight,
     await_hover,
-    said_path,
+    output_path,
     start_hover,
 )
 from benchmarks.measuring.late import alone_late
@@ -39,9 +39,9 @@ from tests.support import ROOT
 
 HOVER_S, QUICK_HOVER_S = 600.0, 60.0
 SETTLE_S = 3.0
-"""Of the beginning and of the end of the hover, not counted."""
+"""Time at the start and at the end of the hover that is not counted."""
 BARE_LEAD_S = 12.0
-"""The bare loop receives so much shorter than the hover lasts: it has to start, and is to end before the landing."""
+"""The bare loop is shorter than the hover by this time, so that it ends before the landing."""
 SAMPLE_S = 1.0
 SAY_EVERY = 30
 EMPTY, BARE = "empty loop", "bare loop"
@@ -51,12 +51,12 @@ Figures = dict[str, Any]
 
 
 class PartError(Exception):
-    """A part could not be measured; one line."""
+    """A part could not be measured; the text is one line."""
 
 
 @dataclass
 class _Sampled:
-    """One process, second by second."""
+    """Usage of one process, second by second."""
 
     t_s: list[float] = field(default_factory=list)
     used: list[Usage] = field(default_factory=list)
@@ -100,7 +100,7 @@ def measure(folder: Path, hover_s: float, say: Callable[[str], None]) -> Figures
 
 
 def _await_viewer(person: subprocess.Popen[bytes], said: Path) -> None:
-    """Until the monitor's page is open: what starting a browser costs is not the flight's to bear."""
+    """Wait until the monitor's page is open, so that the start of the browser is not measured."""
     deadline_s = time.monotonic() + START_TIMEOUT_S
     while not said.stat().st_size:
         if person.poll() is not None or time.monotonic() > deadline_s:
@@ -114,7 +114,7 @@ def _loop(which: str, path: Path) -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def _beside(name: str, folder: Path, *arguments: str) -> Any:
-    """A Python process in a group of its own; what it prints goes to NAME.txt. Ended by SIGTERM, at last for good."""
+    """Run a Python process in its own group, with its output in NAME.txt; end it by SIGTERM, then by SIGKILL."""
     with (folder / f"{name}.txt").open("wb") as said:
         process = subprocess.Popen(
             [sys.executable, *arguments],
@@ -136,7 +136,7 @@ def _beside(name: str, folder: Path, *arguments: str) -> Any:
 
 
 def _land(flight: subprocess.Popen[bytes]) -> None:
-    """Whatever happened here, the flight lands and its processes end."""
+    """Land the flight and end its processes."""
     if flight.poll() is None:
         flight.send_signal(signal.SIGINT)
         try:
@@ -153,7 +153,7 @@ def _watch(
     hover_s: float,
     say: Callable[[str], None],
 ) -> tuple[dict[str, _Sampled], list[tuple[float, ...]]]:
-    """A sample a second of every process and of the computer as a whole, until the flight has ended."""
+    """Sample every process and the whole computer once a second until the flight has ended."""
     begun_s = next_s = time.monotonic()
     samples: dict[str, _Sampled] = {}
     machine: list[tuple[float, ...]] = []
@@ -182,7 +182,7 @@ def _watch(
 
 
 def machine_cpu() -> tuple[float, float, float]:
-    """Of all cores together since the computer started, in the kernel's clock ticks: total, idle, stolen by the host."""
+    """Return the CPU time of all cores since boot, in the kernel's clock ticks: total, idle, stolen by the host."""
     fields = [float(word) for word in Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
     return sum(fields), fields[3] + fields[4], fields[7]
 
@@ -206,7 +206,7 @@ def _judge(
         summary = json.loads((folder / "flight/summary.json").read_text(encoding="utf-8"))
         log = read_hover(folder / "flight/flight.mcap", HOVER, SETTLE_S)
     except (OSError, ValueError) as error:
-        said = said_path(folder).read_text(encoding="utf-8", errors="replace").splitlines()[-1:]
+        said = output_path(folder).read_text(encoding="utf-8", errors="replace").splitlines()[-1:]
         raise PartError(f"the flight ended with exit code {code} and left no hover: {error}; {said}") from None
     start_s = log.start_s + (log.epoch_offset_s - to_wall_s)  # by time.monotonic
     begin_s, end_s = float(start_s[0]), float(start_s[-1]) - SETTLE_S
@@ -273,7 +273,7 @@ def _latencies(log: HoverLog) -> Figures:
 
 
 def _bare(folder: Path) -> Figures:
-    """The bare loop's figures, or why there are none."""
+    """Return the bare loop's figures, or the reason why there are none."""
     try:
         found: Figures = json.loads((folder / "bare.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -283,7 +283,7 @@ def _bare(folder: Path) -> Figures:
 
 
 def _of_process(sampled: _Sampled, begin_s: float, end_s: float) -> Figures | None:
-    """Over the hover; None: too short."""
+    """Return the usage over the hover, or None if it was too short."""
     kept = [(t, used) for t, used in zip(sampled.t_s, sampled.used, strict=True) if begin_s <= t <= end_s]
     if len(kept) < 3:
         return None

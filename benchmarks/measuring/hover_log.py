@@ -1,4 +1,4 @@
-"""What the log of a hover says about its ticks, read one chunk at a time."""
+"""Reads the ticks of a hover from its log, one chunk at a time."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class HoverLog:
 
     timing: Timing
     start_s: Array
-    """Of each tick, on the flight clock."""
+    """Start of each tick on the flight clock."""
     start_to_setpoint_s: Array
-    """Of ticks that sent a setpoint."""
+    """Time from the start of a tick to its setpoint, for ticks that sent one."""
     epoch_offset_s: float
     """Wall clock at zero of the flight clock."""
     realtime: str | None
-    """What the flight process got of the operating system; None: the log does not say."""
+    """Real-time settings that the operating system granted, or None if the log has none."""
 
 
 def read_hover(path: Path, phase: str, settle_s: float) -> HoverLog:

@@ -1,4 +1,4 @@
-"""A flight that hovers over real wires for as long as somebody else measures."""
+"""A flight that hovers over real wires while something is measured."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tests.support import PATIENT, ROOT, set_options
 
 MISSION = ROOT / "configs/missions/hover.yaml"
 HOVER = "hold"
-"""Its phase that is made longer."""
+"""Phase of the mission that is extended."""
 START_TIMEOUT_S, END_TIMEOUT_S = 60.0, 180.0
 BATTERY_MARGIN = 4.0
-"""The battery lives so many times as long as the hover."""
+"""Battery life as a multiple of the hover."""
 LIMITS: dict[str, object] = {
     **{key: value for key, value in PATIENT.items() if "mqtt" not in key},
     "vehicle.safety.arm_timeout_s": 0.5,
@@ -32,18 +32,18 @@ over that is not what is measured here; how late it was is."""
 
 
 class NoFlight(Exception):
-    """It did not begin to hover; what it said."""
+    """The flight did not begin to hover; the text is its output."""
 
 
 def start_hover(folder: Path, hover_s: float, broker_url: str, *, report: bool = True) -> subprocess.Popen[bytes]:
-    """`companion fly`, in a process group of its own; what it prints goes to fly.txt, all else to flight/, both in the folder."""
+    """Start `companion fly` in its own process group, with its output in fly.txt and its files in flight/ in the folder."""
     command = [
         *(sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl", "--mqtt", broker_url),
         *("--out", str(folder / "flight"), *([] if report else ["--no-report"])),
         *set_options(**LIMITS),
         *set_options(**{"mission.phases[1].duration_s": hover_s, "world.battery_life_s": BATTERY_MARGIN * hover_s}),
     ]
-    with said_path(folder).open("wb") as said:
+    with output_path(folder).open("wb") as said:
         return subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -55,8 +55,8 @@ def start_hover(folder: Path, hover_s: float, broker_url: str, *, report: bool =
         )
 
 
-def said_path(folder: Path) -> Path:
-    """What the flight printed."""
+def output_path(folder: Path) -> Path:
+    """Return the file with the flight's output."""
     return folder / "fly.txt"
 
 
@@ -67,7 +67,7 @@ def await_hover(flight: subprocess.Popen[bytes], folder: Path) -> None:
         NoFlight: it has ended, or takes too long.
     """
     deadline_s = time.monotonic() + START_TIMEOUT_S
-    while f"  {HOVER}" not in (said := said_path(folder).read_text(encoding="utf-8", errors="replace")):
+    while f"  {HOVER}" not in (said := output_path(folder).read_text(encoding="utf-8", errors="replace")):
         if flight.poll() is not None or time.monotonic() > deadline_s:
             raise NoFlight(said.strip() or "it said nothing")
         time.sleep(0.1)

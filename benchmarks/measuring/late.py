@@ -1,4 +1,4 @@
-"""Ticks that were late beside a loop that does nothing: whose fault was it?"""
+"""Separates ticks that were late by themselves from those that an empty loop beside them shared."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 WITHIN_S = 0.1
-"""What holds up the computer as a whole makes both late within so much of each other."""
+"""A stall of the whole computer delays both loops within this time of each other."""
 
 
 def alone_late(late_s: Sequence[float], beside_late_s: Sequence[float], within_s: float = WITHIN_S) -> list[float]:
-    """Which ticks were late when nothing beside them was.
+    """Return the times of late ticks without a late tick of the loop beside.
 
     Args:
         late_s: when late ticks began.

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 RATE_HZ = 200.0
-"""Of every loop that is measured."""
+"""Rate of every measured loop."""
 WARM_UP = 100
-"""Turns of each bare loop that do not count."""
+"""Cycles at the start of each bare loop that are not counted."""
 DEADLINE_S = 30.0
-"""For everything that a bare loop waits for."""
+"""Deadline for everything that a bare loop waits for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Latency:
 
     @classmethod
     def of(cls, seconds: Iterable[float]) -> Latency:
-        """Percentiles of samples in s.
+        """Return the percentiles of samples in s.
 
         Raises:
             ValueError: no samples.

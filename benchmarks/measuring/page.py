@@ -18,7 +18,7 @@ HEAD = """# Benchmarks
 
 
 def markdown(results: Mapping[str, Any], sections: Sequence[Section]) -> str:
-    """The whole page.
+    """Return the page as Markdown.
 
     Args:
         results: as written by `benchmarks/__main__.py`.
@@ -36,7 +36,7 @@ def markdown(results: Mapping[str, Any], sections: Sequence[Section]) -> str:
 
 
 def show(results: Mapping[str, Any], sections: Sequence[Section], console: Console) -> None:
-    """Print the tables, and below them what is not as it must be."""
+    """Print the tables, then the targets that were not met."""
     for section in sections:
         table = Table("", "beside", *section.statistics, "target", "", title=section.title, title_justify="left")
         for row in section.rows:

@@ -1,4 +1,4 @@
-"""The tables: which figure stands beside which, and the targets."""
+"""The tables of the page: each figure with its reference and its target."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NO_PART = {"not_measured": "that part was not run"}
 
 
 def sections(parts: Mapping[str, Figures]) -> list[Section]:
-    """All tables.
+    """Return all tables.
 
     Args:
         parts: figures by part, as the parts return them; `{"not_measured": why}` of one that failed, missing: not run.
@@ -32,7 +32,7 @@ def sections(parts: Mapping[str, Figures]) -> list[Section]:
 
 
 def _spread(found: Any) -> dict[str, float]:
-    """Statistics of a `Latency` as it was written down."""
+    """Return the statistics of a saved `Latency`."""
     if not isinstance(found, Mapping):
         return {}
     names = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
@@ -40,7 +40,7 @@ def _spread(found: Any) -> dict[str, float]:
 
 
 def _at(found: Any, *keys: str) -> Any:
-    """Nested figures; None: not there."""
+    """Return a nested figure, or None if it is missing."""
     for key in keys:
         found = found.get(key) if isinstance(found, Mapping) else None
     return found
@@ -51,7 +51,7 @@ def _value(found: Any) -> dict[str, float]:
 
 
 def _why(*found: Any) -> str:
-    """The first reason that any of them gives for not being there."""
+    """Return the first reason why one of them was not measured."""
     return next((str(f["not_measured"]) for f in found if isinstance(f, Mapping) and "not_measured" in f), "")
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
-from benchmarks.measuring.wires import autopilot_edge, bare_mavsdk, receive_and_send, with_room
+from benchmarks.measuring.wires import autopilot_edge, bare_mavsdk, receive_and_send, with_far_end
 from tests.support import ROOT
 
 GRPC_PACKAGE = "mavsdk>=3,<4"
@@ -27,11 +27,11 @@ _TYPE_MASK = 0b111
 
 
 class NotMeasured(Exception):
-    """One line: why not."""
+    """The reason why something was not measured, in one line."""
 
 
 def measure(frames: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """All loops, one after the other; each has `inside` and `wire`, or `not_measured`."""
+    """Measure all loops in turn; each result has `inside` and `wire`, or `not_measured`."""
     found: dict[str, Any] = {}
     for name, loop in (
         ("native", bare_mavsdk),
@@ -50,7 +50,7 @@ def measure(frames: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def pymavlink_echo(frames: int) -> tuple[Latency, Latency]:
-    """recv -> SET_ATTITUDE_TARGET packed by pymavlink and sent: no link, no discovery, nothing beside it."""
+    """Receive, pack SET_ATTITUDE_TARGET with pymavlink and send it, without a link or discovery."""
     from pymavlink.dialects.v20 import common as mavlink
 
     def run(port: int, go: Callable[[], None], mocap: socket.socket) -> list[float]:
@@ -69,11 +69,11 @@ def pymavlink_echo(frames: int) -> tuple[Latency, Latency]:
             go()
             return receive_and_send(mocap, frames, send)
 
-    return with_room(frames, run)
+    return with_far_end(frames, run)
 
 
 def mavsdk_grpc(frames: int) -> tuple[Latency, Latency]:
-    """recv -> Offboard.set_attitude of MAVSDK 3.
+    """Receive, then call Offboard.set_attitude of MAVSDK 3.
 
     Raises:
         NotMeasured: it cannot be installed here.
@@ -106,11 +106,11 @@ def mavsdk_grpc(frames: int) -> tuple[Latency, Latency]:
         _, said = process.communicate()
         raise NotMeasured((said.strip().splitlines() or ["MAVSDK 3 did not find the autopilot"])[-1])
 
-    return with_room(frames, run)
+    return with_far_end(frames, run)
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """It and its server, which is in its process group."""
+    """End the process and its server, which is in its process group."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -119,7 +119,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def grpc_environment(folder: Path = GRPC_FOLDER) -> Path:
-    """An environment with MAVSDK 3, made when there is none; its Python.
+    """Return the Python of an environment with MAVSDK 3; create the environment if needed.
 
     Raises:
         NotMeasured: pip could not install it.

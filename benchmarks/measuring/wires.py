@@ -1,4 +1,4 @@
-"""Mocap datagram in -> SET_ATTITUDE_TARGET out, by loops that do nothing else, against the other end of both wires."""
+"""Bare loops from mocap datagram to SET_ATTITUDE_TARGET, and the process at the other end of both wires."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
-from benchmarks.measuring.far_end import stand_apart
+from benchmarks.measuring.far_end import prepare_far_end
 from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 POSE = struct.Struct("<I7f")
 LOST_MAX = 0.01
-"""Share of setpoints that may be missing at the other end."""
+"""Largest share of setpoints that may be missing at the other end."""
 _SILENCE_S = 3.0
-"""After the last frame: what has not come back by then does not."""
+"""Time after the last frame after which a missing setpoint counts as lost."""
 
 
 def thrust_of(number: int) -> float:
-    """Carries the frame's number through SET_ATTITUDE_TARGET, exactly (multiples of 1/4096)."""
+    """Encode a frame number as a thrust, which SET_ATTITUDE_TARGET carries exactly (multiples of 1/4096)."""
     return 0.25 + (number % 2048) / 4096
 
 
-def _room(parent: Connection, autopilot_port: int, mocap_port: int, frames: int) -> None:
-    """The other end of both wires: sends pose datagrams at 200 Hz, plays PX4, and stamps what comes back."""
+def _far_end(parent: Connection, autopilot_port: int, mocap_port: int, frames: int) -> None:
+    """Play the other end of both wires: send pose datagrams at 200 Hz, play PX4, and time the setpoints that come back."""
     from pymavlink.dialects.v20 import common as mavlink
 
-    stand_apart()
+    prepare_far_end()
     parent_pid = os.getppid()
     out, into = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAVLink(None)
     into.robust_parsing = True
@@ -97,23 +97,23 @@ def receive_and_send(mocap: socket.socket, frames: int, send: Callable[[float], 
 
 
 def receive(mocap: socket.socket) -> tuple[float, float]:
-    """One datagram: the thrust to answer with, and when it arrived, by `time.monotonic`."""
+    """Receive a datagram; return the thrust to answer with, and its arrival on `time.monotonic`."""
     datagram, notes, _, _ = mocap.recvmsg(4096, STAMP_ROOM_BYTES)
     return thrust_of(POSE.unpack(datagram)[0]), arrived_s(notes, time.monotonic)
 
 
-def with_room(
+def with_far_end(
     frames: int, run: Callable[[int, Callable[[], None], socket.socket], list[float]]
 ) -> tuple[Latency, Latency]:
-    """Run a loop against the room process; (inside the loop's process, from wire to wire)."""
+    """Run a loop against the process at the other end; return the latency inside the loop and from wire to wire."""
     autopilot_port = free_udp_port()
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mocap:
         mocap.bind(("127.0.0.1", 0))
         mocap.settimeout(DEADLINE_S)
-        room = spawn.Process(target=_room, args=(there, autopilot_port, mocap.getsockname()[1], frames))
-        room.start()
+        far_end = spawn.Process(target=_far_end, args=(there, autopilot_port, mocap.getsockname()[1], frames))
+        far_end.start()
         try:
             inside_s = run(autopilot_port, lambda: here.send("go"), mocap)
             if not here.poll(2 * DEADLINE_S):
@@ -122,15 +122,15 @@ def with_room(
             if len(wire_s) < (1.0 - LOST_MAX) * len(inside_s):
                 raise RuntimeError(f"{len(inside_s) - len(wire_s)} of {frames} setpoints were lost on the wire")
         finally:
-            room.join(5.0)
-            if room.is_alive():
-                room.terminate()
-                room.join()
+            far_end.join(5.0)
+            if far_end.is_alive():
+                far_end.terminate()
+                far_end.join()
     return Latency.of(inside_s), Latency.of(wire_s)
 
 
 def bare_mavsdk(frames: int) -> tuple[Latency, Latency]:
-    """recv -> Offboard.set_attitude of native MAVSDK, and nothing else in the process."""
+    """Receive, then call Offboard.set_attitude of native MAVSDK, with nothing else in the process."""
     from mavsdk import ComponentType, Configuration, Mavsdk, log_subscribe, log_unsubscribe
     from mavsdk.plugins.offboard.offboard import Attitude, Offboard
 
@@ -147,11 +147,11 @@ def bare_mavsdk(frames: int) -> tuple[Latency, Latency]:
         log_unsubscribe()
         return taken_s
 
-    return with_room(frames, run)
+    return with_far_end(frames, run)
 
 
 def autopilot_edge(frames: int) -> tuple[Latency, Latency]:
-    """recv -> MavsdkAutopilot.send_attitude: frames converted and checked, sent through MavlinkDirect."""
+    """Receive, then call MavsdkAutopilot.send_attitude, which converts, checks and sends through MavlinkDirect."""
     from companion.config.vehicle import AutopilotDevice
     from companion.io.px4.driver import MavsdkAutopilot
     from companion.model.types import IDENTITY_QUAT, AttitudeSetpoint
@@ -171,4 +171,4 @@ def autopilot_edge(frames: int) -> tuple[Latency, Latency]:
 
         return asyncio.run(loop())
 
-    return with_room(frames, run)
+    return with_far_end(frames, run)

@@ -1,1 +1,1 @@
-"""Parts of `benchmarks/soak.py`."""
+"""Parts of `benchmarks.soak`."""

@@ -1,4 +1,4 @@
-"""How late ticks are, minute by minute: of a flight, from its log, and of an empty loop beside it."""
+"""Lateness of ticks, minute by minute: of a flight from its log, and of an empty loop beside it."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ MINUTE_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Minute:
-    """Lateness of the ticks of one minute, ms."""
+    """Lateness of the ticks of one minute, in ms."""
 
     begin_s: float
-    """`time.monotonic` for the empty loop, the flight clock for a flight."""
+    """Start on `time.monotonic` for the empty loop, on the flight clock for a flight."""
     ticks: int
     p50: float
     p99: float
@@ -37,17 +37,17 @@ class Minute:
 
 
 class Minutes:
-    """Takes tick after tick; keeps the ticks of one minute at a time."""
+    """Collects ticks, and keeps only those of the present minute."""
 
     def __init__(self) -> None:
         self._begin_s: float | None = None
         self._lateness_s = array("d")
         self.done: list[Minute] = []
         self.missed = 0
-        """Ticks that began later than a whole period."""
+        """Number of ticks that began later than a whole period."""
 
     def take(self, start_s: float, lateness_s: float) -> None:
-        """A tick that began at `start_s`."""
+        """Take a tick that began at `start_s`."""
         if self._begin_s is None:
             self._begin_s = start_s
         while start_s >= self._begin_s + MINUTE_S:
@@ -57,7 +57,7 @@ class Minutes:
         self.missed += lateness_s > TICK_PERIOD_S
 
     def finish(self) -> list[Minute]:
-        """All minutes; the last one may be shorter, and is left out if it is much so."""
+        """Return all minutes; a much shorter last one is left out."""
         if self._begin_s is not None and len(self._lateness_s) > 0.5 * MINUTE_S / TICK_PERIOD_S:
             self._close(self._begin_s)
         return self.done
@@ -78,13 +78,13 @@ class Ticks:
     minutes: list[Minute]
     ticks: int
     missed: int
-    """Began later than a whole period."""
+    """Number of ticks that began later than a whole period."""
     skipped: int
-    """Deadlines that passed without a tick."""
+    """Number of deadlines without a tick."""
 
 
 def ticks_of_log(path: Path) -> Ticks:
-    """Read from `/sent` alone, one chunk at a time."""
+    """Read the ticks of a log from `/sent`, one chunk at a time."""
     minutes = Minutes()
     count = 0
     first_s = last_s = 0.0
@@ -100,7 +100,7 @@ def ticks_of_log(path: Path) -> Ticks:
     return Ticks(minutes.finish(), count, minutes.missed, max(0, wanted - count))
 
 
-def tick_for_nothing(take: Callable[[float, float], None], *, plain: bool = False) -> int:
+def run_idle_ticks(take: Callable[[float, float], None], *, plain: bool = False) -> int:
     """Tick as a flight does, with its event loop, ticker and priority, and do nothing else, until SIGTERM or until the process that
     started this one is gone.
 
@@ -111,10 +111,10 @@ def tick_for_nothing(take: Callable[[float, float], None], *, plain: bool = Fals
     Returns:
         Deadlines that passed without a tick.
     """
-    return (asyncio.run if plain else run)(_tick_for_nothing(take))
+    return (asyncio.run if plain else run)(_run_idle_ticks(take))
 
 
-async def _tick_for_nothing(take: Callable[[float, float], None]) -> int:
+async def _run_idle_ticks(take: Callable[[float, float], None]) -> int:
     over = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, over.set)
     claim_realtime(FLIGHT_PRIORITY)
@@ -127,15 +127,15 @@ async def _tick_for_nothing(take: Callable[[float, float], None]) -> int:
 
 
 def run_empty_loop(path: Path) -> None:
-    """`tick_for_nothing`, then write the minutes as JSON."""
+    """Run the empty loop, then write its minutes as JSON."""
     minutes = Minutes()
-    skipped = tick_for_nothing(minutes.take)
+    skipped = run_idle_ticks(minutes.take)
     rows = [[m.begin_s, m.ticks, m.p50, m.p99, m.max] for m in minutes.finish()]
     path.write_text(json.dumps({"minutes": rows, "missed": minutes.missed, "skipped": skipped}))
 
 
 def read_minutes(rows: Iterable[list[float]]) -> list[Minute]:
-    """What `run_empty_loop` has written."""
+    """Read the minutes that `run_empty_loop` has written."""
     return [
         Minute(begin_s=begin_s, ticks=int(ticks), p50=p50, p99=p99, max=most) for begin_s, ticks, p50, p99, most in rows
     ]

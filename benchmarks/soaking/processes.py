@@ -17,25 +17,25 @@ ROLES = {
 }
 REALTIME_CLAIMED = frozenset({WORLD_PRIORITY, FLIGHT_PRIORITY, GUARDIAN_PRIORITY})
 LAUNCHER = "launcher"
-"""What was started, and starts the others."""
+"""The process that was started and starts the others."""
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """One process at one moment."""
+    """Usage of one process at one moment."""
 
     rss_mb: float
     """Resident memory, shared pages included, 1e6 bytes."""
     cpu_s: float
     """User and system time since its start."""
     minor_faults: int
-    """Pages that the kernel had to map in since its start, without reading from disk."""
+    """Number of page faults without disk access since its start."""
 
 
 def family(root_pid: int) -> dict[str, int]:
-    """Process ids of a flight by role; a role that is not there yet, or no more, is missing."""
+    """Return the process ids of a flight by role; roles that do not run are missing."""
     parents: dict[int, int] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
@@ -66,7 +66,7 @@ def _command(pid: int) -> list[str]:
 
 
 def usage(pid: int) -> Usage | None:
-    """What a process uses now; None: it is gone."""
+    """Return the present usage of a process, or None if it has ended."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -76,7 +76,7 @@ def usage(pid: int) -> Usage | None:
 
 
 def pss_mb(pid: int) -> float | None:
-    """Proportional set size, 1e6 bytes: shared pages are counted in parts. The kernel walks all pages for it: not every second."""
+    """Return the proportional set size in 1e6 bytes. It is expensive, because the kernel walks all pages."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
@@ -85,7 +85,7 @@ def pss_mb(pid: int) -> float | None:
 
 
 def lift(pid: int, by: int) -> None:
-    """Raise the real-time priority that a process has claimed, of every thread, so that other flights on the machine come second.
+    """Raise the real-time priority of every thread of a process above that of other flights on the computer.
 
     Raises:
         PermissionError: not allowed to.

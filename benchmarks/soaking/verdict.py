@@ -1,4 +1,4 @@
-"""What a soak shows: growth of memory and lateness, what was missed, as a table and as a plot."""
+"""Verdict of a soak: growth of memory and lateness, as a table and as a plot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from benchmarks.soaking.lateness import Minute
 
 MEMORY_GROWTH_MAX = 1.05
 LATENESS_GROWTH_MAX = 1.2
-"""Beyond what the empty loop beside it has grown by: the machine is not the flight's alone."""
+"""Largest growth beyond that of the empty loop, because other processes share the computer."""
 EARLY, LATE = (5.0 / 60.0, 15.0 / 60.0), (50.0 / 60.0, 1.0)
 """Shares of the flight: minutes 5 to 15 and the last 10 of an hour."""
 ROLES = ("flight", "recorder", "guardian", "world", "launcher")
@@ -22,19 +22,19 @@ ROLES = ("flight", "recorder", "guardian", "world", "launcher")
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """All processes at one moment."""
+    """Usage of all processes at one moment."""
 
     t_s: float
-    """Since the first sample."""
+    """Time since the first sample."""
     rss_mb: dict[str, float]
     cpu_s: dict[str, float]
     pss_mb: dict[str, float]
-    """Not in every sample."""
+    """Proportional set size; not in every sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """Of one process."""
+    """Growth of one process."""
 
     role: str
     early_mb: float
@@ -44,17 +44,17 @@ class Growth:
     early_pss_mb: float | None
     late_pss_mb: float | None
     early_cpu_percent: float
-    """Of one core."""
+    """CPU time in percent of one core."""
     late_cpu_percent: float
 
 
 def airborne(samples: Sequence[Sample]) -> list[Sample]:
-    """Those of the flight itself: the recorder is the last to come, and the launcher grades the log when all have gone."""
+    """Return the samples in which every process runs; the recorder starts last, and the launcher goes on to grade the log."""
     return [sample for sample in samples if all(role in sample.rss_mb for role in ROLES)]
 
 
 def memory_growth(samples: Sequence[Sample]) -> list[Growth]:
-    """Of every process, from `airborne` samples."""
+    """Return the growth of every process, given `airborne` samples."""
     if not samples:
         return []
     begin_s, end_s = samples[0].t_s, samples[-1].t_s
@@ -105,7 +105,7 @@ def thirds(minutes: Sequence[Minute], value: str) -> tuple[float, float] | None:
 
 
 def lateness_problems(flight: Sequence[Minute], empty: Sequence[Minute]) -> list[str]:
-    """Growth of the flight's lateness that the machine does not explain."""
+    """Return growth of the flight's lateness that the computer does not explain."""
     found = []
     for value in ("p50", "p99"):
         of_flight, of_empty = thirds(flight, value), thirds(empty, value)
@@ -120,7 +120,7 @@ def lateness_problems(flight: Sequence[Minute], empty: Sequence[Minute]) -> list
 
 
 def print_tables(console: Console, growth: Sequence[Growth], flight: Sequence[Minute], empty: Sequence[Minute]) -> None:
-    """Both tables."""
+    """Print both tables."""
     rows = [
         {
             "process": row.role,
@@ -147,7 +147,7 @@ def print_tables(console: Console, growth: Sequence[Growth], flight: Sequence[Mi
 
 
 def draw(samples: Sequence[Sample], flight: Sequence[Minute], empty: Sequence[Minute], path: Path) -> None:
-    """Memory and lateness over time, as a PNG."""
+    """Draw memory and lateness over time as a PNG."""
     from matplotlib.ticker import NullFormatter
 
     from companion.analysis.plot_style import INK, dress, new_figure, write_png
