@@ -91,17 +91,17 @@ class Campaign(ABC):
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return what stands beside `rows` in the JSON output."""
 
-    @abstractmethod
     def csv_row(self, row: Row) -> Mapping[str, Any]:
         """Return the row as columns of the CSV file."""
+        return {key: "; ".join(value) if isinstance(value, list) else value for key, value in flat(row)}
 
     @abstractmethod
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the content of the HTML page."""
 
-    @abstractmethod
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Write the plots; raises ImportError without matplotlib."""
+        """Write the plots, if there are any; raises ImportError without matplotlib."""
+        return []
 
     @abstractmethod
     def show(self, rows: Sequence[Row], console: Console) -> None:

@@ -1,10 +1,11 @@
-"""`companion report`: summary and report of a flight's log again; of several logs one page that puts the flights side by side."""
+"""`companion report`: summary and report of a log; one page side by side for several logs."""
 
 from __future__ import annotations
 
 import argparse
 import hashlib
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,38 +13,38 @@ from typing import Any
 
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import summarise, write_summary
+from companion.campaigns.runner import to_json
 from companion.campaigns.side_by_side.comparison import FLIGHTS_MAX, Comparison, NotAlignable, compare, jsonable
 from companion.campaigns.side_by_side.flight import Flight, flight_of
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.config.document import ConfigError
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.model.types import Outcome
 from companion.runtime.console import tell
 
 PAGE = "side_by_side.html"
 RESULT = "side_by_side.json"
 _NAME_BYTES_MAX = 200
-"""Of a folder that is named after flights; file systems take 255."""
+"""Longest name of a folder named after flights; file systems allow 255."""
 
 
 def add_parser(commands: Any) -> None:
     """Add `report` to the sub-parsers of `companion`."""
     report = commands.add_parser(
         "report",
-        help="make summary and report of a log again, or put several flights side by side",
-        description=f"One log: make its summary and report again. Two to {FLIGHTS_MAX} logs: one page with what was flown, what was "
-        "set differently, all figures and the pictures over each other.",
+        help="write summary and report of a log, or compare several flights side by side",
+        description=f"One log: write its summary and report again. Two to {FLIGHTS_MAX} logs: write one page with what was flown, "
+        "the settings that differ, all figures, and plots of all flights over each other.",
     )
-    report.add_argument(
-        "log", type=Path, nargs="+", help="flight.mcap; several: side by side, the first is what the others are held to"
-    )
+    report.add_argument("log", type=Path, nargs="+", help="flight.mcap; several: side by side, compared with the first")
     report.add_argument(
         "--out",
         metavar="DIR",
-        help="default: beside the log; of several: a new folder, reports/A-vs-B, in the current one",
+        help="folder to write to (default: that of the log; for several logs a new folder reports/A-vs-B)",
     )
     report.add_argument(
         "--align",
         choices=("catch", "takeoff", "start"),
-        help="several: where their time axes agree (default: the catch if all have one, else the take-off)",
+        help="several logs: zero of the common time axis (default: the catch if all have one, else the take-off)",
     )
     report.add_argument(
         "--gif",
@@ -54,35 +55,34 @@ def add_parser(commands: Any) -> None:
     report.add_argument(
         "--json",
         action="store_true",
-        help="print summary or comparison as JSON, nothing else; files are written only with --out",
+        help="print the summary or comparison as JSON and nothing else; write files only with --out",
     )
     report.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, grade, write; returns the exit code."""
+    """Read and grade the logs and write the report; return the exit code.
+
+    Raises:
+        ConfigError: one line on what the user must change.
+    """
     logs: list[Path] = arguments.log
-    problem = _problem(arguments)
-    if problem is not None:
-        tell(f"companion report: {problem}")
-        return EXIT_BAD_INPUT
+    if arguments.out is not None and not arguments.out.strip():
+        raise _refusal("--out: expected the name of a folder, got an empty one")
+    if len(logs) > FLIGHTS_MAX:
+        raise _refusal(f"{len(logs)} logs: expected at most {FLIGHTS_MAX}, more cannot be told apart in one plot")
+    if arguments.align is not None and len(logs) == 1:
+        raise _refusal("--align: expected two or more logs, got one")
+    if arguments.gif is not None and len(logs) > 1:
+        raise _refusal(f"--gif: expected one log, got {len(logs)}")
     try:
         return _one(logs[0], arguments) if len(logs) == 1 else _several(logs, arguments)
     except (LogError, NotAlignable) as error:
-        tell(error)
-        return EXIT_BAD_INPUT
+        raise ConfigError([str(error)]) from None
 
 
-def _problem(arguments: argparse.Namespace) -> str | None:
-    if arguments.out is not None and not arguments.out.strip():
-        return "--out: expected the name of a folder, got an empty one"
-    if len(arguments.log) > FLIGHTS_MAX:
-        return f"{len(arguments.log)} logs: expected at most {FLIGHTS_MAX}, more cannot be told apart in one picture"
-    if arguments.align is not None and len(arguments.log) == 1:
-        return "--align: there is one log; it is for two and more"
-    if arguments.gif is not None and len(arguments.log) > 1:
-        return f"--gif: expected one log, got {len(arguments.log)}"
-    return None
+def _refusal(text: str) -> ConfigError:
+    return ConfigError([f"companion report: {text}"])
 
 
 # One flight
@@ -90,19 +90,19 @@ def _problem(arguments: argparse.Namespace) -> str | None:
 
 @dataclass(frozen=True)
 class Graded:
-    """A log and its summary, as the launcher would have written it."""
+    """A log with the summary that the launcher would have written."""
 
     log: FlightLog
     summary: dict[str, Any]
     note: str | None
-    """Why the summary beside the log was not used, if it was not."""
+    """Why the summary beside the log was not used; None if it was."""
 
 
 def graded(path: Path) -> Graded:
-    """Read a log and grade it; what only the flight's launcher knew is taken from the summary beside the log.
+    """Read a log and grade it. What only the launcher of the flight knew comes from the summary beside the log.
 
     Raises:
-        LogError: the file is no log.
+        LogError: the file is not a log.
     """
     from companion.launcher.run import TICKS_MAX, autopilot_of
 
@@ -119,29 +119,29 @@ def graded(path: Path) -> Graded:
         "world": known.get("world"),
         "autopilot": known.get("autopilot") or autopilot_of(log, {}),
     }
-    # The guardian acts after the last tick: its events are no outputs of the core.
+    # The guardian acts after the last tick: its events are not in the outputs of the core.
     recorded_ids = {event["id"] for event in summary["events"]}
     summary["events"] = summary["events"] + [e for e in known.get("events", ()) if e["id"] not in recorded_ids]
     return Graded(log, summary, note)
 
 
 def _known(path: Path, own: dict[str, Any]) -> tuple[dict[str, Any], str | None]:
-    """The summary beside the log, if it is of this flight: copied logs may lie beside the summary of another one."""
+    """Return the summary beside the log, and a note if it cannot be used: a copied log may lie beside another flight's summary."""
     try:
         known = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}, None
     except (OSError, ValueError) as error:
-        return {}, f"{path}: cannot be read ({error}); outcome and payload are told without it"
+        return {}, f"{path}: cannot be read ({error}); outcome and payload are not taken from it"
     try:
         times = {event["t_s"] for event in known["events"]}
         same = known["loop"]["ticks"] == own["loop"]["ticks"] and times >= {event["t_s"] for event in own["events"]}
     except (KeyError, TypeError):
-        return {}, f"{path}: is no summary of a flight; outcome and payload are told without it"
+        return {}, f"{path}: is no summary of a flight; outcome and payload are not taken from it"
     return (
         (known, None)
         if same
-        else ({}, f"{path}: is the summary of another flight; outcome and payload are told without it")
+        else ({}, f"{path}: is the summary of another flight; outcome and payload are not taken from it")
     )
 
 
@@ -158,12 +158,9 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
     if flight.note is not None:
         tell(flight.note)
     if arguments.gif is not None:
-        problem = _write_gif(flight, arguments.gif)
-        if problem is not None:
-            tell(f"companion report: {problem}")
-            return EXIT_BAD_INPUT
+        _write_gif(flight, arguments.gif)
     if arguments.json:
-        _print(flight.summary)
+        sys.stdout.write(to_json(flight.summary))
         if arguments.out is None:
             return EXIT_OK
     out = path.parent if arguments.out is None else Path(arguments.out)
@@ -172,7 +169,7 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
         write_summary(flight.summary, out / "summary.json")
         report = report_of(flight.log, flight.summary, out)
     except OSError as error:
-        return _unwritable(out, error)
+        raise _unwritable(out, error) from None
     if report is None:
         return _no_pictures()
     if not arguments.json:
@@ -180,20 +177,20 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _write_gif(flight: Graded, path: Path) -> str | None:
-    """Write the animation of a flight; return why that failed, or None."""
+def _write_gif(flight: Graded, path: Path) -> None:
     try:
         from companion.analysis.animation import movie_of, write_gif
     except ImportError:
-        return "--gif needs matplotlib: pip install 'companion[analysis]'"
+        raise _refusal("--gif needs matplotlib: pip install 'companion[analysis]'") from None
     movie = movie_of(flight.log, flight.summary)
     if movie is None:
-        return f"{flight.log.path}: the vehicle did not take off, or the log lacks its geometry; there is no animation"
+        raise _refusal(
+            f"{flight.log.path}: the vehicle did not take off, or the log lacks its geometry; there is no animation"
+        )
     try:
         write_gif(movie, path)
     except (OSError, ValueError) as error:
-        return f"{path}: cannot be written: {error}"
-    return None
+        raise _refusal(f"{path}: cannot be written: {error}") from None
 
 
 # Several flights
@@ -208,18 +205,15 @@ def _several(paths: Sequence[Path], arguments: argparse.Namespace) -> int:
         flights.append(flight_of(chr(ord("A") + n), name, str(path), _digest(path), flight.log, flight.summary))
         del flight  # one log at a time: the ticks of a long one take half a GB
     comparison = compare(flights, arguments.align)
-    out = _place(arguments.out, flights)
-    if isinstance(out, str):
-        tell(f"companion report: {out}")
-        return EXIT_BAD_INPUT
+    out = _folder(arguments.out, flights)
     if arguments.json:
-        _print(jsonable(comparison))
+        sys.stdout.write(to_json(jsonable(comparison)))
         if arguments.out is None:
             return EXIT_OK
     try:
         page = write_page(comparison, out)
     except OSError as error:
-        return _unwritable(out, error)
+        raise _unwritable(out, error) from None
     except ImportError:
         return _no_pictures()
     for line in comparison.cautions:
@@ -230,7 +224,7 @@ def _several(paths: Sequence[Path], arguments: argparse.Namespace) -> int:
 
 
 def write_page(comparison: Comparison, out: Path) -> Path:
-    """Write side_by_side.html, its pictures as PNG and side_by_side.json into `out`; returns the path of the page.
+    """Write side_by_side.html, its pictures as PNG and side_by_side.json into `out`; return the path of the page.
 
     Raises:
         ImportError: matplotlib is missing.
@@ -240,13 +234,13 @@ def write_page(comparison: Comparison, out: Path) -> Path:
     from companion.campaigns.side_by_side.plots import write_pictures
 
     out.mkdir(parents=True, exist_ok=True)
-    (out / RESULT).write_text(json.dumps(jsonable(comparison), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    (out / RESULT).write_text(to_json(jsonable(comparison)), encoding="utf-8")
     write_html(comparison, write_pictures(comparison, out), out / PAGE)
     return out / PAGE
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """What to call each flight: its folder, or its file where that has a name of its own; distinct."""
+    """Return a distinct name for each flight: its folder, or its file if that is not called flight.mcap."""
     own = [path.resolve().parent.name if path.name == "flight.mcap" else path.stem for path in paths]
     if len(set(own)) < len(own) and len({path.resolve() for path in paths}) == len(paths):
         own = [f"{path.resolve().parent.parent.name}/{name}" if path.name == "flight.mcap" else
@@ -254,13 +248,13 @@ def names_of(paths: Sequence[Path]) -> list[str]:
     return [name if own.count(name) == 1 else f"{name} ({own[: n + 1].count(name)})" for n, name in enumerate(own)]
 
 
-def _place(asked: str | None, flights: Sequence[Flight]) -> Path | str:
-    """The folder to write to, or why it cannot be: what holds a comparison of other flights is never overwritten."""
+def _folder(asked: str | None, flights: Sequence[Flight]) -> Path:
+    """Return the folder to write to: one that holds no report of other flights."""
     digests = [flight.digest for flight in flights]
     if asked is not None:
         folder = Path(asked)
         if _holds_others(folder, digests):
-            return f"--out {folder}: there is a {RESULT} of other flights already; choose another folder"
+            raise _refusal(f"--out {folder}: there is a {RESULT} of other flights already; choose another folder")
         return folder
     name = "-vs-".join(flight.name.replace("/", "-") for flight in flights)
     if len(name.encode()) > _NAME_BYTES_MAX:
@@ -290,13 +284,8 @@ def _digest(path: Path) -> str:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _print(tree: dict[str, Any]) -> None:
-    print(json.dumps(tree, indent=1, allow_nan=False))
-
-
-def _unwritable(out: Path, error: OSError) -> int:
-    tell(f"companion report: {out}: cannot be written: {error.strerror}; choose another folder with --out")
-    return EXIT_BAD_INPUT
+def _unwritable(out: Path, error: OSError) -> ConfigError:
+    return _refusal(f"{out}: cannot be written: {error.strerror}; choose another folder with --out")
 
 
 def _no_pictures() -> int:

@@ -24,7 +24,7 @@ class Flown:
     """A fast flight that has ended, also by an exception."""
 
     config: SitlConfig
-    """As flown."""
+    """The configuration that was flown."""
     fast: FastFlight | None
     """None if an exception ended it."""
     result: FastResult

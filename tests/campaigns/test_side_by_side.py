@@ -514,7 +514,7 @@ def test_json_is_printed_alone_and_nothing_is_written(flights: Path, capsys: pyt
         ((WHOLE, "flights"), r"flights: cannot be read: Is a directory"),
         ((WHOLE,) * 7, r"companion report: 7 logs: expected at most 6, .*"),
         ((WHOLE, SHORT, "--align", "catch"), rf"{SHORT}: --align catch: there is no catch in this flight"),
-        ((WHOLE, "--align", "catch"), r"companion report: --align: there is one log; it is for two and more"),
+        ((WHOLE, "--align", "catch"), r"companion report: --align: expected two or more logs, got one"),
         ((WHOLE, GAINS, "--out", ""), r"companion report: --out: expected the name of a folder, got an empty one"),
         ((WHOLE, GAINS, "--out", WHOLE), r"companion report: flights/whole/flight\.mcap: cannot be written: .*--out"),
         ((WHOLE, "--out", WHOLE), r"companion report: flights/whole/flight\.mcap: cannot be written: .*--out"),
@@ -561,7 +561,7 @@ def test_a_summary_beside_the_log_that_is_of_another_flight_is_not_believed(
     one, other = (flight["summary"] for flight in json.loads(out)["flights"])
     assert (one["outcome"], one["payload_kg"]) == ("crashed", 0.25)
     assert (other["outcome"], other["payload_kg"]) == ("lost", None)
-    assert err == "summary.json: is the summary of another flight; outcome and payload are told without it\n"
+    assert err == "summary.json: is the summary of another flight; outcome and payload are not taken from it\n"
 
 
 @pytest.mark.parametrize("text", ["{", '{"loop": 3, "events": []}'])
@@ -572,7 +572,7 @@ def test_a_damaged_summary_beside_the_log_costs_one_line_and_no_more(
     capsys.readouterr()
     assert main(["report", WHOLE, GAINS, "--json"]) == EXIT_OK
     out, err = capsys.readouterr()
-    assert re.fullmatch(r"flights/whole/summary\.json: .*; outcome and payload are told without it\n", err)
+    assert re.fullmatch(r"flights/whole/summary\.json: .*; outcome and payload are not taken from it\n", err)
     assert (
         json.loads(out)["flights"][0]["summary"]["loop"]["ticks"]
         == json.loads(out)["flights"][1]["summary"]["loop"]["ticks"]

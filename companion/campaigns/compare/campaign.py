@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from companion.campaigns.compare.aggregate import MISSED, Group, aggregate
 from companion.campaigns.compare.grid import Variant, is_ablation, short_label
 from companion.campaigns.compare.printed import SOURCE
 from companion.campaigns.process import Message
-from companion.campaigns.runner import Campaign, Row, flat
+from companion.campaigns.runner import Campaign, Row
 
 EXPLAINED = (
     "RMS, mean ± standard deviation over seeds. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
@@ -74,10 +74,6 @@ class Compare(Campaign):
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return the means and deviations over seeds."""
         return {"aggregate": [group.jsonable() for group in aggregate(rows)]}
-
-    def csv_row(self, row: Row) -> Mapping[str, Any]:
-        """Return the row with nested names joined by dots."""
-        return dict(flat(row))
 
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return both tables and the pictures."""

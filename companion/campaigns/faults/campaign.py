@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,6 @@ from companion.analysis.table import Cell, Column, Table, for_terminal, number, 
 from companion.campaigns.faults.judge import good
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.faults.wires import WireFlights, default_jobs
-from companion.campaigns.process import Message
 from companion.campaigns.runner import Campaign, Flights, Row, counted, outcomes
 from companion.sitl_config.faults import KINDS, FlightPhase
 
@@ -63,10 +62,6 @@ class Faults(Campaign):
             }
         }
 
-    def csv_row(self, row: Row) -> Mapping[str, Any]:
-        """Return the row with its lists as text."""
-        return {key: "; ".join(value) if isinstance(value, list) else value for key, value in row.items()}
-
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the bad flights, then all of them."""
         bad = [row for row in rows if not good(row)]
@@ -86,10 +81,6 @@ class Faults(Campaign):
             else "No flight did what it must not do.",
             good=not bad,
         )
-
-    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Return no picture."""
-        return []
 
     def show(self, rows: Sequence[Row], console: Console) -> None:
         """Print one line per flight, then the problems."""

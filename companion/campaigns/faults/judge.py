@@ -1,4 +1,4 @@
-"""Judges a flight with a fault: how it ended, how soon it was detected, and whether anything happened that must not.
+"""Judges a flight with a fault: how it ended, how soon it was detected, and whether it did something that no flight may do.
 
 A row holds the results of one flight, as `companion faults --json` prints it; docs/faults.md describes its keys.
 """
@@ -38,11 +38,11 @@ class Point:
     """The true state of the machine at one time."""
 
     t_s: float
-    """Flight clock."""
+    """Time on the flight clock."""
     position_world_m: Vec3
     tilt_rad: float
     slack_m: float
-    """Of the tether with its configured length."""
+    """Slack of the tether with its configured length."""
     tension_n: float
 
 
@@ -69,13 +69,13 @@ class FaultFlight:
     """The record of a flight with a fault."""
 
     outcome: str
-    """As in summary.json."""
+    """Outcome as in summary.json."""
     begun_s: float | None
-    """Flight clock at the begin of the fault; None if it never began."""
+    """Time at which the fault began, on the flight clock; None if it never began."""
     course: Sequence[Point]
     ticks: Sequence[Tick]
     events: Sequence[Event]
-    """Of the core and of the guardian."""
+    """Events of the core and of the guardian."""
     landed: bool
     """Whether it ended on the floor with its rotors stopped."""
     caught: bool
@@ -186,7 +186,7 @@ def _drift_m(flown: FaultFlight, course: Sequence[Point], abort: Event | None) -
 def _problems(
     row: Row, variant: Variant, phase: FlightPhase, course: Sequence[Point], abort: Event | None, vehicle: Vehicle
 ) -> list[str]:
-    """Return what must not happen but did."""
+    """Return what the flight did that no flight may do."""
     found = []
     if row["outcome"] not in GOOD and not (row["outcome"] == "refused" and phase == "ground"):
         found.append(str(row["outcome"]))
@@ -219,5 +219,5 @@ def _outside(position_m: Vec3, vehicle: Vehicle) -> bool:
 
 
 def good(row: Row) -> bool:
-    """Return whether nothing happened that must not."""
+    """Return whether the flight did nothing that no flight may do."""
     return not row["problems"]

@@ -26,11 +26,11 @@ class Robustness(Campaign):
     csv_name = "draws.csv"
 
     mission: str
-    """As the user named it."""
+    """Mission file, as the user named it."""
     seed: int
-    """Of the draws."""
+    """Seed of the draws."""
     cases: Sequence[Case] = ()
-    """Empty for draws."""
+    """The cases to fly; empty to fly draws."""
     cases_file: str | None = None
     keep: str | None = None
     """File to which the worst flights, or the flown cases, are written."""

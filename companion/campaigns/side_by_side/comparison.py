@@ -32,7 +32,7 @@ class Figure:
     digits: int
     values: tuple[float | None, ...]
     differences: tuple[float | None, ...]
-    """From the first flight."""
+    """Differences from the first flight."""
     verdicts: tuple[str | None, ...]
     """`better` or `worse` than the first flight, for figures of which a smaller value is certainly better."""
 

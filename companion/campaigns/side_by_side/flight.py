@@ -35,7 +35,7 @@ class Course:
     flown_world_m: Array
     reference_world_m: Array
     lateness_s: Array
-    """Of every recorded tick, also of those that were skipped when reading."""
+    """Lateness of every recorded tick, also of those that were skipped when reading."""
     catch: int | None
     """Row of the first catch."""
     takeoff_s: float | None

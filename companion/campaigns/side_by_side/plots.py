@@ -44,7 +44,7 @@ LINES = tuple(
         strict=False,
     )
 )
-"""One per flight."""
+"""How each flight is drawn, by its position."""
 _EVENT_MARKS = {"info": ("|", 7.0), "warning": ("^", 6.0), "critical": ("X", 7.5)}
 _NAME_SHARE = 0.0074
 """Width of one character of an event's name, as a share of the axis."""
