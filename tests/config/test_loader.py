@@ -58,16 +58,6 @@ BAD_MISSION = [
         [f"{CATCH}:34:5: phases[1].duration: unknown key; write duration_s, in s (without a unit)"],
     ),
     (
-        "height_m: 1.0",
-        "height_ft: 3",
-        [f"{CATCH}:30:5: phases[0].height_ft: unknown key; write height_m, in m (not in ft)"],
-    ),
-    (
-        "  arm_deg: [165.0, 140.0]       # folded",
-        "  arm_rad: [2.9, 2.4]",
-        [f"{CATCH}:15:3: start.arm_rad: unknown key; write arm_deg, in deg (not in rad)"],
-    ),
-    (
         "speed_max_m_s: 0.8",
         "speed_max_km_h: 0.8",
         [f"{CATCH}:18:3: limits.speed_max_km_h: unknown key; write speed_max_m_s, in m/s (not in km/h)"],
@@ -89,10 +79,8 @@ BAD_MISSION = [
         [f'{CATCH}:30:15: phases[0].height_m: expected a number > 0, got "1.0" (write 1.0 without quotes)'],
     ),
     ("height_m: 1.0", "height_m: .nan", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got .nan"]),
-    ("height_m: 1.0", "height_m: -.inf", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got -.inf"]),
     ("height_m: 1.0", "height_m: 1e999", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got .inf"]),
     ("height_m: 1.0", "height_m: true", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got true"]),
-    ("height_m: 1.0", "height_m: [1]", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got [1]"]),
     ("height_m: 1.0", "height_m:", [f"{CATCH}:30:14: phases[0].height_m: expected a number > 0, got nothing"]),
     ("    height_m: 1.0\n", "", [f"{CATCH}:29:5: phases[0].height_m: missing; expected a number > 0"]),
     (
@@ -196,7 +184,6 @@ BAD_VEHICLE = [
     ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 (the register's unit), got 90"]),
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
-    ("up_axis: z ", "up_axis: x ", ['up_axis: expected one of "y", "z", got "x"']),
     ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "4.1", got 3.0 (put it in quotes)']),
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: the first must be below the second, got [2.2, -2.2]"]),
     ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: 0.26 m on 0.2 m"]),
@@ -204,13 +191,9 @@ BAD_VEHICLE = [
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole machine, but arm and tool alone weigh 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2, the sum of the other two, as of every rigid body, got 0.05"]),
-    ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  rotor_arm_m: 0", ["airframe.rotor_arm_m: expected a number > 0, got 0"]),
     ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
     ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: each core once, got 2 twice in [2, 3, 2]"]),
     ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),
-    ("safety:", "computer:\n  cpus: 2\nsafety:", ["computer.cpus: expected a list, got 2"]),
-    ("safety:", "computer:\n  cores: [2]\nsafety:", ["computer.cores: unknown key; known here: cpus, lock_memory"]),
-    ("length_m: 3.0", "length_cm: 300", ["tether.length_cm: unknown key; write length_m, in m (not in cm)"]),
 ]  # fmt: skip
 
 
@@ -229,7 +212,6 @@ def test_bad_vehicle_file(project: Path, old: str, new: str, expected: list[str]
 
 BAD_OVERRIDES = [
     ("world.paylod_kg=0.2", "--set world.paylod_kg: unknown key; did you mean payload_kg?"),
-    ("world.payload_g=200", "--set world.payload_g: unknown key; write payload_kg, in kg (not in g)"),
     ("wrld.payload_kg=0.2", "--set wrld.payload_kg: unknown section 'wrld'; did you mean world?"),
     ("x.y=1", "--set x.y: unknown section 'x'; known are mission, vehicle, controller, world"),
     ("world.payload_kg", "--set world.payload_kg: no '='; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
@@ -237,16 +219,12 @@ BAD_OVERRIDES = [
     ("world=1", "--set world: names a whole document; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("[0]=1", "--set [0]: unknown section '0'; known are mission, vehicle, controller, world"),
-    ("world.payload_kg=2 kg", '--set world.payload_kg: expected a number from 0 to 2, got "2 kg" (write 2; the key\'s name holds the unit)'),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
-    ("world.payload_kg=.inf", "--set world.payload_kg: expected a number from 0 to 2, got .inf"),
     ("world.seed=1.5", "--set world.seed: expected a whole number >= 0, got 1.5"),
     ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 40 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
     ("world.wind_m_s={a: 1, a: 2}", "--set world.wind_m_s: a: duplicate key, already given; remove one of the two"),
-    ("vehicle.safety.mocap_timeout_ms=200", "--set vehicle.safety.mocap_timeout_ms: unknown key; write mocap_timeout_s, in s (not in ms)"),
     ("vehicle.safty.mocap_timeout_s=0.2", "--set vehicle.safty.mocap_timeout_s: safty: unknown key; did you mean safety?"),
-    ("mission.phases[2].duration_s=-3", "--set mission.phases[2].duration_s: expected a number > 0 and <= 600, got -3"),
     ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no [9]; indices there: 0 to 6"),
     ("mission.phases.duration_s=3", "--set mission.phases.duration_s: mission.phases has no keys, it is a list"),
     ("mission.name.x=3", "--set mission.name.x: mission.name has no keys, it is a single value"),
@@ -388,14 +366,8 @@ def test_override_of_a_key_and_a_section_that_the_file_leaves_to_defaults(projec
 
 
 @pytest.mark.parametrize(("law", "preset"), [(law, preset) for law, presets in PRESETS.items() for preset in presets])
-@pytest.mark.parametrize("mission", ["catch", "hover"])
-def test_config_survives_a_json_round_trip(mission: str, law: str, preset: str) -> None:
-    config = load_sitl(
-        ROOT / "configs" / "missions" / f"{mission}.yaml",
-        controller_law=law,
-        preset=preset,
-        overrides=["world.payload_kg=0.1"],
-    )
+def test_config_survives_a_json_round_trip(law: str, preset: str) -> None:
+    config = load_sitl(ROOT / CATCH, controller_law=law, preset=preset, overrides=["world.payload_kg=0.1"])
     assert type(config.controller) is LAWS[law]
     again = SitlConfig.model_validate_json(config.model_dump_json())
     assert again == config

@@ -5,6 +5,7 @@ Limits are wide enough for a loaded machine; the sharp figures are tested in the
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -48,6 +49,8 @@ def test_the_catch(the_catch: Flown) -> None:
     assert "completed" in ended.out
     assert summary["outcome"] == "completed"
     assert (summary["controller"], summary["preset"], summary["payload_kg"]) == ("adaptive", "recommended", PAYLOAD_KG)
+    assert summary["world"]["payload_kg"] == PAYLOAD_KG
+    assert "world" not in json.loads((the_catch.sandbox.cwd / "out/config.json").read_text(encoding="utf-8"))
     assert summary["autopilot"]["kind"] == "stub"
     assert 6.0 < summary["catch_t_s"] < 7.0
     assert summary["rms"]["post"]["e_p_m"] < 0.03
