@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import pytest
 
 from companion.config.loader import load_vehicle
+from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction
 from companion.safety.arm import error_text
@@ -518,3 +520,43 @@ def test_in_the_air_a_repeated_pose_is_not_passed_on_at_once() -> None:
     monitors.check(same(healthy(7)), standing())
     monitors.check(same(healthy(8)), standing())
     assert monitors.mocap_trusted, "on the ground a pose may well repeat"
+
+
+def scaled(key: str, factor: float) -> Vehicle:
+    """The vehicle with one threshold multiplied."""
+    section, _, name = ("safety." + key if "." not in key else key).rpartition(".")
+    part: Any = VEHICLE
+    for step in section.split("."):
+        part = getattr(part, step)
+    value = getattr(part, name)
+    changed = part.model_copy(update={name: type(value)(value * factor)})
+    for step in reversed(section.split(".")[1:]):
+        changed = VEHICLE.devices.model_copy(update={step: changed})
+    return VEHICLE.model_copy(update={section.partition(".")[0]: changed})
+
+
+ELSEWHERE = {
+    *("tether.taut_slack_m", "tether.pull_min_n", "tether.separation_m"),  # TetherWatch: test_tether.py
+    *("tether.react_time_s", "tether.stop_deceleration_m_s2"),  # StopModel: test_stop.py
+    "arm.joints.torque_max_nm",
+    "arm.joints.angle_deg",
+}
+"""Keys that have no effect on the faults above."""
+TURNED = {"mocap_jump_deg": Fault(turned("mocap", 30.0))}
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
+def test_every_threshold_of_the_table_is_one_that_runs(rule: Rule) -> None:
+    hold_time = [rule.hold_time] if isinstance(rule.hold_time, str) else []
+    for key in [*rule.thresholds, *rule.tracked_by, *hold_time]:
+        if key in ELSEWHERE:
+            continue
+        fault = TURNED.get(key, FAULTS[rule.id])
+        inputs = stream(rule.id) if fault is FAULTS[rule.id] else after_a_moment(fault.change)
+
+        def times_s(vehicle: Vehicle, fault: Fault = fault, inputs: list[Inputs] = inputs) -> list[float]:
+            return [event.t_s for event in watched(vehicle, inputs, fault.situation()) if event.id == rule.id]
+
+        expected = times_s(VEHICLE)
+        assert expected
+        assert any(times_s(scaled(key, factor)) != expected for factor in (1e-3, 1e3, -1e3)), key
