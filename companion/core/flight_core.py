@@ -75,10 +75,13 @@ class FlightCore:
         state, request = transition(self._parameters, self._state, observed, observation)
         self._state = state
         self._carry_out(request, i)
-        events = list(request.events)
         self._bent_by = ()
-        reference, command = self._command(dt_s, i, events)
+        reference, command = self._command(dt_s, i)
         self._log = command.log
+        phase, kind = state.phase(t_s)
+        events = list(request.events)
+        if command.log is not None and kind is PhaseKind.FLIGHT:
+            self._watch_for_catch(t_s, command.log, events)
         arm, vehicle = i.arm, i.vehicle
         verdict = self._gate.check(
             command.attitude,
@@ -91,7 +94,6 @@ class FlightCore:
         )
         if verdict.refused or self._refused:
             self._report_refused(t_s, verdict.refused, events)
-        phase, kind = state.phase(t_s)
         start_s = state.mission_start_s
         return Outputs(
             tick=inputs.tick,
@@ -143,7 +145,7 @@ class FlightCore:
         i = self._monitors.trusted
         assert i is not None
         self._watch_tether(i)
-        resume = any(event.id == OPERATOR_RESUME for event in events)
+        resume = bool(events) and any(event.id == OPERATOR_RESUME for event in events)
         return events, Observation(
             inputs=i,
             airborne=situation.airborne,
@@ -192,7 +194,7 @@ class FlightCore:
 
     # -- command ---------------------------------------------------------------------------------------------------
 
-    def _command(self, dt_s: float, i: Inputs, events: list[Event]) -> tuple[Reference | None, Command]:
+    def _command(self, dt_s: float, i: Inputs) -> tuple[Reference | None, Command]:
         state, stage = self._state, self._state.stage
         if stage in (Stage.WAIT, Stage.READY, Stage.DONE):
             return None, Command()
@@ -211,10 +213,7 @@ class FlightCore:
             governed = self._governor.bend(dt_s, reference, self._situation.tether)
             reference, self._bent_by = governed.reference, governed.bent_by
         self._reference = reference
-        command = self._pilot.fly(i, dt_s, reference, state.vertical_scale(i.t_s))
-        if command.log is not None and stage is _PLAN and course.segment(i.t_s).kind is PhaseKind.FLIGHT:
-            self._watch_for_catch(i.t_s, command.log, events)
-        return reference, command
+        return reference, self._pilot.fly(i, dt_s, reference, state.vertical_scale(i.t_s))
 
     def _watch_for_catch(self, t_s: float, log: ControlLog, events: list[Event]) -> None:
         caught_s, start_s = self._pilot.catch_s(t_s, log), self._state.mission_start_s

@@ -11,6 +11,7 @@ from companion.mission.course import Course
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
+from companion.model.codec import Record
 from companion.model.flight_stage import Stage
 from companion.model.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, Reference, TetherState
 from companion.safety.rotor_stop import RotorStop
@@ -109,8 +110,7 @@ class FlightState:
         return self.touchdown.relief
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(Record, frozen=True):
     """What a transition reads beside state and events."""
 
     inputs: Inputs
@@ -130,8 +130,7 @@ class Observation:
     """Stamp of the newest believed pose before this tick; -inf before the first."""
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
+class Request(Record, frozen=True):
     """What a transition asks the core to do."""
 
     autopilot: AutopilotRequest = AutopilotRequest.NONE

@@ -30,7 +30,8 @@ def transition(
         t.change(entered_s=observation.inputs.t_s)
     if observation.armed_by_others and not state.armed_by_others:
         t.change(armed_by_others=True)
-    t.start_asked = any(event.id == OPERATOR_START for event in events)
+    if events:
+        t.start_asked = any(event.id == OPERATOR_START for event in events)
     supervise(t)
     request = advance(t)
     return t.state, Request(request, tuple(t.events), tuple(t.tare), t.resumed)

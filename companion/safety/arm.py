@@ -40,13 +40,17 @@ class ArmTracker:
         self.before: ArmState | None = None
         """The joint state before it, if this tick's is a new one."""
         self.age_s = 0.0
+        self.hottest_c = -math.inf
+        """Temperature of the hotter servo; -inf without a joint state."""
 
     def update(self, i: Inputs, awake_s: float) -> None:
         """Take a tick."""
         arm = self.arm = i.arm
         self.age_s = self._age.update(awake_s, arm.stamp_s if arm else None)
-        self.before = None
+        self.before, self.hottest_c = None, -math.inf
         if arm is not None:
+            first_c, second_c = arm.temperature_c
+            self.hottest_c = first_c if first_c > second_c else second_c
             newest, self._newest = self._newest, arm
             if newest is not None and arm.stamp_s > newest.stamp_s:
                 self.before = newest
@@ -94,18 +98,14 @@ def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
 
 def servo_warm(a: ArmTracker, thresholds: Vec2) -> Values | None:
     """The hotter servo's temperature has reached the first threshold, and not the second."""
-    if a.arm is None:
-        return None
-    hottest_c = max(a.arm.temperature_c)
-    return (hottest_c, thresholds[0]) if thresholds[0] <= hottest_c < thresholds[1] else None
+    return (a.hottest_c, thresholds[0]) if thresholds[0] <= a.hottest_c < thresholds[1] else None
 
 
 def servo_hot(a: ArmTracker, thresholds: Vec2) -> Values | None:
     """The hotter servo's temperature has reached both thresholds."""
-    if a.arm is None:
+    if not (a.hottest_c >= thresholds[0] and a.hottest_c >= thresholds[1]):
         return None
-    hottest_c = max(a.arm.temperature_c)
-    return (hottest_c, max(thresholds)) if hottest_c >= max(thresholds) else None
+    return (a.hottest_c, max(thresholds))
 
 
 def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:

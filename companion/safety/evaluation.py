@@ -63,16 +63,17 @@ class Evaluation:
             rows = self._air_waiting if waiting else self._air
         else:
             rows = self._ground_waiting if waiting else self._ground
-        holds: dict[str, tuple[Rule, Values]] = {}
-        for rule, predicate, tracker, thresholds in rows:
-            values = predicate(tracker, thresholds)
-            if values is not None:
-                holds[rule.id] = (rule, values)
+        found = [
+            (rule, values)
+            for rule, predicate, tracker, thresholds in rows
+            if (values := predicate(tracker, thresholds)) is not None
+        ]
         if self._since_s:
-            self._since_s = {id_: since_s for id_, since_s in self._since_s.items() if id_ in holds}
+            ids = {rule.id for rule, _ in found}
+            self._since_s = {id_: since_s for id_, since_s in self._since_s.items() if id_ in ids}
         events = []
-        for id_, (rule, values) in holds.items():
-            action, severity = rule.verdict(airborne)
+        for rule, values in found:
+            id_, (action, severity) = rule.id, rule.verdict(airborne)
             since_s = self._since_s.setdefault(id_, t_s)
             active = self._active.get(id_)
             if active is not None and active[0] is action:

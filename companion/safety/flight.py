@@ -63,8 +63,8 @@ class FlightTracker:
 
     @property
     def flipped(self) -> bool:
-        """Two sources say in this tick that the vehicle is flipped."""
-        return self.tilt_rad > 0.0 and self._inputs is not None and seems_flipped(self._inputs)
+        """Two sources say in this tick that the vehicle is flipped; meaningful while `tilt_rad` is above 0."""
+        return self._inputs is not None and seems_flipped(self._inputs)
 
     def stop_s(self, vehicle: VehicleState) -> float:
         """Velocity times this is the displacement to where the vehicle would come to rest after a fault."""
@@ -89,7 +89,7 @@ def tilt(f: FlightTracker, tilt_max_rad: float) -> Values | None:
 
 def crashed(f: FlightTracker, _: None) -> Values | None:
     """The vehicle is flipped."""
-    return (math.degrees(f.tilt_rad),) if f.flipped else None
+    return (math.degrees(f.tilt_rad),) if f.tilt_rad > 0.0 and f.flipped else None
 
 
 def too_fast(f: FlightTracker, speed_max_m_s: float) -> Values | None:
@@ -130,11 +130,12 @@ def geofence_near(f: FlightTracker, tolerance_m: float) -> Values | None:
     return None if f.rotors_in_room(x, y, z, tolerance_m) else (x, y, z)
 
 
-def tracking_error(f: FlightTracker, thresholds: tuple[float, ...]) -> Values | None:
-    """The tracking error exceeds all thresholds."""
+def tracking_error(f: FlightTracker, thresholds: tuple[float, float]) -> Values | None:
+    """The tracking error exceeds both thresholds."""
     error_m = f.tracking_error_m
-    limit_m = max(thresholds)
-    return (error_m, limit_m) if error_m is not None and error_m > limit_m else None
+    if error_m is None or not (error_m > thresholds[0] and error_m > thresholds[1]):
+        return None
+    return (error_m, max(thresholds))
 
 
 def tracking_warn(f: FlightTracker, threshold_m: float) -> Values | None:

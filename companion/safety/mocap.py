@@ -274,8 +274,9 @@ def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
 def mocap_too_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
     """The latency exceeds both thresholds."""
     latency_s = m.pose.latency_s if m.pose is not None else None
-    limit_s = max(thresholds)
-    return (latency_s * 1e3, limit_s * 1e3) if latency_s is not None and latency_s > limit_s else None
+    if latency_s is None or not (latency_s > thresholds[0] and latency_s > thresholds[1]):
+        return None
+    return (latency_s * 1e3, max(thresholds) * 1e3)
 
 
 def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:

@@ -34,7 +34,9 @@ def loop_late(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | No
 
 def loop_stalled(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
     """The tick is late by more than both thresholds."""
-    return (p.gap_s * 1e3, max(thresholds) * 1e3) if p.gap_s > max(thresholds) else None
+    if not (p.gap_s > thresholds[0] and p.gap_s > thresholds[1]):
+        return None
+    return (p.gap_s * 1e3, max(thresholds) * 1e3)
 
 
 def recorder_drops(p: ProcessTracker, _: None) -> Values | None:

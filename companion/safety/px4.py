@@ -43,6 +43,8 @@ class Px4Tracker:
         """PX4's clock, in the tick in which it went back."""
         self.repeats = False
         """PX4 sends new positions with the same values although the vehicle moves in the air."""
+        self.left_offboard: AutopilotStatus | None = None
+        """PX4's status if PX4 should be in OFFBOARD and is not; else None."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
         """Take a tick; `moving`: PX4's velocity or rates show that the vehicle moves."""
@@ -61,15 +63,9 @@ class Px4Tracker:
                 age_s = imu_s
             self.state_age_s = age_s
             self._compare(v, situation, awake_s, moving)
+        commands = situation.offboard_expected and status is not None and status.mode is not FlightMode.OFFBOARD
+        self.left_offboard = status if commands else None
         self.heartbeat_age_s = self._heartbeat.update(awake_s, status.heartbeat_stamp_s if status else None)
-
-    @property
-    def left_offboard(self) -> AutopilotStatus | None:
-        """PX4's status if PX4 should be in OFFBOARD and is not; else None."""
-        status = self.status
-        if status is None or status.mode is FlightMode.OFFBOARD or not self.situation.offboard_expected:
-            return None
-        return status
 
     def _compare(self, v: VehicleState, situation: Situation, awake_s: float, moving: bool) -> None:
         before, self._seen = self._seen, v
