@@ -75,29 +75,45 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     if stream is None:
         yield DEVICE.bad("not checked", "", "")
         return
+    pose = (o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad) if o.vehicle and o.arm else None
+    yield from stream_rows(stream, o.force, o.duration_s, vehicle, pose)
+    if o.machine is not None and stream.lost is None:
+        yield usb_latency(USB, o.machine.force_latency_ms)
+
+
+def stream_rows(
+    stream: ForceStream,
+    samples: Sequence[ForceSample],
+    duration_s: float,
+    vehicle: Vehicle,
+    pose: tuple[Quat, Vec2] | None,
+) -> Iterator[Row]:
+    """Return the rows of a sensor that was watched at rest.
+
+    Args:
+        stream: counters.
+        samples: in order of time.
+        duration_s: for how long it was watched.
+        vehicle: limits, and the tool whose weight is tared.
+        pose: attitude of the body and joint angles, rad; None if they are unknown: then there is no row of the tare.
+    """
     if stream.lost is not None:
         yield DEVICE.bad(stream.lost, "it goes on streaming", "check plug and cable")
         return
     yield DEVICE.good(stream.product or "answers")
-    yield _rate(o, stream, vehicle)
-    if stream.bad_sums:
-        yield CHECKSUMS.bad(
-            f"{stream.bad_sums} wrong", "none", "use a shielded cable, away from motors and their wires"
-        )
-    else:
-        yield CHECKSUMS.good("none wrong", "none")
-    if len(o.force) >= 10:
-        yield _noise(o.force)
-        yield _overload(o.force, vehicle)
-        if o.vehicle and o.arm:
-            yield _tare(o, vehicle)
-        yield _still(o.force, vehicle)
-    if o.machine is not None:
-        yield usb_latency(USB, o.machine.force_latency_ms)
+    yield _rate(stream.samples / duration_s, vehicle)
+    fix = "use a shielded cable, away from motors and their wires"
+    yield CHECKSUMS.row(not stream.bad_sums, f"{stream.bad_sums or 'none'} wrong", "none", fix)
+    if len(samples) >= 10:
+        yield _noise(samples)
+        yield _overload(samples, vehicle)
+        if pose is not None:
+            yield _tare(tare_bias_n(samples, vehicle, *pose), vehicle)
+        yield _still(samples, vehicle)
 
 
-def _rate(o: Observations, stream: ForceStream, vehicle: Vehicle) -> Row:
-    rate_hz, expected_hz = stream.samples / o.duration_s, vehicle.devices.force.rate_hz
+def _rate(rate_hz: float, vehicle: Vehicle) -> Row:
+    expected_hz = vehicle.devices.force.rate_hz
     read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz} Hz"
     if rate_hz >= RATE_GOOD * expected_hz:
         return RATE.good(read, wanted)
@@ -128,8 +144,7 @@ def _overload(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     return OVERLOAD.bad(f"{count} of {len(samples)} samples", "none", fix)
 
 
-def _tare(o: Observations, vehicle: Vehicle) -> Row:
-    bias_n = tare_bias_n(o.force, vehicle, o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad)
+def _tare(bias_n: Vec3, vehicle: Vehicle) -> Row:
     size_n, full_n = math.hypot(*bias_n), vehicle.devices.force.force_max_n
     x, y, z = bias_n
     read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beside the net's {vehicle.tool.net_mass_kg:g} kg"

@@ -16,9 +16,9 @@ from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import usb_latency_ms
 from companion.io.protocols import DeviceError
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.observations import ForceStream, Observations
+from companion.model.observations import ForceStream
 from companion.model.rows import Row
-from companion.model.types import IDENTITY_QUAT, ArmState, ForceSample, Vec2, VehicleState
+from companion.model.types import IDENTITY_QUAT, ForceSample, Vec2
 from companion.preflight import force as preflight
 from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check
@@ -130,34 +130,7 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
 def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     """Return the preflight's rows of what was watched, and whether the readings change."""
     samples = seen.empty
-    still = VehicleState(
-        position_stamp_s=0.0,
-        attitude_stamp_s=0.0,
-        imu_stamp_s=0.0,
-        position_world_m=(0.0, 0.0, 0.0),
-        velocity_world_m_s=(0.0, 0.0, 0.0),
-        attitude_wxyz=IDENTITY_QUAT,
-        angular_rate_body_rad_s=(0.0, 0.0, 0.0),
-        specific_force_body_m_s2=(0.0, 0.0, GRAVITY_M_S2),
-    )
-    observed = Observations(
-        start_s=samples[0].stamp_s,
-        duration_s=samples[-1].stamp_s - samples[0].stamp_s,
-        vehicle=(still,),
-        arm=(
-            ArmState(
-                stamp_s=0.0,
-                angle_rad=seen.arm_rad,
-                velocity_rad_s=(0.0, 0.0),
-                torque_nm=(0.0, 0.0),
-                hardware_error=(0, 0),
-                temperature_c=(0.0, 0.0),
-                read_failures=0,
-            ),
-        ),
-        force=tuple(samples),
-        force_stream=seen.stream,
-    )
+    duration_s = samples[-1].stamp_s - samples[0].stamp_s
     bias_fix = (
         "free the net; without a load correct tool.net_mass_kg, or loosen the sensor's mount; what then stays becomes the sensor's own "
         "zero by companion ft tare --sensor"
@@ -165,7 +138,7 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     return [
         *(
             msgspec.structs.replace(row, fix=bias_fix) if row.id == preflight.TARE.id and not row.ok else row
-            for row in preflight.rows(observed, vehicle)
+            for row in preflight.stream_rows(seen.stream, samples, duration_s, vehicle, (IDENTITY_QUAT, seen.arm_rad))
         ),
         ft_fit.stuck_row(samples, vehicle),
         usb_latency(preflight.USB, seen.usb_latency_ms),
