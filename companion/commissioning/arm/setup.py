@@ -212,24 +212,21 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
         return Done(wanted, "refused", (wanted.refusal,), right=False)
     needed = [one for one in wanted.servos if one.needed]
     _show(session, wanted.servos)
-    absent = tuple(
-        f"servo {vehicle.arm.joints[index].servo_id} (joint {index + 1}) does not answer: check its power and cable"
-        for index in wanted.absent
-    )
+    for index in wanted.absent:
+        servo_id = vehicle.arm.joints[index].servo_id
+        session.say(f"servo {servo_id} (joint {index + 1}) does not answer: check its power and cable", "bold red")
     if not needed:
         text = "nothing to write: every servo that answers is as the companion needs it"
-        return Done(wanted, "nothing to do", (*absent, text), right=not absent)
+        return Done(wanted, "nothing to do", (text,), right=not wanted.absent)
     answer = session.ask(f"write this to {len(needed)} servo{'s' if len(needed) > 1 else ''}?")
     if answer is None:
-        return Done(
-            wanted, "not written", (*absent, "nothing was written; --yes writes it without asking"), right=False
-        )
+        return Done(wanted, "not written", ("nothing was written; --yes writes it without asking",), right=False)
     if not answer:
         raise GivenUp("nothing was written")
     carry_out(vehicle.devices.arm.port, needed, lambda text: session.say(f"  {text}"))
     session.say("reading back")
-    lines = [*absent, *_left(vehicle, wanted)]
-    right = not lines
+    lines = _left(vehicle, wanted)
+    right = not lines and not wanted.absent
     if any(setting.register in (bus.DRIVE_MODE, bus.HOMING_OFFSET) for one in needed for setting in one.writes):
         lines.append("a servo counts differently now: run companion arm zero")
     return Done(wanted, "written", (*lines, *(["set up and read back"] if right else [])), right)
