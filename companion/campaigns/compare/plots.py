@@ -108,15 +108,13 @@ def _courses(title: str, messages: Sequence[Message], colours: dict[str, str]) -
 
 def _top(messages: Sequence[Message], key: str) -> float:
     """Return the upper limit of an axis of errors; an incomplete flight is cut off before it hides the others."""
-    peaks: dict[bool, list[float]] = {True: [], False: []}
-    for message in messages:
-        values = _array(message["series"][key])
-        if np.isfinite(values).any():
-            peaks[message["row"]["outcome"] == COMPLETED].append(float(np.nanmax(values)))
-    completed, others = peaks[True], peaks[False]
-    if completed:
-        return 1.1 * max(1e-3, min(max([*completed, *others]), 2.0 * max(completed)))
-    return 1.1 * max(1e-3, min(max(others), 3.0 * float(np.median(others)))) if others else 1.0
+    courses = [(_array(m["series"][key]), m["row"]["outcome"] == COMPLETED) for m in messages]
+    peaks = [(float(np.nanmax(values)), completed) for values, completed in courses if np.isfinite(values).any()]
+    if not peaks:
+        return 1.0
+    every, completed = [peak for peak, _ in peaks], [peak for peak, whole in peaks if whole]
+    limit = 2.0 * max(completed) if completed else 3.0 * float(np.median(every))
+    return 1.1 * max(1e-3, min(max(every), limit))
 
 
 def _overview(groups: Sequence[Group], colours: dict[str, str]) -> Figure:

@@ -123,19 +123,19 @@ def _over_time(
     figure = new_figure(0.9 + 2.0 * len(kept) + lane_in + 0.2 * ((len(flights) + 1) // 2))
     grid = figure.subplots(len(kept) + 1, 1, sharex=True, squeeze=False, height_ratios=[2.0] * len(kept) + [lane_in])
     axes, lane = [row[0] for row in grid[:-1]], grid[-1][0]
-    spans = [_span(flight, zero_s) for flight, zero_s in zip(flights, comparison.zeros_s, strict=True)]
-    known = [span for span in spans if span is not None]
-    begin, end = min(span[0] for span in known), max(span[1] for span in known)
-    axes[0].set_xlim(begin - 0.012 * (end - begin), end + 0.012 * (end - begin))
+    for ax in [*axes, lane]:
+        ax.margins(x=0.012)
     for ax, (label, of) in zip(axes, kept, strict=True):
         dress(ax)
         ax.set_ylabel(label)
         graded: list[Array] = []
         for n, (flight, zero_s) in enumerate(zip(flights, comparison.zeros_s, strict=True)):
             course, values = flight.course, of(flight)
-            t = course.t_s - zero_s
-            drawn = np.where(course.flying, values, np.nan)
-            _draw(ax, t, drawn, n, flight)
+            t, drawn = course.t_s - zero_s, np.where(course.flying, values, np.nan)
+            # The first flight is at the bottom: dashes over a solid line show both where they agree.
+            ax.plot(t, drawn, **_style(n), lw=1.25, zorder=3 + 0.1 * n)
+            if not flight.completed:
+                mark_end(ax, t, drawn, LINES[n].colour)
             seen = values[course.graded if course.graded.any() else course.flying]
             graded.append(seen[np.isfinite(seen)])
         if from_zero:
@@ -151,13 +151,6 @@ def _over_time(
     figure.align_ylabels([*axes, lane])
     _title(figure, comparison, title)
     return figure
-
-
-def _draw(ax: Any, t: Array, values: Array, n: int, flight: Flight) -> None:
-    # The first flight is at the bottom: dashes over a solid line show both where they agree.
-    ax.plot(t, values, **_style(n), lw=1.25, zorder=3 + 0.1 * n)
-    if not flight.completed:
-        mark_end(ax, t, values, LINES[n].colour)
 
 
 def _style(n: int) -> dict[str, Any]:
@@ -285,21 +278,9 @@ def _lateness(comparison: Comparison) -> Figure | None:
     dress(ax)
     for n, late_ms in enumerate(lateness):
         if len(late_ms):
-            ordered = np.sort(late_ms)
-            share = 1.0 - np.arange(len(ordered)) / len(ordered)
-            # 4000 points draw the same line as all of them; the tail keeps every point.
-            body, tail = np.linspace(0, len(ordered) - 1, 4000).astype(int), np.arange(len(ordered))[-500:]
-            kept = np.unique(np.concatenate([body, tail]))
-            ax.plot(
-                ordered[kept],
-                100.0 * share[kept],
-                **_style(n),
-                lw=1.5,
-                drawstyle="steps-pre",
-                zorder=3 + 0.1 * n,
-            )
+            ax.ecdf(late_ms, complementary=True, **_style(n), lw=1.5, zorder=3 + 0.1 * n)
     ax.set_yscale("log")
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g}"))
     known = np.concatenate(lateness)
     typical, late, most = (float(np.percentile(known, percent)) for percent in (50, 99, 100))
     if typical > 0.0 and most > 10.0 * late:
@@ -309,17 +290,11 @@ def _lateness(comparison: Comparison) -> Figure | None:
         ax.set_xlim(left=typical / 3.0)
     else:
         ax.set_xlim(left=0.0)
-    ax.set_ylim(top=130.0)
+    ax.set_ylim(bottom=0.5 / max(map(len, lateness)), top=1.3)
     ax.set_xlabel("tick start after its deadline [ms]")
     ax.set_ylabel("ticks later than that [%]")
     _title(figure, comparison, "Lateness of the control tick")
     return figure
-
-
-def _span(flight: Flight, zero_s: float) -> tuple[float, float] | None:
-    t_s, flying = flight.course.t_s, flight.course.flying
-    part = t_s[flying] if flying.any() else t_s
-    return (float(part[0]) - zero_s, max(float(part[-1]), float(part[0]) + 0.1) - zero_s) if len(part) else None
 
 
 def _title(figure: Figure, comparison: Comparison, title: str) -> None:

@@ -92,12 +92,12 @@ def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[st
     same_mission = "mission" not in kinds
     cautions += _circumstances(flights, any(s.key == "world.payload_kg" for s in kinds.get("payload", ())))
     digests = [flight.digest for flight in flights]
-    cautions += [
-        f"{flight.letter} is the same recording as {flights[digests.index(flight.digest)].letter}."
-        for n, flight in enumerate(flights)
-        if len(set(digests)) > 1 and digests.index(flight.digest) < n
-    ]
-    if len(set(digests)) == 1:
+    same_recording = len(set(digests)) == 1
+    for n, flight in enumerate(flights):
+        first = digests.index(flight.digest)
+        if first < n and not same_recording:
+            cautions.append(f"{flight.letter} is the same recording as {flights[first].letter}.")
+    if same_recording:
         fair = f"The same recording {len(flights)} times: nothing differs."
     elif not law and not cautions:
         fair = "No setting differs: the differences below are scatter between flights."
