@@ -21,6 +21,8 @@ from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import Operator, Operators
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.web import Monitor, ServerSettings, serve_live
+from tests.broker import Broker
+from tests.ground.vehicle import PlayedVehicle, played_vehicle
 from tests.support import DEADLINE_S
 
 ANNA = Operator("anna", b"a" * 32)
@@ -130,6 +132,19 @@ async def viewer_of(monitor: Monitor, token: str | None = None, **settings: Any)
     ):
         await ws.send_json({"kind": "token", "token": token_of(monitor) if token is None else token})
         yield Viewer(ws)
+
+
+@contextlib.asynccontextmanager
+async def on_page(
+    broker: Broker, signer: Signer | str = SIGNER, token: str | None = None, *, quiet: bool = False
+) -> AsyncIterator[tuple[PlayedVehicle, Monitor, Viewer]]:
+    """Connect a vehicle, a monitor and a viewer."""
+    async with (
+        played_vehicle(broker.port, OPERATORS, quiet=quiet) as vehicle,
+        monitor_at(broker.url, signer) as monitor,
+        viewer_of(monitor, token) as viewer,
+    ):
+        yield vehicle, monitor, viewer
 
 
 def self_signed(folder: Path) -> tuple[Path, Path]:

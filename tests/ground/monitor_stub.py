@@ -39,6 +39,7 @@ from companion.model.codec import to_jsonable
 from companion.model.types import Sent
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight, FastResult
+from tests.ground.vehicle import ack_of, state_of
 from tests.support import CATCH, DEADLINE_S
 
 SESSION = "5e55104e"
@@ -92,19 +93,7 @@ def sent_at(tick: int, t_s: float) -> Sent:
 
 def state(presence: Presence = Presence.FLYING, **changes: Any) -> State:
     """Return a state message of the vehicle."""
-    usual = State(
-        v=VERSION,
-        vehicle=NAME,
-        session=SESSION,
-        presence=presence,
-        simulated=True,
-        mission="catch",
-        law="adaptive",
-        preset="recommended",
-        wall_s=1.7e9,
-        commands=True,
-    )
-    return replace(usual, **changes)
+    return replace(state_of(NAME, SESSION), presence=presence, **changes)
 
 
 def preflight() -> Preflight:
@@ -123,19 +112,8 @@ def event(number: int, text: str, *, id_: str = "hold", severity: str = "warning
 
 def ack(command: str, nonce: str, text: str, *, accepted: bool = True, operator: str = "anna") -> Ack:
     """Return the vehicle's answer to a command."""
-    return Ack(
-        v=VERSION,
-        session=SESSION,
-        nonce=nonce,
-        operator=operator,
-        command=CommandName(command),
-        accepted=accepted,
-        text=text,
-        t_s=21.0,
-        phase="catch",
-        action="hold",
-        proof="",
-    )
+    values = {"operator": operator, "accepted": accepted, "text": text, "t_s": 21.0}
+    return ack_of(SESSION, nonce, command=CommandName(command), **values)
 
 
 def relayed(record: object, vehicle: str = NAME, **more: Any) -> Message:

@@ -20,7 +20,6 @@ from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.commands import Accepted, Verifier, make_command
 from companion.ground.protocol.messages import (
     VERSION,
-    Ack,
     CommandName,
     Preflight,
     PreflightRow,
@@ -39,7 +38,7 @@ from companion.model.codec import to_jsonable
 from companion.runtime.tasks import until_first
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played, until
-from tests.ground.vehicle import flight, played_vehicle, state_of
+from tests.ground.vehicle import ack_of, flight, played_vehicle, state_of
 
 pytestmark = pytest.mark.waits
 
@@ -142,19 +141,7 @@ def test_without_a_key_everything_is_shown() -> None:
 
 def test_an_answer_that_the_vehicle_did_not_prove_is_none() -> None:
     """Otherwise anyone who reads the nonce could answer "landing" and end the attempts."""
-    ack = Ack(
-        v=VERSION,
-        session="s1",
-        nonce="0" * 32,
-        operator="anna",
-        command=CommandName.LAND,
-        accepted=True,
-        text="landing",
-        t_s=1.0,
-        phase="catch",
-        action="land",
-        proof="",
-    )
+    ack = ack_of("s1", command=CommandName.LAND, text="landing", action="land")
     watch, topic = VehicleTracker(signer=SIGNER), "companion/rig/ack"
     assert watch.receive(topic, encode(ack), False, 50.0) is None
     assert watch.receive(topic, encode(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
@@ -186,19 +173,7 @@ def genuine() -> dict[Topic, dict[str, Any]]:
     """Return one valid message of each topic, as data."""
     config, _, events = flight()
     scene = scene_of(config, "s1", [(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], mission_s=21.0)
-    ack = Ack(
-        v=VERSION,
-        session="s1",
-        nonce="0" * 32,
-        operator="bert",
-        command=CommandName.HOLD,
-        accepted=True,
-        text="holding",
-        t_s=1.0,
-        phase="catch",
-        action="hold",
-        proof="",
-    )
+    ack = ack_of("s1", operator="bert")
     records = {
         Topic.STATE: state_of("rig", "s1"),
         Topic.SCENE: scene,

@@ -11,11 +11,11 @@ from msgspec.structs import replace
 
 from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
-from companion.ground.protocol.messages import VERSION, Ack, CommandName, Events, Presence, Topic, encode
+from companion.ground.protocol.messages import VERSION, Events, Presence, Topic, encode
 from companion.ground.station.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Outbox
 from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, ReceivedRecord, VehicleTracker
 from companion.ground.station.web_guard import MESSAGES_BURST, RateLimiter, host_allowed, origin_allowed, same_token
-from tests.ground.vehicle import flight, state_of
+from tests.ground.vehicle import ack_of, flight, state_of
 
 pytestmark = pytest.mark.waits
 
@@ -24,22 +24,6 @@ SESSION = "s1"
 
 def stream_of(session: str = SESSION, t_s: float = 1.0, **values: Any) -> bytes:
     return encode(replace(flight()[1][30], session=session, t_s=t_s, **values))
-
-
-def ack_of(nonce: str) -> Ack:
-    return Ack(
-        v=VERSION,
-        session=SESSION,
-        nonce=nonce,
-        operator="anna",
-        command=CommandName.HOLD,
-        accepted=True,
-        text="holding",
-        t_s=1.0,
-        phase="catch",
-        action="hold",
-        proof="",
-    )
 
 
 def took(outbox: Outbox) -> list[Any]:
@@ -187,7 +171,7 @@ def test_everybody_gets_the_same_text_and_who_left_gets_nothing() -> None:
         hub.add(outbox, 0.0)
         took(outbox)
     hub.remove(outboxes[0])
-    hub.publish(ReceivedRecord("rig", Topic.ACK, ack_of("00")))
+    hub.publish(ReceivedRecord("rig", Topic.ACK, ack_of(SESSION, "00")))
     outboxes[0].put("{}")
     assert took(outboxes[0]) == [{}]
     first, second = (took(outbox) for outbox in outboxes[1:])

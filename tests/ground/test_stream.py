@@ -171,20 +171,7 @@ def test_numbers_that_are_none_make_a_message_that_every_parser_reads(bad: float
         return value
 
     event = Event(t_s=1.0, id="e", severity=Severity.INFO, action=SafetyAction.NOMINAL, text="text")
-    tether = TetherState(
-        range_m=1.0,
-        slack_m=1.0,
-        stop_slack_m=1.0,
-        elevation_rad=0.1,
-        clearance_m=0.5,
-        turns=0.0,
-        pull_n=0.0,
-        taut=False,
-        snagged=False,
-        separated=False,
-        vehicle_turns=0.0,
-    )
-    row = changed(IN_FLIGHT, outputs__events=(event,), outputs__tether=tether)
+    row = changed(IN_FLIGHT, outputs__events=(event,), **tether())
     maker = StreamBuilder(CONFIG, "s")
     maker.add_tick(*IN_FLIGHT)
     maker.add_tick(*(spoilt(record) for record in row))

@@ -20,7 +20,17 @@ from companion.ground.station.station import Station
 from companion.ground.station.web import Monitor, ServerSettings, WebError
 from companion.ground.station.web_guard import HEADERS, MESSAGE_MAX_BYTES
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import OPERATORS, SIGNER, base_of, monitor_at, played, self_signed, until, viewer_of
+from tests.ground.monitor_rig import (
+    OPERATORS,
+    SIGNER,
+    base_of,
+    monitor_at,
+    on_page,
+    played,
+    self_signed,
+    until,
+    viewer_of,
+)
 from tests.ground.vehicle import flight, played_vehicle
 
 pytestmark = pytest.mark.waits
@@ -99,11 +109,7 @@ async def test_a_viewer_that_talks_rubbish_is_sent_away(broker: Broker, text: st
 
 @played
 async def test_a_viewer_that_floods_is_sent_away(broker: Broker) -> None:
-    async with (
-        played_vehicle(broker.port, OPERATORS) as vehicle,
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with on_page(broker) as (vehicle, _monitor, viewer):
         await viewer.until("stream")
         with contextlib.suppress(ConnectionError):
             for _ in range(500):
@@ -115,11 +121,7 @@ async def test_a_viewer_that_floods_is_sent_away(broker: Broker) -> None:
 
 @played
 async def test_a_viewer_that_does_not_keep_up_is_sent_away_and_nobody_else_misses_an_event(broker: Broker) -> None:
-    async with (
-        played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with on_page(broker, quiet=True) as (vehicle, monitor, viewer):
         await viewer.until("events")
         with idle_viewer(monitor):
             await until(lambda: monitor.viewers == 2)

@@ -17,7 +17,7 @@ from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import ATTEMPTS, NO_ANSWER, signer_of
 from companion.ground.station.vehicles import LIVE_S
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, played, token_of, viewer_of
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, on_page, played, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle
 
 pytestmark = pytest.mark.waits
@@ -54,11 +54,7 @@ async def test_a_command_is_signed_judged_by_the_vehicle_and_its_answer_shown(
 
 @played
 async def test_a_refusal_of_the_vehicle_reaches_the_page(broker: Broker) -> None:
-    async with (
-        played_vehicle(broker.port, OPERATORS) as vehicle,
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with on_page(broker) as (vehicle, _monitor, viewer):
         vehicle.accepts = lambda command: (False, "nothing to resume: not holding")
         await viewer.until("stream")
         await viewer.order("resume")
@@ -72,11 +68,7 @@ async def test_a_refusal_of_the_vehicle_reaches_the_page(broker: Broker) -> None
 async def test_no_answer_is_said_and_only_what_makes_things_safer_is_sent_again(broker: Broker, command: str) -> None:
     tries = ATTEMPTS if command == "hold" else 1
 
-    async with (
-        played_vehicle(broker.port, OPERATORS) as vehicle,
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with on_page(broker) as (vehicle, _monitor, viewer):
         vehicle.answers = False
         await viewer.until("stream")
         await viewer.order(command)
@@ -92,11 +84,7 @@ async def test_no_answer_is_said_and_only_what_makes_things_safer_is_sent_again(
 
 @played
 async def test_a_late_answer_ends_the_tries(broker: Broker) -> None:
-    async with (
-        played_vehicle(broker.port, OPERATORS) as vehicle,
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with on_page(broker) as (vehicle, _monitor, viewer):
         vehicle.answers = False
         await viewer.until("stream")
         await viewer.order("land")
@@ -113,11 +101,7 @@ async def test_a_late_answer_ends_the_tries(broker: Broker) -> None:
 async def test_a_newer_command_ends_the_tries_of_an_older_one(broker: Broker) -> None:
     """A HOLD that is repeated after a RESUME would hold again."""
 
-    async with (
-        played_vehicle(broker.port, OPERATORS) as vehicle,
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with on_page(broker) as (vehicle, _monitor, viewer):
         vehicle.answers = False
         await viewer.until("stream")
         await viewer.order("hold")
@@ -131,11 +115,7 @@ async def test_a_newer_command_ends_the_tries_of_an_older_one(broker: Broker) ->
 
 @played
 async def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broker) -> None:
-    async with (
-        played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
-        monitor_at(broker.url) as monitor,
-        viewer_of(monitor) as viewer,
-    ):
+    async with on_page(broker, quiet=True) as (vehicle, _monitor, viewer):
 
         async def why_not(name: str) -> str:
             await viewer.order("hold", name)
@@ -227,11 +207,7 @@ def test_a_key_is_made_for_this_computer_alone(tmp_path: Path, monkeypatch: pyte
 
 @played
 async def test_nobody_commands_through_a_monitor_that_is_view_only(broker: Broker) -> None:
-    async with (
-        played_vehicle(broker.port, OPERATORS) as vehicle,
-        monitor_at(broker.url, "nobody shall") as monitor,
-        viewer_of(monitor, "") as viewer,
-    ):
+    async with on_page(broker, "nobody shall", "") as (vehicle, monitor, viewer):
         assert "#" not in monitor.url
         hello = await viewer.next()
         assert (hello["can_command"], hello["operator"], hello["why_not"]) == (False, None, "nobody shall")

@@ -20,6 +20,7 @@ from companion.ground.protocol.messages import (
     VERSION,
     Ack,
     Command,
+    CommandName,
     Events,
     Preflight,
     PreflightRow,
@@ -59,6 +60,24 @@ def state_of(name: str, session: str, **values: Any) -> State:
         commands=True,
     )
     return replace(state, **values)
+
+
+def ack_of(session: str, nonce: str = "0" * 32, **values: Any) -> Ack:
+    """Return the answer to a HOLD of anna, with fields replaced."""
+    ack = Ack(
+        v=VERSION,
+        session=session,
+        nonce=nonce,
+        operator="anna",
+        command=CommandName.HOLD,
+        accepted=True,
+        text="holding",
+        t_s=1.0,
+        phase="catch",
+        action="hold",
+        proof="",
+    )
+    return replace(ack, **values)
 
 
 class PlayedVehicle:
