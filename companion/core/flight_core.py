@@ -126,7 +126,7 @@ class FlightCore:
     # -- observation -----------------------------------------------------------------------------------------------
 
     def _observe(self, inputs: Inputs) -> tuple[tuple[Event, ...], Observation]:
-        """Monitors and tether: the events of this tick, and what the transition reads."""
+        """Run the monitors and the tether watch. Return this tick's events, and what the transition reads."""
         situation, stage = self._situation, self._state.stage
         if stage is not self._situation_stage:
             self._situation_stage = stage
@@ -158,7 +158,7 @@ class FlightCore:
         )
 
     def _watch_tether(self, i: Inputs) -> None:
-        """From arming on: winding before take-off is not known, and counts as none."""
+        """Update the tether's state, from arming on: winding before take-off is not known, and counts as none."""
         v = i.vehicle
         if v is None or not self._tether_watched:
             return
@@ -174,7 +174,7 @@ class FlightCore:
         )
 
     def _carry_out(self, request: Request, i: Inputs) -> None:
-        """What a transition requests of the core itself."""
+        """Do what a transition requests of the core itself."""
         if i.mocap is not None and i.mocap.tracking_valid:
             self._pose_s = i.mocap.stamp_s
         if request.resumed:

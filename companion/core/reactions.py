@@ -57,7 +57,7 @@ def _escalate(t: Transition) -> None:
 
 
 def _react(t: Transition) -> None:
-    """The action has become graver."""
+    """React to an action that has become graver."""
     state, action = t.state, t.state.supervisor.action
     if action.rank < _HOLD.rank:
         return
@@ -89,7 +89,7 @@ def _react(t: Transition) -> None:
 
 
 def _hold_on_ground(t: Transition) -> None:
-    """On the ground HOLD means not to lift. A flight that waits for its start does that already."""
+    """Call the take-off off. A flight that waits for its start continues to wait."""
     waits = t.parameters.waits_for_start and t.state.stage in (Stage.WAIT, Stage.READY)
     if not waits and not t.state.armed_by_others:
         text = "hold commanded before take-off; the vehicle stays on the ground"
@@ -97,7 +97,7 @@ def _hold_on_ground(t: Transition) -> None:
 
 
 def _hold(t: Transition) -> None:
-    """Come to rest and stay; a landing goes on, and near the floor the hold becomes one."""
+    """Come to rest and stay. A landing continues, and near the floor the vehicle lands instead."""
     course, t_s = t.state.course, t.i.t_s
     if course is None or course.segment(t_s).kind is PhaseKind.LANDING:
         return
@@ -126,7 +126,7 @@ def _land_instead(t: Transition, text: str) -> None:
 
 
 def _land(t: Transition) -> None:
-    """From the last reference on: stop, fold, descend."""
+    """Stop from the last reference, fold the arm and descend."""
     now, p = t.o.reference, t.parameters
     if now is None:  # the law has never flown
         t.finish(Outcome.ABORTED)
@@ -146,7 +146,7 @@ def _land(t: Transition) -> None:
 
 
 def _allowed_velocity(t: Transition, now: Reference) -> Vec3:
-    """The velocity that a stop may begin with, m/s: nothing outward or up while the tether pulls."""
+    """Return the velocity that a stop may begin with, m/s: nothing outward or up while the tether pulls."""
     tether = t.o.tether
     if tether is not None and (tether.taut or tether.snagged):
         return inward_only(now.velocity_world_m_s, now.position_world_m, t.parameters.vehicle.tether.anchor_world_m)

@@ -23,7 +23,7 @@ from companion.safety.notices import Notice
 ARMED_SHOWN_S = 1.5
 """PX4's HEARTBEAT reports once a second whether it is armed: after a request to arm, an older "not armed" proves nothing."""
 NO_TOUCHDOWN_S = 5.0
-"""After the plan's end."""
+"""Time after the plan's end without a touchdown, until PX4 lands."""
 _NONE = AutopilotRequest.NONE
 
 
@@ -47,7 +47,7 @@ def _wait(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 
 def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
-    """Until every input is there and PX4 demonstrably follows motion capture, for as long as the tare takes."""
+    """Wait until every input has arrived and PX4 has followed motion capture for as long as the tare takes."""
     i, was_ready = t.i, t.state.waiting.was_ready
     overdue = elapsed_s > seq.WAIT_TIMEOUT_S and not was_ready
     missing = missing_inputs(i)
@@ -95,7 +95,7 @@ def _is_ready(t: Transition) -> None:
 
 
 def _ready(t: Transition, _: float) -> AutopilotRequest:
-    """Everything is there; until the operator starts the take-off, or something is lost again."""
+    """Wait until the operator starts the take-off, or until something that the flight needs is lost again."""
     i, waiting = t.i, t.state.waiting
     missing = missing_inputs(i)
     problem = _nothing_from(missing) if missing else unfused(i)
@@ -134,7 +134,7 @@ def _weigh(t: Transition) -> None:
 
 
 def _misplaced(t: Transition) -> list[str]:
-    """In what the vehicle does not stand as the mission says."""
+    """Return in what the vehicle's pose differs from the mission's start; empty if it does not."""
     vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
     assert vehicle is not None and arm is not None
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
@@ -142,7 +142,7 @@ def _misplaced(t: Transition) -> list[str]:
 
 
 def _take_off(t: Transition) -> None:
-    """From where the vehicle stands now."""
+    """Plan the mission from where the vehicle stands now, and enter OFFBOARD."""
     vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
     assert vehicle is not None and arm is not None
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
@@ -283,7 +283,7 @@ def _done(_: Transition, __: float) -> AutopilotRequest:
 
 
 def _left_to_pilot(t: Transition) -> bool:
-    """A pilot took over while PX4 was to be disarmed: from now on nothing is sent, and the pilot's own disarm is waited for."""
+    """Return whether a pilot took over before PX4 was disarmed. From then on nothing is sent, and the pilot disarms."""
     if not seq.flown_by_pilot(t.i.status):
         return False
     if not any(event.id == PILOT_TOOK_OVER for event in t.events):
@@ -295,7 +295,7 @@ def _left_to_pilot(t: Transition) -> bool:
 
 
 def _crash(t: Transition, text: str) -> None:
-    """Reported once: the rule of the same id may have done so."""
+    """Report a crash, unless the rule of the same id has done so."""
     if t.state.outcome is not Outcome.CRASHED:
         t.report_rule(CRASHED, SafetyAction.TERMINATE, text)
         t.finish(Outcome.CRASHED)

@@ -115,7 +115,7 @@ class Transition:
         )
 
     def enter(self, stage: Stage, *, pilot_flies: bool = False, flipped: bool = False) -> None:
-        """Go to a stage. Of a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is known already."""
+        """Enter a stage. For a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is already known."""
         p, t_s = self.parameters, self.i.t_s
         if stage is Stage.AUTOPILOT_LAND:
             self.enter_landing(pilot_flies, self.pose_s, flipped)
@@ -125,7 +125,7 @@ class Transition:
             self.change(stage=stage, entered_s=t_s)
 
     def enter_landing(self, pilot_flies: bool, pose_s: float, flipped: bool = False) -> None:
-        """PX4 lands; `pose_s` is the stamp of the newest pose that it has had, -inf if that is not known."""
+        """Enter the landing by PX4; `pose_s` is the stamp of the newest pose that PX4 has had, -inf if that is not known."""
         p, t_s = self.parameters, self.i.t_s
         landing = AutopilotLanding.begin(
             t_s, p.clearance_m, p.tilt_max_rad, pilot_flies, pose_s=pose_s, flipped=flipped
@@ -133,7 +133,7 @@ class Transition:
         self.change(stage=Stage.AUTOPILOT_LAND, entered_s=t_s, landing=landing)
 
     def finish(self, outcome: Outcome) -> None:
-        """Fix the outcome; a graver one replaces it, a better one never does."""
+        """Set the outcome. A graver one replaces it, a better one never does."""
         if self.state.outcome in (None, Outcome.COMPLETED) or outcome is Outcome.CRASHED:
             self.change(outcome=outcome)
 
