@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
@@ -72,8 +73,12 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
         scene = Scene(log.config["vehicle"])
     except (KeyError, TypeError):
         return None
-    first, last = int(flying[0]), int(flying[-1])
+    first, last = int(flying[0]), _end(log, flying, scene)
+    if last <= first:
+        return None
     caught = metrics.catch_index(log)
+    if caught is not None and caught >= last:
+        caught = None
     start_s, t_s = log.outputs[first].mission_t_s - log.columns.t_s[first], log.columns.t_s
     track = _Track(log, scene, caught, _throw_velocity_m_s(log, summary))
     axes, curves = _plots(log, t_s + start_s, slice(first, last + 1), caught)
@@ -100,6 +105,13 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
         x = _PLOT_X[0] + (t_s[k] - t_s[first]) / (t_s[last] - t_s[first]) * (_PLOT_X[1] - _PLOT_X[0])
         frames.append(Frame(shapes, float(x)))
     return Movie(axes, curves, frames, max(still - 4, 0))
+
+
+def _end(log: FlightLog, flying: npt.NDArray[np.intp], scene: Scene) -> int:
+    """Return the index of the last frame: the reference of a landing reaches the floor, below which it goes to detect touch-down."""
+    landing = np.array([log.outputs[k].phase_kind is PhaseKind.LANDING for k in flying])
+    low = log.columns.reference_position_world_m[flying, 2] < scene.standing_height_m
+    return int(flying[np.argmax(landing & low)] if (landing & low).any() else flying[-1])
 
 
 def _times(first_s: float, last_s: float, catch_s: float | None) -> Iterator[tuple[float, float]]:
@@ -177,7 +189,15 @@ def _throw_velocity_m_s(log: FlightLog, summary: dict[str, Any]) -> Array | None
 
 def _labels(log: FlightLog, k: int, mission_s: float, speed: float) -> list[Shape]:
     at = np.array([[16.0, 24.0]])
-    pace = "real time" if abs(speed - 1) < 0.05 else "¼ speed" if speed < 1 else f"{speed:.0f}× speed"
+    pace = (
+        "real time"
+        if abs(speed - 1) < 0.05
+        else "¼ speed"
+        if speed < 1
+        else f"{speed:.1f}× speed"
+        if speed < 1.95
+        else f"{speed:.0f}× speed"
+    )
     return [
         Shape(at, INK, 18.0, text=log.outputs[k].phase, align="left"),
         Shape(at + np.array([0.0, 24.0]), _SOFT, 14.0, text=f"t = {mission_s:.2f} s", align="left"),
@@ -187,7 +207,7 @@ def _labels(log: FlightLog, k: int, mission_s: float, speed: float) -> list[Shap
 
 def _plots(log: FlightLog, mission_s: Array, ticks: slice, caught: int | None) -> tuple[list[Shape], list[Shape]]:
     """Return the axes and the curves of position error and arm error."""
-    graded = np.logical_or(*metrics.flight_masks(log))
+    scaled = np.array([o.phase_kind in (PhaseKind.TAKEOFF, PhaseKind.FLIGHT) for o in log.outputs])
     arm = np.degrees(_norm(log.columns.arm_rad - log.columns.arm_reference_rad))
     axes: list[Shape] = [Shape(np.array([[_SPLIT_PX, 0.0], [_SPLIT_PX, HEIGHT]]), _GRID, 1.0)]
     curves: list[Shape] = []
@@ -196,7 +216,7 @@ def _plots(log: FlightLog, mission_s: Array, ticks: slice, caught: int | None) -
         (_PLOTS_Y[0], "position error [cm]", 100.0 * _norm(metrics.position_error_m(log)), FRONT),
         (_PLOTS_Y[1], "arm error [deg]", arm, LINK),
     ):
-        seen = values[graded & np.isfinite(values)]
+        seen = values[scaled & np.isfinite(values)]
         limit = _round_up(1.1 * float(seen.max())) if len(seen) else 1.0
         axes.append(Shape(np.array([[_PLOT_X[0] - 34, top - 22]]), INK, 14.0, text=name, align="left"))
         for share in (0.0, 0.5, 1.0):
@@ -216,13 +236,13 @@ def _plots(log: FlightLog, mission_s: Array, ticks: slice, caught: int | None) -
 
 
 def _curve(t_s: Array, share: Array, top: float, bottom: float) -> Array:
-    """Return a curve with the largest value of each pixel column. Values above the axis, as at touchdown, are left out."""
+    """Return a curve with the largest value of each pixel column; values above the axis, as at touchdown, are drawn at its top."""
     x = _PLOT_X[0] + (t_s - t_s[0]) / (t_s[-1] - t_s[0]) * (_PLOT_X[1] - _PLOT_X[0])
     starts = np.flatnonzero(np.diff(np.floor(x), prepend=-1.0))
     largest = np.fmax.reduceat(share, starts)
-    points = np.column_stack([x[starts], bottom + largest * (top - bottom)])
-    shown: Array = points[largest <= 1.0]
-    return shown
+    points = np.column_stack([x[starts], bottom + np.minimum(largest, 1.0) * (top - bottom)])
+    known: Array = points[np.isfinite(largest)]
+    return known
 
 
 def _round_up(value: float) -> float:
@@ -298,9 +318,8 @@ def write_gif(movie: Movie, path: Path, width_px: int = 800) -> None:
         pictures.append(picture.reduce(2))
     palette = pictures[movie.still].quantize(64, dither=Image.Dither.NONE)
     first, *others = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    first.save(
-        path, "GIF", save_all=True, append_images=others, duration=round(1000 / FRAMES_PER_S), loop=0, optimize=True
-    )
+    shown_ms = [round(1000 / FRAMES_PER_S)] * len(others) + [1600]
+    first.save(path, "GIF", save_all=True, append_images=others, duration=shown_ms, loop=0, optimize=True)
 
 
 def _grown(movie: Movie, frame: Frame) -> Iterator[Shape]:

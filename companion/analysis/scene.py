@@ -124,6 +124,11 @@ class Scene:
         room = vehicle["room"]
         self._low, self._high = (np.array([room[axis][k] for axis in ("x_m", "y_m", "z_m")]) for k in (0, 1))
 
+    @property
+    def standing_height_m(self) -> float:
+        """Height of the body's origin while the vehicle stands, world z."""
+        return float(self._low[2] + self._foot_m)
+
     def net_world_m(self, pose: Pose) -> Array:
         """Return the centre of the net."""
         return self._world(pose, self._arm_body_m(pose.arm_rad)[1])
