@@ -15,12 +15,13 @@ import math
 import statistics
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.px4_log import Px4Log, newest
+from benchmarks.report import write_json
 from companion.analysis.log import FlightLog, LogError
 from companion.campaigns.faults.wires import WITNESS
 from sitl.px4.hil_link import Px4Error
@@ -90,16 +91,7 @@ def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
     """Fly once, unless the folder holds the flight already."""
     if (folder / "summary.json").exists():
         return
-    command = [
-        sys.executable,
-        "-m",
-        "companion",
-        "fly",
-        str(MISSION),
-        f"--sitl={autopilot}",
-        "--out",
-        str(folder),
-    ]
+    command = [sys.executable, "-m", "companion", "fly", str(MISSION), f"--sitl={autopilot}", "--out", str(folder)]
     command += ["--set", *case.overrides, f"world.seed={run}"]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with open(folder.with_name(f"{folder.name}.txt"), "wb") as output:
@@ -164,65 +156,50 @@ def _after_fault_of_the_stub(witness: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+Cell = Callable[[Sequence[Row]], str]
+
+
+def _spread_of(key: str, digits: int, scale: float = 1.0) -> Cell:
+    return lambda rows: _spread([getattr(row, key) for row in rows], scale, digits)
+
+
+FLIGHT_COLUMNS: dict[str, Cell] = {
+    "ended as it must": lambda rows: _count(rows),
+    "e_p before the catch, mm": _spread_of("e_p_before_m", 1, 1e3),
+    "after it, mm": _spread_of("e_p_m", 1, 1e3),
+    "e_q, deg": _spread_of("e_q_deg", 2),
+    "arm error, deg": _spread_of("e_alpha_deg", 2),
+    "mocap to setpoint, ms: p50": _spread_of("latency_p50_ms", 1),
+    "p99": _spread_of("latency_p99_ms", 1),
+    "modes": lambda rows: " / ".join(sorted({row.modes for row in rows})),
+}
+FAULT_COLUMNS: dict[str, Cell] = {
+    "ended as it must": lambda rows: _count(rows),
+    "last setpoint, s": _spread_of("last_setpoint_s", 3),
+    "longest gap in vision, s": _spread_of("vision_gap_s", 3),
+    "next mode": lambda rows: " / ".join(sorted({row.mode or "-" for row in rows})),
+    "after, s": _spread_of("mode_s", 3),
+    "PX4's own failsafe, s": _spread_of("failsafe_s", 2),
+    "disarmed, s": _spread_of("disarmed_s", 1),
+    "drift, m": _spread_of("drift_m", 2),
+    "largest tilt, deg": _spread_of("worst_tilt_deg", 0),
+}
+
+
 def markdown(rows: Sequence[Row]) -> str:
     """Return two tables for docs/px4.md, flights without and with a fault, with the spread over the runs."""
     versions = sorted({row.version or "?" for row in rows if row.autopilot == "px4"})
-    lines = [
-        f"PX4 {' and '.join(versions)}; each cell: smallest to largest of the runs.",
-        "",
-        "| flight | autopilot | ended as it must | e_p before the catch, mm | after it, mm | e_q, deg | arm error, deg "
-        "| mocap to setpoint, ms (p50, p99) | modes |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for case in CASES:
-        for autopilot in AUTOPILOTS:
-            some = [row for row in rows if (row.case, row.autopilot) == (case.name, autopilot)]
-            if some and not case.fault:
-                lines.append(_flight_line(case, autopilot, some))
-    lines += [
-        "",
-        "| fault | autopilot | ended as it must | last setpoint, s | longest gap in vision, s | next mode | after, s "
-        "| PX4's own failsafe, s | disarmed, s | drift, m | largest tilt, deg |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for case in CASES:
-        for autopilot in AUTOPILOTS:
-            some = [row for row in rows if (row.case, row.autopilot) == (case.name, autopilot)]
-            if some and case.fault:
-                lines.append(_fault_line(case, autopilot, some))
+    lines = [f"PX4 {' and '.join(versions)}; each cell: smallest to largest of the runs."]
+    for fault, columns in ((False, FLIGHT_COLUMNS), (True, FAULT_COLUMNS)):
+        lines += ["", f"| {' | '.join(('fault' if fault else 'flight', 'autopilot', *columns))} |"]
+        lines.append("|---" * (len(columns) + 2) + "|")
+        for case in CASES:
+            for autopilot in AUTOPILOTS:
+                some = [row for row in rows if (row.case, row.autopilot) == (case.name, autopilot)]
+                if some and case.fault is fault:
+                    cells = (case.name, autopilot, *(cell(some) for cell in columns.values()))
+                    lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
-
-
-def _flight_line(case: Case, autopilot: str, rows: Sequence[Row]) -> str:
-    cells = (
-        case.name,
-        autopilot,
-        _count(rows),
-        _spread([row.e_p_before_m for row in rows], 1e3, 1),
-        _spread([row.e_p_m for row in rows], 1e3, 1),
-        _spread([row.e_q_deg for row in rows], 1.0, 2),
-        _spread([row.e_alpha_deg for row in rows], 1.0, 2),
-        f"{_spread([row.latency_p50_ms for row in rows], 1.0, 1)}, {_spread([row.latency_p99_ms for row in rows], 1.0, 1)}",
-        " / ".join(sorted({row.modes for row in rows})),
-    )
-    return f"| {' | '.join(cells)} |"
-
-
-def _fault_line(case: Case, autopilot: str, rows: Sequence[Row]) -> str:
-    cells = (
-        case.name,
-        autopilot,
-        _count(rows),
-        _spread([row.last_setpoint_s for row in rows], 1.0, 3),
-        _spread([row.vision_gap_s for row in rows], 1.0, 3),
-        " / ".join(sorted({row.mode or "-" for row in rows})),
-        _spread([row.mode_s for row in rows], 1.0, 3),
-        _spread([row.failsafe_s for row in rows], 1.0, 2),
-        _spread([row.disarmed_s for row in rows], 1.0, 1),
-        _spread([row.drift_m for row in rows], 1.0, 2),
-        _spread([row.worst_tilt_deg for row in rows], 1.0, 0),
-    )
-    return f"| {' | '.join(cells)} |"
 
 
 def _count(rows: Sequence[Row]) -> str:
@@ -285,8 +262,7 @@ def main(argv: list[str] | None = None) -> int:
     problems = verdicts(rows)
     for problem in problems:
         print(problem, file=sys.stderr)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
+    write_json(arguments.json, [asdict(row) for row in rows])
     return 1 if problems or failed else 0
 
 

@@ -30,7 +30,7 @@ TRUTH_FILE = "world.json"
 """Written beside the configuration after a flight with faults or several throws: the true course, modes and frames."""
 
 
-def _say(message: dict[str, Any]) -> None:
+def _send(message: dict[str, Any]) -> None:
     with contextlib.suppress(OSError):  # the launcher is gone; standard input ends too
         os.write(
             1, json.dumps(message).encode() + b"\n"
@@ -40,7 +40,7 @@ def _say(message: dict[str, Any]) -> None:
 async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_folder: Path | None) -> None:
     start = config.mission.start
     ports = Ports() if for_launcher else _STANDARD
-    on_message = _say if for_launcher else _tell
+    on_message = _send if for_launcher else _print_message
     px4 = None
     if px4_folder is not None:
         airframe = config.vehicle.airframe
@@ -54,26 +54,26 @@ async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_f
 
         def on_ready() -> None:
             if for_launcher:
-                _say({"type": "ready", "devices": devices, "flight_environment": sitl.flight_environment()})
+                _send({"type": "ready", "devices": devices, "flight_environment": sitl.flight_environment()})
             else:
-                _introduce(devices, px4)
+                _print_addresses(devices, px4)
 
         if for_launcher:
-            _leave_with_launcher(sitl)
+            _end_with_launcher(sitl)
         claim_realtime(WORLD_PRIORITY, lock_memory=False)
         await sitl.run(on_ready)
     if for_launcher:
-        _say_last(sitl, truth_file if config.world.faults or config.world.throws > 1 else None)
+        _send_final(sitl, truth_file if config.world.faults or config.world.throws > 1 else None)
 
 
-def _say_last(sitl: Sitl, truth_file: Path | None) -> None:
+def _send_final(sitl: Sitl, truth_file: Path | None) -> None:
     if truth_file is not None:
         with contextlib.suppress(OSError):  # the flight's folder may be gone, or full
             truth_file.write_text(json.dumps(sitl.ground_truth()), encoding="utf-8")
-    _say({"type": "final", "world": sitl.final()})
+    _send({"type": "final", "world": sitl.final()})
 
 
-def _leave_with_launcher(sitl: Sitl) -> None:
+def _end_with_launcher(sitl: Sitl) -> None:
     """Read the flight process's pid from standard input; when the launcher ends, end as soon as the vehicle has landed."""
     loop = asyncio.get_running_loop()
     descriptor = sys.stdin.fileno()
@@ -90,7 +90,7 @@ def _leave_with_launcher(sitl: Sitl) -> None:
     loop.add_reader(descriptor, on_input)
 
 
-def _tell(message: dict[str, Any]) -> None:
+def _print_message(message: dict[str, Any]) -> None:
     if message["type"] == "event":
         print(f"  t = {message['t_s']:7.2f} s  payload {message['kind']}", flush=True)
     elif message["type"] == "progress":
@@ -99,7 +99,7 @@ def _tell(message: dict[str, Any]) -> None:
         print("  disarmed" if message["at_rest"] else "  armed", flush=True)
 
 
-def _introduce(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) -> None:
+def _print_addresses(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) -> None:
     mocap = devices["mocap"]
     port = 14540 + (px4.number if px4 is not None else 0)
     name = "PX4 stub" if px4 is None else f"PX4 {px4.about()['version']}"
@@ -131,7 +131,7 @@ def main(argv: list[str] | None = None) -> int:
     except (OSError, LinkError, FaultError, Px4Error) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:
-            _say({"type": "error", "text": text})
+            _send({"type": "error", "text": text})
         else:
             print(text, file=sys.stderr)
         return 3

@@ -264,7 +264,7 @@ class Px4Stub:
         self._next_commander_s = self._position_at_s = -math.inf
         self._climb_rate_controlled = False
 
-    def pilot_chooses(self, state: NavState) -> None:
+    def pilot_sets_mode(self, state: NavState) -> None:
         """Change the mode by the switch of a pilot's radio, with a home position set before."""
         estimate = self.estimate
         if estimate is None:

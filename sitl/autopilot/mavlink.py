@@ -124,7 +124,7 @@ class Link(UdpEndpoint):
         """Queue _HASH_CHECK and every parameter; `pump` sends a few at a time."""
         self._params_to_send = deque([None, *self._stub.params])
 
-    def saw_ground_station(self) -> None:
+    def note_ground_station(self) -> None:
         """Note a ground station: PX4 sends STATUSTEXT only on links with one, and then also recent texts."""
         self._ground_station_at_s = self._stub.t_s
         self._send_texts()

@@ -36,7 +36,7 @@ class Reply(Protocol):
     def send_all_params(self) -> None:
         """Start sending every parameter."""
 
-    def saw_ground_station(self) -> None:
+    def note_ground_station(self) -> None:
         """A ground station's heartbeat arrived."""
 
     def status_text(self, severity: int, text: str) -> None:
@@ -86,7 +86,7 @@ class Receiver:
 
     def _heartbeat(self, link: Reply, message: Message) -> None:
         if message.type == mavlink.MAV_TYPE_GCS:
-            link.saw_ground_station()
+            link.note_ground_station()
 
     def _ping(self, link: Reply, message: Message) -> None:
         if message.target_system == 0 and message.target_component == 0:

@@ -94,7 +94,7 @@ class _StubEnd:
     def send_all_params(self) -> None:
         """Do nothing: the guardian does not ask for parameters."""
 
-    def saw_ground_station(self) -> None:
+    def note_ground_station(self) -> None:
         """Do nothing: there is no ground station."""
 
     def status_text(self, severity: int, text: str) -> None:

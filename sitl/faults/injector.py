@@ -52,7 +52,7 @@ class Autopilot(Protocol):
     def reboot(self, for_s: float) -> None:
         """Restart; it runs again `for_s` later."""
 
-    def pilot_chooses(self, state: NavState) -> None:
+    def pilot_sets_mode(self, state: NavState) -> None:
         """Change the mode as a pilot does by radio."""
 
 
@@ -125,7 +125,7 @@ class Faults:
             self._second = None
         if t_s >= self._pilot_lands_s:
             self._pilot_lands_s = math.inf
-            self._px4.pilot_chooses(NavState.LAND)
+            self._px4.pilot_sets_mode(NavState.LAND)
 
     def _switch(self, fault: Fault, on: bool, t_s: float) -> None:
         if on:
@@ -179,7 +179,7 @@ class Faults:
             case "arming_refused":
                 px4.refuses_arming = on
             case "pilot_takeover" if on:
-                px4.pilot_chooses(NavState.LOITER)
+                px4.pilot_sets_mode(NavState.LOITER)
                 self._pilot_lands_s = t_s + size
             case "mocap_swap":
                 x, y, _ = world.q[0:3]

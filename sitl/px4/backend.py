@@ -43,7 +43,7 @@ STUB_ONLY_FAULTS: Mapping[FaultKind, str] = {
 """Faults that only the stub can have, and why."""
 _LINK_FAULTS: frozenset[FaultKind] = frozenset({"link_loss", "link_delay"})
 
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 
 
 def refuse_what_needs_the_stub(config: WorldConfig) -> None:
@@ -70,7 +70,7 @@ class RealPx4:
         airframe: airframe of the vehicle file.
         config: configuration of the world.
         folder: folder for PX4's parameters, logs and output.
-        tell: called with one line for the user.
+        progress: called with one line for the user.
 
     Raises:
         Px4Error: the world needs the stub, PX4_SITL names no program, or no instance number is free.
@@ -78,12 +78,12 @@ class RealPx4:
 
     lockstep = True
 
-    def __init__(self, airframe: Airframe, config: WorldConfig, folder: Path, tell: Tell) -> None:
+    def __init__(self, airframe: Airframe, config: WorldConfig, folder: Path, progress: Progress) -> None:
         refuse_what_needs_the_stub(config)
         self._airframe = airframe
         self._config = config
         self._folder = folder
-        self._tell = tell
+        self._progress = progress
         self._installation: Installation | None = find()
         self._instance = Instance.claim()
         self._link = SimulatorLink(self._instance.simulator, HilSensors(config.seed))
@@ -145,25 +145,25 @@ class RealPx4:
             Px4Error: PX4 did not connect, or does not keep its parameters.
         """
         if self._process is None:
-            self._tell(
+            self._progress(
                 f"px4 was not found: looking for {BY_HAND_DEADLINE_S:g} s for one that was started by hand, on TCP "
                 f"{self._link.port}"
             )
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._control.version()
-        self._tell(f"PX4 {self._version}, instance {self.number}: setting its parameters")
+        self._progress(f"PX4 {self._version}, instance {self.number}: setting its parameters")
         wanted = parameters(self._airframe, self._config, self._world.hover_command)
-        changed = await self._settle(wanted)
+        changed = await self._write_parameters(wanted)
         if changed:
             await self._restart(changed)
-            left = await self._settle(wanted)
+            left = await self._write_parameters(wanted)
             if left:
                 fix = f"see {self._folder}" if self._process is not None else "start it both times in the same folder"
                 raise Px4Error(
                     f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; {fix}"
                 )
         await self._control.write(self._config.overridden_px4_params())
-        await self._control.show_modes()
+        await self._control.request_mode_stream()
         self._flies = True
 
     async def _boot(self, deadline_s: float) -> None:
@@ -173,7 +173,7 @@ class RealPx4:
             Px4Error: it has ended, or a deadline has passed.
         """
         found, end_s = "nobody there", time.monotonic() + deadline_s
-        while not await self._link.until_in_step(0.2):
+        while not await self._link.await_lockstep(0.2):
             if self._process is not None and not self._process.running:
                 raise Px4Error(self._process.exit_summary())
             if self._link.connected and found == "nobody there":
@@ -184,12 +184,12 @@ class RealPx4:
                 raise Px4Error(
                     f"PX4: expected it on TCP {self._link.port} within {deadline_s:g} s, found {found}; {how}"
                 )
-        await self._control.until_heard()
+        await self._control.await_heartbeat()
 
     def _how(self) -> str:
         return f"{HOW_TO_GET_IT}; or {HOW_TO_START_IT.format(model=MODEL, number=self.number)}"
 
-    async def _settle(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
+    async def _write_parameters(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
         """Write the parameters that differ and return them, in PX4's types."""
         have = await self._control.read(wanted)
         absent = [name for name in wanted if name not in have and name not in VERSION_DEPENDENT]
@@ -208,19 +208,19 @@ class RealPx4:
     async def _restart(self, changed: Mapping[str, Value]) -> None:
         """Restart PX4 in the same folder, or ask the user to restart it."""
         if self._process is None:
-            self._tell(
+            self._progress(
                 "the vehicle's parameters are set; PX4 must start again for them: end it and start it once more, in the same folder, "
                 "where it keeps them"
             )
-            if not await self._link.until_gone(USER_DEADLINE_S):
+            if not await self._link.await_disconnect(USER_DEADLINE_S):
                 raise Px4Error(f"PX4: expected it to be restarted within {USER_DEADLINE_S:g} s, found it still running")
         else:
             store = await stored(self._folder, changed)
-            self._process.ask_to_end()
-            await self._process.until_ended(END_DEADLINE_S)  # meanwhile the world is stepped, and PX4's clock with it
+            self._process.terminate()
+            await self._process.await_end(END_DEADLINE_S)  # meanwhile the world is stepped, and PX4's clock with it
             self._process.kill()
             restore(self._folder, store)
-            await self._link.until_gone(1.0)
+            await self._link.await_disconnect(1.0)
             self._start({})
         await self._boot(BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S)
 
@@ -244,7 +244,7 @@ class RealPx4:
     async def _exit_summary(self) -> str:
         if self._process is None:
             return "PX4: expected it to stay until the flight is over, found that it has closed its simulator link"
-        await self._process.until_ended(1.0)
+        await self._process.await_end(1.0)
         return self._process.exit_summary()
 
     def step(self, imu: ImuSample) -> Vec4:
@@ -291,7 +291,7 @@ class RealPx4:
         if self._link.armed:
             self._control.force_disarm()
         t_s, end_s = imu.t_s, time.monotonic() + END_DEADLINE_S
-        process.ask_to_end()
+        process.terminate()
         while process.running and time.monotonic() < end_s:
             t_s += SAMPLE_S
             self.sense(imu._replace(t_s=t_s))
@@ -316,9 +316,9 @@ class _Faulty:
         """
         raise Px4Error("world.faults: autopilot_reboot needs the stub; fly it with --sitl")
 
-    def pilot_chooses(self, state: NavState) -> None:
+    def pilot_sets_mode(self, state: NavState) -> None:
         """Change the mode as a ground station does."""
-        self._control.choose_mode(state)
+        self._control.request_mode(state)
 
 
 def _as_type_of(known: Value, value: Value) -> Value:

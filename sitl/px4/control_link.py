@@ -79,7 +79,7 @@ class ControlLink(UdpEndpoint):
             for handler in tuple(self._handlers):
                 handler(message)
 
-    async def until_heard(self) -> None:
+    async def await_heartbeat(self) -> None:
         """Wait for PX4's heartbeat.
 
         Raises:
@@ -191,7 +191,7 @@ class ControlLink(UdpEndpoint):
         """
         await self.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1.0)
 
-    async def show_modes(self) -> None:
+    async def request_mode_stream(self) -> None:
         """Request CURRENT_MODE every MODE_PERIOD_S; PX4 forgets the request when it restarts.
 
         Raises:
@@ -201,7 +201,7 @@ class ControlLink(UdpEndpoint):
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_CURRENT_MODE, MODE_PERIOD_S * 1e6
         )
 
-    def choose_mode(self, state: NavState) -> None:
+    def request_mode(self, state: NavState) -> None:
         """Request a mode as a ground station does, without waiting for an answer."""
         main, sub = state.value[0:2]
         self._command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main, sub)

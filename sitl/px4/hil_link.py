@@ -157,11 +157,11 @@ class SimulatorLink:
         """Whether it answers samples, so that its modules run."""
         return self._peer is not None and self.answers > 0
 
-    async def until_in_step(self, deadline_s: float) -> bool:
+    async def await_lockstep(self, deadline_s: float) -> bool:
         """Wait for PX4's first answer while samples go on; return False if none came in time."""
         return await self._until(lambda: self.in_step, deadline_s)
 
-    async def until_gone(self, deadline_s: float) -> bool:
+    async def await_disconnect(self, deadline_s: float) -> bool:
         """Wait until PX4 has disconnected; return False if it has not in time."""
         return await self._until(lambda: not self.connected, deadline_s)
 

@@ -223,13 +223,13 @@ class Px4Process:
         how = "is running" if code is None else how_it_ended(code)
         return f"PX4: px4 -i {self._number} {how}{self._last_error_line()}; see {self.log}"
 
-    async def until_ended(self, deadline_s: float) -> bool:
+    async def await_end(self, deadline_s: float) -> bool:
         """Wait until PX4 has ended; return False if it has not in time."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             await asyncio.to_thread(self._process.wait, deadline_s)
         return not self.running
 
-    def ask_to_end(self) -> None:
+    def terminate(self) -> None:
         """Send SIGTERM. In lockstep PX4 needs samples until it has ended, because they drive its clock."""
         if self.running:
             self._process.terminate()

@@ -49,7 +49,7 @@ async def connected() -> AsyncIterator[tuple[ControlLink, Rig]]:
 def test_parameters_are_written_by_type_and_read_back() -> None:
     async def scenario() -> None:
         async with connected() as (control, rig):
-            await control.until_heard()
+            await control.await_heartbeat()
             await control.write({"EKF2_EV_CTRL": 15, "MPC_THR_HOVER": 0.43, "COM_OF_LOSS_T": 0.3})
             assert rig.params["EKF2_EV_CTRL"] == 15
             assert rig.params["MPC_THR_HOVER"] == pytest.approx(0.43)
@@ -66,7 +66,7 @@ def test_a_parameter_that_is_not_taken_is_one_line(monkeypatch: pytest.MonkeyPat
 
     async def scenario() -> None:
         async with connected() as (control, _):
-            await control.until_heard()
+            await control.await_heartbeat()
             with pytest.raises(Px4Error, match="expected EKF2_EV_CTRL to become 15, found 11"):
                 await control.write({"EKF2_EV_CTRL": 15.0})  # of the wrong type: PX4 ignores it
 
@@ -80,7 +80,7 @@ def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) ->
         with Instance.claim() as instance:
             async with ControlLink(instance) as control:
                 with pytest.raises(Px4Error, match="expected a heartbeat on UDP"):
-                    await control.until_heard()
+                    await control.await_heartbeat()
 
     asyncio.run(scenario())
 
@@ -88,11 +88,11 @@ def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_mode_is_chosen_and_seen() -> None:
     async def scenario() -> None:
         async with connected() as (control, rig):
-            await control.until_heard()
-            control.choose_mode(NavState.LAND)
+            await control.await_heartbeat()
+            control.request_mode(NavState.LAND)
             async with asyncio.timeout(DEADLINE_S):
                 while control.nav_state is not NavState.LAND:
-                    await control.until_heard()
+                    await control.await_heartbeat()
             assert rig.stub.nav_state is NavState.LAND
 
     asyncio.run(scenario())

@@ -37,7 +37,7 @@ async def boot(link: SimulatorLink, i: int = 0) -> int:
     async with asyncio.timeout(DEADLINE_S):
         while not link.in_step:
             link.send(sample(i), 0.3, LEVEL)
-            await link.until_in_step(PERIOD_S)
+            await link.await_lockstep(PERIOD_S)
             i += 1
     return i
 
@@ -154,7 +154,7 @@ def test_a_px4_that_leaves_stops_the_rotors_and_may_come_back() -> None:
                 i = await boot(under_test)
                 assert under_test.rotors == (0.5, 0.5, 0.5, 0.5)
                 under_test.send(sample(i), 0.3, LEVEL)
-            assert await under_test.until_gone(DEADLINE_S)
+            assert await under_test.await_disconnect(DEADLINE_S)
             await under_test.answered()  # what was pending will never come
             assert under_test.rotors == (0.0, 0.0, 0.0, 0.0)
             assert not under_test.armed
@@ -182,7 +182,7 @@ def test_the_clock_of_a_px4_begins_anew_however_late_it_connects() -> None:
                     assert {later - earlier for earlier, later in itertools.pairwise(stamps)} == {4000}
                     assert under_test.clock_begun_s is not None
                     assert begun * PERIOD_S <= under_test.clock_begun_s <= i * PERIOD_S
-                assert await under_test.until_gone(DEADLINE_S)
+                assert await under_test.await_disconnect(DEADLINE_S)
             assert under_test.unanswered == 0
 
     asyncio.run(scenario())

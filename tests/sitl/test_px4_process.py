@@ -88,9 +88,9 @@ def test_it_runs_in_its_folder_and_ends_when_asked(tmp_path: Path) -> None:
                         while not link.in_step:
                             t_s += 0.004
                             link.send(ImuSample(t_s, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81)), 0.3, (1.0, 0.0, 0.0, 0.0))
-                            await link.until_in_step(0.004)
-                    process.ask_to_end()
-                    assert await process.until_ended(DEADLINE_S)
+                            await link.await_lockstep(0.004)
+                    process.terminate()
+                    assert await process.await_end(DEADLINE_S)
                 finally:
                     process.kill()
         log = (tmp_path / "scratch" / "px4.log").read_text()
@@ -105,7 +105,7 @@ def test_one_that_dies_is_told_with_its_last_complaint(tmp_path: Path) -> None:
     assert installation is not None
     with Instance.claim() as instance:
         process = Px4Process(installation, instance, tmp_path / "scratch", {})
-        assert asyncio.run(process.until_ended(DEADLINE_S))
+        assert asyncio.run(process.await_end(DEADLINE_S))
         process.kill()
     scratch = tmp_path / "scratch"
     assert process.exit_summary() == (

@@ -43,7 +43,7 @@ class Wire:
     def send_all_params(self) -> None:
         self.list_requests += 1
 
-    def saw_ground_station(self) -> None:
+    def note_ground_station(self) -> None:
         self.texts.append("ground station")
 
     def status_text(self, severity: int, text: str) -> None:
