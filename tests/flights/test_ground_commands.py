@@ -18,7 +18,8 @@ from mcap.reader import make_reader
 from companion.analysis.log import FlightLog
 from companion.config.ground import topic_name
 from companion.config.loader import load_flight
-from companion.ground.protocol.commands import FlightClock, make_command
+from companion.ground.protocol.commands import make_command
+from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.keys import load_operators
 from companion.ground.protocol.messages import (
     Ack,

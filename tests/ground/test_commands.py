@@ -17,7 +17,6 @@ from companion.ground.protocol.commands import (
     LIMITS,
     REFUSED_MAX,
     Accepted,
-    FlightClock,
     Reason,
     Refused,
     Verdict,
@@ -26,6 +25,7 @@ from companion.ground.protocol.commands import (
     make_command,
     sign,
 )
+from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.keys import Operator, Operators, Permission, new_key
 from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, CommandName, encode
 

@@ -18,7 +18,8 @@ from mcap.reader import NonSeekingReader
 from paho.mqtt.enums import CallbackAPIVersion
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.ground.protocol.commands import FlightClock, make_command
+from companion.ground.protocol.commands import make_command
+from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.keys import Operator, load_login, new_key, operators_text, write_private
 from companion.ground.protocol.messages import CommandName, Stream, Topic, decode, encode, vehicle_of
 from companion.model.types import Inputs, Outputs, Sent

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from companion.config.ground import VEHICLE_NAME
-from companion.ground.protocol.commands import FlightClock
+from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.messages import (
     RECORDS,
     Ack,
