@@ -6,15 +6,15 @@ from companion.model.types import Outcome
 
 EXIT_OK = 0
 EXIT_BAD_INPUT = 2
-"""The command line or a file is wrong; nothing was started, nothing moved."""
+"""The command line or a file is invalid; nothing was started and nothing moved."""
 EXIT_REFUSED = 3
 """A device or the preflight refused; nothing was armed."""
 EXIT_ABORTED = 4
-"""The mission was given up and the machine landed safely."""
+"""The mission was aborted and the vehicle landed safely."""
 EXIT_LOST = 5
-"""Crashed or lost."""
+"""The vehicle crashed or was lost."""
 EXIT_INTERNAL = 70
-"""Of the flight process alone, never of `companion`: an error of its own in the air; the guardian lands."""
+"""Exit code of the flight process only, never of `companion`: an internal error in the air; the guardian lands."""
 
 EXIT_CODES = {
     Outcome.COMPLETED: EXIT_OK,

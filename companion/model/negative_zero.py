@@ -1,4 +1,4 @@
-"""Texts for people without negative zeros: a small negative number that rounds to zero reads `0.00`, not `-0.00`."""
+"""Removes the sign of rounded negative zeros from displayed text: `0.00` instead of `-0.00`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NEGATIVE_ZERO = re.compile(
 def without_negative_zero(text: str) -> str:
     """Return the text with every `-0`, `-0.0`, `-0.00` ... as zero without a sign.
 
-    After two spaces, as in a column of a table, a third one takes the place of the sign. Names that contain `-0` stay as they are.
+    After two spaces, as in a table column, a space replaces the sign. Names that contain `-0` are not changed.
     """
     return _NEGATIVE_ZERO.sub(_unsigned, text) if "-0" in text else text
 

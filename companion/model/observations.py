@@ -1,4 +1,4 @@
-"""What a preflight has seen: plain records, gathered by `companion.preflight.observe`, judged by the rooms beside it. No I/O here."""
+"""What a preflight observed: gathered by `companion.preflight.observe`, evaluated by the other modules of `companion.preflight`."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ class EstimatorReport(Record, frozen=True, kw_only=True):
     flags: int
     """ESTIMATOR_STATUS_FLAGS."""
     velocity_ratio: float
-    """Innovation test ratios: below 1 the measurements are accepted; 0 exactly: nothing is fused."""
+    """Innovation test ratios: below 1 if the measurements are accepted, exactly 0 if nothing is fused."""
     position_horizontal_ratio: float
     position_vertical_ratio: float
     position_horizontal_accuracy_m: float
-    """One sigma."""
+    """Accuracies are one standard deviation."""
     position_vertical_accuracy_m: float
 
 
 class ServoReport(Record, frozen=True, kw_only=True):
-    """One servo's identity and settings, registers of the XM430 control table."""
+    """Identity and settings of one servo, from registers of the XM430 control table."""
 
     servo_id: int
     model: int
@@ -46,20 +46,20 @@ class ServoReport(Record, frozen=True, kw_only=True):
 
 
 class Machine(Record, frozen=True, kw_only=True):
-    """The computer itself; None: not told here."""
+    """State of the onboard computer. A field is None if the system does not provide it."""
 
     disk_free_bytes: int | None
-    """Where the flight's files go."""
+    """Free space where the flight's files are written."""
     governors: tuple[str, ...]
-    """Of each core, /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor; empty: none is told."""
+    """Frequency governor of each core (/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor); empty if unknown."""
     realtime: str | None
-    """What `companion.runtime.realtime` would be permitted; None: SCHED_FIFO is refused."""
+    """Real-time priority that the system permits, as `companion.runtime.realtime` describes it; None if SCHED_FIFO is refused."""
     memory_lock: str | None
-    """Why `companion.runtime.realtime` would lock no memory; None: it would."""
+    """Why the system permits no locked memory; None if it does."""
     cpus: tuple[int, ...]
-    """Cores that a process may be put on, in order."""
+    """Cores that a process may run on, in ascending order."""
     arm_latency_ms: int | None
-    """FTDI latency timer of the arm's serial port; None: not an FTDI port."""
+    """FTDI latency timer of the arm's serial port; None if it is not an FTDI port. The next field is that of the force sensor."""
     force_latency_ms: int | None
 
 
@@ -104,15 +104,15 @@ class MocapStream(Record, frozen=True, kw_only=True):
     """What the motion-capture driver counted while it was watched."""
 
     frames: int
-    """Frames of any kind that arrived."""
+    """Frames that arrived, with or without the body in view."""
     lost: int
-    """Gaps in the frame numbers."""
+    """Frames missing in the sequence of frame numbers."""
     application: str
-    """Server's name and version."""
+    """Name and version of the server."""
     other_bodies: tuple[int, ...] = ()
-    """Rigid bodies in the stream that are not ours."""
+    """Ids of the other rigid bodies in the stream."""
     body_name: str = ""
-    """Of ours, as the server says it; empty: it does not."""
+    """Name of the vehicle's rigid body on the server; empty if the server does not send it."""
 
 
 class ForceStream(Record, frozen=True, kw_only=True):
@@ -122,32 +122,32 @@ class ForceStream(Record, frozen=True, kw_only=True):
     bad_sums: int
     """Packets with a wrong checksum since the port was opened."""
     product: str
-    """The sensor's own name and firmware."""
+    """Name and firmware version that the sensor reports."""
     lost: str | None = None
-    """Why the port is not read any more; None: it is."""
+    """Why the port is no longer read; None while it is."""
 
 
 class StateCounts(Record, frozen=True):
-    """Messages of PX4's state while it was watched."""
+    """Number of state messages received from PX4 during the observation."""
 
     position: int
-    """LOCAL_POSITION_NED."""
+    """Number of LOCAL_POSITION_NED."""
     attitude: int
-    """ATTITUDE_QUATERNION."""
+    """Number of ATTITUDE_QUATERNION."""
     imu: int
-    """HIGHRES_IMU."""
+    """Number of HIGHRES_IMU."""
 
 
 class Observations(Record, frozen=True, kw_only=True):
-    """Everything that was seen in `duration_s`, newest last. Empty or None: nothing came."""
+    """Everything that was observed for `duration_s`, newest last. A field is empty or None if nothing was received."""
 
     start_s: float
-    """Flight clock."""
+    """Flight clock at the start of the observation."""
     duration_s: float
     firmware: str | None = None
-    """As `MavsdkAutopilot.firmware` tells it: `PX4 1.16.1 release (git ...)`."""
+    """PX4's version as `MavsdkAutopilot.firmware` returns it, such as `PX4 1.16.1 release (git ...)`."""
     params: Mapping[str, float | int] = msgspec.field(default_factory=dict)
-    """PX4's parameters by name; one that PX4 does not have is absent."""
+    """PX4's parameters by name, without those that PX4 does not have."""
     vehicle: tuple[VehicleState, ...] = ()
     status: tuple[AutopilotStatus, ...] = ()
     estimator: tuple[EstimatorReport, ...] = ()
@@ -158,27 +158,27 @@ class Observations(Record, frozen=True, kw_only=True):
     force: tuple[ForceSample, ...] = ()
     machine: Machine | None = None
     broker: str | None = None
-    """None: no broker was asked for. Empty: it answered. Else why it did not."""
+    """Why the broker did not answer; empty if it did, None if no broker is configured."""
     hand_test: str | None = None
-    """None: not asked for. Else what is on record of the guided hand test of this set-up; empty: nothing is."""
+    """The recorded hand test of this setup; empty if there is none, None if no hand test is required."""
     hand_test_changed: str = ""
-    """What the set-up differs in from the one that the test was passed with; empty: it never was."""
+    """Differences between this setup and the one that last passed the hand test; empty if none ever passed."""
     state_counts: StateCounts | None = None
     force_stream: ForceStream | None = None
     arm_reads: tuple[int, int] | None = None
-    """Bus cycles, and how many of them brought no answer."""
+    """Number of bus cycles, and of those without an answer."""
     mission_s: float | None = None
-    """Length of the planned mission."""
+    """Duration of the planned mission."""
     plan: tuple[str, ...] | None = None
-    """Why the mission cannot be flown as written, one line each; None: that was looked at before."""
+    """Reasons why the mission cannot be flown, one line each; None if this was checked before."""
     recorder: str | None = None
-    """None: not tried. Empty: a log could be opened. Else why not."""
+    """Why no log can be opened; empty if one can, None if this was not tried."""
     failures: Mapping[str, str] = msgspec.field(default_factory=dict)
     """Device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`), and the driver's error line."""
 
 
 class Waiting(Record, frozen=True):
-    """What is worth waiting for, beyond the observation itself."""
+    """A condition that the preflight should wait for after the observation."""
 
     what: str
     longest_s: float

@@ -1,4 +1,4 @@
-"""One row per check: what was read, what was wanted, why, and how to put it right."""
+"""Result of a preflight check: what was read, what was expected, why it matters, and how to fix it."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ from companion.model.codec import Record
 
 
 class Level(Enum):
-    """What a row that is not ok means."""
+    """Consequence of a failed check."""
 
     REFUSE = "refuse"
-    """The machine does not lift."""
+    """The vehicle must not take off."""
     WARN = "warn"
-    """People are told, and decide."""
+    """The operator is warned and decides."""
 
 
 class Row(Record, frozen=True, kw_only=True):
     """The result of one check."""
 
     id: str
-    """Dotted, stable: `px4.param.EKF2_EV_CTRL`, `mocap.rate`; scripts tell rows apart by it."""
+    """Stable dotted name for scripts, such as `px4.param.EKF2_EV_CTRL` or `mocap.rate`."""
     title: str
-    """For people, a few words."""
+    """Name of the check for the operator, a few words."""
     ok: bool
     read: str
-    """What was found, with its unit."""
+    """Value that was found, with its unit."""
     wanted: str = ""
-    """What would be ok; empty where the row only reports."""
+    """Value that was expected; empty if the row only reports."""
     why: str = ""
-    """What goes wrong without it, in one sentence."""
+    """Consequence of a wrong value, in one sentence."""
     fix: str = ""
-    """What to do about it; empty when the row is ok."""
+    """What to do; empty if the check passed."""
     level: Level = Level.REFUSE
 
     @property
     def refuses(self) -> bool:
-        """This row keeps the machine on the ground."""
+        """Whether this row forbids take-off."""
         return not self.ok and self.level is Level.REFUSE
 
     def line(self) -> str:
-        """The row as one line, for a refusal."""
+        """Return the row as one line, as in a refusal."""
         wanted = f", wanted {self.wanted}" if self.wanted else ""
         fix = f"; {self.fix}" if self.fix else ""
         return f"{self.title}: {self.read}{wanted}{fix}"
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`, the log and the status channel."""
+        """Return the row as nested data for `--json`, the log and the status channel."""
         return {**msgspec.structs.asdict(self), "level": self.level.value}
 
 
 def refusals(rows: Iterable[Row]) -> list[Row]:
-    """The rows that keep the machine on the ground."""
+    """Return the rows that forbid take-off."""
     return [row for row in rows if row.refuses]

@@ -1,13 +1,13 @@
-"""Frozen records that pass between the rooms of the companion.
+"""Frozen records that pass between the packages of the companion.
 
-Everything here is plain data: floats, tuples of floats, enums and other records. Tuples, not arrays, because they are truly
-immutable, compare bit for bit with ``==`` and survive a JSON round trip exactly; rooms that do linear algebra make arrays of them.
+They hold floats, tuples of floats, enums and other records. Tuples instead of arrays, because tuples are immutable, compare with
+``==`` and survive a JSON round trip exactly. Packages that do linear algebra make arrays of them.
 
 Conventions
     * World frame: ENU-like, z up, metres. Body frame: FLU (x forward, y left, z up).
     * Quaternions are ``(w, x, y, z)``, unit norm, and rotate a body vector into the world.
     * ``*_stamp_s`` and ``t_s`` are seconds on the flight clock (monotonic, zero when the flight process starts).
-    * A value that is not known is ``None``, never NaN.
+    * An unknown value is ``None``, never NaN.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ IDENTITY_QUAT: Quat = (1.0, 0.0, 0.0, 0.0)
 
 
 class FlightMode(Enum):
-    """The autopilot's flight mode, as far as the companion tells modes apart."""
+    """The autopilot's flight mode, as far as the companion distinguishes modes."""
 
     UNKNOWN = "unknown"
     OFFBOARD = "offboard"
@@ -34,7 +34,7 @@ class FlightMode(Enum):
     TAKEOFF = "takeoff"
     LAND = "land"
     RETURN = "return"
-    MANUAL = "manual"  # any mode in which a pilot steers: manual, stabilized, acro, altitude, position
+    MANUAL = "manual"  # any mode that a pilot steers: manual, stabilized, acro, altitude, position
     OTHER = "other"
 
 
@@ -49,7 +49,7 @@ class LandedState(Enum):
 
 
 class Severity(Enum):
-    """How bad an event is."""
+    """Severity of an event."""
 
     INFO = "info"
     WARNING = "warning"
@@ -57,19 +57,19 @@ class Severity(Enum):
 
 
 class SafetyAction(Enum):
-    """Rungs of the safety ladder, mildest first."""
+    """Safety states in the order of escalation, and the actions that lead to them."""
 
     NOMINAL = "nominal"
     WARN = "warn"
-    HOLD = "hold"  # come to rest on the planned way and stay
-    RETRACT = "retract"  # the arm folds, back inward along the tether, then land
-    LAND = "land"  # the companion lands, with position
-    AUTOPILOT_LAND = "autopilot_land"  # the companion's own state is not to be trusted: PX4's LAND mode
+    HOLD = "hold"  # stop on the planned path and stay
+    RETRACT = "retract"  # fold the arm, fly back toward the anchor, then land
+    LAND = "land"  # the companion lands under position control
+    AUTOPILOT_LAND = "autopilot_land"  # PX4's LAND mode, because the companion's own state cannot be trusted
     TERMINATE = "terminate"
 
     @property
     def rank(self) -> int:
-        """Position on the ladder; a larger one is graver."""
+        """Position in the order of escalation, 0 for NOMINAL."""
         return _ACTION_RANK[self]
 
 
@@ -77,18 +77,18 @@ _ACTION_RANK = {action: rank for rank, action in enumerate(SafetyAction)}
 
 
 class AutopilotRequest(Enum):
-    """What the core asks of the autopilot beside setpoints. The driver carries it out and reports through `AutopilotStatus`."""
+    """A request to the autopilot in addition to setpoints. The driver executes it; `AutopilotStatus` shows the effect."""
 
     NONE = "none"
-    OFFBOARD = "offboard"  # enter OFFBOARD (setpoints are streaming already)
+    OFFBOARD = "offboard"  # enter OFFBOARD; setpoints are already streaming
     ARM = "arm"
     LAND = "land"  # PX4's own LAND mode
     DISARM = "disarm"
-    FORCE_DISARM = "force_disarm"  # against PX4's land detector; when it is allowed: companion.safety.rotor_stop
+    FORCE_DISARM = "force_disarm"  # overrides PX4's land detector; companion.safety.rotor_stop says when it is allowed
 
 
 class Outcome(Enum):
-    """How a flight ended; values of `outcome` in summary.json."""
+    """Outcome of a flight; the values of `outcome` in summary.json."""
 
     COMPLETED = "completed"
     REFUSED = "refused"
@@ -98,7 +98,7 @@ class Outcome(Enum):
 
 
 class PhaseKind(Enum):
-    """What sort of flying a phase is; metrics and safety tell phases apart by it, people by its name."""
+    """Kind of a phase. Metrics and safety distinguish phases by their kind, the operator by their name."""
 
     GROUND = "ground"  # before the rotors lift
     TAKEOFF = "takeoff"
@@ -108,26 +108,26 @@ class PhaseKind(Enum):
 
 
 class OperatorCommand(Enum):
-    """What the people on the ground ask for."""
+    """A command from the ground."""
 
     NONE = "none"
     HOLD = "hold"
-    RESUME = "resume"  # go on after a HOLD, if what held it is gone; nothing else is taken back by it
-    START = "start"  # take off, for a flight that waits for it
+    RESUME = "resume"  # continue after a HOLD if its cause is gone; reverts no other safety state
+    START = "start"  # take off; only for a flight that waits for its start
     LAND = "land"
-    ABORT = "abort"  # land at once, the arm folds; recorded as what it is
+    ABORT = "abort"  # fold the arm and land now; the outcome is ABORTED
 
 
 class GroundCommand(Record, frozen=True, kw_only=True):
-    """A command that came over the air, verified by the recorder process; in `Inputs` only what was asked for goes on."""
+    """A command from a ground station, verified by the recorder process. Only `command` goes into `Inputs`."""
 
     command: OperatorCommand
     operator: str
-    """Name of the one whose key signed it."""
+    """Name of the operator whose key signed the command."""
     nonce: str
-    """The answer names it."""
+    """Identifies the command; the answer repeats it."""
     hold: int
-    """Number of the hold that a RESUME is to end, `Sent.hold`; 0: none, and in every other command."""
+    """Number of the hold that a RESUME ends, as in `Sent.hold`; 0 in every other command."""
 
 
 class VehicleState(Record, frozen=True, kw_only=True):
@@ -141,17 +141,17 @@ class VehicleState(Record, frozen=True, kw_only=True):
     attitude_wxyz: Quat
     angular_rate_body_rad_s: Vec3
     specific_force_body_m_s2: Vec3
-    """What the accelerometer feels: +9.81 on z at rest, level."""
+    """Accelerometer reading: (0, 0, 9.81) at rest and level."""
     boot_s: float | None = None
-    """PX4's own clock, seconds since it started (time_boot_ms of ATTITUDE or ODOMETRY); None: not told."""
+    """PX4's own clock, seconds since boot (time_boot_ms of ATTITUDE or ODOMETRY); None if unknown."""
     imu_boot_s: float | None = None
-    """End of the newest IMU sample's interval on PX4's clock (HIGHRES_IMU.time_usec), s; None: unknown, as in old logs."""
+    """End of the newest IMU sample's interval on PX4's clock (HIGHRES_IMU.time_usec), s; None in older logs."""
     delta_velocity_body_m_s: Vec3 | None = None
-    """Integral of the specific force over all IMU samples since the link was opened, up to `imu_boot_s`; None: unknown."""
+    """Integral of the specific force over all IMU samples since the link was opened, up to `imu_boot_s`; None in older logs."""
 
 
 class AutopilotStatus(Record, frozen=True, kw_only=True):
-    """Slow state of the autopilot."""
+    """State of the autopilot that changes slowly, from HEARTBEAT, EXTENDED_SYS_STATE and BATTERY_STATUS."""
 
     heartbeat_stamp_s: float
     armed: bool
@@ -159,49 +159,49 @@ class AutopilotStatus(Record, frozen=True, kw_only=True):
     landed: LandedState
     battery_voltage_v: float | None = None
     battery_remaining: float | None = None
-    """0 to 1."""
+    """Remaining charge, 0 to 1; None if PX4 reports none."""
     system_status: int | None = None
-    """HEARTBEAT.system_status (MAV_STATE); None if unknown, as in logs written before it was recorded."""
+    """HEARTBEAT.system_status (MAV_STATE); None in older logs."""
 
 
 class MocapPose(Record, frozen=True, kw_only=True):
-    """One motion-capture frame of the vehicle's rigid body, already in the world frame of the mission."""
+    """Pose of the vehicle's rigid body in one motion-capture frame, in the world frame of the mission."""
 
     stamp_s: float
-    """When the datagram arrived."""
+    """Flight clock when the datagram arrived."""
     latency_s: float | None = None
-    """Mid-exposure to transmission, by the server's own clock (NatNet >= 3.0)."""
+    """Time from mid-exposure to transmission, measured by the server (NatNet >= 3.0); None if the server does not send it."""
     frame_number: int
     position_world_m: Vec3
     attitude_wxyz: Quat
     tracking_valid: bool
     marker_error_m: float
     exposure_server_s: float | None = None
-    """Mid-exposure on the server's own clock (NatNet >= 3.0), s; None: unknown, as in old logs."""
+    """Mid-exposure on the server's clock (NatNet >= 3.0), s; None in older logs."""
 
 
 class ArmState(Record, frozen=True, kw_only=True):
     """Joint state in the paper's angles: alpha_1 from body +x turning down, alpha_2 turning link 2 the other way."""
 
     stamp_s: float
-    """When the joint read was complete."""
+    """Flight clock when the joint read was complete."""
     angle_rad: Vec2
     velocity_rad_s: Vec2
     torque_nm: Vec2
-    """From the present current and the torque constant."""
+    """Torque from the present current and the torque constant."""
     hardware_error: tuple[int, int]
-    """Register 70 of each servo; 0 is healthy. Bit 7 is the companion's own: the bus watchdog had let go and was started again."""
+    """Register 70 of each servo, 0 if healthy. The companion sets bit 7 after the bus watchdog has tripped and was restarted."""
     temperature_c: Vec2
     read_failures: int
-    """Consecutive bus cycles without an answer from every servo, up to now."""
+    """Number of the newest consecutive bus cycles in which not every servo answered."""
     written_s: float | None = None
-    """When the bus thread had written the newest currents before this read; None before the first."""
+    """Flight clock when the bus thread had written the last currents before this read; None before the first write."""
     asked_s: float | None = None
-    """When the bus thread began this read."""
+    """Flight clock when the bus thread began this read."""
 
 
 class ForceSample(Record, frozen=True, kw_only=True):
-    """One sample of the force-torque sensor in its own frame, as measured (tare and gravity not removed)."""
+    """One sample of the force-torque sensor, in the sensor's frame, without tare and without gravity compensation."""
 
     stamp_s: float
     force_sensor_n: Vec3
@@ -210,7 +210,7 @@ class ForceSample(Record, frozen=True, kw_only=True):
 
 
 class Inputs(Record, frozen=True, kw_only=True):
-    """Everything that `FlightCore.step` may look at."""
+    """All inputs of `FlightCore.step` in one tick."""
 
     tick: int
     t_s: float
@@ -222,11 +222,11 @@ class Inputs(Record, frozen=True, kw_only=True):
     command: OperatorCommand
     recorder_dropped: int
     guardian_ready: bool | None = None
-    """The guardian said within the last second that it could take over; None: none stands by (fast loop)."""
+    """The guardian reported within the last second that it can take over; None if there is no guardian (fast loop)."""
 
 
 class Reference(Record, frozen=True, kw_only=True):
-    """Where the machine should be at one instant."""
+    """Reference motion of vehicle and arm at one instant."""
 
     position_world_m: Vec3
     velocity_world_m_s: Vec3
@@ -237,19 +237,19 @@ class Reference(Record, frozen=True, kw_only=True):
     arm_rate_rad_s: Vec2
     arm_acceleration_rad_s2: Vec2
     jerk_world_m_s3: Vec3
-    """For laws that feed the acceleration forward ahead of time."""
+    """Used by laws that feed the acceleration forward with lead time."""
 
 
 class AttitudeSetpoint(Record, frozen=True):
-    """SET_ATTITUDE_TARGET in the companion's frames."""
+    """Attitude and thrust setpoint (SET_ATTITUDE_TARGET), in the companion's frames."""
 
     attitude_wxyz: Quat
     thrust: float
-    """Collective, normalised 0 to 1."""
+    """Collective thrust, normalised to 0..1."""
 
 
 class Event(Record, frozen=True, kw_only=True):
-    """Something that happened and that a person may have to understand afterwards."""
+    """An event of the flight, for the log and the operator."""
 
     t_s: float
     id: str
@@ -259,116 +259,116 @@ class Event(Record, frozen=True, kw_only=True):
 
 
 class ControlLog(Record, frozen=True, kw_only=True):
-    """What the law computed in one tick; rows are chi = [p; q; alpha]."""
+    """Quantities that the control law computed in one tick. Vectors of 8 follow chi = [p; q; alpha]."""
 
     error: Vec8
     error_rate: Vec8
     sliding: Vec8
     gamma: Vec8
     tau: Vec8
-    """After saturation: N for rows 0-2, N m for rows 6-7; rows 3-5 belong to PX4 and are 0."""
+    """Generalised force after saturation: N in rows 0-2, N m in rows 6-7. Rows 3-5 are controlled by PX4 and are 0."""
     e_tau: Vec8
     h_hat: Vec4
     zeta: float
     rho: float
     force_ext_world_n: Vec3
-    """Tared, gravity of the net removed, low-passed."""
+    """External force on the net: tared, without the net's weight, low-pass filtered."""
     attitude_desired_rad: Vec3
     """Roll, pitch, yaw (ZYX) of the filtered desired attitude."""
     hover_thrust: float
     saturated: tuple[bool, bool, bool]
-    """Vertical force, lateral force, joint torque."""
+    """Whether vertical force, lateral force and joint torque were saturated."""
     payload_estimate_kg: float | None = None
-    """Mass that the law believes to carry beyond the machine's own; None: the law estimates none."""
+    """Estimated mass of the payload; None if the law does not estimate it."""
 
 
 class TetherState(Record, frozen=True, kw_only=True):
-    """What is known of the safety tether in one tick."""
+    """State of the safety tether in one tick."""
 
     range_m: float
-    """Anchor to attachment."""
+    """Distance from the anchor to the attachment point."""
     slack_m: float
-    """Length less range."""
+    """Tether length minus range."""
     stop_slack_m: float
-    """Slack where the machine could stop at the soonest: after v t_react + v^2 / (2 a) of its outward speed."""
+    """Slack at the earliest point where the machine could stop: after v t_react + v^2 / (2 a) at outward speed v."""
     elevation_rad: float
-    """Of the straight line seen from the vehicle, below horizontal positive."""
+    """Elevation of the straight line from the vehicle to the anchor, positive below the horizontal."""
     clearance_m: float
-    """Least distance of the hanging line to rotor disk and arm sweep; negative: touches. The arm counts only if the attachment
-    lies outside of the arm's plane (`companion.safety.tether_shape.Clearance.judges_arm`)."""
+    """Smallest distance between the sagging line and rotor disks or arm, negative if they touch. The arm counts only if the
+    attachment point lies outside the arm's plane (`companion.safety.tether_shape.Clearance.judges_arm`)."""
     turns: float
-    """Winding about the anchor's vertical, counter-clockwise from above positive, in turns; whole turns come and go."""
+    """Winding about the vertical through the anchor, in turns, positive counter-clockwise seen from above."""
     pull_n: float
-    """Force towards the anchor that rotors, gravity and tool do not explain, low-passed; 0 if unknown, never negative."""
+    """Force toward the anchor that rotors, gravity and tool do not explain, low-pass filtered; 0 if unknown, never negative."""
     taut: bool
-    """Slack used up, or a pull that grows with the range."""
+    """The slack is used up, or the tension grows with the range."""
     snagged: bool
-    """A pull towards the anchor or to the side although there is slack."""
+    """There is tension toward the anchor or sideways although there is slack."""
     separated: bool
-    """Farther away than the line is long, and nothing pulls."""
+    """The range exceeds the tether's length and there is no tension."""
     vehicle_turns: float
-    """Always 0; `turns` is the larger of the two windings. Logs have the field."""
+    """Always 0: `turns` is the larger of the windings about anchor and vehicle. Kept because logs have the field."""
 
 
 class Outputs(Record, frozen=True, kw_only=True):
-    """Everything that one tick decides."""
+    """All outputs of `FlightCore.step` in one tick."""
 
     tick: int
     t_s: float
     mission_t_s: float
-    """Seconds since take-off was commanded; 0 before."""
+    """Time since take-off was commanded, 0 before."""
     phase: str
     phase_kind: PhaseKind
     progress: float
-    """0 to 1 of the whole mission's duration."""
+    """Share of the mission's planned duration that has passed, 0 to 1."""
     reference: Reference | None = None
     attitude: AttitudeSetpoint | None = None
-    """None: nothing is to be sent to the autopilot in this tick."""
+    """None if no setpoint must be sent to the autopilot in this tick."""
     arm_torque_nm: Vec2 | None = None
-    """None: nothing is to be sent to the arm in this tick (its bus watchdog will let go)."""
+    """None if no command must be sent to the arm in this tick; without commands its bus watchdog trips."""
     request: AutopilotRequest
     action: SafetyAction
     events: tuple[Event, ...]
     control: ControlLog | None = None
     outcome: Outcome | None = None
-    """Set when the flight is over."""
+    """Outcome of the flight; None until it has ended."""
     mocap_trusted: bool
-    """Motion capture is plausible; while False no pose is to be passed on to PX4."""
+    """Motion capture is plausible. While False no pose must be forwarded to PX4."""
     tether: TetherState | None = None
     bent_by: tuple[str, ...]
-    """What the governor bent the reference for."""
+    """Reasons for which the governor constrained the reference."""
     mocap_innovation_m: float | None = None
-    """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged, None in old logs."""
+    """Distance between the newest pose and the position predicted from the IMU; 0 while it is not evaluated, None in older logs."""
 
 
 class Sent(Record, frozen=True, kw_only=True):
-    """What really left in one tick, and when: the drivers' answer to `Outputs`."""
+    """What the drivers sent in one tick, and when."""
 
     tick: int
     attitude_sent: bool
     arm_torque_sent_nm: Vec2 | None = None
-    """After rounding to current counts and clipping."""
+    """Torque after rounding to current counts and clipping; None if no currents were sent."""
     start_s: float
-    """When the tick began, flight clock."""
+    """Flight clock when the tick began."""
     lateness_s: float
-    """Behind the motion-capture frame that started the tick, or behind its deadline."""
+    """Delay of the tick's start after the motion-capture frame that triggered it, or after its deadline."""
     joint_read_s: float
     core_s: float
     setpoint_sent_s: float
     current_sent_s: float
-    """Stamps on the flight clock of: joint state at hand, core step done, setpoint sent, currents handed to the bus thread."""
+    """Flight clock when the joint state was read, the core step ended, the setpoint was sent, and the bus thread got the currents."""
     hold: int | None = None
-    """Number of the hold that stands after this tick, counted from 1 in each flight. A command to hold begins a new one, also where
-    the vehicle holds already. None: it does not hold."""
+    """Number of the hold that is active after this tick, counted from 1 in each flight; None if none is. Each HOLD command starts a
+    new one, even during a hold."""
 
 
 class LinkIdentity(Record, frozen=True, kw_only=True):
-    """What another process must know to go on speaking on the MAVLink link to PX4."""
+    """Addresses and ids that another process needs to take over the MAVLink link to PX4."""
 
     autopilot_system: int
     own_system: int
     own_component: int
     local_port: int
-    """UDP port that MAVSDK speaks from; 0: not UDP, or not known."""
+    """UDP port that MAVSDK sends from; 0 if it is unknown or the link is not UDP."""
     peer: tuple[str, int] | None = None
-    """PX4's IPv4 address and UDP port, the only ones that MAVSDK hears; None: not UDP."""
+    """PX4's IPv4 address and UDP port, the only ones that MAVSDK accepts; None if the link is not UDP."""

@@ -1,4 +1,4 @@
-"""The flight clock: monotonic seconds since the flight process started. Drivers and the flight process read it; the core never does."""
+"""The flight clock: monotonic seconds since the flight process started. The core never reads it; drivers and flight process do."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Clock = Callable[[], float]
 
 
 def flight_clock(origin_s: float | None = None) -> Clock:
-    """A clock that reads seconds since `origin_s` of `time.monotonic` (default: now)."""
+    """Return a clock that counts seconds since `origin_s` of `time.monotonic` (default: now)."""
     start_s = time.monotonic() if origin_s is None else origin_s
 
     def now_s() -> float:

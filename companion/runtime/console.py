@@ -1,4 +1,4 @@
-"""What a person sees in the terminal while a flight runs and when it is over."""
+"""Terminal output of a flight: live progress and the result."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ from companion.runtime.ipc import Message
 
 
 class SteadyStream:
-    """A text stream whose reader may go away (a pipe that closes, a terminal that hangs up): then it takes everything and shows
-    nothing. A flight must not care.
+    """A text stream that never fails. If its reader has gone (a closed pipe, a terminal that hung up), further text is discarded,
+    so that the flight continues.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write what still can be written."""
+        """Write the text, or discard it if the reader has gone."""
         try:
             return self._stream.write(text)
         except OSError:
-            self._let_go()
+            self._discard()
             return len(text)
 
     def flush(self) -> None:
-        """Flush what still can be flushed."""
+        """Flush the stream, if its reader is still there."""
         try:
             self._stream.flush()
         except OSError:
-            self._let_go()
+            self._discard()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    def _let_go(self) -> None:
+    def _discard(self) -> None:
         # The interpreter flushes once more at its end, and would change the exit code if that failed.
         with contextlib.suppress(OSError), open(os.devnull, "wb") as nowhere:
             os.dup2(nowhere.fileno(), self._stream.fileno())
 
 
 class _PlainNumbers(SteadyStream):
-    """A steady stream for people: it prints no negative zero."""
+    """A steady stream that prints no negative zeros."""
 
     def write(self, text: str) -> int:
         """Write the text without negative zeros."""
@@ -61,17 +61,17 @@ class _PlainNumbers(SteadyStream):
 
 
 def console_on(stream: TextIO) -> Console:
-    """Return a console for people on a stream whose reader may go away."""
+    """Return a console on a stream whose reader may disappear."""
     return Console(file=cast("IO[str]", _PlainNumbers(stream)))
 
 
 def terminal_console() -> Console:
-    """The console on standard output."""
+    """Return a console on standard output."""
     return console_on(sys.stdout)
 
 
 def tell(text: object) -> None:
-    """One line on standard error."""
+    """Print one line to standard error."""
     stream = SteadyStream(sys.stderr)
     stream.write(f"{text}\n")
     stream.flush()
@@ -82,7 +82,7 @@ _OUTCOME_STYLE = {"completed": "bold green", "aborted": "bold yellow", "refused"
 
 
 class _Numbers(ProgressColumn):
-    """The few figures that tell whether all is well."""
+    """Progress column with the most important figures of the flight."""
 
     def render(self, task: Task) -> Text:
         m: Message = task.fields.get("status") or {}
@@ -108,7 +108,7 @@ class FlightDisplay:
         self._title = title
         self._phase = ""
         self._event = ""
-        """Text of the newest event: a phase that begins with an event of the same name has its line."""
+        """Text of the newest event; a phase that begins with an event of the same name gets no line of its own."""
         self._progress = Progress(
             TextColumn("[bold]{task.description:<22}"),
             BarColumn(bar_width=28),
@@ -129,7 +129,7 @@ class FlightDisplay:
         self._progress.stop()
 
     def on_message(self, message: Message) -> None:
-        """Show one message of the flight or of the world."""
+        """Show one message of the flight process or of the simulated world."""
         kind = message.get("type")
         if kind == "status":
             self._progress.update(
@@ -171,7 +171,7 @@ class FlightDisplay:
             self._line("ground", message["text"], "cyan")
 
     def _preflight(self, rows: list[Message]) -> None:
-        """Rows that refuse are told at the end, as the reason of the refusal."""
+        """Show the preflight's result; the rows that refuse are printed at the end, as the reason of the refusal."""
         self._progress.update(self._task, description="starting", completed=0.0, note="")
         bad = [row for row in rows if not row["ok"]]
         warned = [row for row in bad if row["level"] == Level.WARN.value]
@@ -182,7 +182,7 @@ class FlightDisplay:
             self._line("", Row(**{**row, "level": Level.WARN}).line(), "yellow")
 
     def say(self, text: str) -> None:
-        """One line of the launcher's own."""
+        """Print one line of the launcher."""
         self._line("", text, "yellow")
 
     def _line(self, head: str, text: str, style: str) -> None:
@@ -192,7 +192,7 @@ class FlightDisplay:
 
 
 def print_result(console: Console, summary: dict[str, Any], out: Path, report: Path | None) -> None:
-    """The result table, and where everything lies."""
+    """Print the result table and the paths of the flight's files."""
     outcome = summary["outcome"]
     table = Table(title=None, show_header=True, header_style="bold", box=None, pad_edge=False)
     table.add_column("")

@@ -1,4 +1,4 @@
-"""Cores of this computer: which there are, and how the processes beside the flight keep off those that are its own."""
+"""CPU cores: which are usable, and how other processes stay off the cores that are reserved for the flight process."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from collections.abc import Collection
 from pathlib import Path
 
 CPU_MAX = 1023
-"""Largest number that sched_setaffinity(2) takes in its usual set (CPU_SETSIZE less one)."""
+"""Largest core number that sched_setaffinity(2) accepts in a default set (CPU_SETSIZE - 1)."""
 
 
 def usable_cpus() -> tuple[int, ...]:
-    """Cores that this process may be put on, isolated ones (isolcpus=) and those that it is not on now included; what the system's
-    cpusets withhold is not among them. Tried on a thread that ends at once.
+    """Return the cores that this process may run on, in ascending order.
+
+    They include isolated cores (isolcpus=) and cores outside its present affinity, but not those that a cpuset excludes. A short
+    thread finds out by trying.
     """
     found: set[int] = set()
 
     def attempt() -> None:
         with contextlib.suppress(OSError):
-            os.sched_setaffinity(
-                0, range(CPU_MAX + 1)
-            )  # 0: the calling thread alone; what does not exist is passed over
+            os.sched_setaffinity(0, range(CPU_MAX + 1))  # the calling thread only; cores that do not exist are ignored
         found.update(os.sched_getaffinity(0))
 
     thread = threading.Thread(target=attempt, name="cores")
@@ -32,16 +32,23 @@ def usable_cpus() -> tuple[int, ...]:
 
 
 def others(own: Collection[int], now: Collection[int], usable: Collection[int]) -> frozenset[int]:
-    """Cores for what is not the flight: those that it is on, less the flight's `own`; if none is left, any that is not.
+    """Return the cores that a process other than the flight process should move to.
 
-    Empty: there is nothing to change, or nowhere to go.
+    Args:
+        own: cores reserved for the flight process.
+        now: cores that the process may run on now.
+        usable: cores that it could run on.
+
+    Returns:
+        The cores of `now` without `own`, or if there are none, those of `usable` without `own`. Empty if nothing needs to change or
+        no core is left.
     """
     left = frozenset(now) - frozenset(own) or frozenset(usable) - frozenset(own)
     return frozenset() if left == frozenset(now) else left
 
 
 def keep_off(own: Collection[int]) -> None:
-    """Move all threads of this process off the flight's `own` cores; what it starts follows. Without another core it stays."""
+    """Move all threads of this process, and the children it will start, off the flight's `own` cores, if there are others."""
     if not own:
         return
     cpus = others(own, os.sched_getaffinity(0), usable_cpus())
@@ -53,7 +60,7 @@ def keep_off(own: Collection[int]) -> None:
 
 
 def listed(cpus: Collection[int]) -> str:
-    """For people, as the kernel writes it: `0-2,5`."""
+    """Return the cores in the kernel's notation: `0-2,5`."""
     runs: list[list[int]] = []
     for cpu in sorted(cpus):
         if runs and runs[-1][-1] == cpu - 1:

@@ -1,4 +1,4 @@
-"""The event loop of processes that keep time."""
+"""Event loop for processes with precise timers."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _T = TypeVar("_T")
 
 
 def fine_loop() -> asyncio.AbstractEventLoop:
-    """An event loop whose timers are not late by up to 1 ms.
+    """Return an event loop with timers more precise than 1 ms.
 
-    asyncio's own waits in `epoll`, whose time-outs Python rounds up to whole milliseconds; `select` takes microseconds. It knows no
-    descriptors of 1024 and above: a handful is open here.
+    asyncio's default loop waits in `epoll`, whose timeouts Python rounds up to whole milliseconds; `select` takes microseconds.
+    `select` does not support descriptors from 1024 on, which these processes do not reach.
     """
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
 def run(main: Coroutine[Any, Any, _T]) -> _T:
-    """`asyncio.run` on a `fine_loop`."""
+    """Run a coroutine like `asyncio.run`, on a `fine_loop`."""
     with asyncio.Runner(loop_factory=fine_loop) as runner:
         return runner.run(main)

@@ -1,4 +1,4 @@
-"""Threads that belong to a native library and call into Python."""
+"""Threads of native libraries that call Python."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import ctypes
 import threading
 
 _own = threading.local()
-"""Lives as long as the calling thread's interpreter state."""
+"""Exists as long as the calling thread's interpreter state."""
 
 
 def keep_interpreter_state() -> None:
-    """To be called in a callback from a native thread: the interpreter's state for that thread outlives the callback.
+    """Keep the interpreter state of the calling native thread after its callback; call it in the callback.
 
-    Each callback of such a thread makes an interpreter state of 16 kB and throws it away again, in fresh pages every time: at 900
-    callbacks a second as many page faults. One PyGILState_Ensure that is never released keeps the first one; a thread that ends
-    leaves it behind, so it is for the few threads that live as long as the process does.
+    Otherwise each callback allocates and frees an interpreter state of 16 kB, which costs a page fault per callback, 900 a second.
+    One PyGILState_Ensure without a release keeps the first state. It leaks when the thread ends, so use it only for threads that
+    live as long as the process.
     """
     if not getattr(_own, "kept", False):
         _own.kept = True

@@ -1,4 +1,4 @@
-"""What a process of the flight asks of the operating system."""
+"""Real-time settings that the processes of a flight request from the operating system."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 GIL_SWITCH_S = 0.0005
-"""The bus thread gets the interpreter this soon from a tick that computes on; Python's default is 5 ms, a whole period."""
+"""Interpreter switch interval: how long the bus thread waits for a computing tick. Python's default of 5 ms is a whole period."""
 FLIGHT_PRIORITY = 50
 GUARDIAN_PRIORITY = 60
-"""Above the flight: a flight process that spins must not keep the guardian from noticing."""
+"""Above the flight process, so that the guardian runs even if the flight process spins."""
 WORLD_PRIORITY = 40
-"""Of the simulated world: below the flight that it must not disturb."""
+"""Priority of the simulated world, below the flight process that it must not disturb."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # <bits/mman.h>, the same numbers on x86 and ARM
 _CAP_IPC_LOCK = 14  # <linux/capability.h>
@@ -28,16 +28,16 @@ _CAP_IPC_LOCK = 14  # <linux/capability.h>
 
 @dataclass(frozen=True, slots=True)
 class Realtime:
-    """What a process got from `claim_realtime`; `str()` is one line for people."""
+    """Result of `claim_realtime`; `str()` returns it as one line of text."""
 
     priority: int | None
-    """SCHED_FIFO, of every thread; None: refused, it runs at normal priority."""
+    """SCHED_FIFO priority of all threads; None if it was refused and the process runs at normal priority."""
     cpus: tuple[int, ...]
-    """Cores that it may run on."""
+    """Cores that the process may run on."""
     memory_locked: bool
-    """What it has in memory stays there, and so does what it will touch (mlockall)."""
+    """Present pages, and those touched later, stay in memory (mlockall)."""
     refused: tuple[str, ...]
-    """What it did not get of what it asked for, and why, one phrase each."""
+    """Requests that were refused, each with the reason."""
 
     def __str__(self) -> str:
         got = [f"SCHED_FIFO {self.priority}"] if self.priority is not None else []
@@ -48,17 +48,16 @@ class Realtime:
 
 
 def claim_realtime(priority: int, *, cpus: Collection[int] = (), lock_memory: bool = True) -> Realtime:
-    """Set what a process of the flight needs for even timing: garbage collection off, the interpreter's switch interval, cores,
-    memory that stays, SCHED_FIFO. May be called again: threads that have come since get it, too.
+    """Apply the settings for precise timing to all threads of this process: garbage collection off, interpreter switch interval,
+    cores, locked memory, SCHED_FIFO.
 
-    Every part is for all threads of this process. Children get the cores, but neither priority nor locked memory; threads that come
-    later get all but the priority.
+    Call it again to include threads that were started later; they inherit all but the priority. Children inherit the cores only.
 
     Args:
-        priority: of SCHED_FIFO, 1 to 99.
-        cpus: cores that the process is to run on; empty: as it is.
-        lock_memory: keep the process in memory. Pages are locked as they are touched (MCL_ONFAULT): without it every thread's stack
-            and every mapped library would be brought in whole.
+        priority: SCHED_FIFO priority, 1 to 99.
+        cpus: cores that the process runs on; empty to leave them unchanged.
+        lock_memory: keep the process in memory. Pages are locked when they are touched (MCL_ONFAULT), which avoids loading all
+            thread stacks and mapped libraries.
     """
     gc.collect()
     gc.freeze()
@@ -78,7 +77,7 @@ def claim_realtime(priority: int, *, cpus: Collection[int] = (), lock_memory: bo
 
 
 def realtime_permitted(priority: int) -> str | None:
-    """Real-time scheduling as `claim_realtime` would get it, tried on a thread that ends at once; None: it is refused."""
+    """Return the scheduling that `claim_realtime` would get, tried on a short thread; None if it would be refused."""
     got: list[str] = []
 
     def attempt() -> None:
@@ -93,9 +92,9 @@ def realtime_permitted(priority: int) -> str | None:
 
 
 def memory_lock_refused() -> str | None:
-    """Why memory is not to be locked, one phrase; None: it may be.
+    """Return why memory must not be locked, or None if it may be.
 
-    A limit that is not `unlimited` refuses: under it the process would get no more memory once it has used it up, in flight.
+    It must not under a finite RLIMIT_MEMLOCK: once the limit is used up, the process would get no more memory, in flight.
     """
     limit_bytes = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     if limit_bytes == resource.RLIM_INFINITY or _has_capability(_CAP_IPC_LOCK):
