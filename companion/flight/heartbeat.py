@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import msgspec
 
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
@@ -105,5 +105,5 @@ class FlightGuard:
             now: PX4's newest status; None if none was received.
         """
         if self._last is not None and not (now is not None and now.armed):
-            self._last = dataclasses.replace(self._last, goodbye=True)
+            self._last = msgspec.structs.replace(self._last, goodbye=True)
             self._client.send_heartbeat(self._last)

@@ -10,7 +10,18 @@ from pathlib import Path
 
 from companion import __version__
 
-_PACKAGES = ("mavsdk", "pymavlink", "dynamixel-sdk", "pyserial", "numpy", "pydantic", "foxglove-sdk", "mcap", "mujoco")
+_PACKAGES = (
+    "mavsdk",
+    "pymavlink",
+    "dynamixel-sdk",
+    "pyserial",
+    "numpy",
+    "pydantic",
+    "msgspec",
+    "foxglove-sdk",
+    "mcap",
+    "mujoco",
+)
 
 
 def versions() -> dict[str, str]:
