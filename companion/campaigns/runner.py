@@ -33,7 +33,7 @@ class Flights(Protocol):
     """Flights that are being flown."""
 
     def results(self) -> Iterator[Message]:
-        """Yield `{index, row, ...}` as each flight ends, in any order. Raises `CampaignError` if it cannot go on."""
+        """Yield `{index, row, wall_s}` and more as each flight ends, in any order. Raises `CampaignError` if it cannot go on."""
 
     def ask_to_stop(self) -> None:
         """Make `results` end soon. Safe in a signal handler."""
@@ -44,7 +44,7 @@ class Campaign(ABC):
     """What one campaign flies and how it shows its results."""
 
     name: ClassVar[str]
-    """Of the command and of its result files."""
+    """Name of the command and of its result files."""
     csv_name: ClassVar[str]
 
     configs: Sequence[SitlConfig]

@@ -6,6 +6,7 @@ import base64
 import csv
 import json
 import re
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,24 @@ def test_a_bad_flight_with_a_fault_is_shown_and_is_exit_code_5(monkeypatch: pyte
     assert "1 of 2 flights did what no flight may do." in page.text
     assert page.tags.count("tr") == (1 + 1) + (1 + 2), "the bad one, then both"
     assert "script" not in page.tags
+
+
+def test_a_flight_over_wires_that_is_refused_is_lost_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = Path("python")
+    program.write_text('#!/bin/sh\necho refused: "$@" >&2\nexit 2\n', encoding="utf-8")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program.resolve()))
+    words = ("faults", str(CATCH), "--wires", "--kinds", "kill_guardian,kill_recorder", "--preset", "paper")
+    ended = run_here(*words, "--jobs", "2", "--out", "out", "--json")
+    assert ended.code == EXIT_LOST, ended.err
+    found = json.loads(ended.out)
+    assert [(row["fault"], row["outcome"]) for row in found["rows"]] == [
+        ("kill_recorder", "lost"),
+        ("kill_guardian", "lost"),
+    ]
+    for row in found["rows"]:
+        assert f'fly {CATCH} --preset paper --sitl --set world.faults=[{{"kind": "{row["fault"]}"' in row["error"]
+    assert len(json.loads(Path("out/faults.json").read_text())["wall_s"]) == 2
 
 
 def test_draws_are_written_as_table_and_cases_and_a_crash_is_exit_code_5(monkeypatch: pytest.MonkeyPatch) -> None:

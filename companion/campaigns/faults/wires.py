@@ -7,8 +7,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,7 +17,6 @@ from companion.analysis.log import FlightLog, LogError
 from companion.campaigns.faults.judge import FaultFlight, Point, row_of, ticks_of
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.process import Message
-from companion.campaigns.runner import Row
 from companion.config.loader import FlightConfig
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
@@ -75,22 +75,19 @@ class WireFlights:
     def results(self) -> Iterator[Message]:
         """Yield the result of each flight as it ends."""
         with ThreadPoolExecutor(self._jobs) as pool:
-            waiting: dict[Future[Row | None], int] = {
-                pool.submit(self._fly, n, variant, phase): n for n, (variant, phase) in enumerate(self._flights)
-            }
+            waiting = {pool.submit(self._fly, n, variant, phase) for n, (variant, phase) in enumerate(self._flights)}
             while waiting:
-                done, _ = wait(waiting, _POLL_S, FIRST_COMPLETED)
-                for future in done:
-                    number, row = waiting.pop(future), future.result()
-                    if row is not None:
-                        yield {"index": number, "row": row}
+                # With a timeout, so that a signal that asks to stop is handled meanwhile.
+                done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+                yield from (message for future in done if (message := future.result()) is not None)
 
-    def _fly(self, number: int, variant: Variant, phase: FlightPhase) -> Row | None:
+    def _fly(self, number: int, variant: Variant, phase: FlightPhase) -> Message | None:
         if self._stop_asked:
             return None
+        begun_s = time.monotonic()
         folder = self._out / f"{number:02d}-{variant.kind}-{phase}"
         faults = f"world.faults={json.dumps([variant.fault(phase)])}"
-        command = [sys.executable, "-m", "companion.cli.main", "fly", *self._options, "--sitl", "--set", faults]
+        command = [sys.executable, "-m", "companion", "fly", *self._options, "--sitl", "--set", faults]
         with open(self._out / f"{folder.name}.txt", "wb") as console:
             process = subprocess.Popen(
                 [*command, "--out", str(folder)], stdin=subprocess.DEVNULL, stdout=console, stderr=console
@@ -104,9 +101,11 @@ class WireFlights:
             return None
         if code == EXIT_BAD_INPUT or code is None:
             last = (self._out / f"{folder.name}.txt").read_text(encoding="utf-8", errors="replace").strip()
-            why = "it did not end" if code is None else last.rpartition("\n")[2]
-            return row_of(variant, phase, _lost(why), self._config.vehicle)
-        return row_of(variant, phase, flown(folder, self._config), self._config.vehicle)
+            record = _lost("it did not end" if code is None else last.rpartition("\n")[2])
+        else:
+            record = flown(folder, self._config)
+        row = row_of(variant, phase, record, self._config.vehicle)
+        return {"index": number, "row": row, "wall_s": time.monotonic() - begun_s}
 
     @staticmethod
     def _wait(process: subprocess.Popen[bytes]) -> int | None:
