@@ -100,8 +100,8 @@ def bare_dynamixel_in_world(cycles: int, mission: Path, folder: Path) -> BusCycl
 
 
 def _bus_cycles(path: str, cycles: int) -> BusCycles:
-    """dynamixel-sdk's sync read then sync write at 200 Hz, without a real-time priority: it asks the port again and again without a
-    pause, and with one it would keep the kernel's own thread from bringing the answer."""
+    """Run dynamixel-sdk's sync read and sync write at 200 Hz, without real-time priority: the SDK polls the port without a pause and
+    would block the kernel thread that delivers the answer."""
     from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
     port, packet = PortHandler(path), PacketHandler(2.0)

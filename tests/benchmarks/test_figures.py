@@ -1,4 +1,4 @@
-"""What is computed from figures: ratios, verdicts, whose fault a late tick was."""
+"""Ratios, verdicts and late ticks are computed from figures correctly."""
 
 from __future__ import annotations
 

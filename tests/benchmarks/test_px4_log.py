@@ -1,4 +1,4 @@
-"""What is read from PX4's own log: modes, and times after a fault on PX4's clock."""
+"""Modes, and times after a fault, are read from PX4's own log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks`: every part by itself, what it leaves, and the page."""
+"""`python -m benchmarks`: every part, its files, and the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""benchmarks/soak.py: what it measures, and that it says so when something grew. The hour itself is flown by hand."""
+"""benchmarks.soak measures correctly and reports growth. The flight of an hour is not part of the tests."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ GOOD = {
 
 
 def hour(growing: str | None = None, mb_per_hour: float = 0.0) -> list[Sample]:
-    """A sample a second; before and after the flight only the launcher is there, and it grows."""
+    """One sample a second; before and after the flight only the launcher runs, and it grows."""
     samples = [Sample(float(t_s), {"launcher": 10.0}, {"launcher": 0.0}, {}) for t_s in range(10)]
     for t_s in range(10, 3610):
         rss_mb = {role: 50.0 + (mb_per_hour * (t_s - 10) / 3600.0 if role == growing else 0.0) for role in ROLES}

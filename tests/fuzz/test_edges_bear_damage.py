@@ -1,4 +1,4 @@
-"""Every wire bears a few thousand damaged inputs, and every input that it once did not bear. `benchmarks/fuzz.py` feeds a million."""
+"""Every wire survives a few thousand damaged inputs, and every input on which it once failed. `benchmarks/fuzz.py` feeds a million."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def target_of_file(stem: str) -> str:
 
 @pytest.fixture(autouse=True)
 def quiet() -> Iterator[None]:
-    """The edges say what they refuse; thousands of lines help nobody."""
+    """Silence the drivers, which log every rejected input."""
     logger = logging.getLogger("companion")
     before = logger.level
     logger.setLevel(logging.CRITICAL + 1)

@@ -1,4 +1,4 @@
-"""The harness itself: what a broken edge does is noticed, and an input can be had again."""
+"""The fuzzing harness detects a faulty driver, and repeats an input."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks.fuzzing.targets import NAMES, target_class
 
 
 class Broken(Target):
-    """Fails in the way that its first byte says."""
+    """A target that fails as its input says."""
 
     name: ClassVar[str] = "broken"
 

@@ -1,4 +1,4 @@
-"""What fuzzing showed of YAML that is refused: the place is the right one, and the line is one a person can read."""
+"""Rejected YAML is reported with the correct place, in one readable line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A MAVSDK 4 script as anybody would write it against PX4: it knows nothing of this repository.
+"""A MAVSDK 4 script for PX4 that uses nothing of this repository.
 
 Arms, takes off, goes offboard with position and then with attitude setpoints, lands, waits for the automatic disarm. One line of JSON
 per step goes to stdout. Usage: python mavsdk_mission.py CONNECTION_URL

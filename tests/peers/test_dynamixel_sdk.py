@@ -1,4 +1,4 @@
-"""The unmodified dynamixel-sdk, as anybody would use it, against the emulated bus on its pty."""
+"""The unmodified dynamixel-sdk against the emulated bus on its pty."""
 
 from __future__ import annotations
 

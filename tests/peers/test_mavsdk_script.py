@@ -1,4 +1,4 @@
-"""An unmodified MAVSDK 4 script, in a process of its own, flies the PX4 stub: arm, take off, offboard, land, disarm."""
+"""An unmodified MAVSDK 4 script in a separate process flies the PX4 stub: arm, take off, offboard, land, disarm."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def free_udp_port() -> int:
 
 
 async def fly_script(rig: Rig) -> tuple[int, list[dict[str, Any]], str, float]:
-    """Exit code, steps, standard error and the greatest height of one run of the script."""
+    """Run the script; return exit code, steps, standard error and greatest height."""
     port = free_udp_port()
     stop = asyncio.Event()
     highest_m = 0.0

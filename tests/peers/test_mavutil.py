@@ -15,7 +15,7 @@ DEADLINE_S = 30.0
 
 
 def ground_script(connection: Any) -> dict[str, Any]:
-    """Blocking, in a thread of its own: everything in it is mavutil's own code."""
+    """Run mavutil's blocking code; call it in a thread."""
     seen: dict[str, Any] = {}
     beat = connection.wait_heartbeat(timeout=DEADLINE_S)
     assert beat is not None, "no heartbeat"

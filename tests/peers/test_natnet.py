@@ -1,4 +1,4 @@
-"""PyPI `natnet`, a client that nobody here wrote, reads the SITL's NatNet server."""
+"""The independent client `natnet` of PyPI reads the simulated NatNet server."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POSES = (
 
 
 def read_one(server: NatNetServer, multicast: bool, deadline_s: float = 20.0) -> tuple[Any, Any, Any]:
-    """Server info, first frame and model definitions, as the foreign client understands them."""
+    """Return server info, first frame and model definitions as that client decodes them."""
     frames: list[Any] = []
     models: list[Any] = []
     client = NatNetClient(

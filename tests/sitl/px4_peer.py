@@ -19,11 +19,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 ARMED = int(mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 Answer = Callable[[Any], list[float] | None]
-"""Controls for one HIL_SENSOR; None: no answer."""
+"""Return controls for one HIL_SENSOR, or None for no answer."""
 
 
 class LockstepPeer:
-    """A thread of its own, so that the simulator under test may wait for it."""
+    """The peer runs in a thread, so that the simulator under test can wait for it."""
 
     def __init__(self, port: int, answer: Answer, mode: int = ARMED) -> None:
         self.sensors: list[Any] = []

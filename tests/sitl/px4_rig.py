@@ -126,7 +126,7 @@ class Rig:
         return texts
 
     async def fly(self, server: MavlinkServer, stop: asyncio.Event) -> None:
-        """World time follows wall time until `stop`; a late loop catches up step by step, no faster than it can."""
+        """Let world time follow wall time until `stop`; a late loop catches up step by step."""
         origin_s = time.monotonic() - self.t_s
         while not stop.is_set():
             steps = 0

@@ -1,7 +1,7 @@
-"""The world's device ends in one process, on a clock of its own: what they put on their wires in a short flight.
+"""The simulated devices in one process on simulated time: what they send over their wires in a short flight.
 
-The event loop's time is the world's, so that the same world gives the same bytes. A pilot within the test flies the machine: through
-the stub itself, and through the servo bus.
+The event loop runs on world time, so that the same world gives the same bytes. A pilot in the test flies the vehicle through the stub
+and the servo bus.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ START_M = (-0.2, 0.0)
 OFFBOARD = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 STREAM_S, MODE_S, ARM_S, UP_S = 0.3, 0.5, 0.6, 0.75
 END_STEPS = 1500
-"""Steps of the physics in which all is over, the catch included."""
+"""Physics steps of a whole flight, including the catch."""
 PERIOD_STEPS = 5
 _LAST_BYTES_S = 0.05
 NM_PER_COUNT = 1.3 * 2.69e-3
@@ -50,15 +50,15 @@ BAUD_BPS = 3_000_000
 
 @dataclass(frozen=True)
 class Emitted:
-    """What the ends put on their wires."""
+    """What the devices send."""
 
     steps: tuple[tuple[Any, ...], ...]
-    """Step by step of the physics: MAVLink, NatNet, servo bus, and what became of processes."""
+    """Per physics step: MAVLink, NatNet, servo bus, and faults of processes."""
     force: bytes
-    """The whole stream of the force sensor; when its bytes come through the pty is the kernel's affair."""
+    """Whole stream of the force sensor; the kernel decides when its bytes arrive."""
 
     def goes_on_as(self, steps: Sequence[tuple[Any, ...]], force: bytes) -> bool:
-        """Whether the newest step and the bytes so far are those of this flight."""
+        """Return whether the newest step and the bytes so far equal those of this flight."""
         return steps[-1] == self.steps[len(steps) - 1] and self.force.startswith(force)
 
 
@@ -73,9 +73,9 @@ class WorldLoop(asyncio.SelectorEventLoop):
 
 
 def emitted(config: SitlConfig, end: int, usual: Emitted | None = None) -> Emitted:
-    """Return what the ends emit in so many steps of the physics.
+    """Return what the devices send in `end` physics steps.
 
-    The flight ends at the first step in which that is not what they emit in `usual`.
+    The flight ends at the first step that differs from `usual`.
     """
     with asyncio.Runner(loop_factory=WorldLoop) as runner:
         return runner.run(_emitted(with_fault_times(config), end, usual))
@@ -112,7 +112,7 @@ async def _emitted(config: SitlConfig, end: int, usual: Emitted | None) -> Emitt
 
 @contextlib.contextmanager
 def _flight_process() -> Iterator[subprocess.Popen[bytes]]:
-    """A process that stands for the flight process."""
+    """Run a process in place of the flight process."""
     process = subprocess.Popen(["sleep", "600"])
     try:
         yield process
@@ -122,7 +122,7 @@ def _flight_process() -> Iterator[subprocess.Popen[bytes]]:
 
 
 async def turns_until(done: Callable[[], bool]) -> None:
-    """Let the event loop turn until it is so."""
+    """Let the event loop run until the condition holds."""
     give_up_s = time.monotonic() + DEADLINE_S
     while not done():
         assert time.monotonic() < give_up_s
@@ -130,7 +130,7 @@ async def turns_until(done: Callable[[], bool]) -> None:
 
 
 class Partner:
-    """The other side of the four wires: asks each device for what it can say, and keeps every byte."""
+    """The other end of the four wires: requests data from each device and records every byte."""
 
     def __init__(self, sitl: Sitl, devices: dict[str, dict[str, Any]]) -> None:
         autopilot, mocap = urlsplit(devices["autopilot"]["address"]), devices["mocap"]
@@ -147,10 +147,10 @@ class Partner:
         self._tty = os.open(devices["force"]["port"], os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         self._answers: list[tuple[bytes, float]] = []
         self.force = b""
-        """Everything that the force sensor sent."""
+        """Bytes that the force sensor sent."""
 
     async def all_hear(self) -> None:
-        """Start the force sensor's stream, and let every device take what was sent to it so far."""
+        """Start the force sensor's stream, and let every device read what was sent so far."""
         os.write(self._tty, rft.pack(bytes((rft.Command.START,)), rft.COMMAND_BYTES))
         await turns_until(lambda: self._sensor.streaming)
         for _ in range(20):  # the event loop takes a datagram in a turn
@@ -161,13 +161,13 @@ class Partner:
         self._answers.append(self._bus.answer_to(data, BAUD_BPS))
 
     def heard(self) -> tuple[Any, ...]:
-        """What came on each wire since the last call."""
+        """Return what arrived on each wire since the last call."""
         answers, self._answers = tuple(self._answers), []
         self.read_force(0.0)
         return (*map(_received, self._sockets), answers)
 
     def read_force(self, within_s: float) -> None:
-        """Read the force sensor until nothing has come for that long."""
+        """Read the force sensor until nothing has arrived for `within_s`."""
         while select.select([self._tty], [], [], within_s)[0]:
             self.force += os.read(self._tty, 65535)
 
@@ -194,7 +194,7 @@ def _received(opened: socket.socket) -> bytes:
 
 
 class Pilot:
-    """Takes off, flies in +x through the catch and holds the arm as it was; leaves the rotors off if a hand is there."""
+    """Takes off, flies in +x through the catch and holds the arm; does not arm while the vehicle is handled."""
 
     def __init__(self, config: SitlConfig, autopilot: StubBackend, plant: Plant, partner: Partner) -> None:
         self._joints, self._arm_rad = config.vehicle.arm.joints, plant.world.q[slice(*_span(plant))]
@@ -203,7 +203,7 @@ class Pilot:
         self._hover = config.vehicle.airframe.mass_kg * 9.81 / config.vehicle.airframe.thrust_max_n
 
     def step(self, step: int) -> None:
-        """Before each step of the physics."""
+        """Act before each physics step."""
         if step % PERIOD_STEPS:
             return
         period, t_s = step // PERIOD_STEPS, self._plant.t_s
@@ -259,7 +259,7 @@ def _writing(address: int, value: int) -> bytes:
 
 
 _READ_PRESENT = _reading(reg.PRESENT_CURRENT.address, 21)
-"""To the temperature."""
+"""Reads the present values up to the temperature."""
 _SET_UP = (
     _writing(reg.LED.address, 1),
     *(_reading(register.address, register.size) for register in reg.REGISTERS if register.eeprom),

@@ -1,4 +1,4 @@
-"""The fast closed loop itself: what it keeps of the world, what its knobs do, what it leaves behind."""
+"""The fast closed loop: what it records of the world, its settings, and its clean-up."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_the_arm_delay_delays_the_currents_and_nothing_else() -> None:
 
 
 def test_a_silent_servo_lets_go_and_that_is_told_when_it_answers_again() -> None:
-    """As over the wire: its watchdog trips, the edge restarts it and says so in one state."""
+    """As over the wire: the watchdog trips, and the driver restarts it and reports it in one state."""
     result = flown("world.faults=[{kind: servo_loss, t_s: 4.0, duration_s: 0.12}]")
     armed_s = next(i.t_s for i in result.inputs if i.status is not None and i.status.armed)
     told = [i.t_s - armed_s for i in result.inputs if i.arm is not None and i.arm.hardware_error != (0, 0)]

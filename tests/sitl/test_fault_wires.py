@@ -162,7 +162,7 @@ with open(sys.argv[2], "wb", buffering=0) as file:
 
 @pytest.fixture
 def recorder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A child that is called as the recorder is, and writes when it is told to."""
+    """A child process with the recorder's command line that writes on request."""
     command = [sys.executable, "-c", _WRITER, "companion.recorder.main", str(tmp_path / "log")]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:

@@ -1,4 +1,4 @@
-"""The hand of the simulated world, and motion-capture servers that are set up wrongly."""
+"""Handling in the simulated world, and wrongly configured motion-capture servers."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_mirrored_stream_turns_the_other_way() -> None:
 
 
 def test_every_set_of_axes_streams_rotations_that_turn_as_they_are_seen() -> None:
-    """Between two attitudes the stream's own points turn by the stream's own quaternions."""
+    """Points of the stream rotate by the quaternions of the stream."""
     later = quat_multiply(quat_from_euler_zyx(0.3, 0.1, -0.4), Q)
     axes_of = ("x", "y", "z")
     for order in itertools.permutations(axes_of):

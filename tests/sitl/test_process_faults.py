@@ -1,4 +1,4 @@
-"""Faults of the flight process: what they do to a process, and whether the world's report would show what went wrong."""
+"""Faults of the flight process: their effect on a process, and the world's report."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ while True:
 
 @contextmanager
 def flight_process(kind: FlightFaultKind) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that takes itself for the flight process, with the hooks for this fault."""
+    """A process with the flight process's arguments and the hooks for this fault."""
     process = subprocess.Popen(
         [sys.executable, "-c", _FLIGHT, "companion.flight.main"],
         stdout=subprocess.PIPE,
@@ -51,7 +51,7 @@ def flight_process(kind: FlightFaultKind) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def letters(process: subprocess.Popen[bytes]) -> set[str]:
-    """Who has written since the last call."""
+    """Return which threads have written since the last call."""
     assert process.stdout is not None
     return set((process.stdout.read() or b"").decode())
 

@@ -33,7 +33,7 @@ async def connected(link: SimulatorLink, answer: Answer) -> LockstepPeer:
 
 
 async def boot(link: SimulatorLink, i: int = 0) -> int:
-    """Samples until the first answer; the number of the next one."""
+    """Send samples until the first answer; return the number of the next sample."""
     async with asyncio.timeout(DEADLINE_S):
         while not link.in_step:
             link.send(sample(i), 0.3, LEVEL)
@@ -43,7 +43,7 @@ async def boot(link: SimulatorLink, i: int = 0) -> int:
 
 
 async def until_answered(link: SimulatorLink, i: int) -> None:
-    """It is in lockstep again: a sample is waited for, and answered."""
+    """Check that lockstep works again: a sample is awaited and answered."""
     async with asyncio.timeout(DEADLINE_S):
         while True:
             i += 1

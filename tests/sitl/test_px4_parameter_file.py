@@ -1,4 +1,4 @@
-"""PX4's parameter file: read while PX4 writes it, never believed in part, made whole after PX4's end."""
+"""PX4's parameter file: an incomplete file is rejected, and the complete one is restored after PX4's end."""
 
 from __future__ import annotations
 

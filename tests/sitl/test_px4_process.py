@@ -1,4 +1,4 @@
-"""A px4 is found, gets an instance that nobody uses, lives in its folder, and its end is told. The binary is a peer of ours."""
+"""PX4 is found, gets a free instance and its own folder, and its end is reported. The binary is a test peer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEADLINE_S = 20.0
 
 
 def installed(folder: Path, script: str = "") -> Path:
-    """A folder as a build leaves it; the binary is the peer, or another script."""
+    """Return a folder like that of a build; its binary is the peer or another script."""
     (folder / "bin").mkdir(parents=True)
     (folder / "etc" / "init.d-posix").mkdir(parents=True)
     (folder / "etc" / "init.d-posix" / "rcS").touch()

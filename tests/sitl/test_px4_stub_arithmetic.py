@@ -1,4 +1,4 @@
-"""Arithmetic that is written out for speed, against the same thing said plainly, to the last bit."""
+"""Arithmetic written out for speed equals the plain formulas to the last bit."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Peer:
 
 
 async def run(rig: Rig, server: MavlinkServer, peer: Peer, world_s: float) -> None:
-    """World time passes; the wire is pumped and read as it goes."""
+    """Advance world time, and pump and read the link."""
     until_s = rig.t_s + world_s
     while rig.t_s < until_s:
         rig.step()
@@ -62,7 +62,7 @@ async def run(rig: Rig, server: MavlinkServer, peer: Peer, world_s: float) -> No
 
 
 async def run_until_handled(rig: Rig, server: MavlinkServer, peer: Peer, messages: int) -> None:
-    """Until the stub has decoded so many messages in all."""
+    """Wait until the stub has decoded this many messages."""
     async with asyncio.timeout(DEADLINE_S):
         while server.messages_in < messages:
             await run(rig, server, peer, 0.004)

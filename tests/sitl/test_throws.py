@@ -1,4 +1,4 @@
-"""Throw after throw: what the world does, and that a flight that repeats catches each."""
+"""Repeated throws: the world's behaviour, and a repeating flight that catches each of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sitl.world.world import World
 
 ROOT = Path(__file__).parents[2]
 CATCH_S, PERIOD_S = 6.5, 15.0
-"""Of catch.yaml: the first catch, and how much later each further one is."""
+"""Time of the first catch of catch.yaml, and time between two catches."""
 
 
 def configured(*overrides: str, mission: str = "catch") -> SitlConfig:

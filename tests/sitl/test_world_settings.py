@@ -33,10 +33,9 @@ ON_WIRES_ONLY = {
 """Settings without a meaning in the fast closed loop, and why."""
 
 UNTIL_S = EARLY_S, _, _ = 1.05, 2.2, 7.0
-"""Flight times in the fast loop: the servos give torque, the rotors turn, all is over, the catch included.
+"""Flight times in the fast loop: until the servos give torque, until the rotors turn, and including the catch.
 
-A pair flies until its first difference. Its usual world flies the shortest time in which the two may differ, or the longest at once
-if other pairs share it.
+A pair flies until its first difference. Shorter flights are tried first, unless other pairs share the usual world.
 """
 SHARED = {world for world, pairs_of_it in Counter(json.dumps(pair.usual) for pair in PAIRS).items() if pairs_of_it > 3}
 UNTIL_STEPS = (130, 400, END_STEPS)
@@ -44,11 +43,11 @@ UNTIL_STEPS = (130, 400, END_STEPS)
 
 
 class Unlike(Exception):
-    """The flight has done something else."""
+    """The flight differs."""
 
 
 class Watched(list[Any]):
-    """A record that ends the flight as soon as it is unlike an earlier one."""
+    """A record that ends the flight at the first difference from an earlier record."""
 
     def __init__(self, usual: list[Any]) -> None:
         super().__init__()
@@ -87,7 +86,7 @@ def usual_emitted(world_json: str, end: int) -> Emitted:
 
 
 def flights_differ(pair: Pair, limit_s: float) -> bool:
-    """Whether core, world or guardian do something else in the fast loop up to this time."""
+    """Return whether core, world or guardian differ in the fast loop up to this time."""
     usual = usual_flight(world(pair.usual).world.model_dump_json(), limit_s)
     result = FastResult(
         inputs=Watched(usual.inputs),
@@ -103,18 +102,18 @@ def flights_differ(pair: Pair, limit_s: float) -> bool:
 
 
 def devices_differ(pair: Pair, end: int) -> bool:
-    """Whether the devices send something else up to this step of the physics."""
+    """Return whether the devices' output differs up to this physics step."""
     usual = usual_emitted(world(pair.usual).world.model_dump_json(), end)
     return emitted(world(pair.changed), end, usual) != usual
 
 
 def tried(pair: Pair, limits: tuple[Any, ...]) -> tuple[Any, ...]:
-    """How long to fly, one after the other, until the pair differs."""
+    """Return the limits to try in turn until the pair differs."""
     return limits[-1:] if json.dumps(pair.usual) in SHARED else limits[pair.acts :]
 
 
 def field(pair: Pair) -> str:
-    """The setting without its component or place."""
+    """Return the setting without its component or place."""
     return pair.setting.partition("[")[0].partition(" ")[0]
 
 

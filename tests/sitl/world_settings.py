@@ -36,7 +36,7 @@ EXAMPLES: dict[type[Model], Settings] = {
     Servo: {},
     Fault: {"kind": "gust", "t_s": 0.1},
 }
-"""What the parts of the world look like whose fields are walked."""
+"""Examples of the parts of the world whose fields are tested."""
 
 VALUES: dict[str, Any] = {
     "mocap_axes": ("-x", "-y", "z"),
@@ -54,11 +54,11 @@ VALUES: dict[str, Any] = {
     "faults.size": 3.0,
     "faults.after": "start",
 }
-"""Other values of settings whose type or default does not say enough."""
+"""Other values of settings for which type and default do not suffice."""
 
 _HANDLED: Settings = {"hand": True, "hand_t_s": 0.0}
 _HANDLED_FOR_LONG: Settings = {**_HANDLED, "px4_params": {"EKF2_EV_CTRL": 0}}
-"""Without an estimate nothing arms."""
+"""Handling for long: without an estimate the vehicle does not arm."""
 TOGETHER: dict[str, Settings] = {
     "hand": {"hand_t_s": 0.0},
     "hand_t_s": _HANDLED,
@@ -70,7 +70,7 @@ TOGETHER: dict[str, Settings] = {
     "keep_s": {"throws": 2, "keep_s": 0.2},
     "throws": {"keep_s": 0.2},
 }
-"""What else is set, in both worlds, so that the setting acts early in a flight."""
+"""Further settings of both worlds that make the setting act early in a flight."""
 
 TOGETHER_IN_PART: dict[str, Settings] = {
     "faults.phase": {"t_s": None, "phase": "line"},
@@ -83,11 +83,11 @@ ACTS_LATE = frozenset({"throws", "keep_s", "hand_taps", "hand_tap_n", "faults.ph
 
 _NEVER = {"kind": "gust", "t_s": 1000.0}
 BESIDE: dict[str, Settings] = {"tether_cut": {"kind": "tether_taut", "t_s": 0.0, "size": 0.02}}
-"""Kinds of faults that act only while another one does."""
+"""Kinds of faults that act only together with another one."""
 IN_THE_AIR = frozenset({"motor_weak", "offboard_refused", "pilot_takeover", "tether_taut", "tether_snag", "tether_cut"})
 """Kinds of faults that show only once the rotors turn."""
 SIZES: dict[str, float] = {"payload_missed": 0.0, "autopilot_reboot": 0.1}
-"""Sizes of faults that half of the default size does not tell apart from it."""
+"""Sizes of faults for which half of the default size makes no difference."""
 
 
 def pairs() -> Iterator[Pair]:
@@ -147,7 +147,7 @@ def _placed(field: FieldInfo, part: type[Model], settings: Settings, place: int)
 
 
 def _changes(path: str, field: FieldInfo, usual: Settings, model: type[Model]) -> Iterator[tuple[str, Settings]]:
-    """The number of the component ("" if it has none) and what is set instead."""
+    """Yield the number of the component ("" without one) and the changed settings."""
     name = path.rpartition(".")[2]
     if path in VALUES:
         yield "", {name: VALUES[path]}
