@@ -123,8 +123,7 @@ class Px4Stub:
         """Setpoint of the attitude loop (ATTITUDE_TARGET)."""
         self.rotors: RotorCommands = _STOPPED
         self.vision_received = 0
-        self.vision_passed_on = 0
-        """Numbers of vision poses that arrived, and of those that EKF2_EV_CTRL admitted to the estimator."""
+        """Number of vision poses that arrived."""
         self._estimator = estimator
         self._cascade = cascade
         self._setpoint_delay_s = setpoint_delay_s
@@ -223,7 +222,6 @@ class Px4Stub:
         self.vision_received += 1
         if self.params.integer("EKF2_EV_CTRL") & _EV_POSITION_AND_YAW != _EV_POSITION_AND_YAW:
             return False
-        self.vision_passed_on += 1
         taken_s = t_s - self.params.real("EKF2_EV_DELAY") / 1000.0
         self._estimator.fuse_vision(taken_s, position_ned_m, attitude_ned_frd, self.params.real("EKF2_EVP_NOISE"))
         return True
