@@ -110,12 +110,12 @@ def law_us(config: SitlConfig, inputs: list[Inputs], repeats: int) -> float:
     """Return the CPU time per update of the law on the states of a recorded flight."""
     calls: list[LawCall] = []
     core = FlightCore(config)
-    core._pilot._controller = _RecordedLaw(core._pilot._controller, calls)
+    core._control._controller = _RecordedLaw(core._control._controller, calls)
     for given in inputs:
         core.step(given)
     times_us: list[float] = []
     for _ in range(repeats):
-        step = FlightCore(config)._pilot._controller.step
+        step = FlightCore(config)._control._controller.step
         begun_s = time.process_time()
         for call in calls:
             step(*call)

@@ -136,8 +136,8 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
 
     check = commands.add_parser(
         "check",
-        help="may the machine fly? devices, PX4's parameters, frames and mission; nothing moves",
-        description="Look at everything that a flight would look at before it arms. Exit code 0: it may fly, 3: it may not.",
+        help="run all checks before a flight: devices, PX4's parameters, frames, mission; nothing moves",
+        description="Run every check that a flight runs before it arms. Exit code 0: the vehicle may fly, 3: it may not.",
     )
     _add_flight_options(check, mission_default=True)
     check.add_argument(

@@ -40,7 +40,7 @@ class Controller(Protocol):
 
 
 class Law(Controller, Protocol):
-    """Protocol of a controller as `Pilot` uses it."""
+    """Protocol of a controller as `VehicleControl` uses it."""
 
     hover_thrust: float
     """Normalised thrust that carries the machine without payload, for the log; set before every step."""

@@ -10,7 +10,7 @@ import math
 import msgspec
 
 from companion.config.loader import FlightConfig
-from companion.control.pilot import Command, Pilot
+from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Observation, Request, Tare
 from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
@@ -44,7 +44,7 @@ class FlightCore:
     def __init__(self, config: FlightConfig) -> None:
         vehicle = config.vehicle
         self._vehicle = vehicle
-        self._pilot = Pilot(config)
+        self._control = VehicleControl(config)
         # Solved here once, so that the plan from the measured start costs a tick next to nothing.
         Plan.build(config.mission, config.vehicle)
         self._monitors = Monitors(vehicle)
@@ -134,7 +134,7 @@ class FlightCore:
             situation.offboard_expected = stage in seq.COMMANDING
             self._tether_watched = stage not in seq.BEFORE_LIFT
             situation.found_armed = None
-        situation.tracking_error_m = self._pilot.tracking_error_m if stage is _PLAN else None
+        situation.tracking_error_m = self._control.tracking_error_m if stage is _PLAN else None
         situation.control = self._log
         situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
@@ -153,7 +153,7 @@ class FlightCore:
             standing=self._monitors.standing() if resume else None,
             reference=self._reference,
             tether=situation.tether,
-            thrust_share=self._pilot.thrust_share,
+            thrust_share=self._control.thrust_share,
             pose_s=self._pose_s,
         )
 
@@ -169,7 +169,7 @@ class FlightCore:
             v.velocity_world_m_s,
             v.attitude_wxyz,
             i.arm.angle_rad if i.arm is not None else None,
-            self._pilot.disturbance_world_n if flying else None,
+            self._control.disturbance_world_n if flying else None,
             log.force_ext_world_n if flying and log is not None else None,
         )
 
@@ -181,11 +181,11 @@ class FlightCore:
             self._monitors.forget()
         for step in request.tare:
             if step is Tare.BEGIN:
-                self._pilot.begin_tare()
+                self._control.begin_tare()
             elif step is Tare.COLLECT:
-                self._pilot.collect_tare(i)
+                self._control.collect_tare(i)
             else:
-                self._pilot.finish_tare()
+                self._control.finish_tare()
 
     def _report_refused(self, t_s: float, refused: tuple[Refusal, ...], events: list[Event]) -> None:
         before = {refusal.kind for refusal in self._refused}
@@ -199,28 +199,28 @@ class FlightCore:
         if stage in (Stage.WAIT, Stage.READY, Stage.DONE):
             return None, Command()
         if stage is Stage.STAND_DOWN and state.armed_by_others:
-            return None, msgspec.structs.replace(self._pilot.wait(i), attitude=None)
+            return None, msgspec.structs.replace(self._control.wait(i), attitude=None)
         if stage is Stage.AUTOPILOT_LAND:
-            folding = self._pilot.fold(i, dt_s)
+            folding = self._control.fold(i, dt_s)
             return None, msgspec.structs.replace(
-                folding, attitude=self._pilot.level(i)
+                folding, attitude=self._control.level(i)
             ) if state.zero_thrust else folding
         course = state.course
         if course is None or not (stage is _PLAN or stage is _SPOOL or stage is _TOUCHDOWN):
-            return None, self._pilot.wait(i)
+            return None, self._control.wait(i)
         reference = course.plan.reference(0.0) if stage is _SPOOL else course.reference(i.t_s)
         if stage is _PLAN:
             governed = self._governor.bend(dt_s, reference, self._situation.tether)
             reference, self._bent_by = governed.reference, governed.bent_by
         self._reference = reference
-        return reference, self._pilot.fly(i, dt_s, reference, state.vertical_scale(i.t_s))
+        return reference, self._control.fly(i, dt_s, reference, state.vertical_scale(i.t_s))
 
     def _watch_for_catch(self, t_s: float, log: ControlLog, events: list[Event]) -> None:
-        caught_s, start_s = self._pilot.catch_s(t_s, log), self._state.mission_start_s
+        caught_s, start_s = self._control.catch_s(t_s, log), self._state.mission_start_s
         if caught_s is not None and start_s is not None:
             self._situation.caught = True
             text = f"payload caught at t = {caught_s - start_s:.2f} s"
             events.append(event_of(notices.CATCH, caught_s, text))
-        elif self._pilot.payload_left(t_s):
+        elif self._control.payload_left(t_s):
             self._situation.caught = False
             events.append(event_of(notices.PAYLOAD_LEFT, t_s, "the payload has left the net"))

@@ -30,7 +30,7 @@ class Command(Record, frozen=True):
     log: ControlLog | None = None
 
 
-class Pilot:
+class VehicleControl:
     """Owner of the control law, the force sensor's tare and the arm's holding target.
 
     Args:
