@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks.px4_log import Px4Log, newest
 from benchmarks.report import write_json
 from companion.analysis.log import FlightLog, LogError
-from companion.campaigns.faults.wires import WITNESS
+from companion.campaigns.faults.sitl_flights import WITNESS
 from sitl.px4.hil_link import Px4Error
 
 ROOT = Path(__file__).parents[1]

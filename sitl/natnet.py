@@ -279,7 +279,9 @@ def encode_frame(
     exposure_t_s: float | None,
     names: dict[int, str],
 ) -> bytes:
-    """Return one NAT_FRAMEOFDATA datagram with every section of the version; arguments as for `NatNetServer.publish`."""
+    """Return one NAT_FRAMEOFDATA datagram with all sections that this NatNet version defines; arguments as for
+    `NatNetServer.publish`.
+    """
     markers = {
         pose.id: [_add(pose.position_m, quat_rotate(pose.quat_wxyz, offset)) for offset in _MARKERS_BODY_M]
         for pose in poses

@@ -1,5 +1,5 @@
 """Fit of the hover thrust without payload to the calm parts of a flight's log: least squares over the balance of
-`companion.control.hover`, thrust = h . load, and over the battery voltage if it changed enough.
+`companion.control.hover_thrust`, thrust = h . load, and over the battery voltage if it changed enough.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.analysis.log import Array, FlightLog
-from companion.control.hover import Balance
+from companion.control.hover_thrust import Balance
 from companion.control.sensing import acceleration_world_m_s2
 from companion.model.types import PhaseKind
 

@@ -1,7 +1,4 @@
-"""HTML pages: one file each that holds its pictures, opens anywhere and prints well. `page.html` is their template.
-
-Needs jinja2 (extras `sitl` and `analysis`).
-"""
+"""Build self-contained HTML pages: one file with embedded pictures, also for printing."""
 
 from __future__ import annotations
 

@@ -29,9 +29,9 @@ from companion.io.protocols import DeviceError
 from companion.launcher.launcher import replace_device_settings
 from companion.launcher.sitl_process import SitlProcess
 from companion.mission.plan import Plan
+from companion.model.check_row import Level, Row, refusals
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.model.observations import Observations
-from companion.model.rows import Level, Row, refusals
 from companion.preflight import run as preflight
 from companion.preflight.hand_test.command import run_hand_test
 from companion.preflight.hand_test.record import record_path
@@ -251,7 +251,7 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
 
 
 def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, header: bool = False) -> Table:
-    """Return one row of the table. All rows have the same columns; a row without an expected value uses both."""
+    """Return one row of the table. In a row without an expected value the measured value also uses that column's width."""
     width = min(console.width, _WIDTH_MAX)
     title_width = min(_TITLE_WIDTH, width // 3)
     left = max(20, width - _MARK_WIDTH - title_width - 4 * _GAP)

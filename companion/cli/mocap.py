@@ -16,7 +16,7 @@ def add_parser(commands: Any) -> None:
     parts = mocap.add_subparsers(dest="part", required=True, metavar="PART")
     check = add_tool(
         parts, "check", _TOOLS,
-        help="server, bodies, rate, jitter, latency, losses",
+        help="check the stream: server, bodies, rate, jitter, latency and lost frames",
         description="Watch motion capture and report what is wrong. Nothing moves, PX4 is not needed. Exit 0: nothing is wrong; 3: "
         "something is wrong.",
     )  # fmt: skip

@@ -24,8 +24,8 @@ from companion.config.document import ConfigError, Data
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.io.protocols import DeviceError
+from companion.model.check_row import Level, Row, refusals
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
-from companion.model.rows import Level, Row, refusals
 from companion.preflight.checks import Check
 from companion.runtime.console import console_on, tell
 

@@ -74,8 +74,8 @@ def read_document(path: str | Path, shown_as: str | None = None) -> Document:
     """Read one YAML file whose top level is a mapping.
 
     Raises:
-        ConfigError: one line, if the file cannot be read or is not YAML. What is readable but refused (duplicate keys) is
-            collected in `Document.problems`, to be reported together with what the models find.
+        ConfigError: one line, if the file cannot be read or is not YAML. Duplicate keys do not raise; they are collected in
+            `Document.problems` and reported with the validation errors.
     """
     shown = shown_as or str(path)
     try:

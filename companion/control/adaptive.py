@@ -260,8 +260,8 @@ class AdaptiveController:
         )
 
     def _base_force(self, tau: Rows, reference: Reference, force: Vec3, disturbance: Vec3) -> Vec3:
-        """Return the force on the base: tau and hover thrust, plus the configured force feedforward, disturbance compensation
-        and lead.
+        """Return the force on the base: tau plus the weight, with force feedforward, disturbance compensation and the jerk lead
+        applied.
         """
         (x, y, z, _, _), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = tau, force, disturbance, self._force_share
         x -= c0 * f0 + d0

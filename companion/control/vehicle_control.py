@@ -8,7 +8,7 @@ from companion.config.loader import FlightConfig
 from companion.control.arm_hold import hold_torque_nm
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.factory import build_controller
-from companion.control.hover import HoverThrust, off_the_ground
+from companion.control.hover_thrust import HoverThrust, off_the_ground
 from companion.control.manipulator import Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
 from companion.control.types import Controller, PlantState

@@ -35,10 +35,10 @@ _PLAN, _SPOOL, _TOUCHDOWN = Stage.PLAN, Stage.SPOOL, Stage.TOUCHDOWN
 
 
 class FlightCore:
-    """All decisions of one flight.
+    """Makes all decisions of one flight.
 
     Args:
-        config: the effective configuration; `vehicle.airframe.hover_thrust` must be known by now.
+        config: the effective configuration; `vehicle.airframe.hover_thrust` must already be set.
     """
 
     def __init__(self, config: FlightConfig) -> None:
@@ -158,7 +158,7 @@ class FlightCore:
         )
 
     def _watch_tether(self, i: Inputs) -> None:
-        """Update the tether's state, from arming on: winding before take-off is not known, and counts as none."""
+        """Update the tether's state from arming on. Turns from before that are unknown; zero turns are assumed."""
         v = i.vehicle
         if v is None or not self._tether_watched:
             return

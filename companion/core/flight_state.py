@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 from enum import Enum
 
+from companion.mission.active_plan import Course
 from companion.mission.autopilot_landing import AutopilotLanding
-from companion.mission.course import Course
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 
 from companion.core.flight_state import Tare
 from companion.core.transition import Transition
+from companion.mission.active_plan import Course
 from companion.mission.autopilot_landing import FLIPPED, TIPPED
 from companion.mission.check import check_start
-from companion.mission.course import Course
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
@@ -112,7 +112,7 @@ def _ready(t: Transition, _: float) -> AutopilotRequest:
         t.change_waiting(settled=SettledEstimate())
     if problem is not None:
         t.change_waiting(unready=problem, tare_start_s=None)
-        t.report(notices.NOT_READY, f"not ready any more: {problem}")
+        t.report(notices.NOT_READY, f"no longer ready: {problem}")
         t.enter(Stage.WAIT)
         if t.start_asked:
             _decline_start(t)

@@ -9,8 +9,8 @@ from typing import Any
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
 from companion.core.flight_state import FlightState, Observation, Tare
+from companion.mission.active_plan import Course
 from companion.mission.autopilot_landing import AutopilotLanding
-from companion.mission.course import Course
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
 from companion.model.flight_stage import Stage
@@ -24,7 +24,7 @@ from companion.safety.touchdown import Touchdown
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What does not change during a flight."""
+    """Constants of one flight: configuration, derived limits and options."""
 
     config: FlightConfig
     vehicle: Vehicle

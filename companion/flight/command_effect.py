@@ -57,7 +57,7 @@ def _hold(before: Outputs | None, after: Outputs) -> Effect:
         return True, "too low to hold: landing"
     action = after.action
     if action is SafetyAction.RETRACT:
-        return False, "not held: it returns along the tether and lands"
+        return False, "HOLD rejected: the vehicle is in RETRACT and will land"
     if action.rank > SafetyAction.HOLD.rank or after.phase_kind is PhaseKind.LANDING:
         return False, "not held: it is landing"
     held_already = before is not None and before.action is SafetyAction.HOLD

@@ -12,8 +12,8 @@ from companion.config.loader import FlightConfig
 from companion.io.devices import Devices
 from companion.io.protocols import Autopilot, DeviceError
 from companion.mission.plan import Plan
+from companion.model.check_row import Row, refusals
 from companion.model.observations import Observations
-from companion.model.rows import Row, refusals
 from companion.model.types import Vec3
 from companion.preflight import run as preflight
 from companion.recorder.client import RecorderClient

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.model.rows import Level
+from companion.model.check_row import Level
 from companion.model.types import SafetyAction, Severity
 
 WAIT_MAX = 0.15

@@ -136,9 +136,9 @@ def _total_s(points_m: tuple[Vec3, ...], shares: tuple[float, ...], limits: Vehi
 def fast_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) -> NDArray[np.float64]:
     """Return the same coefficients as minsnap-trajectories, in linear time, for a search with hundreds of evaluations.
 
-    Minimum snap means that derivatives 4 to 6 are continuous at an inner point: three equations for its velocity, acceleration and jerk
-    and those of its neighbours, block tridiagonal. The library solves dense matrices, which BLAS distributes over threads: on a busy
-    machine one solution of ten pieces took 100 ms there and 2 ms here.
+    Derivatives 4 to 6 are continuous at each inner point. This gives three equations per point, coupled to its neighbours: a
+    block-tridiagonal system. The library solves a dense system instead; for ten pieces on a busy machine it took 100 ms, this function
+    2 ms.
 
     Returns:
         Coefficients [piece, power, axis] in the piece's own time.

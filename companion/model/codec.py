@@ -222,7 +222,7 @@ _LEAVES = {bool: "boolean", int: "integer", float: "number", str: "string"}
 
 
 def _without_none(hint: Any) -> Any:
-    """Return X of `X | None`; any other type as it is."""
+    """Return X for `X | None`. Return any other type unchanged."""
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         (hint,) = [arg for arg in typing.get_args(hint) if arg is not types.NoneType]
     return hint

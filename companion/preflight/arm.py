@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Row
 from companion.model.observations import Observations, ServoReport
-from companion.model.rows import Row
 from companion.model.types import ArmState
 from companion.preflight.checks import Check
 from companion.safety.arm import error_text

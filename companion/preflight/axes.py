@@ -55,8 +55,8 @@ class AxisMap:
         return (a * true[i], b * true[j], c * true[k])
 
     def rotation(self, true: Quat) -> Quat:
-        """Convert a true rotation to the streamed one if the body's axes are permuted as well: A R A', a rotation even if A is a
-        reflection.
+        """Convert a true rotation R to the streamed rotation A R A', for a server that permutes the body axes too. The result is a
+        rotation even if A is a reflection.
         """
         x, y, z = self.vector((true[1], true[2], true[3]))
         d = self.determinant

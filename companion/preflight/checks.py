@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from companion.model.check_row import Level, Row
 from companion.model.negative_zero import without_negative_zero
-from companion.model.rows import Level, Row
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,13 @@ import math
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.observations import EstimatorReport, Observations
-from companion.model.rows import Row
 from companion.model.types import FlightMode, MocapPose, VehicleState
 from companion.preflight.checks import Check
-from companion.px4.wanted import HOVER as HOVER_PARAM
+from companion.px4.required import HOVER as HOVER_PARAM
 from companion.safety.mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
 
 DEVICE = Check("px4.device", "PX4", "the link opens, PX4 answers", "the flight needs PX4")
@@ -213,7 +213,7 @@ def agreement(o: Observations) -> Iterator[Row]:
     """Return the row on the difference between PX4's position and motion capture, frame by frame, and its variation."""
     pairs = list(_pairs(o.vehicle, o.mocap))
     if not pairs:
-        fix = "see the rates of both"
+        fix = "check the rates of PX4's position and of motion capture"
         yield AGREES.bad("no pair matches in time", "", fix)
         return
     apart = [
@@ -268,7 +268,7 @@ def _battery(o: Observations, vehicle: Vehicle) -> Row:
     if voltage_v is not None and voltage_min_v is not None and voltage_v < voltage_min_v:
         return BATTERY.bad(read, wanted, "charge the battery, or correct safety.battery_voltage_min_v for its cells")
     if remaining is None or (voltage_v is None and voltage_min_v is not None):
-        return BATTERY.doubtful(read, wanted, "set BAT1_SOURCE, BAT1_N_CELLS and the power module up in PX4")
+        return BATTERY.doubtful(read, wanted, "configure BAT1_SOURCE, BAT1_N_CELLS and the power module in PX4")
     return BATTERY.good(read, wanted)
 
 

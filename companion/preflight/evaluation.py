@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from companion.config.loader import FlightConfig
+from companion.model.check_row import Row, refusals
 from companion.model.observations import Observations, Waiting
-from companion.model.rows import Row, refusals
 from companion.preflight import arm, estimator, force, frames, machine, mission, mocap, px4, tether
 from companion.preflight.checks import Check
-from companion.px4 import wanted
+from companion.px4 import required
 
 CHECKS: tuple[Check, ...] = (
     *estimator.CHECKS,
@@ -59,4 +59,4 @@ def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
 
 def param_names() -> tuple[str, ...]:
     """Return the PX4 parameters that the rows need."""
-    return wanted.names()
+    return required.names()

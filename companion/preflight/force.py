@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.control.sensing import ForceSensing
+from companion.model.check_row import Row
 from companion.model.observations import ForceStream, Observations
-from companion.model.rows import Row
 from companion.model.types import ForceSample, Quat, Vec2, Vec3
 from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check

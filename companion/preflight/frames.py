@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate, wrap_rad, yaw_from_quat
 from companion.model.observations import Observations
-from companion.model.rows import Row
 from companion.model.types import MocapPose, Quat, Vec3, VehicleState
 from companion.preflight.axes import IDENTITY, MIRRORINGS, ROTATIONS, Y_UP, AxisMap
 from companion.preflight.checks import Check

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from companion.config.computer import Computer
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Row
 from companion.model.observations import Machine, Observations
-from companion.model.rows import Row
 from companion.preflight.checks import Check
 from companion.runtime.cores import listed
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from companion.config.loader import FlightConfig
 from companion.config.mission import Start
 from companion.config.vehicle import Room
+from companion.model.check_row import Row
 from companion.model.observations import Observations
-from companion.model.rows import Row
 from companion.model.types import Vec2, Vec3
 from companion.preflight.checks import Check
 
@@ -31,7 +31,7 @@ ROOM = Check(
     "mission.room",
     "place in the room",
     "body origin and rotors inside `room`",
-    "only the configured room keeps the rotors from the real walls",
+    "nothing detects the real walls; only the limits in `room` keep the rotors away from them",
 )
 CHECKS = (PLAN, ARM, ROOM)
 
@@ -41,7 +41,9 @@ def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
     mission, vehicle = config.mission, config.vehicle
     if o.plan is not None:
         if o.plan:
-            yield PLAN.bad("; ".join(o.plan), "", "change the mission; companion check --plan-only is a quick check")
+            yield PLAN.bad(
+                "; ".join(o.plan), "", "correct the mission, then check it with: companion check --plan-only"
+            )
         else:
             length = f", {o.mission_s:.0f} s" if o.mission_s is not None else ""
             yield PLAN.good(f"'{mission.name}' can be flown{length}")

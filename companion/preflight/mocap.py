@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Row
 from companion.model.observations import MocapStream, Observations
-from companion.model.rows import Row
 from companion.model.types import MocapPose
 from companion.preflight.checks import Check
 

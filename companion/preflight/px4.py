@@ -1,4 +1,4 @@
-"""Checks of PX4's firmware and parameters against the table `companion.px4.wanted`. Pure."""
+"""Checks of PX4's firmware and parameters against the table `companion.px4.required`. Pure."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator, Mapping
 
 from companion.config.vehicle import Vehicle
-from companion.model.rows import Level, Row
-from companion.px4.wanted import WANTED, Value, Wanted
+from companion.model.check_row import Level, Row
+from companion.px4.required import WANTED, Value, Wanted
 
 KNOWN_GOOD = ((1, 16), (1, 18))
 """Versions with which missions were flown, in simulation."""
@@ -75,7 +75,7 @@ def firmware_row(firmware: str) -> Row:
     if version not in KNOWN_GOOD:
         return row(False, fix="this version was not tested: flash 1.16 or 1.18, or fly with care, tethered")
     if kind != "release":
-        return row(False, fix=f"this is a build of kind {kind}: flash the release")
+        return row(False, fix=f"this is a {kind} build: flash a release build")
     return row(True)
 
 

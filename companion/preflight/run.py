@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
 from companion.io.devices import AvailableDevices, Devices
+from companion.model.check_row import Row, refusals
 from companion.model.observations import Observations
-from companion.model.rows import Row, refusals
 from companion.preflight import evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.observe import Tell, observe

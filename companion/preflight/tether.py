@@ -8,9 +8,9 @@ import math
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Row
 from companion.model.frames import quat_rotate
 from companion.model.observations import Observations
-from companion.model.rows import Row
 from companion.preflight.checks import Check
 
 LINE = Check(

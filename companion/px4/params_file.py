@@ -58,11 +58,7 @@ def read(path: str | Path) -> dict[str, Value]:
 
 
 def parse(text: str, source: str) -> list[Entry]:
-    """The entries of a file's text; `source` is its name for messages.
-
-    Raises:
-        ConfigError: one line per problem, `source:line: what is wrong`.
-    """
+    """Parse the text of a parameter file and return its entries. `source` is the file name used in messages."""
     entries: dict[str, Entry] = {}
     problems: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):

@@ -294,7 +294,7 @@ class RecorderProcess:
 
 
 def epoch_offset_ns(flight_clock_s: float) -> int:
-    """Return the wall clock (ns since 1970) at zero of a flight clock that reads `flight_clock_s` now."""
+    """Return the Unix time (ns) at which the flight clock was zero. `flight_clock_s` is its current reading."""
     return time.time_ns() - round(flight_clock_s * 1e9)
 
 

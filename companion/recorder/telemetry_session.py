@@ -191,7 +191,7 @@ class TelemetrySession:
         return None
 
     def reject(self, command: Command, text: str, now_s: float) -> None:
-        """Answer a well-signed command that was not carried out."""
+        """Queue a negative acknowledgement for a command with a valid signature that is not executed."""
         newest = self._stream.newest_outputs
         self._acks.append(
             Ack(

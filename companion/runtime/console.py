@@ -14,9 +14,9 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from companion.model.check_row import Level, Row
 from companion.model.flight_stage import Stage
 from companion.model.negative_zero import without_negative_zero
-from companion.model.rows import Level, Row
 from companion.runtime.ipc import Message
 
 

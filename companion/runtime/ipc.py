@@ -25,11 +25,7 @@ def send(channel: socket.socket, message: Message) -> bool:
 
 
 def receive(channel: socket.socket) -> Message | None:
-    """Return one message; None at the end of the channel.
-
-    Raises:
-        BlockingIOError: no message has arrived (non-blocking channel).
-    """
+    """Return one message, or None if the peer has closed the channel."""
     try:
         data = channel.recv(MAX_MESSAGE_BYTES + 1)
     except ConnectionResetError:

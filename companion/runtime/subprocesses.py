@@ -54,7 +54,7 @@ def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file of the flight's folder whole (`companion.runtime.files.write_whole`).
+    """Write a file in the flight's folder atomically (`companion.runtime.files.write_whole`).
 
     Raises:
         LaunchError: the file cannot be written.
@@ -114,7 +114,9 @@ class JsonLines:
         """The child has closed its end: it has exited or is about to."""
 
     def read(self, deadline_s: float) -> Iterator[dict[str, Any]]:
-        """Yield objects until the deadline (`time.monotonic`; 0 for those that have arrived) or the end of the pipe."""
+        """Yield JSON objects until the deadline (`time.monotonic`) or the end of the pipe. With deadline 0, yield only what has already
+        arrived.
+        """
         while not self.ended:
             while b"\n" in self._buffer:
                 line, _, self._buffer = self._buffer.partition(b"\n")

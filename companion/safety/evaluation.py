@@ -43,7 +43,7 @@ class Evaluation:
         self._active = {id_: active for id_, active in self._active.items() if active[1] == math.inf}
 
     def standing(self) -> str | None:
-        """Return the message of the active rule with the gravest action, HOLD at least; None if there is no such rule."""
+        """Return the message of the active rule with the most severe action, or None if no active rule requires HOLD or more."""
         gravest: SafetyAction | None = None
         text = None
         for action, _, rule, values in self._active.values():

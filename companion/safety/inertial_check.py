@@ -33,7 +33,9 @@ CLOCK_RESTART_S = 0.5
 
 
 class RemoteClock:
-    """Maps a device's clock to the flight clock by the least delay of its messages: what comes later was only late."""
+    """Maps a device's clock to the flight clock. The offset comes from the message with the smallest delay; larger offsets are treated
+    as transport delay.
+    """
 
     def __init__(self) -> None:
         self._offset_s = math.inf

@@ -187,7 +187,7 @@ class MocapTracker:
         return min(max(-IMU_GAP_MAX_S, self._imu_s - sent_s + latency_s), self._s.mocap_timeout_s)
 
     def _follows(self, before: MocapPose, pose: MocapPose, vehicle: VehicleState) -> bool:
-        """The pose is where the body can be by now."""
+        """Return whether the pose is reachable from the previous pose or from PX4's estimate within the jump limit."""
         dt_s = pose.stamp_s - before.stamp_s
         x, y, z = pose.position_world_m
         if dt_s <= CONTINUOUS_S:

@@ -77,7 +77,7 @@ HOLD_EXPIRED = Notice("hold_expired", _CRITICAL, _LAND, "a HOLD lasted longer th
 RETRACT_EXPIRED = Notice(
     "retract_expired", _CRITICAL, _LAND, "a RETRACT lasted longer than `retract_max_s`: it lands where it is"
 )
-RETRACT_DONE = Notice("retract_done", _INFO, _LAND, "a RETRACT is complete: it lands")
+RETRACT_DONE = Notice("retract_done", _INFO, _LAND, "RETRACT complete: the vehicle lands")
 NO_ROOM_TO_STAY = Notice(
     "no_room_to_stay", _CRITICAL, _LAND, "a HOLD lower than 0.3 m above standing, or a RETRACT in a landing: it lands"
 )

@@ -23,7 +23,8 @@ class StopModel:
     """Stopping distance as a function of speed.
 
     Args:
-        tether: `react_time_s` from the fault to the mode LAND, `stop_deceleration_m_s2` of the governor.
+        tether: provides `react_time_s` (time from a fault to LAND mode) and `stop_deceleration_m_s2` (braking deceleration of the
+            governor).
     """
 
     __slots__ = ("_half_per_a", "_half_per_land", "_knee_ahead_m", "_knee_m_s", "_react_s")

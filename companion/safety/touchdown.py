@@ -66,7 +66,7 @@ class Sinking:
     """Stamp and height of the poses, s and m."""
 
     def update(self, t_s: float, pose: MocapPose | None) -> Sinking:
-        """Return the evidence after one more tick; empty without a fresh pose."""
+        """Return the updated height history; it is empty if the pose is stale."""
         if pose is None or not pose.tracking_valid or t_s - pose.stamp_s >= MOCAP_FRESH_S:
             return Sinking()
         seen = self.seen

@@ -16,7 +16,7 @@ _STAMP_MAX_S = 1.0e9
 
 
 class InputFilter:
-    """Removes invalid records from the inputs. A record is judged once."""
+    """Removes invalid records from the inputs. Each record is checked once."""
 
     def __init__(self) -> None:
         self._vehicle: VehicleState | None = None

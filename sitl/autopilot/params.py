@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 
 from companion.px4.defaults import PX4_DEFAULTS as PX4_DEFAULTS
-from companion.px4.wanted import BY_NAME, simulated_values
+from companion.px4.required import BY_NAME, simulated_values
 
 MAV_PARAM_TYPE_INT32 = 6
 MAV_PARAM_TYPE_REAL32 = 9

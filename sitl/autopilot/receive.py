@@ -37,7 +37,7 @@ class Reply(Protocol):
         """Start sending every parameter."""
 
     def note_ground_station(self) -> None:
-        """A ground station's heartbeat arrived."""
+        """Record that a heartbeat from a ground station has arrived."""
 
     def status_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT on this link."""

@@ -84,7 +84,7 @@ def sys_status(stub: Px4Stub) -> Message:
 
 
 def extended_sys_state(stub: Px4Stub) -> Message:
-    """EXTENDED_SYS_STATE."""
+    """Build EXTENDED_SYS_STATE."""
     if stub.landed:
         landed = mavlink.MAV_LANDED_STATE_ON_GROUND
     elif stub.nav_state is NavState.TAKEOFF:

@@ -1,6 +1,6 @@
 """Flights of `companion robustness`: {name, number, world}; a flight without a `world` is drawn at random by its number.
 
-Further keys of the job: `seed` of the draws, and `fixed`, the keys of the world that keep their configured values.
+The job also has `seed` (seed of the random draws) and `fixed` (names of world keys that keep their configured values).
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ class _RecordedImu:
         self.total = DeltaVelocity()
 
     def step(self, imu: ImuSample) -> Vec4:
-        """Step PX4 by one sample; the sum restarts when PX4 reboots."""
+        """Step PX4 by one IMU sample and add it to `total`, which restarts when PX4 reboots."""
         boot_s = imu.t_s - self._px4.booted_at_s
         if boot_s >= 0.0:
             self.total.add(boot_s, imu.accel_frd_m_s2)

@@ -55,11 +55,11 @@ def refuse_what_needs_the_stub(config: WorldConfig) -> None:
     for fault in config.faults:
         if fault.kind in STUB_ONLY_FAULTS:
             raise Px4Error(
-                f"world.faults: {fault.kind} {STUB_ONLY_FAULTS[fault.kind]}, which only the stub can simulate; fly it with --sitl"
+                f"world.faults: {fault.kind} {STUB_ONLY_FAULTS[fault.kind]}, which only the stub can simulate; run with --sitl"
             )
     if config.battery_start != 1.0:
         raise Px4Error(
-            "world.battery_start: PX4's own battery simulator starts full, expected 1.0 with a real PX4; fly it with --sitl"
+            "world.battery_start: PX4's own battery simulator starts full, expected 1.0 with a real PX4; run with --sitl"
         )
 
 
@@ -314,7 +314,7 @@ class _Faulty:
         Raises:
             Px4Error: always.
         """
-        raise Px4Error("world.faults: autopilot_reboot needs the stub; fly it with --sitl")
+        raise Px4Error("world.faults: autopilot_reboot needs the stub; run with --sitl")
 
     def pilot_sets_mode(self, state: NavState) -> None:
         """Change the mode as a ground station does."""

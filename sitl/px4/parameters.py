@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from companion.config.vehicle import Airframe
-from companion.px4.wanted import WANTED, simulated_values
+from companion.px4.required import WANTED, simulated_values
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.params import PX4_DEFAULTS, VEHICLE_DEFAULTS, Value
 from sitl.world.model import ROTORS, rotor_offset_m

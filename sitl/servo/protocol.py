@@ -17,7 +17,7 @@ _PREFIX = 7  # header, id, length
 
 
 class Instruction(IntEnum):
-    """Instruction field."""
+    """Values of the instruction field of a packet."""
 
     PING = 0x01
     READ = 0x02

@@ -78,10 +78,10 @@ class Wrench(NamedTuple):
 
 
 class Handling:
-    """Computes the force and torque of the hand on the vehicle.
+    """Computes the force and torque that handling applies to the vehicle.
 
     Args:
-        config: `hand`, `hand_t_s`, `hand_taps`, `hand_tap_n`, and the seed of the sway.
+        config: `hand`, `hand_t_s`, `hand_taps`, `hand_tap_n`, and the random seed of the hand's sway.
         weight_n: weight of the whole vehicle.
     """
 

@@ -9,9 +9,9 @@ from typing import Any, get_args
 import pytest
 
 from companion.campaigns.faults.judge import FaultFlight, Point, Tick, good, row_of
+from companion.campaigns.faults.sitl_flights import _offset_s
+from companion.campaigns.faults.sitl_flights import flown as flown_over_wires
 from companion.campaigns.faults.variants import VARIANTS, WIRES, Variant, planned
-from companion.campaigns.faults.wires import _offset_s
-from companion.campaigns.faults.wires import flown as flown_over_wires
 from companion.cli.main import main
 from companion.launcher.launcher import FlightResult
 from companion.launcher.run import _summary

@@ -21,8 +21,8 @@ from companion.io.devices import AvailableDevices, VisionFilter
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.protocols import DeviceError
+from companion.model.check_row import Row
 from companion.model.exit_codes import EXIT_OK
-from companion.model.rows import Row
 from companion.preflight import arm as preflight
 from companion.preflight.observe import observe
 from companion.runtime.clock import flight_clock

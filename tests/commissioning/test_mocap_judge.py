@@ -13,7 +13,7 @@ from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.loader import load_vehicle
 from companion.io.mocap.natnet import RigidBody, ServerInfo
-from companion.model.rows import Row
+from companion.model.check_row import Row
 from companion.model.types import IDENTITY_QUAT, Vec3
 from tests.support import ROOT
 

@@ -7,7 +7,7 @@ from functools import cache
 
 import pytest
 
-from companion.control.hover import SHARE_MAX, HoverThrust
+from companion.control.hover_thrust import SHARE_MAX, HoverThrust
 from companion.control.types import PlantState
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx

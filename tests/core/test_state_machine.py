@@ -10,7 +10,7 @@ from companion.core import flight_core
 from companion.core.flight_state import FlightState, Observation, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
-from companion.mission.course import Course
+from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
 from companion.model.types import Event, Outcome

@@ -175,7 +175,7 @@ FORGIVING = (
 def test_commands_while_it_goes_back_along_the_tether() -> None:
     flown = commanded((7.0, HOLD), (7.1, RESUME), (7.3, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"))
     assert flown.effects[:2] == [
-        (False, "not held: it returns along the tether and lands"),
+        (False, "HOLD rejected: the vehicle is in RETRACT and will land"),
         (False, "nothing to resume: it goes back along the tether and lands"),
     ]
     assert flown.effects[2] == (True, "landing")

@@ -323,4 +323,4 @@ def test_a_fault_of_the_stub_refuses_the_flight_in_one_line(tmp_path: Path) -> N
         sandbox.assert_nobody_left()
     assert ended.code == EXIT_REFUSED
     assert len(ended.err_lines) == 1, ended.err
-    assert "arming_refused" in ended.err and "fly it with --sitl" in ended.err
+    assert "arming_refused" in ended.err and "run with --sitl" in ended.err

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config.loader import load_flight
-from companion.mission.course import HOLD_DECELERATION_M_S2, Course
+from companion.mission.active_plan import HOLD_DECELERATION_M_S2, Course
 from companion.mission.plan import Plan
 from companion.model.types import Reference
 

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from companion.config.loader import load_flight
 from companion.config.mission import Mission
+from companion.mission.active_plan import Course
 from companion.mission.check import check_mission
-from companion.mission.course import Course
 from companion.mission.plan import Plan
 from companion.mission.sample_check import SampleCheck
 from companion.model.types import PhaseKind, Reference

@@ -7,9 +7,9 @@ import math
 import pytest
 from msgspec.structs import replace
 
+from companion.model.check_row import Row
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.observations import Observations
-from companion.model.rows import Row
 from companion.model.types import Vec3
 from companion.preflight import frames
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from companion.config.loader import load_flight
-from companion.model.rows import Row
+from companion.model.check_row import Row
 from companion.preflight.hand_test.record import (
     Passed,
     RecordError,

@@ -10,8 +10,8 @@ from functools import cache
 import pytest
 from msgspec.structs import replace
 
+from companion.model.check_row import Row, refusals
 from companion.model.frames import quat_rotate
-from companion.model.rows import Row, refusals
 from companion.model.types import MocapPose, Quat, Vec3
 from companion.preflight.axes import ALL, IDENTITY, MIRRORINGS, ROTATIONS, AxisMap
 from companion.preflight.hand_test import evaluation as hand_test_evaluation

@@ -19,7 +19,7 @@ from rich.console import Console
 from companion.config.vehicle import MocapDevice
 from companion.io.devices import AvailableDevices, VisionFilter, open_available
 from companion.io.mocap.driver import NatNetMocap
-from companion.model.rows import Row
+from companion.model.check_row import Row
 from companion.model.types import AutopilotRequest, FlightMode
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record

@@ -11,8 +11,8 @@ import pytest
 from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
+from companion.model.check_row import Level, Row
 from companion.model.observations import ForceStream, Observations, StateCounts
-from companion.model.rows import Level, Row
 from companion.model.types import VehicleState
 from companion.preflight import evaluation, frames, px4
 from tests.preflight import records as r

@@ -15,7 +15,7 @@ from companion.io.px4.transfer import compare
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.px4 import params_file
 from companion.px4.params_file import single
-from companion.px4.wanted import file_values
+from companion.px4.required import file_values
 from tests.io.px4_peer import Px4Peer, free_udp_port
 from tests.io.stub_rig import standing_stub
 

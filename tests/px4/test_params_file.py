@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from companion.config.document import ConfigError
 from companion.px4 import params_file
-from companion.px4.wanted import BY_NAME, WANTED, file_values
+from companion.px4.required import BY_NAME, WANTED, file_values
 from tools.docs import px4 as published
 
 ROOT = Path(__file__).parents[2]

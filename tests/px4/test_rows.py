@@ -11,10 +11,10 @@ from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import AutopilotDevice, Vehicle
 from companion.io.px4.driver import MavsdkAutopilot
-from companion.model.rows import Level, Row
+from companion.model.check_row import Level, Row
 from companion.preflight.px4 import firmware_row, rows
 from companion.px4.defaults import PX4_DEFAULTS
-from companion.px4.wanted import HOVER, WANTED, file_values, names, simulated_values
+from companion.px4.required import HOVER, WANTED, file_values, names, simulated_values
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import load_world
 from companion.sitl_config.world import World

@@ -115,7 +115,7 @@ def test_the_hover_thrust_is_wrong_by_what_the_world_says() -> None:
 @pytest.mark.parametrize("kind", list(STUB_ONLY_FAULTS))
 def test_a_fault_that_needs_the_stub_is_refused_in_one_line(kind: str) -> None:
     world = World(faults=(Fault.model_validate({"kind": kind, "t_s": 1.0}),))
-    with pytest.raises(Px4Error, match=f"world.faults: {kind} .* which only the stub can simulate; fly it with --sitl"):
+    with pytest.raises(Px4Error, match=f"world.faults: {kind} .* which only the stub can simulate; run with --sitl"):
         refuse_what_needs_the_stub(world)
 
 

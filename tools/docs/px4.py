@@ -1,4 +1,4 @@
-"""The files of configs/px4/ and the table of docs/px4.md, made from `companion.px4.wanted`.
+"""The files of configs/px4/ and the table of docs/px4.md, made from `companion.px4.required`.
 
 `python -m tools.docs.px4 .` writes them below the repository's root.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from companion.preflight.px4 import text_of
 from companion.px4 import params_file
 from companion.px4.params_file import PACKAGED
-from companion.px4.wanted import GROUPS, NO_RADIO, RADIO, file_values
+from companion.px4.required import GROUPS, NO_RADIO, RADIO, file_values
 from tools.docs.tables import written
 
 NO_RADIO_FILE = "no_radio.params"

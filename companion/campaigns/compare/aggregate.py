@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.campaigns.compare.grid import is_ablation
-from companion.campaigns.compare.printed import PrintedFlight, printed
+from companion.campaigns.compare.paper_results import PrintedFlight, printed
 from companion.campaigns.runner import Row, flat
 
 COMPLETED = "completed"

@@ -14,7 +14,7 @@ from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, table
 from companion.campaigns.compare.aggregate import MISSED, Group, aggregate
 from companion.campaigns.compare.grid import Variant, is_ablation, short_label
-from companion.campaigns.compare.printed import SOURCE
+from companion.campaigns.compare.paper_results import SOURCE
 from companion.campaigns.process import Message
 from companion.campaigns.runner import Campaign, Row
 

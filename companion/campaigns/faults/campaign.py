@@ -13,8 +13,8 @@ from rich.console import Console
 from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, number, table
 from companion.campaigns.faults.judge import good
+from companion.campaigns.faults.sitl_flights import WireFlights, default_jobs
 from companion.campaigns.faults.variants import Variant
-from companion.campaigns.faults.wires import WireFlights, default_jobs
 from companion.campaigns.runner import Campaign, Flights, Row, counted, outcomes
 from companion.sitl_config.faults import KINDS, FlightPhase
 

@@ -68,7 +68,7 @@ def drivers(world: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def sensor_of(row: Row) -> str:
-    """Return the state of the force sensor when the payload came: biased, lost later, or missing."""
+    """Return the state of the force sensor at the catch: biased, lost after the catch, or missing at the catch."""
     if drivers(row["world"])["force_lost_s"] is None:
         return "biased"
     return "lost after the catch" if row["felt"] else "missing at the catch"

@@ -16,7 +16,7 @@ from companion.config.document import Data
 from companion.config.vehicle import Arm, ArmDevice, Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.protocols import DeviceError
-from companion.model.rows import Row
+from companion.model.check_row import Row
 from companion.preflight import arm as preflight
 from companion.preflight.checks import Check
 

@@ -12,16 +12,16 @@ from companion.commissioning.arm import setup as arm_setup
 from companion.commissioning.arm.bus import BAUDS
 from companion.commissioning.arm.drive import Driven, Leader, drive
 from companion.commissioning.arm.friction import fit
-from companion.commissioning.arm.hold import hold
 from companion.commissioning.arm.jog import ByKeys
 from companion.commissioning.arm.motion import LOAD_NM, SPEED_MAX_DEG_S, TORQUE_SHARE, limits_deg
 from companion.commissioning.arm.servo import Scan
 from companion.commissioning.arm.sweep import Leg, Sample, Sweeper, duration_s, legs_of
 from companion.commissioning.arm.zero import ZeroGuide, ZeroResult
+from companion.commissioning.arm.zero_session import hold
 from companion.commissioning.tool import ARM, GivenUp, Report, Session, Tool
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
-from companion.model.rows import Level
+from companion.model.check_row import Level
 from companion.runtime.terminal import Bars, pressed, raw_keys
 
 _NAMES = ("joint 1", "joint 2")

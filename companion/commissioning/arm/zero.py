@@ -140,7 +140,7 @@ class ZeroGuide:
         return self._conclude(moved)
 
     def _still_s(self, t_s: float) -> float:
-        """Return for how long nothing has moved."""
+        """Return how long both joints have been at rest, s."""
         newest = self._window[-1][1]
         low, high = list(newest), list(newest)
         since_s = t_s

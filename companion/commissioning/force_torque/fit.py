@@ -15,9 +15,9 @@ from typing import Any, Final
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.rows import Row
 from companion.model.types import ForceSample, Quat, Vec2, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.preflight.checks import Check

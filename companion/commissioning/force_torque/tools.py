@@ -15,9 +15,9 @@ from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import usb_latency_ms
 from companion.io.protocols import DeviceError
+from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.observations import ForceStream
-from companion.model.rows import Row
 from companion.model.types import IDENTITY_QUAT, ForceSample, Vec2
 from companion.preflight import force as preflight
 from companion.preflight.arm import usb_latency

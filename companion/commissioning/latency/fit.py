@@ -264,7 +264,7 @@ def _slow(s: Floats, degree: int) -> Floats:
 
 
 def _vertex(grid: Floats, costs: Floats, best: int) -> tuple[float, float]:
-    """Return minimum and second derivative of the parabola through the least cost and its neighbours."""
+    """Return the position of the minimum and the second derivative of the parabola through the lowest cost and its two neighbours."""
     step = float(grid[1] - grid[0])
     a, b, c = (float(costs[best + k]) for k in (-1, 0, 1))
     bend = a - 2.0 * b + c

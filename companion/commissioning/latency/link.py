@@ -1,7 +1,7 @@
-"""PX4's IMU with PX4's own stamps, and PX4's clock against ours, by HIGHRES_IMU and TIMESYNC. I/O only.
+"""Read IMU samples with PX4's timestamps (HIGHRES_IMU) and measure the offset between PX4's clock and ours (TIMESYNC). I/O only.
 
-HIGHRES_IMU carries the time of its sample (`time_usec`), so the latency of the message does not matter. PX4 answers TIMESYNC with `tc1`
-0 at once with its clock: half of the round trip is the way back.
+HIGHRES_IMU carries the time of its sample (`time_usec`), so the latency of the message does not matter. PX4 answers a TIMESYNC request
+(`tc1` = 0) immediately with its time; half of the round-trip time is taken as the delay of the reply.
 """
 
 from __future__ import annotations

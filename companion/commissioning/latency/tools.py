@@ -24,11 +24,11 @@ from companion.commissioning.latency.fit import (
 from companion.commissioning.tool import SENSORS, Report, Session, Tool
 from companion.config.vehicle import Vehicle
 from companion.io.protocols import DeviceError
-from companion.model.rows import Row
+from companion.model.check_row import Row
 from companion.model.types import MocapPose
 from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import PoseAt
-from companion.px4.wanted import WANTED
+from companion.px4.required import WANTED
 from companion.runtime.clock import Clock, flight_clock
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 

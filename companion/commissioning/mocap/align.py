@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from companion.config.base import Location
 from companion.config.document import Data
+from companion.model.check_row import Row
 from companion.model.frames import quat_rotate, wrap_rad
-from companion.model.rows import Row
 from companion.model.types import Vec3
 from companion.preflight.axes import IDENTITY, Y_UP, AxisMap
 from companion.preflight.checks import Check
@@ -79,7 +79,7 @@ def world_row(found: Alignment, tolerance_deg: float) -> Row | None:
     if yaw_deg is None:
         return None
     limit_deg = max(tolerance_deg, YAW_MAX_DEG)  # a hand is not exact to the degree
-    read = f"forward is {yaw_deg:+.0f} deg from the mission's start yaw"
+    read = f"forward is {yaw_deg:+.0f} deg off the mission's start yaw"
     fix = (
         f"if the machine stood as the mission's start.yaw_deg says, Motive's ground plane is turned by {yaw_deg:+.0f} deg: set it anew "
         "with the calibration square's x along the room's x; if not, turn the machine that way and repeat"

@@ -15,12 +15,12 @@ from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
 from companion.io.mocap.natnet import RigidBody, ServerInfo, z_up_from_y_up
+from companion.model.check_row import Row
 from companion.model.observations import MocapStream, Observations
-from companion.model.rows import Row
 from companion.model.types import MocapPose
 from companion.preflight import mocap as preflight
 from companion.preflight.checks import Check
-from companion.px4.wanted import WANTED
+from companion.px4.required import WANTED
 
 SERVER = Check("mocap.server", "mocap server", why="nothing is streamed to the vehicle")
 OWN = Check("mocap.own", "rigid body of the vehicle", why="the pose of another body would be used")

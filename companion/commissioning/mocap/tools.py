@@ -21,7 +21,7 @@ from companion.config.mission import Start
 from companion.config.vehicle import MocapDevice, Vehicle
 from companion.io.mocap.natnet import ServerInfo
 from companion.io.protocols import DeviceError
-from companion.model.rows import refusals
+from companion.model.check_row import refusals
 from companion.preflight.hand_test import evaluation as hand_evaluation
 from companion.preflight.hand_test.run import HandResult
 from companion.runtime.clock import flight_clock

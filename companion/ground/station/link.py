@@ -26,7 +26,7 @@ class LinkError(Exception):
 
 
 class BrokerRefused(Exception):
-    """The broker refuses the connection for a reason that does not change with time; one line for the user."""
+    """The broker permanently refuses the connection, so a retry is useless. The text is one line for the user."""
 
 
 class Link:

@@ -114,7 +114,7 @@ class _Screen:
         return known.get(self._chosen) if self._chosen is not None else None
 
     def _command(self, key: str, station: Station) -> CommandName | None:
-        """Return the command that a key gives now, or None."""
+        """Return the command to send for this key press. None if the key has no command or the command still needs confirmation."""
         if key == "n":
             names = sorted(station.tracker.vehicles)
             if self._chosen in names:

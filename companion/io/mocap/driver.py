@@ -292,7 +292,7 @@ class NatNetMocap:
         self._keep_alive = asyncio.get_running_loop().call_later(client.request_period_s, self._keep_connected)
 
     def _drain(self, readable: socket.socket) -> None:
-        """Read all that waits in the socket; deliver the newest frame only."""
+        """Read all pending datagrams and deliver only the newest frame."""
         newest: Frame | None = None
         newest_s = 0.0
         for datagram, ancillary, sender_ip in sockets.waiting(readable):

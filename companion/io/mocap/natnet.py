@@ -151,7 +151,7 @@ def encode_message(message: Message, payload: bytes = b"") -> bytes:
 
 
 def encode_request(message: Message, text: str = "") -> bytes:
-    """A client's datagram with a zero-terminated string (NAT_REQUEST "FrameRate", keep-alive "", ...)."""
+    """Return a client datagram with a zero-terminated string (NAT_REQUEST "FrameRate", keep-alive "", ...)."""
     return encode_message(message, text.encode() + b"\0")
 
 
@@ -216,10 +216,10 @@ def parse_server_info(datagram: Buffer) -> ServerInfo | Malformed:
 def parse_frame(
     datagram: Buffer, version: NatNetVersion, body_id: int, clock_frequency_hz: int | None
 ) -> Frame | Malformed:
-    """NAT_FRAMEOFDATA: find one rigid body, skip the rest, read the suffix.
+    """Parse a NAT_FRAMEOFDATA datagram: the wanted rigid body and the suffix; all other sections are skipped.
 
     Args:
-        datagram: header included.
+        datagram: the datagram including its header.
         version: the server's NatNet version.
         body_id: streaming id of the wanted rigid body.
         clock_frequency_hz: from `ServerInfo`, for the latency.

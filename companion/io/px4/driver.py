@@ -157,13 +157,13 @@ class MavsdkAutopilot:
         )
 
     async def forward_to(self, port: int) -> int:
-        """Forward between PX4 and a UDP port of 127.0.0.1; returns the port of 127.0.0.1 from which MAVSDK sends to it.
+        """Forward MAVLink between PX4 and the local UDP port `port`. Return the local port from which MAVSDK sends.
 
         MAVSDK trusts messages from that connection as it trusts PX4's: only the relay (`companion.io.qgroundcontrol.relay`) may be at
         the other end, and all other senders are ignored.
 
         Raises:
-            DeviceError: the connection cannot be opened, or not be restricted to that one partner.
+            DeviceError: the connection cannot be opened, or cannot be restricted to that one peer.
         """
         self._require_open()
         assert self._forwarding, "made without forwarding"

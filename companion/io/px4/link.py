@@ -34,7 +34,7 @@ _log_users = 0
 
 
 def device_error(address: str, expected: str, found: str, fix: str) -> DeviceError:
-    """Return the error with its one line for the user."""
+    """Return a DeviceError with the text "autopilot ADDRESS: expected ..., found ...; FIX"."""
     return DeviceError(f"autopilot {address}: expected {expected}, found {found}; {fix}")
 
 

@@ -2,9 +2,9 @@
 
 PX4 considers its global position valid only with an origin; HOLD, RETURN and LAND then work on motion capture alone. The origin is
 latitude 0, longitude 0, altitude 0, because EKF2 without GPS has placed local (0, 0, 0) there by itself: the local position does not
-move, whether vision is fused already or not. Any other origin moves it, measured on PX4 1.16.1: with 47.4 deg N, 8.5 deg E and 488 m
-set before the first vision, LOCAL_POSITION_NED is thousands of kilometres away until vision is fused, and its z keeps an error of 488
-m; set while vision is fused, the filter resets and its innovation ratio rises to 2.
+move, whether vision is fused already or not. Any other origin shifts the local position (measured on PX4 1.16.1 with 47.4 deg N, 8.5
+deg E, 488 m). If it is set before vision is fused, LOCAL_POSITION_NED is off by thousands of kilometres until fusion starts, and z
+stays off by 488 m. If it is set during fusion, the filter resets and its innovation ratio rises to 2.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class RequestQueue:
                 self._messages.extend(self._texts.once(f"{request.name} refused: {refusal}", now_s))
 
     def answer_sent_once(self, refusal: str | None, now_s: float) -> None:
-        """Report a COMMAND_ACK to arming or disarming, which answers the outstanding requests of `SENT_ONCE`."""
+        """Apply the COMMAND_ACK of an arm or disarm command to all outstanding requests in `SENT_ONCE`."""
         for request in SENT_ONCE:
             with self._lock:
                 kind = self._kinds.get(request)

@@ -91,7 +91,7 @@ class OffboardSetpoints:
         return True
 
     def stop(self) -> None:
-        """Destroy the plugin, which ends the repetition by its thread."""
+        """Destroy the plugin, so that its thread stops repeating the last setpoint."""
         if self._plugin is not None:
             self._plugin.destroy()
             self._plugin = None

@@ -257,8 +257,8 @@ class DownlinkFilter:
         return picked
 
     def _extra(self, frame: Frame) -> int | None:
-        """Return CRC_EXTRA of the frame's message. For a message that the dialect lacks it is found from its first frame: only one
-        value matches the checksum.
+        """Return CRC_EXTRA of the frame's message. If the dialect does not define the message, derive it from its first frame by trying
+        all 256 values against the checksum.
         """
         if frame.message_id not in self._extras:
             fits = (extra for extra in range(256) if frame.right_checksum(extra) == frame.checksum)

@@ -82,7 +82,7 @@ class Texts:
         self._number = 0
 
     def say(self, severity: int, text: str) -> None:
-        """Queue a text. A full queue drops the least severe one, the oldest of those."""
+        """Queue a text. If the queue is full, drop the oldest of the least severe texts."""
         self._waiting.append((severity, text))
         if len(self._waiting) > TEXTS_WAITING_MAX:
             self._waiting.remove(max(self._waiting, key=lambda one: one[0]))

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from companion.config.loader import FlightConfig
 from companion.io.devices import AvailableDevices, Devices
-from companion.model.rows import Row, refusals
+from companion.model.check_row import Row, refusals
 from companion.model.types import AutopilotStatus, MocapPose, VehicleState
 from companion.preflight.checks import Check
 from companion.preflight.hand_test import evaluation as hand_test_evaluation

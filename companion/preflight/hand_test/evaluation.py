@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from companion.model.check_row import Row
 from companion.model.frames import quat_rotate
-from companion.model.rows import Row
 from companion.model.types import Vec3
 from companion.preflight.axes import ALL, IDENTITY, Y_UP, AxisMap
 from companion.preflight.checks import Check

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config.vehicle import Vehicle
-from companion.model.rows import Row
+from companion.model.check_row import Row
 from companion.runtime.files import write_whole
 
 SCHEMA_VERSION = 1

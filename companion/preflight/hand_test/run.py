@@ -59,7 +59,7 @@ class Step(Enum):
 
 _NEXT: Final = {Step.STAND: Step.LIFT, Step.LIFT: Step.FORWARD, Step.FORWARD: Step.TURN, Step.TURN: Step.DONE}
 TOLD: Final = {
-    Step.STAND: "let it stand on the floor, hands off",
+    Step.STAND: "place the vehicle on the floor and let go of it",
     Step.LIFT: "take it by its legs, lift it straight up by 30 cm in about two seconds, hold it still",
     Step.FORWARD: "move it 30 cm forward, where its nose points, without turning it; hold it still",
     Step.TURN: "turn it to the left, seen from above, by 45 deg; hold it still",
@@ -125,7 +125,7 @@ class _Rest:
 
 
 class HandTest:
-    """State of the test. Call `update` with every sample in order of time."""
+    """State of the test. Call `update` with each sample in time order."""
 
     def __init__(self) -> None:
         self._poses: list[PoseAt] = []

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
+from companion.model.check_row import Level
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.flight_stage import SPOOL_S
-from companion.model.rows import Level
 
 HOVER = "MPC_THR_HOVER"
 RADIO = "COM_RC_IN_MODE"
