@@ -135,12 +135,12 @@ def bench(folder: Path, servos: str = "[{}, {}]") -> Iterator[Rig]:
         models, vehicle.arm.joints, start_of(start.position_m, start.yaw_deg, start.arm_deg).arm_rad, strict=True
     ):
         model.update(0.0, joint.zero_count * dxl.RAD_PER_COUNT + joint.sign * angle_rad, 0.0)
-    with sandbox_in(folder / "tool") as sandbox, _served(ServoBus(plugged_in(models, config.world))) as port:
+    with sandbox_in(folder / "tool") as sandbox, served(ServoBus(plugged_in(models, config.world))) as port:
         yield Rig(sandbox, port, _copy(folder))
 
 
 @contextmanager
-def _served(bus: ServoBus) -> Iterator[str]:
+def served(bus: ServoBus) -> Iterator[str]:
     """The bus's port; its event loop runs in a thread."""
     loop = asyncio.new_event_loop()
 

@@ -38,6 +38,9 @@ _WRITE_TIMEOUT_S = 1.0
 _REPLY_TIMEOUT_MS: Final = 100.0
 """An FTDI adapter with its factory latency timer delays an answer by 16 ms, a busy computer by more."""
 _ERROR_NUMBER: Final = 0x7F
+_CRC_ERROR: Final = 3
+_ATTEMPTS: Final = 3
+"""Number of times that a read or write is sent: a line with interference loses or damages single packets."""
 
 
 class _CountingPort(dxl.ServoPort):
@@ -125,18 +128,21 @@ class ServoTalk:
         return bool(result == COMM_SUCCESS)
 
     def read(self, servo_id: int, register: Register) -> int:
-        """Return a register's value.
+        """Return a register's value. A lost or damaged packet is repeated.
 
         Raises:
             DeviceError: no answer, or a refusal.
         """
-        with self._named(f"servo {servo_id}: reading {register}"):
-            data, result, error = self._protocol.readTxRx(self._port, servo_id, register.address, register.size)
+        for _ in range(_ATTEMPTS):
+            with self._named(f"servo {servo_id}: reading {register}"):
+                data, result, error = self._protocol.readTxRx(self._port, servo_id, register.address, register.size)
+            if result == COMM_SUCCESS and error & _ERROR_NUMBER != _CRC_ERROR:
+                break
         self._check(servo_id, f"reading {register}", result, error)
         return int.from_bytes(bytes(data), "little", signed=register.signed)
 
     def write(self, servo_id: int, register: Register, value: int, *, read_back: bool = True) -> None:
-        """Write a register and read it back.
+        """Write a register and read it back. A lost or damaged packet is repeated.
 
         Args:
             servo_id: whose.
@@ -148,8 +154,11 @@ class ServoTalk:
             DeviceError: no answer, a refusal, or another value is read afterwards.
         """
         data = list(value.to_bytes(register.size, "little", signed=register.signed))
-        with self._named(f"servo {servo_id}: writing {register}"):
-            result, error = self._protocol.writeTxRx(self._port, servo_id, register.address, register.size, data)
+        for _ in range(_ATTEMPTS if read_back else 1):
+            with self._named(f"servo {servo_id}: writing {register}"):
+                result, error = self._protocol.writeTxRx(self._port, servo_id, register.address, register.size, data)
+            if result == COMM_SUCCESS and error & _ERROR_NUMBER != _CRC_ERROR:
+                break
         if not read_back:
             return
         self._check(servo_id, f"writing {register}", result, error)
