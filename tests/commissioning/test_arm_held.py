@@ -111,7 +111,10 @@ def read_until(terminal: int, pattern: str) -> str:
     while not re.search(pattern, seen):
         left_s = deadline_s - time.monotonic()
         assert left_s > 0 and select.select([terminal], [], [], left_s)[0], (pattern, seen)
-        seen += os.read(terminal, 65536).decode(errors="replace")
+        try:
+            seen += os.read(terminal, 65536).decode(errors="replace")
+        except OSError:  # the process has ended
+            raise AssertionError((pattern, seen)) from None
     return seen
 
 

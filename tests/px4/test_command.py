@@ -19,6 +19,7 @@ from companion.px4.required import file_values
 from tests.io.px4_peer import Px4Peer, free_udp_port
 from tests.io.stub_rig import standing_stub
 
+pytestmark = pytest.mark.waits
 SPOILED = {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 5.0, "EKF2_HGT_REF": 0}
 
 
