@@ -1,12 +1,14 @@
 """`python -m tests.stages [STAGE ...]`: run the stages of `make test`, all of them, and sum them up.
 
-A stage that fails does not stop the others. The last line counts tests; each check (format, lint, imports, types) counts as one.
+A stage that fails does not stop the others. Tests that compute run beside those that wait and fly, with the lowest priority. The last
+line counts tests; each check (format, lint, imports, types) counts as one.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import signal
 import subprocess
@@ -27,6 +29,7 @@ _TOGETHER = {"waiting": "waits", "flights": "flights"}
 """Stages whose number of simultaneous tests depends on the computer, with their names in `tests.at_a_time`."""
 _INTERRUPTED = 130
 _LINE_MAX = 120
+_TALLY, _OUTPUT = "tally.json", "output"
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,8 @@ class Stage:
     command: tuple[str, ...]
     tests: bool
     """Whether the command is pytest, which lists its results."""
+    beside: bool = False
+    """Whether it runs beside the stages after it, on what they leave of the processors. Its output follows theirs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +68,12 @@ STAGES = (
     Stage("lint", (str(_BIN / "ruff"), "check", "."), tests=False),
     Stage("imports", (str(_BIN / "lint-imports"), "--no-cache"), tests=False),
     Stage("types", (str(_BIN / "mypy"),), tests=False),
-    Stage("computing", (*_PYTEST, "-n", "3", "--dist", "worksteal", "-m", "not flight and not waits"), tests=True),
+    Stage(
+        "computing",
+        (*_PYTEST, "-n", "3", "--dist", "worksteal", "-m", "not flight and not waits"),
+        tests=True,
+        beside=True,
+    ),
     Stage("waiting", (*_PYTEST, "--dist", "loadgroup", "-m", "waits", *_files_of("waits")), tests=True),
     Stage("flights", (*_PYTEST, "--dist", "loadgroup", "-m", "flight and not alone", *_files_of("flight")), tests=True),
     Stage("alone", (*_PYTEST, "-m", "alone", *_files_of("alone")), tests=True),
@@ -77,21 +87,51 @@ def _shown(words: Iterable[str]) -> str:
     return shlex.join(word.removeprefix(here) for word in words)
 
 
-def run(stage: Stage) -> Result:
-    """Run one stage; its output goes where ours goes."""
+@dataclass(frozen=True, slots=True)
+class Running:
+    """A stage that was started."""
+
+    stage: Stage
+    process: subprocess.Popen[bytes]
+    begun_s: float
+    folder: Path
+    """Its own. Holds `tally.json` when pytest has ended, and the output of a stage that runs beside others in `output`."""
+
+
+def start(stage: Stage, folder: Path, *, beside: bool = False) -> Running:
+    """Start one stage; its output goes where ours goes, or into a file if it runs beside others."""
     words = _shown(stage.command)
-    print(f"\n=== {stage.name}: {words if len(words) < _LINE_MAX else f'{words[:_LINE_MAX]} ...'}", flush=True)
+    note = " (beside the next)" if beside else ""
+    print(f"\n=== {stage.name}{note}: {words if len(words) < _LINE_MAX else f'{words[:_LINE_MAX]} ...'}", flush=True)
+    own = folder / stage.name
+    own.mkdir()
+    command = stage.command
+    if stage.tests:
+        command += (*_at_a_time(stage), "-p", "tests.tally", "--tally", str(own / _TALLY), "--durations=10")
     begun_s = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder:
-        tally = Path(folder) / "tally.json"
-        more = (*_at_a_time(stage), "-p", "tests.tally", "--tally", str(tally), "--durations=10") if stage.tests else ()
-        code = _wait(subprocess.Popen((*stage.command, *more)))
-        duration_s = time.monotonic() - begun_s
-        if not tally.exists():
-            return Result(
-                stage=stage, ok=code == 0, duration_s=duration_s, passed=int(code == 0), failed=int(code != 0)
-            )
-        counts = json.loads(tally.read_text(encoding="utf-8"))
+    if not beside:
+        return Running(stage, subprocess.Popen(command), begun_s, own)
+    with (own / _OUTPUT).open("wb") as output:
+        command = (sys.executable, "-m", "tests.low_priority", *command)
+        return Running(
+            stage,
+            subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, start_new_session=True),
+            begun_s,
+            own,
+        )
+
+
+def finish(running: Running) -> Result:
+    """Wait for the stage's end, print its output if that went into a file, and return what came of it."""
+    stage = running.stage
+    code = _wait(running.process)
+    duration_s = time.monotonic() - running.begun_s
+    output, tally = running.folder / _OUTPUT, running.folder / _TALLY
+    if output.exists():
+        print(f"\n=== {stage.name}:\n{output.read_text(encoding='utf-8', errors='replace')}", flush=True)
+    if not tally.exists():
+        return Result(stage=stage, ok=code == 0, duration_s=duration_s, passed=int(code == 0), failed=int(code != 0))
+    counts = json.loads(tally.read_text(encoding="utf-8"))
     failed = max(len(counts["failed"]), int(code != 0))
     return Result(
         stage=stage,
@@ -148,16 +188,28 @@ def _again(result: Result) -> Iterable[str]:
     return [_shown(result.stage.command)]
 
 
-def run_all(stages: Iterable[Stage]) -> int:
-    """Run the stages in turn and print the summary; returns the exit code."""
+def run_all(stages: Sequence[Stage]) -> int:
+    """Run the stages and print the summary; returns the exit code."""
     results: list[Result] = []
+    beside: list[Running] = []
     interrupted = False
-    try:
-        for stage in stages:
-            results.append(run(stage))
-    except KeyboardInterrupt:
-        interrupted = True
-        print("\ninterrupted; the stages below had ended")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            for stage in stages:
+                if stage.beside and stage is not stages[-1]:
+                    beside.append(start(stage, folder, beside=True))
+                else:
+                    results.append(finish(start(stage, folder)))
+            while beside:
+                results.append(finish(beside[0]))
+                del beside[0]
+        except KeyboardInterrupt:
+            interrupted = True
+            for running in beside:  # in sessions of their own, which Ctrl-C does not reach
+                os.killpg(running.process.pid, signal.SIGINT)
+                running.process.wait()
+            print("\ninterrupted; the stages below had ended")
     print(summary(results), flush=True)
     if interrupted:
         return _INTERRUPTED
@@ -173,7 +225,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         parser.error(f"no stage {unknown[0]!r}; there are {', '.join(names)}")
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if a shell started us in the background
-    return run_all(stage for stage in STAGES if stage.name in wanted)
+    return run_all([stage for stage in STAGES if stage.name in wanted])
 
 
 if __name__ == "__main__":

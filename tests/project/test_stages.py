@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.stages import Stage, run_all
-from tests.support import DEADLINE_S, ROOT
+from tests.support import DEADLINE_S, ROOT, wait_until
 
 PYTHON = sys.executable.removeprefix(f"{ROOT}/")
 OWN = """
@@ -67,6 +67,24 @@ def test_all_green_is_exit_0(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr().out.splitlines()[-1] == "1 passed, 0 failed, 0 skipped"
 
 
+def test_a_stage_runs_beside_the_next_ones_in_a_session_of_its_own(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With the lowest priority in it, and among sessions where the kernel has groups of them; its output comes whole."""
+    met = tmp_path / "met"
+    waits = f"import os, pathlib, time\nwhile not pathlib.Path({str(met)!r}).exists(): time.sleep(0.01)\n"
+    waits += "print(os.getsid(0) == os.getpid(), os.nice(0))\n"
+    waits += "path = pathlib.Path('/proc/self/autogroup'); print(path.read_text().split()[-1] if path.exists() else 19)"
+    stages = [
+        Stage("computing", (sys.executable, "-c", waits), tests=False, beside=True),
+        Stage("types", (sys.executable, "-c", f"import pathlib; pathlib.Path({str(met)!r}).touch()"), tests=False),
+    ]
+    assert run_all(stages) == 0
+    out = capfd.readouterr().out
+    assert "=== computing:\nTrue 19\n19\n" in out
+    assert out.index("=== types") < out.index("=== computing:\n")
+
+
 GROUP = """
 import os, time
 import pytest
@@ -88,20 +106,22 @@ def test_tests_of_a_group_share_one_worker(tmp_path: Path) -> None:
     assert len(set((tmp_path / "workers").read_text(encoding="utf-8").splitlines())) == 1
 
 
-def test_ctrl_c_lets_the_stage_end_in_order(tmp_path: Path) -> None:
+@pytest.mark.parametrize("beside", [False, True])
+def test_ctrl_c_lets_the_stage_end_in_order(tmp_path: Path, *, beside: bool) -> None:
     """The stage takes two seconds to end."""
-    slow = "import pathlib, signal, sys, time\ntry:\n    print('works', flush=True); signal.pause()\nfinally:\n"
-    slow += "    time.sleep(2.0); pathlib.Path(sys.argv[1]).touch()\n"
-    stage = f"Stage('types', (sys.executable, '-c', {slow!r}, {str(tmp_path / 'ended')!r}), tests=False)"
-    code = f"import signal, sys; from tests.stages import *; sys.exit(run_all([{stage}]))"
+    begun, ended = tmp_path / "begun", tmp_path / "ended"
+    slow = "import pathlib, signal, sys, time\ntry:\n    pathlib.Path(sys.argv[1]).touch(); signal.pause()\nfinally:\n"
+    slow += "    time.sleep(2.0); pathlib.Path(sys.argv[2]).touch()\n"
+    stage = f"Stage('computing', (sys.executable, '-c', {slow!r}, {str(begun)!r}, {str(ended)!r}), tests=False, beside={beside})"
+    other = "Stage('types', (sys.executable, '-c', 'import signal; signal.pause()'), tests=False)"
+    code = f"import signal, sys; from tests.stages import *; sys.exit(run_all([{stage}, {other}]))"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, start_new_session=True) as process:
         assert process.stdout is not None
-        while process.stdout.readline() != b"works\n":
-            pass
+        wait_until(begun.exists, lambda: "the stage has not begun")
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(DEADLINE_S) == 130
         assert process.stdout.read().splitlines()[-1] == b"0 passed, 0 failed, 0 skipped"
-    assert (tmp_path / "ended").exists()
+    assert ended.exists()
 
 
 DRAWS = """
