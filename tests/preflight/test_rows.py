@@ -183,7 +183,7 @@ CASES = {
     "force's latency timer": Case("force.usb_latency", "16 ms", "udev", {"machine": r.machine(force_latency_ms=16)}, WARN),
     "weak tether": Case("tether.strength", "40 N", "stronger", {}, vehicle={"tether.load_rating_n": 40.0}),
     "short tether": Case("tether.slack", "0.11 m", "nearer", {}, vehicle={"tether.length_m": 1.7}),
-    "mission that cannot be flown": Case("mission.plan", "leaves the room", "change the mission", {"plan": ("leaves the room",)}),
+    "mission that cannot be flown": Case("mission.plan", "leaves the room", "correct the mission", {"plan": ("leaves the room",)}),
     "arm elsewhere": Case("mission.arm", "(150, 140)", "by hand", {"arm": r.arm(angle_rad=(math.radians(150), r.ARM_RAD[1]))}),
     "near the wall": Case("mission.room", "(-1.00,", "further in", {}, vehicle={"room.x_m": (-1.3, 2.2)}),
     "little disk": Case("machine.disk", "40 MB", "--out", {"machine": r.machine(disk_free_bytes=40_000_000)}, WARN),
