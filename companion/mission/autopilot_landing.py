@@ -128,7 +128,7 @@ class AutopilotLanding:
         if not heard:
             now, stands = now._watch_standing(i)
             if stands:
-                text = "the vehicle stands by motion capture, but PX4 does not answer: approach with care and disarm it by hand"
+                text = "PX4 does not answer; motion capture shows the vehicle at rest: approach with care and disarm it by hand"
                 return now, LandingStep(
                     request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=text
                 )
@@ -159,7 +159,7 @@ class AutopilotLanding:
         return now, LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
 
     def _watch_mode(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """A pilot takes over: a mode in which somebody steers; or, once PX4 was landing, any that only a pilot chooses."""
+        """Return whether a pilot takes over: PX4 is in a manual mode or, once it was landing, in any mode that only a pilot selects."""
         mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
         now = self if self.was_landing or mode is not FlightMode.LAND else replace(self, was_landing=True)
         chosen = i.status is not None and chosen_by_pilot(i.status)

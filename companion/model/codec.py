@@ -151,8 +151,15 @@ def differences(a: object, b: object, path: str = "") -> tuple[str, object, obje
 
 
 def _from_numpy(value: Any) -> Any:
-    """Return a numpy scalar or array that slipped into a record as a Python number or list."""
-    return value.tolist()
+    """Return a numpy scalar or array that slipped into a record as a Python number or list.
+
+    Raises:
+        TypeError: the value is something else, which no record may hold.
+    """
+    tolist = getattr(value, "tolist", None)
+    if tolist is None:
+        raise TypeError(f"a record cannot hold a {type(value).__name__}")
+    return tolist()
 
 
 _PACKETS = msgspec.msgpack.Encoder(enc_hook=_from_numpy)

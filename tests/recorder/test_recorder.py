@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
@@ -305,6 +306,19 @@ def test_a_record_that_cannot_be_written_is_counted_and_named(recorder: Recorder
     assert (report.samples, report.dropped) == (2, 1)
     assert report.error is not None
     assert "packet 0 could not be written" in report.error
+
+
+@pytest.mark.parametrize("value", [object(), 2**70], ids=["object", "huge"])
+def test_a_record_that_cannot_be_packed_is_counted_and_never_reaches_the_control_tick(value: object) -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        client = RecorderClient(ours)
+        inputs, outputs, sent = tick(0)
+        broken = msgspec.structs.replace(outputs, progress=value)
+        assert not client.record(inputs, broken, sent)
+        assert client.record(inputs, outputs, sent)
+        assert (client.samples, client.dropped) == (1, 1)
+        assert client.error is not None and "could not be packed" in client.error
 
 
 def test_epoch_offset_is_the_wall_clock_at_zero_of_the_flight_clock() -> None:
