@@ -10,6 +10,9 @@ from companion.config.loader import FlightConfig, check_document, load_flight
 from companion.config.overrides import parse_overrides
 from companion.sitl_config.world import World
 
+WORLD_DIRECTORY = Path(__file__).parent / "worlds"
+"""Built-in worlds are package data, so that they are found wherever the package is installed."""
+
 
 class SitlConfig(FlightConfig):
     """A flight's configuration and the truth of its simulated world. The flight process and the core are given `flight`."""

@@ -12,6 +12,7 @@ import pytest
 from companion.cli.schema import KINDS, schema_json
 from companion.config.loader import PRESET_DIRECTORY, PRESETS
 from companion.config.yaml_strict import read_document
+from companion.sitl_config.loader import WORLD_DIRECTORY
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "controller"}
@@ -61,3 +62,9 @@ def test_every_preset_is_there_once_and_shown_beside_the_other_configurations() 
     assert {path.name for path in PRESET_DIRECTORY.glob("*.yaml")} == names
     for name in names:
         assert (CONFIGS / "controllers" / name).resolve() == (PRESET_DIRECTORY / name).resolve()
+
+
+def test_every_world_is_there_once_and_shown_beside_the_other_configurations() -> None:
+    assert {path.name for path in WORLD_DIRECTORY.glob("*.yaml")} == {"ideal.yaml", "lab.yaml"}
+    for path in WORLD_DIRECTORY.glob("*.yaml"):
+        assert (CONFIGS / "worlds" / path.name).resolve() == path.resolve()

@@ -1,0 +1,1 @@
+"""Sections of the simulated world: one effect of a laboratory each, with its switch and its parameters."""
