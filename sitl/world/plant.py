@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
-
-import numpy as np
 
 from companion.config.vehicle import Joint, Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
@@ -23,6 +21,7 @@ from sitl.autopilot.types import ImuSample
 from sitl.faults.injector import Faults
 from sitl.world.handling import Handling, HungWeight
 from sitl.world.mocap_misalignment import MocapMisalignment
+from sitl.world.noise import noise
 from sitl.world.world import PHYSICS_DT_S, Truth, World
 
 IMU_EVERY = 2
@@ -68,19 +67,8 @@ def battery_voltage_v(remaining: float) -> float:
     return BATTERY_EMPTY_V + (BATTERY_FULL_V - BATTERY_EMPTY_V) * remaining
 
 
-_NOISE_BLOCK = 4096
-
-
 _MOCAP, _IMU, _FORCE = range(3)
 _PHASES = (0.0, math.tau / 3.0, 2.0 * math.tau / 3.0)
-
-
-def noise(seed: int, sensor: int) -> Iterator[Vec3]:
-    """Yield triples of standard normal numbers, drawn in blocks for speed (well under a microsecond each)."""
-    rng = np.random.default_rng((seed, sensor))
-    while True:
-        values = iter(rng.standard_normal(_NOISE_BLOCK).tolist()[::-1])
-        yield from zip(values, values, values, strict=False)
 
 
 class Plant:
@@ -145,6 +133,7 @@ class Plant:
         self._mocap_noise, self._imu_noise, self._force_noise = (
             noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
         )
+        self.world.restart_noise()
 
     @property
     def t_s(self) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -14,6 +14,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.handling import Wrench
+from sitl.world.loads import ZERO, Loads
 from sitl.world.model import mjcf
 
 PHYSICS_DT_S = 0.002
@@ -110,6 +111,16 @@ class Ball(NamedTuple):
         )
 
 
+class Effect(Protocol):
+    """An effect that loads bodies of the world."""
+
+    def apply(self, world: World) -> None:
+        """Set this effect's loads for the next step."""
+
+    def restart_noise(self) -> None:
+        """Start its noise sequence again."""
+
+
 class World:
     """The physics; `step` advances it by `PHYSICS_DT_S`."""
 
@@ -144,7 +155,6 @@ class World:
         """Point where the tether is snagged, and its free length from there; None if it is free."""
         self.throw_aside_m = 0.0
         """Distance by which the throw misses the net."""
-        self._held: Wrench | None = None
         self._tether = m.tendon("tether").id
         self._attachment = m.site("tether").id
         self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
@@ -166,8 +176,8 @@ class World:
         d = self.data
         # Views: looking up MuJoCo's arrays in every step costs more than reading them.
         self._ctrl, self._qpos, self._qvel, self._sensordata = d.ctrl, d.qpos, d.qvel, d.sensordata
-        self._drag_force, self._push_force = d.xfrc_applied[self._base, 0:3], d.xfrc_applied[self._net, 0:3]
-        self._hold_torque = d.xfrc_applied[self._base, 3:6]
+        self.loads = Loads(d)
+        self._effects: tuple[Effect, ...] = ()
         self.t_s = 0.0
         """World time."""
         self.q: list[float] = []
@@ -195,12 +205,16 @@ class World:
 
     def push(self, force_world_n: Vec3) -> None:
         """Set the external force on the centre of the net, N."""
-        self._push_force[:] = force_world_n
+        self.loads.set(self._net, "push", force_world_n)
 
     def hold(self, wrench: Wrench | None) -> None:
         """Set force and torque of a hand on the base; None releases it."""
-        self._held = wrench
-        self._hold_torque[:] = (0.0, 0.0, 0.0) if wrench is None else wrench.torque_nm
+        self.loads.set(self._base, "hold", *(wrench or (ZERO, ZERO)))
+
+    def restart_noise(self) -> None:
+        """Start the noise of all effects again."""
+        for effect in self._effects:
+            effect.restart_noise()
 
     @property
     def weight_n(self) -> float:
@@ -236,17 +250,17 @@ class World:
         self._ctrl[:] = thrust + joint_torque_nm
         if self._parked and all(joint_torque_nm):
             self.release_arm()
+        force_n = ZERO
         if drag:
             (wx, wy, wz), v = self.wind_m_s, self.v
-            self._drag_force[:] = (
-                DRAG_N_PER_M_S * (wx - v[0]),
-                DRAG_N_PER_M_S * (wy - v[1]),
-                DRAG_N_PER_M_S * (wz - v[2]),
-            )
+            force_n = (DRAG_N_PER_M_S * (wx - v[0]), DRAG_N_PER_M_S * (wy - v[1]), DRAG_N_PER_M_S * (wz - v[2]))
         if self.snag is not None:
-            self._drag_force += self._snag_pull_n(*self.snag)
-        if self._held is not None:
-            self._drag_force += self._held.force_n
+            (x, y, z), (px, py, pz) = force_n, self._snag_pull_n(*self.snag)
+            force_n = (x + px, y + py, z + pz)
+        self.loads.set(self._base, "drag and snag", force_n)
+        for effect in self._effects:
+            effect.apply(self)
+        self.loads.write()
         mujoco.mj_step(self.model, self.data)
         self.t_s = self.data.time
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()

@@ -1,0 +1,36 @@
+"""External forces and torques on the bodies of the world, by cause."""
+
+from __future__ import annotations
+
+import mujoco
+
+from companion.model.types import Vec3
+
+ZERO: Vec3 = (0.0, 0.0, 0.0)
+
+
+class Loads:
+    """External forces and torques on bodies; each acts until its cause sets it again.
+
+    Args:
+        data: MuJoCo's data; its `xfrc_applied` is written by nothing else.
+    """
+
+    def __init__(self, data: mujoco.MjData) -> None:
+        self._rows = tuple(data.xfrc_applied)  # views: looking them up in every step costs more
+        self._loads: tuple[dict[str, tuple[Vec3, Vec3]], ...] = tuple({} for _ in self._rows)
+        self._changed: set[int] = set()
+
+    def set(self, body: int, cause: str, force_n: Vec3, torque_nm: Vec3 = ZERO) -> None:
+        """Set force and torque of one cause on the centre of mass of a body, world frame."""
+        self._loads[body][cause] = (force_n, torque_nm)
+        self._changed.add(body)
+
+    def write(self) -> None:
+        """Give MuJoCo the sums on the bodies whose loads have changed."""
+        for body in self._changed:
+            fx = fy = fz = tx = ty = tz = 0.0
+            for (ax, ay, az), (bx, by, bz) in self._loads[body].values():
+                fx, fy, fz, tx, ty, tz = fx + ax, fy + ay, fz + az, tx + bx, ty + by, tz + bz
+            self._rows[body][:] = (fx, fy, fz, tx, ty, tz)
+        self._changed.clear()
