@@ -22,6 +22,21 @@ _TORQUE_BITS = (Overload.TX, Overload.TY, Overload.TZ)
 _MAX_CATCH_UP = 8  # packets; after a longer jump of the world's time the rest is skipped
 
 
+def quantised(force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
+    """Return a reading as it arrives over the wire, rounded to the protocol's counts."""
+    (fx, fy, fz), (tx, ty, tz) = force_n, torque_nm
+    force, torque = rft.FORCE_PER_N, rft.TORQUE_PER_NM
+    return (
+        (round(fx * force) / force, round(fy * force) / force, round(fz * force) / force),
+        (round(tx * torque) / torque, round(ty * torque) / torque, round(tz * torque) / torque),
+    )
+
+
+def overloaded(force_n: Vec3, torque_nm: Vec3) -> bool:
+    """Return whether an axis is loaded beyond its capacity."""
+    return max(map(abs, force_n)) > FORCE_CAPACITY_N or max(map(abs, torque_nm)) > TORQUE_CAPACITY_NM
+
+
 class ForceTorqueServer:
     """The emulated sensor; an async context manager on the running event loop.
 

@@ -35,6 +35,7 @@ def refuse(title: str, problems: list[tuple[Location, str]]) -> None:
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+RelativeError = Annotated[float, Field(ge=-0.5, le=0.5)]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]

@@ -7,13 +7,14 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from companion.config.base import Fraction, Model, NonNegative, Positive, Vector2, Vector3
+from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
 from companion.config.explain import nearest
 from companion.px4.defaults import PX4_DEFAULTS
+from companion.sitl_config.effects.force_sensor import ForceSensor
+from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.faults import Fault as Fault
 
 REAL32_MAX = 3.4e38
-RelativeError = Annotated[float, Field(ge=-0.5, le=0.5)]
 SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
@@ -147,6 +148,8 @@ class World(Model):
     px4_params: Px4Params = Field(default={})
     """PX4 parameters by name that override those of a set-up vehicle."""
     faults: tuple[Fault, ...] = ()
+    machine: Machine = Machine()
+    force_sensor: ForceSensor = ForceSensor()
 
     def servo(self, joint: int) -> Servo:
         """Return the servo of joint 0 or 1."""

@@ -54,6 +54,7 @@ from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
 from sitl.faults.injector import COOL_C, Faults
 from sitl.faults.timing import with_fault_times
+from sitl.force_torque import overloaded, quantised
 from sitl.server import start_of
 from sitl.servo.drive import MODE_CURRENT
 from sitl.servo.from_config import plugged_in, servos_of
@@ -312,8 +313,11 @@ class FastFlight:
                 self._dropped += 1
             dropped = self._dropped
         if plant.fault("force_loss") is None:
-            force, torque = plant.force_torque()
-            self._force = ForceSample(stamp_s=t_s, force_sensor_n=force, torque_sensor_nm=torque, overload=False)
+            load = plant.force_torque()
+            force, torque = quantised(*load)
+            self._force = ForceSample(
+                stamp_s=t_s, force_sensor_n=force, torque_sensor_nm=torque, overload=overloaded(*load)
+            )
         if self._arm is None or plant.faults is None or not self._bus_fails():
             self._arm = self._read_arm(t_s)
         else:

@@ -7,6 +7,7 @@ import math
 from companion.config.vehicle import Airframe, Vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.world import World
+from sitl.world.effects import machine
 
 PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"
@@ -34,7 +35,8 @@ def link_masses_kg(vehicle: Vehicle, world: World) -> tuple[float, float]:
 
 
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
-    """Return the model as MJCF."""
+    """Return the model of the machine as it is built, as MJCF."""
+    vehicle = machine.as_built(vehicle, world.machine)
     airframe, arm, tool = vehicle.airframe, vehicle.arm, vehicle.tool
     l1, l2 = arm.link_lengths_m
     m1, m2 = link_masses_kg(vehicle, world)
@@ -78,7 +80,7 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
              solimp="0.95 0.99 0.01"/>"""
     return f"""
 <mujoco model="{vehicle.name}">
-  <compiler angle="radian" eulerseq="ZYX" inertiafromgeom="auto"/>
+  <compiler angle="radian" eulerseq="zyx" inertiafromgeom="auto"/>
   <option timestep="{timestep_s}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast" cone="pyramidal"/>
   <size memory="2M"/>
   <worldbody>
@@ -86,12 +88,13 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     <site name="anchor" pos="{xyz(vehicle.tether.anchor_world_m)}"/>
     <body name="base" pos="0 0 {clearance}">
       <freejoint name="base"/>
-      <inertial pos="0 0 0" mass="{base_mass_kg(vehicle, world)}" diaginertia="{xyz(airframe.inertia_kg_m2)}"/>
+      <inertial pos="{xyz(machine.centre_of_mass_m(world.machine))}" mass="{base_mass_kg(vehicle, world)}"
+                diaginertia="{xyz(airframe.inertia_kg_m2)}"/>
       <site name="imu"/>
       <site name="tether" pos="{xyz(vehicle.tether.attachment_body_m)}"/>
       {rotors}
       {feet}
-      <body name="link1" pos="{xyz(arm.shoulder_body_m)}">
+      <body name="link1" pos="{xyz(arm.shoulder_body_m)}" euler="{xyz(machine.shoulder_ypr_rad(world.machine))}">
         <joint name="alpha1" axis="0 1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
                armature="{arm.joint_armature_kg_m2}"/>
         {rod(m1, arm.link_com_m[0], l1)}

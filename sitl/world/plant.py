@@ -19,6 +19,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
 from sitl.faults.injector import Faults
+from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.handling import Handling, HungWeight
 from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
@@ -117,6 +118,7 @@ class Plant:
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
         """Whether the force sensor is read; in the fast closed loop it always is."""
+        self._force_sensor = ForceSensor.of(config.force_sensor, config.seed)
         self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self._tick = 0
         self._imu_sample: ImuSample | None = None
@@ -296,19 +298,24 @@ class Plant:
     def force_torque(self) -> tuple[Vec3, Vec3]:
         """Return a reading of the force-torque sensor in N and N m, sensor frame, with noise, bias, faults and scale error."""
         s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
+        (fx, fy, fz), (tx, ty, tz) = (-s[f], -s[f + 1], -s[f + 2]), (-s[tq], -s[tq + 1], -s[tq + 2])
+        if self._force_sensor is not None:
+            (fx, fy, fz), (tx, ty, tz) = self._force_sensor.measure(self.world.t_s, (fx, fy, fz), (tx, ty, tz))
         bx, by, bz = self._config.force_bias_n
         noise_n = self._config.force_noise_n
         noise_nm = noise_n * 0.02
         nx, ny, nz = next(self._force_noise)
         mx, my, mz = next(self._force_noise)
         wrench = (
-            (-s[f] + bx + noise_n * nx, -s[f + 1] + by + noise_n * ny, -s[f + 2] + bz + noise_n * nz),
-            (-s[tq] + noise_nm * mx, -s[tq + 1] + noise_nm * my, -s[tq + 2] + noise_nm * mz),
+            (fx + bx + noise_n * nx, fy + by + noise_n * ny, fz + bz + noise_n * nz),
+            (tx + noise_nm * mx, ty + noise_nm * my, tz + noise_nm * mz),
         )
         if self.faults is not None:
             wrench = self.faults.wrench(*wrench)
         scale = self._config.force_scale
-        return wrench if scale == 1.0 else (_scaled(wrench[0], scale), _scaled(wrench[1], scale))
+        if scale != 1.0:
+            wrench = (_scaled(wrench[0], scale), _scaled(wrench[1], scale))
+        return wrench if self._force_sensor is None else self._force_sensor.rounded(*wrench)
 
 
 def _scaled(v: Vec3, k: float) -> Vec3:

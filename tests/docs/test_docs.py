@@ -13,6 +13,7 @@ import pytest
 
 from companion.analysis.summary import empty_summary
 from companion.cli.main import _normalised, _parser
+from companion.config.base import Model
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import PRESETS, load_flight
 from companion.config.vehicle import Safety
@@ -30,7 +31,7 @@ from tools.docs.tables import written
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", ROOT / "benchmarks/README.md", *(ROOT / "docs").rglob("*.md")])
 COMMANDS, SAFETY, SITL = ROOT / "docs/commands.md", ROOT / "docs/safety.md", ROOT / "docs/sitl.md"
-FAULTS = ROOT / "docs/faults.md"
+FAULTS, LABORATORY = ROOT / "docs/faults.md", ROOT / "docs/world.md"
 LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
 # What a flight writes, or what a user is told to make: no files of the repository.
 MADE_LATER = {
@@ -153,8 +154,11 @@ def test_exit_codes_match() -> None:
 
 def test_knobs_match() -> None:
     told = {codes(row[0])[0]: json.loads(row[1]) for row in table(SITL, "key", "default")}
-    assert told == json.loads(World().model_dump_json())
-    assert list(told) == list(World.model_fields)
+    effects = {name for name, field in World.model_fields.items() if isinstance(field.default, Model)}
+    assert told == json.loads(World().model_dump_json(exclude=effects))
+    assert list(told) == [name for name in World.model_fields if name not in effects]
+    switches = {name for row in table(LABORATORY, "effect", "what it does") for name in codes(row[4])}
+    assert {f"{name}.on" for name in effects} <= switches
     assert f"{len(KINDS)} kinds" in text_of(SITL)
 
 

@@ -15,6 +15,8 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from companion.config.base import Model
+from companion.sitl_config.effects.force_sensor import ForceSensor
+from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.faults import KINDS, Fault
 from companion.sitl_config.world import Push, Servo, World
 
@@ -35,6 +37,8 @@ EXAMPLES: dict[type[Model], Settings] = {
     Push: {"t_s": 0.1, "duration_s": 0.1, "force_world_n": (0.0, 0.0, -2.0)},
     Servo: {},
     Fault: {"kind": "gust", "t_s": 0.1},
+    Machine: {"on": True},
+    ForceSensor: {"on": True},
 }
 """Examples of the parts of the world whose fields are tested."""
 

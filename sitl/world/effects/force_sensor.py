@@ -1,0 +1,87 @@
+"""Errors of the force-torque sensor: mounting, cross-talk, drift, its own low-pass and its resolution.
+
+The readings pass mounting and cross-talk (one 6x6 matrix), the drift of the zero, and the low-pass; `Plant` adds noise and bias, faults
+and scale, and `rounded` is last.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.types import Vec3
+from companion.sitl_config.effects.force_sensor import ForceSensor as Config
+from sitl.force_torque import FORCE_CAPACITY_N, TORQUE_CAPACITY_NM
+
+_STREAM = 19
+"""Number of the random draw of this effect."""
+_TORQUE_PER_FORCE_M = TORQUE_CAPACITY_NM / FORCE_CAPACITY_N
+
+
+class ForceSensor:
+    """The sensor's errors.
+
+    Args:
+        config: the section `force_sensor`.
+        seed: seed of the world; it draws the cross-talk.
+    """
+
+    def __init__(self, config: Config, seed: int) -> None:
+        share = np.random.default_rng((seed, _STREAM)).uniform(-config.cross_talk, config.cross_talk, (6, 6))
+        np.fill_diagonal(share, 1.0)
+        capacity = np.repeat((FORCE_CAPACITY_N, TORQUE_CAPACITY_NM), 3)
+        roll, pitch, yaw = config.mounting_rpy_deg
+        mounted = quat_from_euler_zyx(math.radians(roll), math.radians(pitch), math.radians(yaw))
+        axes = [quat_rotate(mounted, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+        to_sensor = np.kron(np.eye(2), np.array(axes))
+        self._rows = (share * capacity[:, None] / capacity @ to_sensor).tolist()
+        self._config = config
+        self._turns = math.tau * config.filter_hz
+        self._t_s = -math.inf
+        self._filtered = [0.0] * 6
+
+    @classmethod
+    def of(cls, config: Config, seed: int) -> ForceSensor | None:
+        """Return the effect, or None if it is off."""
+        return cls(config, seed) if config.on else None
+
+    def measure(self, t_s: float, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
+        """Return the reading before noise, bias and rounding, sensor frame.
+
+        Args:
+            t_s: world time, not before that of the last call.
+            force_n: true force, in the sensor frame of the vehicle file.
+            torque_nm: true torque, same frame.
+        """
+        config = self._config
+        a, b, c = force_n
+        d, e, f = torque_nm
+        minutes, warm_k = t_s / 60.0, config.warm_up_k * (1.0 - math.exp(-t_s / config.warm_up_s))
+        (rate_x, rate_y, rate_z), (per_k_x, per_k_y, per_k_z) = config.drift_n_per_min, config.temperature_drift_n_per_k
+        x, y, z = (
+            rate_x * minutes + per_k_x * warm_k,
+            rate_y * minutes + per_k_y * warm_k,
+            rate_z * minutes + per_k_z * warm_k,
+        )
+        share = 1.0 - math.exp(self._turns * (self._t_s - t_s))
+        self._t_s = t_s
+        k = _TORQUE_PER_FORCE_M
+        self._filtered = fx, fy, fz, tx, ty, tz = [
+            old + share * (m0 * a + m1 * b + m2 * c + m3 * d + m4 * e + m5 * f + drift - old)
+            for old, (m0, m1, m2, m3, m4, m5), drift in zip(
+                self._filtered, self._rows, (x, y, z, k * x, k * y, k * z), strict=True
+            )
+        ]
+        return (fx, fy, fz), (tx, ty, tz)
+
+    def rounded(self, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
+        """Return the reading in steps of the resolution."""
+        return _rounded(force_n, self._config.resolution_n), _rounded(torque_nm, self._config.resolution_nm)
+
+
+def _rounded(v: Vec3, step: float) -> Vec3:
+    if step == 0.0:
+        return v
+    return (step * round(v[0] / step), step * round(v[1] / step), step * round(v[2] / step))

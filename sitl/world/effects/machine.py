@@ -1,0 +1,51 @@
+"""The machine as it is built, which differs from its vehicle file."""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Vehicle
+from companion.model.types import Vec3
+from companion.sitl_config.effects.machine import Machine
+
+
+def as_built(vehicle: Vehicle, machine: Machine) -> Vehicle:
+    """Return the vehicle with its true inertia, shoulder position, link lengths and links' centres of mass."""
+    if not machine.on:
+        return vehicle
+    airframe, arm = vehicle.airframe, vehicle.arm
+    shoulder, lengths, coms = arm.shoulder_body_m, arm.link_lengths_m, arm.link_com_m
+    (x, y, z), (dx, dy, dz) = shoulder, machine.shoulder_offset_m
+    (l1, l2), (dl1, dl2) = lengths, machine.link_length_error_m
+    (c1, c2), (dc1, dc2) = coms, machine.link_com_error_m
+    return vehicle.model_copy(
+        update={
+            "airframe": airframe.model_copy(update={"inertia_kg_m2": _inertia_kg_m2(airframe.inertia_kg_m2, machine)}),
+            "arm": arm.model_copy(
+                update={
+                    "shoulder_body_m": (x + dx, y + dy, z + dz),
+                    "link_lengths_m": (l1 + dl1, l2 + dl2),
+                    "link_com_m": (c1 + dc1, c2 + dc2),
+                }
+            ),
+        }
+    )
+
+
+def centre_of_mass_m(machine: Machine) -> Vec3:
+    """Return the centre of mass of the base without arm and tool, body frame."""
+    return machine.centre_of_mass_m if machine.on else (0.0, 0.0, 0.0)
+
+
+def shoulder_ypr_rad(machine: Machine) -> Vec3:
+    """Return yaw, pitch and roll of the shoulder mount in the body frame, in MuJoCo's order of ZYX angles."""
+    if not machine.on:
+        return (0.0, 0.0, 0.0)
+    roll, pitch, yaw = machine.shoulder_rpy_deg
+    return (math.radians(yaw), math.radians(pitch), math.radians(roll))
+
+
+def _inertia_kg_m2(believed: Vec3, machine: Machine) -> Vec3:
+    """Return the true moments of inertia; each is limited to the sum of the other two, as of every body."""
+    x, y, z = (moment * (1.0 + error) for moment, error in zip(believed, machine.inertia_error, strict=True))
+    return (min(x, y + z), min(y, x + z), min(z, x + y))
