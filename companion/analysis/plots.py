@@ -50,6 +50,12 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
         ("tracking", "Tracking", "Position and attitude by motion capture against the reference.", _tracking),
         ("actuation", "Actuation", "What the law asked for and what was sent.", _actuation),
         ("adaptation", "Adaptation", "Switching gain and its adapted parameters.", _adaptation),
+        (
+            "load",
+            "Adaptive load",
+            "Loads that the law has adapted to: force on the base, first moments of the links, joint friction.",
+            _load,
+        ),
         ("force", "Contact force", "Tared force on the net in the world frame, its weight removed.", _force),
         ("path", "Path", "By motion capture, seen from above and from the side.", _path),
         (
@@ -137,6 +143,24 @@ def _adaptation(log: FlightLog) -> Figure | None:
     axes[2].set_ylabel(r"$\zeta$")
     for ax in axes:
         ax.set_ylim(bottom=0.0)
+    return figure
+
+
+def _load(log: FlightLog) -> Figure | None:
+    force = log.column(lambda i, o, s: o.control.load_estimate_n if o.control else None, 3)
+    if not np.isfinite(force).any():
+        return None
+    figure, axes, t = _stack(log, "Adaptive load", (1.0, 0.8, 0.8))
+    moments = log.column(lambda i, o, s: o.control.moment_estimate_kg_m if o.control else None, 2)
+    friction = log.column(lambda i, o, s: o.control.friction_estimate_nm if o.control else None, 2)
+    for j, name in enumerate("xyz"):
+        _line(axes[0], t, force[:, j], f"${name}$", _SERIES[j])
+    for j in range(2):
+        _line(axes[1], t, moments[:, j], f"link {j + 1}", _SERIES[j])
+        _line(axes[2], t, friction[:, j], f"joint {j + 1}", _SERIES[j])
+    for ax, label in zip(axes, ("load [N]", "first moment [kg m]", "friction [N m]"), strict=True):
+        ax.set_ylabel(label)
+        _legend(ax, columns=3)
     return figure
 
 

@@ -12,6 +12,7 @@ Positive8 = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Po
 NonNegative8 = tuple[
     NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
 ]
+NonNegative2 = tuple[NonNegative, NonNegative]
 NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
 
@@ -50,6 +51,24 @@ class AdaptiveConfig(Model):
     """Largest ||S chi_dd|| that may enter rho; 0 switches H_3 off."""
     acceleration_lowpass_hz: Positive
     force_lowpass_hz: Positive
+    h_max: Positive4 | None = None
+    """Bound of H_0 .. H_3 (projection); null leaves them to the leakage, as in the paper."""
+    load_rate_xyz: NonNegative3 = (0.0, 0.0, 0.0)
+    """Gamma of the adaptive load on x, y and z, kg/s^2; 0 switches it off, as in the paper."""
+    load_leakage: NonNegative = 0.0
+    """Leakage of every adaptive load, 1/s."""
+    load_max_n: NonNegative = 8.0
+    """Bound of the adaptive load on x, y and z (projection)."""
+    moment_rate: NonNegative = 0.0
+    """Gamma of the adaptive first moments of the links, kg s^2; 0 switches them off."""
+    moment_max_kg_m: NonNegative = 0.3
+    """Bound of the adaptive first moments (projection)."""
+    friction_rate: NonNegative = 0.0
+    """Gamma of the adaptive joint friction, kg m^2/s^2; 0 switches it off."""
+    friction_max_nm: NonNegative = 0.3
+    """Bound of the adaptive joint friction (projection)."""
+    arm_gravity_nominal: bool = True
+    """Feed the arm's gravity torque forward with the vehicle file's masses."""
     desired_force_time_s: Positive | None = None
     """T_d of F_d = lowpass(F_ext). If it is absent, F_d = 0 as in the paper."""
     force_feedforward_xyz: NonNegative3 = (0.0, 0.0, 0.0)

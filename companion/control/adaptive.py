@@ -18,18 +18,13 @@ from companion.control.arm_inertia import ArmInertia
 from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.impedance import Impedance
+from companion.control.load_adaptation import FRICTION_RATE_RAD_S, LoadAdaptation, Rows
 from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
 from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
-
-FRICTION_RATE_RAD_S = 0.1
-"""Joint rate below which the friction feedforward fades out, so that a joint at rest is not shaken."""
-
-Rows = tuple[float, float, float, float, float]
-"""Values of the active rows: x, y, z, alpha_1, alpha_2."""
 
 
 def active(rows: tuple[float, ...]) -> Rows:
@@ -53,6 +48,7 @@ class Adaptation:
 
         self._held = HoldTable(held)
         """e^{-nu T} for H_0 to H_3, then (1 - e^{-nu T}) / nu."""
+        self._h_max = config.h_max
         self.h: Vec4 = config.h_initial
         self.zeta = config.zeta_initial
 
@@ -79,6 +75,9 @@ class Adaptation:
             k2 * h2 + g2 * drive * b2,
             k3 * h3 + g3 * drive * b3,
         )
+        if self._h_max is not None:
+            h0, h1, h2, h3 = map(min, self.h, self._h_max)
+            self.h = (h0, h1, h2, h3)
 
 
 class AccelerationFilter:
@@ -113,6 +112,7 @@ class AdaptiveController:
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._impedance = Impedance(config)
         self._adaptation = Adaptation(config)
+        self._load = LoadAdaptation(config)
         weights = active(config.row_weights_s)
         self._weights_squared: Rows = (
             weights[0] ** 2,
@@ -135,6 +135,8 @@ class AdaptiveController:
             mass_kg, config.disturbance_time_xyz_s, config.disturbance_lag_s, config.disturbance_max_n
         )
         self._arm_inertia = ArmInertia(vehicle) if config.arm_inertia_nominal else None
+        self._gravity_nominal = config.arm_gravity_nominal
+        self._up_m_s2: Vec2 = (0.0, GRAVITY_M_S2)
         self._friction_nm = config.arm_friction_share * vehicle.arm.joint_friction_nm
         self._weight_n = mass_kg * GRAVITY_M_S2
         self._force_share, self._compliance = config.force_feedforward_xyz, config.base_compliance_xyz
@@ -149,7 +151,7 @@ class AdaptiveController:
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
-        adaptation, impedance, sent = self._adaptation, self._impedance, self._actuation
+        adaptation, impedance, sent, load = self._adaptation, self._impedance, self._actuation, self._load
         clipped_before = sent.any_clipped
         acceleration = self._acceleration.step(dt_s, state)
         force = self._force.step(dt_s, state.force_ext_world_n)
@@ -172,6 +174,7 @@ class AdaptiveController:
         (f0, f1, f2), (t6, t7) = sent.force_world_n, sent.arm_torque_nm
         self._remember(sent.force_world_n, force)
         adaptation.advance(dt_s, norm_s, regressor, clipped_before)
+        load.advance(dt_s, active(s), learn)
         gamma = impedance.advance(dt_s, e_tau)
         self._desired.advance(dt_s, force)
         log = ControlLog(
@@ -188,6 +191,9 @@ class AdaptiveController:
             attitude_desired_rad=sent.roll_pitch_yaw_rad,
             hover_thrust=self.hover_thrust,
             saturated=sent.clipped,
+            load_estimate_n=load.force_n if load.on else None,
+            moment_estimate_kg_m=load.moments_kg_m if load.on else None,
+            friction_estimate_nm=load.friction_nm if load.on else None,
         )
         return Wrench(
             attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
@@ -196,6 +202,7 @@ class AdaptiveController:
     def _torque_error(self, arm_rad: Vec2, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Vec8, Vec2, Vec2]:
         """Return e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that hold the arm against gravity."""
         (xx, xy, xz), (zx, zy, zz) = body_x, body_z
+        self._up_m_s2 = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * zz)
         jx6, jx7, jz6, jz7, g6, g7 = self._manipulator.joint_terms(arm_rad, GRAVITY_M_S2 * xz, GRAVITY_M_S2 * zz)
         (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
         f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
@@ -264,9 +271,10 @@ class AdaptiveController:
         applied.
         """
         (x, y, z, _, _), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = tau, force, disturbance, self._force_share
-        x -= c0 * f0 + d0
-        y -= c1 * f1 + d1
-        z -= c2 * f2 + d2
+        q0, q1, q2 = self._load.force_n
+        x += q0 - (c0 * f0 + d0)
+        y += q1 - (c1 * f1 + d1)
+        z += q2 - (c2 * f2 + d2)
         lead_s = self._lead_s
         if lead_s > 0.0:
             jerk, inertia = reference.jerk_world_m_s3, self._inertia
@@ -289,8 +297,14 @@ class AdaptiveController:
         The star marks what the target impedance asks for now: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d - Phi e +
         gamma = alpha' - s.
         """
-        t6, t7 = tau[3] + gravity[0], tau[4] + gravity[1]
+        t6, t7 = tau[3], tau[4]
         rates = state.arm_rate_rad_s
+        if self._gravity_nominal:
+            t6, t7 = t6 + gravity[0], t7 + gravity[1]
+        if self._load.on:
+            levers = self._manipulator.gravity_levers_m_s2(state.arm_rad, *self._up_m_s2)
+            first, second = self._load.joint_torque_nm(levers, (rates[0] - s[6], rates[1] - s[7]))
+            t6, t7 = t6 + first, t7 + second
         if self._arm_inertia is not None:
             _, _, _, m6, m7 = self._inertia
             _, _, _, p6, p7 = self._phi

@@ -95,6 +95,17 @@ class Manipulator:
         c2 *= l2
         return -l1 * s1 - s2, s2, -l1 * c1 - c2, c2, about_1 + about_2, -about_2
 
+    def gravity_levers_m_s2(self, angle_rad: Vec2, up_x_m_s2: float, up_z_m_s2: float) -> Vec2:
+        """Return the torque that holds each link against gravity for a first moment of 1 kg m, about its own joint; arguments as for
+        `joint_terms`.
+        """
+        a1, a2 = angle_rad
+        b = a1 - a2
+        return (
+            -math.sin(a1) * up_x_m_s2 - math.cos(a1) * up_z_m_s2,
+            -math.sin(b) * up_x_m_s2 - math.cos(b) * up_z_m_s2,
+        )
+
     def sensor_attitude_body(self, angle_rad: Vec2) -> Quat:
         """Return the rotation from the force-torque sensor's frame to the body frame."""
         half = 0.5 * (angle_rad[0] - angle_rad[1])

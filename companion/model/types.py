@@ -280,6 +280,12 @@ class ControlLog(Record, frozen=True, kw_only=True):
     """Whether vertical force, lateral force and joint torque were saturated."""
     payload_estimate_kg: float | None = None
     """Estimated mass of the payload; None if the law does not estimate it."""
+    load_estimate_n: Vec3 | None = None
+    """Force that the rotors give against the load that the law has adapted to, world frame. None if the law adapts to none."""
+    moment_estimate_kg_m: Vec2 | None = None
+    """Adapted first moments of link 1 and 2 about their joints, in addition to the nominal ones."""
+    friction_estimate_nm: Vec2 | None = None
+    """Adapted dry friction of both joints."""
 
 
 class TetherState(Record, frozen=True, kw_only=True):

@@ -1,0 +1,89 @@
+"""Adaptive estimates of loads that are linear in unknown constants: what the norm-bounding gains of the paper cannot cancel.
+
+    theta' = Gamma phi' s - nu_theta theta,    each theta_i projected to its bounds
+
+phi holds a constant for each of x, y and z (an unknown force: weight, wind, tilt, rotors that lose thrust), the levers of gravity of
+both links (their first moments, payload included), and the direction in which each joint is meant to turn (dry friction). tau contains
+the estimated load. With V_theta = (theta - theta*)' Gamma^-1 (theta - theta*) / 2 added to the paper's Lyapunov function, the term
+s' phi (theta* - theta) of V' cancels for constant theta*; leakage, projection and a load that varies leave a bounded remainder, as the
+leakage of H does (eq. adaptive_law_full). s is integrated and not e: at s = 0 the target impedance holds, so a measured force still
+moves the arm as K_d and K_p say.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.controller import AdaptiveConfig
+from companion.control.zero_order_hold import HoldTable
+from companion.model.types import Vec2, Vec3
+
+Rows = tuple[float, float, float, float, float]
+FRICTION_RATE_RAD_S = 0.1
+"""Joint rate below which the friction fades out, so that a joint at rest is not shaken."""
+
+
+class LoadAdaptation:
+    """Load on the rows x, y, z (N) and on both joints (N m), integrated with an exact zero-order hold.
+
+    Args:
+        config: rates, leakage and bounds.
+        moments_kg_m: first moments of link 1 and link 2 about their joints at the start; 0 if they are not known.
+    """
+
+    def __init__(self, config: AdaptiveConfig) -> None:
+        leakage = config.load_leakage
+        self._rate_xyz = config.load_rate_xyz
+        self._rate_moment, self._rate_friction = config.moment_rate, config.friction_rate
+        self._max_n, self._max_kg_m, self._max_nm = config.load_max_n, config.moment_max_kg_m, config.friction_max_nm
+        self.on = self._rate_moment + self._rate_friction + sum(self._rate_xyz) > 0.0
+
+        def held(dt_s: float) -> tuple[float, ...]:
+            decay = math.exp(-leakage * dt_s)
+            return (decay, (1.0 - decay) / leakage if leakage > 0.0 else dt_s)
+
+        self._held = HoldTable(held)
+        self.force_n: Vec3 = (0.0, 0.0, 0.0)
+        """Estimated force that the rotors must give in addition, world frame."""
+        self.moments_kg_m: Vec2 = (0.0, 0.0)
+        """Estimated first moments of the links about their joints, in addition to the nominal ones."""
+        self.friction_nm: Vec2 = (0.0, 0.0)
+        """Estimated dry friction of the joints."""
+        self._levers: Vec2 = (0.0, 0.0)
+        self._turning: Vec2 = (0.0, 0.0)
+
+    def joint_torque_nm(self, levers_m_s2: Vec2, wanted_rate_rad_s: Vec2) -> Vec2:
+        """Return the torque of the estimated gravity and friction.
+
+        Args:
+            levers_m_s2: gravity times the cosine of each link's elevation (`Manipulator.gravity_levers_m_s2`).
+            wanted_rate_rad_s: rate of each joint that the target impedance asks for.
+        """
+        if not self.on:
+            return (0.0, 0.0)
+        (m1, m2), (u1, u2), (f1, f2), (r1, r2) = self.moments_kg_m, levers_m_s2, self.friction_nm, wanted_rate_rad_s
+        t1, t2 = self._turning = (math.tanh(r1 / FRICTION_RATE_RAD_S), math.tanh(r2 / FRICTION_RATE_RAD_S))
+        self._levers = levers_m_s2
+        return (m1 * u1 + m2 * u2 + f1 * t1, f2 * t2 - m2 * u2)
+
+    def advance(self, dt_s: float, s: Rows, learn: bool) -> None:
+        """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation."""
+        if not self.on or not learn:
+            return
+        decay, step = self._held[dt_s]
+        s0, s1, s2, s6, s7 = s
+        (u1, u2), (t1, t2) = self._levers, self._turning
+
+        def updated(value: float, rate: float, error: float, low: float, high: float) -> float:
+            value = decay * value - step * rate * error
+            return low if value < low else high if value > high else value
+
+        (x, y, z), (rx, ry, rz), n = self.force_n, self._rate_xyz, self._max_n
+        self.force_n = (updated(x, rx, s0, -n, n), updated(y, ry, s1, -n, n), updated(z, rz, s2, -n, n))
+        (m1, m2), rate, most = self.moments_kg_m, self._rate_moment, self._max_kg_m
+        self.moments_kg_m = (
+            updated(m1, rate, s6 * u1, -most, most),
+            updated(m2, rate, (s6 - s7) * u2, -most, most),
+        )
+        (f1, f2), rate, most = self.friction_nm, self._rate_friction, self._max_nm
+        self.friction_nm = (updated(f1, rate, s6 * t1, 0.0, most), updated(f2, rate, s7 * t2, 0.0, most))
