@@ -17,7 +17,31 @@ NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
 
 
-class AdaptiveConfig(Model):
+class _LawConfig(Model):
+    """Settings of every law: the measured force, what is compensated beyond its own terms, and the limits of its commands."""
+
+    force_lowpass_hz: Positive
+    desired_force_time_s: Positive | None = None
+    """T_d of F_d = lowpass(F_ext) on the joint rows. If it is absent, F_d = 0 and the arm sags under a carried payload."""
+    force_feedforward_xyz: NonNegative3 = (0.0, 0.0, 0.0)
+    """Share of the measured F_ext that the base carries directly, per world axis."""
+    disturbance_time_xyz_s: NonNegative3 = (0.0, 0.0, 0.0)
+    """Time constant of the disturbance observer, per world axis. It estimates and compensates the forces on the base that are neither
+    commanded nor fed forward. 0 switches it off, as in the paper."""
+    disturbance_lag_s: NonNegative = 0.1
+    """Lag from the commanded to the actual force that the observer assumes."""
+    disturbance_max_n: NonNegative = 6.0
+    """Bound of the observer's estimate, per axis."""
+    feedforward_lead_s: NonNegative = 0.0
+    """Lead of the feedforward of the reference's horizontal acceleration (a + lead times jerk), for the delay of the attitude loop."""
+    arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the vehicle file's `arm.joint_friction_nm` that is fed forward along the reference joint rate."""
+    lateral_force_max_n: Positive = 12.0
+    attitude_filter_rad_s: Positive = 30.0
+    attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
+
+
+class AdaptiveConfig(_LawConfig):
     """Adaptive impedance control (paper, tab:control_parameters).
 
     Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
@@ -50,7 +74,6 @@ class AdaptiveConfig(Model):
     acceleration_cap: NonNegative
     """Largest ||S chi_dd|| that may enter rho; 0 switches H_3 off."""
     acceleration_lowpass_hz: Positive
-    force_lowpass_hz: Positive
     h_max: Positive4 | None = None
     """Bound of H_0 .. H_3 (projection); null leaves them to the leakage, as in the paper."""
     load_rate_xyz: NonNegative3 = (0.0, 0.0, 0.0)
@@ -69,28 +92,10 @@ class AdaptiveConfig(Model):
     """Bound of the adaptive joint friction (projection)."""
     arm_gravity_nominal: bool = True
     """Feed the arm's gravity torque forward with the vehicle file's masses."""
-    desired_force_time_s: Positive | None = None
-    """T_d of F_d = lowpass(F_ext). If it is absent, F_d = 0 as in the paper."""
-    force_feedforward_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Share of the measured F_ext that the base carries directly, per world axis."""
     base_compliance_xyz: NonNegative3 = (0.0, 0.0, 0.0)
     """Share of the measured F_ext that enters e_tau on the base rows (0: as in the paper)."""
-    disturbance_time_xyz_s: NonNegative3 = (0.0, 0.0, 0.0)
-    """Time constant of the disturbance observer, per world axis. It estimates and compensates the forces on the base that are neither
-    commanded nor fed forward. 0 switches it off, as in the paper."""
-    disturbance_lag_s: NonNegative = 0.1
-    """Lag from the commanded to the actual force that the observer assumes."""
-    disturbance_max_n: NonNegative = 6.0
-    """Bound of the observer's estimate, per axis."""
-    feedforward_lead_s: NonNegative = 0.0
-    """Lead of the feedforward of the reference's horizontal acceleration (a + lead times jerk), for the delay of the attitude loop."""
     arm_inertia_nominal: bool = False
     """Feed the arm's nominal inertia and Coriolis torque forward in place of M_d. Vehicle and coupling stay unknown."""
-    arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the vehicle file's `arm.joint_friction_nm` that is fed forward along the reference joint rate."""
-    lateral_force_max_n: Positive = 12.0
-    attitude_filter_rad_s: Positive = 30.0
-    attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
 
     @model_validator(mode="after")
     def _conditions(self) -> Self:
@@ -111,18 +116,7 @@ class AdaptiveConfig(Model):
         return self
 
 
-class _ComparisonConfig(Model):
-    """Settings that the two comparison laws share."""
-
-    desired_force_time_s: Positive | None = None
-    """T_d of F_d = lowpass(F_ext) on the joint rows. If it is absent, F_d = 0 and the arm sags under a carried payload."""
-    force_lowpass_hz: Positive
-    lateral_force_max_n: Positive = 12.0
-    attitude_filter_rad_s: Positive = 30.0
-    attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
-
-
-class CscConfig(_ComparisonConfig):
+class CscConfig(_LawConfig):
     """Complete-system compliance (after Cataldi et al., IROS 2016): one impedance for vehicle and arm, realised by the nominal model.
 
     Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
@@ -145,7 +139,7 @@ class CscConfig(_ComparisonConfig):
     """Factor on the masses and inertias of the vehicle file, for studies of a wrong model."""
 
 
-class PscConfig(_ComparisonConfig):
+class PscConfig(_LawConfig):
     """Partitioned compliance (after Wang et al., RA-L 2024): impedance of the arm alone, position control of the vehicle alone."""
 
     schema_version: Literal[1]

@@ -16,9 +16,9 @@ from companion.config.controller import AdaptiveConfig
 from companion.config.vehicle import Vehicle
 from companion.control.arm_inertia import ArmInertia
 from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
-from companion.control.disturbance import DisturbanceObserver
+from companion.control.compensation import Compensation
 from companion.control.impedance import Impedance
-from companion.control.load_adaptation import FRICTION_RATE_RAD_S, LoadAdaptation, Rows
+from companion.control.load_adaptation import LoadAdaptation, Rows
 from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
@@ -130,22 +130,12 @@ class AdaptiveController:
         self._force = ForceFilter(config.force_lowpass_hz)
         self._desired = DesiredForce(config.desired_force_time_s)
         self._actuation = Actuation(config, vehicle, hover_thrust)
-        mass_kg = vehicle.airframe.mass_kg
-        self._disturbance = DisturbanceObserver(
-            mass_kg, config.disturbance_time_xyz_s, config.disturbance_lag_s, config.disturbance_max_n
-        )
+        self._compliance = config.base_compliance_xyz
+        self._compensation = Compensation(config, vehicle, self._compliance, self._inertia[:2])
         self._arm_inertia = ArmInertia(vehicle) if config.arm_inertia_nominal else None
         self._gravity_nominal = config.arm_gravity_nominal
         self._up_m_s2: Vec2 = (0.0, GRAVITY_M_S2)
-        self._friction_nm = config.arm_friction_share * vehicle.arm.joint_friction_nm
-        self._weight_n = mass_kg * GRAVITY_M_S2
-        self._force_share, self._compliance = config.force_feedforward_xyz, config.base_compliance_xyz
-        self._lead_s = config.feedforward_lead_s
-        shares = zip(self._force_share, self._compliance, strict=True)
-        x, y, z = (min(1.0, fed + yielding) for fed, yielding in shares)
-        self._accounted: Vec3 = (x, y, z)
-        self._known_n: Vec3 = (0.0, 0.0, 0.0)
-        """Known force on the base in the last tick: rotors, weight, and the part of the measured force that the law accounts for."""
+        self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self.hover_thrust = hover_thrust
         """Normalised hover thrust, for the log. Its estimator sets it before every step."""
 
@@ -156,7 +146,7 @@ class AdaptiveController:
         acceleration = self._acceleration.step(dt_s, state)
         force = self._force.step(dt_s, state.force_ext_world_n)
         learn = vertical_scale >= 1.0 and not clipped_before
-        disturbance = self._disturbance.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
+        self._compensation.observe(dt_s, state, learn)
         body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
         error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
         e_tau, tau_d, arm_gravity = self._torque_error(state.arm_rad, body_x, body_z, force)
@@ -168,11 +158,11 @@ class AdaptiveController:
         varpi = self._varpi
         robust = rho / (varpi if varpi > norm_s else norm_s)
         tau = self._tau(s, robust, error_rate, tau_d, reference)
-        wanted_n = self._base_force(tau, reference, force, disturbance)
+        wanted_n = self._base_force(tau, reference, force)
         wanted_nm = self._arm_torque(tau, arm_gravity, s, e_tau, error_rate, state, reference)
         sent.step(dt_s, wanted_n, wanted_nm, body_z, reference.yaw_rad, vertical_scale)
         (f0, f1, f2), (t6, t7) = sent.force_world_n, sent.arm_torque_nm
-        self._remember(sent.force_world_n, force)
+        self._compensation.remember(sent.force_world_n, force)
         adaptation.advance(dt_s, norm_s, regressor, clipped_before)
         load.advance(dt_s, active(s), learn)
         gamma = impedance.advance(dt_s, e_tau)
@@ -266,20 +256,10 @@ class AdaptiveController:
             m7 * (a7 - p7 * v7) - (l7 + robust * w7) * s7 - d7 * g7 - tau_d[1],
         )
 
-    def _base_force(self, tau: Rows, reference: Reference, force: Vec3, disturbance: Vec3) -> Vec3:
-        """Return the force on the base: tau plus the weight, with force feedforward, disturbance compensation and the jerk lead
-        applied.
-        """
-        (x, y, z, _, _), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = tau, force, disturbance, self._force_share
-        q0, q1, q2 = self._load.force_n
-        x += q0 - (c0 * f0 + d0)
-        y += q1 - (c1 * f1 + d1)
-        z += q2 - (c2 * f2 + d2)
-        lead_s = self._lead_s
-        if lead_s > 0.0:
-            jerk, inertia = reference.jerk_world_m_s3, self._inertia
-            x += inertia[0] * lead_s * jerk[0]
-            y += inertia[1] * lead_s * jerk[1]
+    def _base_force(self, tau: Rows, reference: Reference, force: Vec3) -> Vec3:
+        """Return the force on the base: tau with the adaptive load and the compensation, plus the weight."""
+        (x, y, z, _, _), (q0, q1, q2) = tau, self._load.force_n
+        x, y, z = self._compensation.base_force_n((x + q0, y + q1, z + q2), force, reference)
         return (x, y, z + self._weight_n)
 
     def _arm_torque(
@@ -301,9 +281,10 @@ class AdaptiveController:
         rates = state.arm_rate_rad_s
         if self._gravity_nominal:
             t6, t7 = t6 + gravity[0], t7 + gravity[1]
+        wanted_rate = (rates[0] - s[6], rates[1] - s[7])
         if self._load.on:
             levers = self._manipulator.gravity_levers_m_s2(state.arm_rad, *self._up_m_s2)
-            first, second = self._load.joint_torque_nm(levers, (rates[0] - s[6], rates[1] - s[7]))
+            first, second = self._load.joint_torque_nm(levers, wanted_rate)
             t6, t7 = t6 + first, t7 + second
         if self._arm_inertia is not None:
             _, _, _, m6, m7 = self._inertia
@@ -315,14 +296,4 @@ class AdaptiveController:
             first, second = self._arm_inertia.torque_nm(state.arm_rad, rates, (a6, a7))
             t6 += first - m6 * a6
             t7 += second - m7 * a7
-        if self._friction_nm > 0.0:
-            t6 += self._friction_nm * math.tanh((rates[0] - s[6]) / FRICTION_RATE_RAD_S)
-            t7 += self._friction_nm * math.tanh((rates[1] - s[7]) / FRICTION_RATE_RAD_S)
-        return (t6, t7)
-
-    def _remember(self, sent_n: Vec3, force: Vec3) -> None:
-        """Store the known force for the disturbance observer. It contains the measured force as far as the law feeds it forward or
-        complies with it.
-        """
-        (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
-        self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)
+        return self._compensation.joint_torque_nm((t6, t7), wanted_rate)

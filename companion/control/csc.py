@@ -19,7 +19,7 @@ from companion.control.common import tracking_errors
 from companion.control.dynamics import chi_rate_from_body_rate, rotation_matrix
 from companion.control.model_based import ModelBasedLaw
 from companion.control.types import PlantState, Wrench
-from companion.model.frames import body_x_z_axes_world, euler_zyx_from_quat, yaw_from_quat
+from companion.model.frames import euler_zyx_from_quat, yaw_from_quat
 from companion.model.types import Reference, Vec3, Vec8
 
 
@@ -27,7 +27,7 @@ class CscController(ModelBasedLaw):
     """The CSC law for vehicle and arm."""
 
     def __init__(self, config: CscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
-        super().__init__(config, vehicle, hover_thrust, config.model_mass_scale)
+        super().__init__(config, vehicle, hover_thrust, config.external_xyz, config.model_mass_scale)
         self._c = config
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
@@ -36,12 +36,13 @@ class CscController(ModelBasedLaw):
         error, error_rate = tracking_errors(state, reference, yaw_from_quat(state.attitude_wxyz))
         tau_ext, e_tau = self._external(state, force)
         tau = self._tau(state, reference, error, error_rate, e_tau)
-        self._actuation.step(
+        self._send(
             dt_s,
+            state,
+            reference,
             (tau[0] - tau_ext[0], tau[1] - tau_ext[1], tau[2] - tau_ext[2]),
             (tau[6] - tau_ext[6], tau[7] - tau_ext[7]),
-            body_x_z_axes_world(state.attitude_wxyz)[1],
-            reference.yaw_rad,
+            force,
             vertical_scale,
         )
         return self._end(dt_s, error, error_rate, e_tau, force)

@@ -15,12 +15,11 @@ from __future__ import annotations
 import math
 
 from companion.config.controller import AdaptiveConfig
+from companion.control.compensation import FRICTION_RATE_RAD_S
 from companion.control.zero_order_hold import HoldTable
 from companion.model.types import Vec2, Vec3
 
 Rows = tuple[float, float, float, float, float]
-FRICTION_RATE_RAD_S = 0.1
-"""Joint rate below which the friction fades out, so that a joint at rest is not shaken."""
 
 
 class LoadAdaptation:

@@ -6,14 +6,15 @@ from typing import Protocol
 
 from companion.config.vehicle import Vehicle
 from companion.control.common import ZERO8, Actuation, ActuationConfig, DesiredForce, ForceFilter
+from companion.control.compensation import Compensation, CompensationConfig
 from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
-from companion.model.frames import quat_conjugate, quat_rotate
-from companion.model.types import ControlLog, Vec2, Vec3, Vec8
+from companion.model.frames import body_x_z_axes_world, quat_conjugate, quat_rotate
+from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec8
 
 
-class ModelBasedConfig(ActuationConfig, Protocol):
+class ModelBasedConfig(ActuationConfig, CompensationConfig, Protocol):
     """The part of a model-based law's configuration that concerns the measured force."""
 
     @property
@@ -32,19 +33,50 @@ class ModelBasedLaw:
         config: configuration of the law.
         vehicle: the nominal machine, without payload.
         hover_thrust: normalised thrust that carries it, 0 to 1.
+        answered_xyz: share of the measured force, per world axis, that the law itself answers.
         model_mass_scale: ratio of the model's masses to the nominal ones.
     """
 
     def __init__(
-        self, config: ModelBasedConfig, vehicle: Vehicle, hover_thrust: float, model_mass_scale: float = 1.0
+        self,
+        config: ModelBasedConfig,
+        vehicle: Vehicle,
+        hover_thrust: float,
+        answered_xyz: Vec3 = (0.0, 0.0, 0.0),
+        model_mass_scale: float = 1.0,
     ) -> None:
         self._dynamics = Dynamics(vehicle, model_mass_scale)
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._force = ForceFilter(config.force_lowpass_hz)
         self._desired = DesiredForce(config.desired_force_time_s)
         self._actuation = Actuation(config, vehicle, hover_thrust)
+        mass_kg = vehicle.airframe.mass_kg
+        self._compensation = Compensation(config, vehicle, answered_xyz, (mass_kg, mass_kg))
         self.hover_thrust = hover_thrust
         """Normalised hover thrust, for the log. Its estimator sets it before every step."""
+
+    def _send(
+        self,
+        dt_s: float,
+        state: PlantState,
+        reference: Reference,
+        wanted_n: Vec3,
+        torque_nm: Vec2,
+        force_world_n: Vec3,
+        vertical_scale: float,
+    ) -> None:
+        """Compensate force and torques, and convert them to commands."""
+        compensation, sent = self._compensation, self._actuation
+        compensation.observe(dt_s, state, vertical_scale >= 1.0 and not sent.any_clipped)
+        sent.step(
+            dt_s,
+            compensation.base_force_n(wanted_n, force_world_n, reference),
+            compensation.joint_torque_nm(torque_nm, reference.arm_rate_rad_s),
+            body_x_z_axes_world(state.attitude_wxyz)[1],
+            reference.yaw_rad,
+            vertical_scale,
+        )
+        compensation.remember(sent.force_world_n, force_world_n)
 
     def _joint_torques_nm(self, state: PlantState, force_world_n: Vec3) -> tuple[Vec2, Vec2]:
         """Return J'F and J'F_d, N m."""
@@ -69,13 +101,13 @@ class ModelBasedLaw:
         log = ControlLog(
             error=error,
             error_rate=error_rate,
-            sliding=ZERO8,  # sliding
-            gamma=ZERO8,  # gamma
+            sliding=ZERO8,
+            gamma=ZERO8,
             tau=(fx, fy, fz, 0.0, 0.0, 0.0, t1, t2),
             e_tau=e_tau,
-            h_hat=(0.0, 0.0, 0.0, 0.0),  # h_hat
-            zeta=0.0,  # zeta
-            rho=0.0,  # rho
+            h_hat=(0.0, 0.0, 0.0, 0.0),
+            zeta=0.0,
+            rho=0.0,
             force_ext_world_n=force_world_n,
             attitude_desired_rad=sent.roll_pitch_yaw_rad,
             hover_thrust=self.hover_thrust,

@@ -79,8 +79,8 @@ class PscController(ModelBasedLaw):
         error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
         e_tau, torque = self._arm(state, reference, error, error_rate, force)
         wanted = self._vehicle(reference, error, error_rate, self._mass_kg + payload_kg)
+        self._send(dt_s, state, reference, wanted, torque, force, vertical_scale)
         sent = self._actuation
-        sent.step(dt_s, wanted, torque, body_z, reference.yaw_rad, vertical_scale)
         self._commanded_n = sent.collective_n
         self._integrate(dt_s, error, flying, sent.clipped)
         rows = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau)

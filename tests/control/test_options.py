@@ -187,6 +187,6 @@ def test_a_force_that_the_base_gives_way_to_is_not_observed_away(config: FlightC
                 jerk_world_m_s3=(0.0, 0.0, 0.0),
             )
             controller.step(0.005, state, reference, 1.0)
-        found.append(controller._disturbance.force_n[0])
+        found.append(controller._compensation._observer.force_n[0])
     without, with_rows = found
     assert without - with_rows > 1.0

@@ -1,0 +1,110 @@
+"""What a law may compensate beyond its own terms: measured force, estimated disturbances, the attitude loop's delay, joint friction.
+
+Every law has the same, so that laws can be compared with the same extras.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+from companion.config.vehicle import Vehicle
+from companion.control.disturbance import DisturbanceObserver
+from companion.control.types import PlantState
+from companion.model.constants import GRAVITY_M_S2
+from companion.model.types import Reference, Vec2, Vec3
+
+FRICTION_RATE_RAD_S = 0.1
+"""Joint rate below which the friction fades out, so that a joint at rest is not shaken."""
+
+
+class CompensationConfig(Protocol):
+    """The part of a law's configuration that concerns its extras."""
+
+    @property
+    def force_feedforward_xyz(self) -> Vec3:
+        """Share of the measured force that the base carries directly, per world axis."""
+
+    @property
+    def disturbance_time_xyz_s(self) -> Vec3:
+        """Time constant of the disturbance observer, per world axis."""
+
+    @property
+    def disturbance_lag_s(self) -> float:
+        """Lag from the commanded to the actual force, s."""
+
+    @property
+    def disturbance_max_n(self) -> float:
+        """Bound of the observer's estimate, N."""
+
+    @property
+    def feedforward_lead_s(self) -> float:
+        """Lead of the feedforward of the reference's horizontal acceleration, s."""
+
+    @property
+    def arm_friction_share(self) -> float:
+        """Share of the vehicle file's joint friction that is fed forward."""
+
+
+class Compensation:
+    """Forces and torques to add to those of a law.
+
+    Args:
+        config: of the law.
+        vehicle: nominal machine.
+        answered_xyz: share of the measured force, per world axis, that the law itself answers, so that the observer leaves it alone.
+        inertia_xy_kg: inertia that the law gives the base along x and y, for the lead.
+    """
+
+    def __init__(
+        self, config: CompensationConfig, vehicle: Vehicle, answered_xyz: Vec3, inertia_xy_kg: tuple[float, float]
+    ) -> None:
+        mass_kg = vehicle.airframe.mass_kg
+        self._weight_n = mass_kg * GRAVITY_M_S2
+        self._observer = DisturbanceObserver(
+            mass_kg, config.disturbance_time_xyz_s, config.disturbance_lag_s, config.disturbance_max_n
+        )
+        self._force_share, self._lead_s, self._inertia = (
+            config.force_feedforward_xyz,
+            config.feedforward_lead_s,
+            inertia_xy_kg,
+        )
+        x, y, z = (min(1.0, fed + own) for fed, own in zip(self._force_share, answered_xyz, strict=True))
+        self._accounted: Vec3 = (x, y, z)
+        self._known_n: Vec3 = (0.0, 0.0, 0.0)
+        """Known force on the base in the last tick: rotors, weight, and the part of the measured force that is accounted for."""
+        self._friction_nm = config.arm_friction_share * vehicle.arm.joint_friction_nm
+
+    def observe(self, dt_s: float, state: PlantState, learn: bool) -> None:
+        """Run the disturbance observer for one tick; without `learn` its estimate does not change."""
+        self._observer.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
+
+    def base_force_n(self, wanted_n: Vec3, force: Vec3, reference: Reference) -> Vec3:
+        """Return the wanted force with the measured force, the estimated disturbance and the lead compensated, world frame."""
+        (x, y, z), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = wanted_n, force, self._observer.force_n, self._force_share
+        x -= c0 * f0 + d0
+        y -= c1 * f1 + d1
+        z -= c2 * f2 + d2
+        lead_s = self._lead_s
+        if lead_s > 0.0:
+            jerk, (mx, my) = reference.jerk_world_m_s3, self._inertia
+            x += mx * lead_s * jerk[0]
+            y += my * lead_s * jerk[1]
+        return (x, y, z)
+
+    def joint_torque_nm(self, torque_nm: Vec2, wanted_rate_rad_s: Vec2) -> Vec2:
+        """Return the torques with friction added along the rates that the joints are meant to have. Along the measured rates it would
+        shake a joint at rest.
+        """
+        if self._friction_nm == 0.0:
+            return torque_nm
+        (t1, t2), (r1, r2) = torque_nm, wanted_rate_rad_s
+        return (
+            t1 + self._friction_nm * math.tanh(r1 / FRICTION_RATE_RAD_S),
+            t2 + self._friction_nm * math.tanh(r2 / FRICTION_RATE_RAD_S),
+        )
+
+    def remember(self, sent_n: Vec3, force: Vec3) -> None:
+        """Store the known force for the observer. It contains the measured force as far as it is accounted for."""
+        (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
+        self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)
