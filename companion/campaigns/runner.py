@@ -80,6 +80,7 @@ class Campaign(ABC):
             "command": self.command,
             "mission": sources.mission,
             "vehicle": sources.vehicle,
+            "world": self.configs[0].laboratory.name,
             "overrides": list(self.overrides),
         }
 

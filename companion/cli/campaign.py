@@ -13,10 +13,11 @@ from typing import Any
 from rich.console import Console
 
 from companion.campaigns.runner import Campaign, run
+from companion.cli.world_options import add_world
 from companion.config.document import ConfigError
 from companion.mission.check import check_mission
 from companion.runtime.console import terminal_console
-from companion.sitl_config.loader import SitlConfig, load_sitl
+from companion.sitl_config.loader import DEFAULT_WORLD, SitlConfig, load_sitl
 
 DEFAULT_MISSION = "configs/missions/catch.yaml"
 PIPED_WIDTH = 132
@@ -24,12 +25,13 @@ PIPED_WIDTH = 132
 CAMPAIGN_WIDTH = 168
 
 
-def add_options(parser: argparse.ArgumentParser, *, one_law: bool) -> None:
+def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str = DEFAULT_WORLD) -> None:
     """Add the options that all campaigns share.
 
     Args:
         parser: of the command.
         one_law: whether the campaign flies one control law, for `--controller` and `--preset`.
+        world: default of `--world`.
     """
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     if one_law:
@@ -38,6 +40,7 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool) -> None:
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="override for every flight"
     )
+    add_world(parser, world)
     parser.add_argument(
         "--jobs", type=count, metavar="N", help="number of flights at the same time (default: by the cores)"
     )
@@ -72,14 +75,20 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def checked(
-    mission: str, vehicle: str | None, controller: str | None, preset: str | None, overrides: Sequence[str]
+    mission: str,
+    vehicle: str | None,
+    controller: str | None,
+    preset: str | None,
+    overrides: Sequence[str],
+    *,
+    world: str,
 ) -> SitlConfig:
     """Load a configuration and check its mission.
 
     Raises:
         ConfigError: one line per problem.
     """
-    config = load_sitl(mission, vehicle, controller, preset, overrides)
+    config = load_sitl(mission, vehicle, controller, preset, overrides, world=world)
     problems = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
     if problems:
         raise ConfigError(problems)

@@ -74,7 +74,14 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         overrides = (*arguments.overrides, *variant.overrides)
         try:
             configs.append(
-                load(arguments.mission, arguments.vehicle, variant.controller, variant.base_preset, overrides)
+                load(
+                    arguments.mission,
+                    arguments.vehicle,
+                    variant.controller,
+                    variant.base_preset,
+                    overrides,
+                    world=arguments.world,
+                )
             )
         except ConfigError as error:
             # A problem of the first variant is usually one of all; a problem of a later one is its own.

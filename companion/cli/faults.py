@@ -11,6 +11,7 @@ from companion.analysis.table import for_terminal
 from companion.campaigns.faults.campaign import Faults, kinds_list, kinds_table
 from companion.campaigns.faults.variants import WIRES, planned
 from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, fly, names, wide_console
+from companion.cli.world_options import add_seed
 from companion.config.document import ConfigError
 from companion.config.explain import nearest
 from companion.model.exit_codes import EXIT_OK
@@ -44,6 +45,7 @@ def add_parser(commands: Any) -> None:
         help=f"fly {len(WIRES)} chosen faults with `companion fly --sitl`, a minute each",
     )
     add_options(parser, one_law=True)
+    add_seed(parser)
     parser.set_defaults(run=run)
 
 
@@ -87,7 +89,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
             raise ConfigError(["companion faults: --set world.faults: the campaign sets it; use --kinds and --phases"])
     given = arguments.vehicle, arguments.controller, arguments.preset
     return Faults(
-        configs=[checked(arguments.mission, *given, arguments.overrides)],
+        configs=[checked(arguments.mission, *given, arguments.overrides, world=arguments.world)],
         flights=[
             {"variant": 0, "kind": v.kind, "size": v.size, "duration_s": v.duration_s, "phase": phase}
             for v, phase in flights
@@ -100,7 +102,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
 
 def _fly_options(arguments: argparse.Namespace) -> list[str]:
     options = [arguments.mission]
-    for name in ("vehicle", "controller", "preset"):
+    for name in ("vehicle", "controller", "preset", "world"):
         value = getattr(arguments, name)
         options += [f"--{name}", value] if value is not None else []
     for override in arguments.overrides:

@@ -14,6 +14,7 @@ from typing import Any
 
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
+from companion.cli.world_options import add_seed, add_world
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig
 from companion.install.extras import missing_extra
@@ -183,6 +184,8 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="e.g. world.payload_kg=0.3"
     )
+    add_world(parser)
+    add_seed(parser)
 
 
 def _load(arguments: argparse.Namespace, *, hardware: bool) -> SitlConfig:
@@ -196,6 +199,7 @@ def _load(arguments: argparse.Namespace, *, hardware: bool) -> SitlConfig:
         arguments.preset,
         arguments.overrides,
         hardware=hardware,
+        world=arguments.world,
     )
 
 

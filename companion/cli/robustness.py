@@ -66,7 +66,7 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
     law = arguments.controller or (kept.controller if kept is not None else None)
     numbers = range(arguments.first, arguments.first + arguments.draws)
     return Robustness(
-        configs=[checked(mission, arguments.vehicle, law, preset, arguments.overrides)],
+        configs=[checked(mission, arguments.vehicle, law, preset, arguments.overrides, world=arguments.world)],
         flights=[{"variant": 0, "name": case.name, "number": None, "world": case.knobs()} for case in cases]
         or [{"variant": 0, "name": f"draw {n}", "number": n, "world": None} for n in numbers],
         **common(arguments),

@@ -36,7 +36,7 @@ MANY_OPTIONS = 12
 
 
 @functools.cache
-def _schema_of(model: type[Model]) -> _Node:
+def schema_of(model: type[Model]) -> _Node:
     """Return the model's JSON Schema; making it takes longer than all other validation."""
     return model.model_json_schema()
 
@@ -48,10 +48,12 @@ def validate(model: type[M], document: Document) -> M | None:
         model: the model to build.
         document: the document after overrides.
     """
-    schema = _schema_of(model)
+    schema = schema_of(model)
     found = [
-        _problem(RANK_VALUE, document.origin(at), at, f"expected {describe(node, schema)}, got {_show(value)}")
-        for at, node, value in _booleans(schema, document.data, ())
+        # In JSON `true` equals the constant 1.
+        problem(RANK_VALUE, document.origin(at), at, f"expected {describe(node, schema)}, got {_show(value)}")
+        for at, node, value in values(schema, document.data)
+        if isinstance(value, bool) and node is not None and ("const" in node or "enum" in node)
     ]
     try:
         built = model.model_validate_json(json.dumps(document.data), strict=True)
@@ -72,7 +74,7 @@ def _problems(error: ValidationError, schema: _Node, document: Document) -> list
         at, node, parent = _walk(schema, detail["loc"])
         if detail["type"] == "extra_forbidden":
             text, instead = _unknown(at, parent, document)
-            problems.append(_problem(RANK_KEY, document.key_origin(at), at, text))
+            problems.append(problem(RANK_KEY, document.key_origin(at), at, text))
             if instead is not None:
                 meant.add((*at[:-1], instead))
             continue
@@ -87,7 +89,7 @@ def _problems(error: ValidationError, schema: _Node, document: Document) -> list
             problems.append(_value_problem(detail, at, node, schema, document))
     for at, expected in missing:
         if at not in meant:
-            problems.append(_problem(RANK_MISSING, document.origin(at[:-1]), at, f"missing; expected {expected}"))
+            problems.append(problem(RANK_MISSING, document.origin(at[:-1]), at, f"missing; expected {expected}"))
     return problems
 
 
@@ -98,23 +100,23 @@ def _value_problem(
     context = detail.get("ctx", {})
     if kind in ("condition", "value_error"):
         text = context["text"] if kind == "condition" else str(context["error"])
-        return _problem(RANK_VALUE, document.origin(at), at, text)
+        return problem(RANK_VALUE, document.origin(at), at, text)
     if kind in ("union_tag_invalid", "union_tag_not_found") and node is not None:
         tags = list(node["discriminator"]["mapping"])
         at = (*at, node["discriminator"]["propertyName"])
         expected = f"one of {', '.join(tags)}"
         if kind == "union_tag_not_found":
-            return _problem(RANK_MISSING, document.origin(at), at, f"missing; expected {expected}")
+            return problem(RANK_MISSING, document.origin(at), at, f"missing; expected {expected}")
         value = _get(document, at)
         text = f"expected {expected}, got {_show(value)}{_did_you_mean(str(value), tags)}"
-        return _problem(RANK_VALUE, document.origin(at), at, text)
+        return problem(RANK_VALUE, document.origin(at), at, text)
     value = _get(document, at)
     expected = describe(node, schema) if node is not None else str(detail["msg"])
-    return _problem(RANK_VALUE, document.origin(at), at, f"expected {expected}, got {_show(value)}{_hint(value, node)}")
+    return problem(RANK_VALUE, document.origin(at), at, f"expected {expected}, got {_show(value)}{_hint(value, node)}")
 
 
-def _problem(rank: int, origin: Origin, at: Location, text: str) -> Problem:
-    """Return a problem; its text leaves out the key if the command-line option already names it."""
+def problem(rank: int, origin: Origin, at: Location, text: str) -> Problem:
+    """Return a problem of the value at a location; its text leaves out the key if the command-line option already names it."""
     key = key_path(at)
     if not key or (not origin.line and origin.source.endswith(f".{key}")):
         return Problem(rank, origin, text)
@@ -253,7 +255,8 @@ def _resolve(node: _Node, schema: _Node) -> _Node:
 
 def _step(node: _Node, step: str | int) -> _Node | None:
     if isinstance(step, str):
-        return cast("_Node | None", node.get("properties", {}).get(step))
+        other = node.get("additionalProperties")
+        return cast("_Node | None", node.get("properties", {}).get(step, other if isinstance(other, dict) else None))
     prefix = node.get("prefixItems", [])
     return prefix[step] if step < len(prefix) else node.get("items")
 
@@ -275,20 +278,24 @@ def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | 
     return tuple(at), node, parent
 
 
-def _booleans(
-    node: _Node | None, data: Data, at: Location, root: _Node | None = None
+def values(
+    node: _Node | None, data: Data, at: Location = (), root: _Node | None = None
 ) -> Iterator[tuple[Location, _Node | None, Data]]:
-    """Yield each true or false where the schema expects a constant: in JSON `true` equals the constant 1."""
+    """Yield every value of a document, a container before its contents, with its location and its node of the model's JSON Schema.
+
+    Args:
+        node: schema node of the data; None for data that the schema does not know.
+        data: plain data.
+        at: location of the data.
+        root: the whole schema; None if `node` is it.
+    """
     root = root if root is not None else node or {}
     node = _resolve(node, root) if node is not None else None
     if node is not None and "discriminator" in node and isinstance(data, dict):
         tag = data.get(node["discriminator"]["propertyName"])
         reference = node["discriminator"]["mapping"].get(tag) if isinstance(tag, str) else None
         node = _resolve({"$ref": reference}, root) if reference else None
-    if isinstance(data, bool):
-        if node is not None and ("const" in node or "enum" in node):
-            yield at, node, data
-        return
+    yield at, node, data
     children: Iterator[tuple[str | int, Data]]
     if isinstance(data, dict):
         children = iter(data.items())
@@ -297,4 +304,4 @@ def _booleans(
     else:
         return
     for step, child in children:
-        yield from _booleans(_step(node, step) if node is not None else None, child, (*at, step), root)
+        yield from values(_step(node, step) if node is not None else None, child, (*at, step), root)

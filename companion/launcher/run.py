@@ -78,7 +78,12 @@ def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[Fligh
     }
     summary = summarise(log, **about) if log is not None else empty_summary(**about)
     summary["autopilot"] = autopilot_of(log, result.world)
-    summary["world"] = result.world.get("knobs")
+    knobs = result.world.get("knobs")
+    summary["world"] = knobs and {
+        "name": config.laboratory.name,
+        "drawn": config.laboratory.drawn(config.world),
+        **knobs,
+    }
     logged = {event["id"] for event in summary["events"]}
     summary["events"] += [event for event in result.events if event["id"] not in logged]
     summary["events"] += result.guardian_events

@@ -5,19 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion.config.document import ConfigError, Document
-from companion.config.loader import FlightConfig, check_document, load_flight
-from companion.config.overrides import parse_overrides
+from companion.config.document import ConfigError, Data, Document
+from companion.config.explain import nearest
+from companion.config.loader import FlightConfig, load_flight
+from companion.config.overrides import apply_overrides, parse_overrides
+from companion.config.yaml_strict import read_document
+from companion.sitl_config.laboratory import Laboratory, check_world, take_ranges
 from companion.sitl_config.world import World
 
 WORLD_DIRECTORY = Path(__file__).parent / "worlds"
 """Built-in worlds are package data, so that they are found wherever the package is installed."""
+WORLDS = tuple(sorted(path.stem for path in WORLD_DIRECTORY.glob("*.yaml")))
+"""Names of the built-in worlds."""
+DEFAULT_WORLD = "ideal"
+"""The world of a simulated flight or campaign for which none is named."""
 
 
 class SitlConfig(FlightConfig):
     """A flight's configuration and the truth of its simulated world. The flight process and the core are given `flight`."""
 
     world: World = World()
+    laboratory: Laboratory = Laboratory()
+    """Where the world comes from; its ranges are drawn in `world`."""
 
     @property
     def flight(self) -> FlightConfig:
@@ -33,35 +42,63 @@ def load_sitl(
     overrides: Sequence[str] = (),
     *,
     hardware: bool = False,
+    world: str = DEFAULT_WORLD,
 ) -> SitlConfig:
-    """Read, override and check everything; arguments as for `load_flight`, with overrides of `world.` as well.
+    """Read, override, draw and check everything; arguments as for `load_flight`, with overrides of `world.` as well.
+
+    Args:
+        world: a built-in world, or a file.
 
     Raises:
-        ConfigError: one message per problem of all files and of the world.
+        ConfigError: one message per problem of all files.
     """
     lines: list[str] = []
-    flight = world = None
+    flight = simulated = None
     try:
         flight = load_flight(mission_path, vehicle_path, controller_law, preset, overrides, hardware=hardware)
     except ConfigError as error:
         lines += error.lines
     try:
-        world = load_world(overrides)
+        simulated = load_world(overrides, world)
     except ConfigError as error:
         lines += [line for line in error.lines if line not in lines]
-    if flight is None or world is None:
+    if flight is None or simulated is None:
         raise ConfigError(lines)
-    return SitlConfig(**{name: getattr(flight, name) for name in FlightConfig.model_fields}, world=world)
+    truth, laboratory = simulated
+    return SitlConfig(
+        **{name: getattr(flight, name) for name in FlightConfig.model_fields}, world=truth, laboratory=laboratory
+    )
 
 
-def load_world(overrides: Sequence[str] = ()) -> World:
-    """Return the simulated world of the `world.` overrides; there is no file of it.
+def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tuple[World, Laboratory]:
+    """Return a simulated world, drawn by its seed, and the laboratory that it was drawn from.
+
+    Args:
+        overrides: `--set` options; those of other sections are not read. They override ranges before the draw.
+        world: a built-in world, or a file.
 
     Raises:
         ConfigError: one message per problem.
     """
-    lines: list[str] = []
-    world = check_document(World, Document("world", {}), "world", parse_overrides(overrides), lines)
-    if world is None:
-        raise ConfigError(lines)
-    return world
+    document = _open_world(world)
+    apply_overrides(document, "world", parse_overrides(overrides))
+    ranges = take_ranges(document)
+    return check_world(document, ranges, _seed_of(document.data)), Laboratory(name=world, ranges=ranges)
+
+
+def _open_world(world: str) -> Document:
+    if world in WORLDS:
+        path = WORLD_DIRECTORY / f"{world}.yaml"
+        here = Path.cwd()
+        return read_document(path, str(path.relative_to(here)) if path.is_relative_to(here) else str(path))
+    if not Path(world).suffix and not Path(world).exists():
+        close = nearest(world, list(WORLDS))
+        hint = f" (did you mean {close}?)" if close else ""
+        raise ConfigError([f"--world {world}: expected {', '.join(WORLDS)} or a file, found neither{hint}"])
+    return read_document(world)
+
+
+def _seed_of(data: dict[str, Data]) -> int:
+    """Return the seed of a world's data; an invalid one is reported by the model."""
+    seed = data.get("seed", World().seed)
+    return seed if type(seed) is int and seed >= 0 else 0

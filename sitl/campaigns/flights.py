@@ -14,7 +14,9 @@ from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.config.loader import FlightConfig
 from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Sent, Severity
+from companion.sitl_config.laboratory import draw
 from companion.sitl_config.loader import SitlConfig
+from companion.sitl_config.world import World
 from sitl.campaigns.runner import Data
 from sitl.fast.loop import FastFlight, FastResult
 
@@ -37,11 +39,17 @@ class Flown:
         return None if self.fast is None else self.fast.plant.world.caught_t_s
 
 
-def with_world(config: SitlConfig, world: Data) -> SitlConfig:
-    """Return the configuration with keys of its world changed."""
-    data = config.model_dump(mode="json")
-    data["world"].update(world)
-    return SitlConfig.model_validate_json(json.dumps(data))
+def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
+    """Return the configuration with keys of its world changed; another seed draws another laboratory.
+
+    Args:
+        config: of a flight.
+        changes: plain data by key of the world. A key that is given is not drawn.
+    """
+    laboratory = config.laboratory.without(list(changes))
+    data = config.world.model_dump(mode="json") | changes
+    world = World.model_validate_json(json.dumps(draw(data, laboratory.ranges, data["seed"])))
+    return config.model_copy(update={"world": world, "laboratory": laboratory})
 
 
 def fly_to_end(config: SitlConfig) -> Flown:

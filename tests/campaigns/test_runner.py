@@ -165,7 +165,10 @@ def test_a_flight_over_wires_that_is_refused_is_lost_and_says_why(monkeypatch: p
         ("kill_guardian", "lost"),
     ]
     for row in found["rows"]:
-        assert f'fly {CATCH} --preset paper --sitl --set world.faults=[{{"kind": "{row["fault"]}"' in row["error"]
+        assert (
+            f'fly {CATCH} --preset paper --world ideal --sitl --set world.faults=[{{"kind": "{row["fault"]}"'
+            in row["error"]
+        )
     assert len(json.loads(Path("out/faults.json").read_text())["wall_s"]) == 2
 
 

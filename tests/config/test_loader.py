@@ -414,7 +414,7 @@ def test_a_vehicle_on_the_command_line_is_relative_to_the_current_directory(
 def test_vehicle_and_world_load_alone(project: Path) -> None:
     overrides = ["vehicle.airframe.mass_kg=3.1", "world.seed=7", "mission.phases[99].x=1"]
     assert load_vehicle(VEHICLE, overrides).airframe.mass_kg == 3.1
-    assert load_world(overrides).seed == 7
+    assert load_world(overrides)[0].seed == 7
     assert lines_of(lambda: load_vehicle(VEHICLE, ["vehicle.airframe.mass_kg=x"]))[0].startswith(
         "--set vehicle.airframe"
     )
@@ -432,7 +432,7 @@ def test_a_flights_configuration_holds_nothing_of_the_simulated_world(project: P
 
 def test_the_world_in_the_configuration_of_an_older_log_is_left_out(project: Path) -> None:
     config = load_sitl(CATCH, overrides=["world.payload_kg=0.37"])
-    assert logged_flight(config.model_dump_json()) == config.flight
+    assert logged_flight(config.model_dump_json(exclude={"laboratory"})) == config.flight
 
 
 def test_a_loaded_config_is_frozen(project: Path) -> None:

@@ -15,7 +15,7 @@ from companion.config.yaml_strict import read_document
 from companion.sitl_config.loader import WORLD_DIRECTORY
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "controller"}
+FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "controller", "worlds": "world"}
 FILES = [(path, kind) for folder, kind in FOLDERS.items() for path in sorted((CONFIGS / folder).glob("*.yaml"))]
 
 

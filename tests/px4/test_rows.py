@@ -165,7 +165,7 @@ def test_types_and_names_are_those_of_px4() -> None:
 
 def test_spoiled_over_real_mavlink_the_row_is_there() -> None:
     spoiled = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0}
-    world = load_world([f"world.px4_params={spoiled}".replace("'", "")])
+    world, _ = load_world([f"world.px4_params={spoiled}".replace("'", "")])
 
     async def read() -> list[Row]:
         port = free_udp_port()

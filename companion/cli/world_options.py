@@ -1,0 +1,35 @@
+"""The options that choose the simulated world, the same in every command that has one."""
+
+from __future__ import annotations
+
+import argparse
+
+from companion.sitl_config.loader import DEFAULT_WORLD, WORLDS
+
+
+def add_world(parser: argparse.ArgumentParser, default: str = DEFAULT_WORLD) -> None:
+    """Add `--world`."""
+    parser.add_argument(
+        "--world",
+        default=default,
+        metavar=f"{'|'.join(WORLDS)}|FILE",
+        help=f"the simulated world, built in or from a file (default: {default})",
+    )
+
+
+def add_seed(parser: argparse.ArgumentParser) -> None:
+    """Add `--seed`, which is short for an override of `world.seed`."""
+    parser.add_argument(
+        "--seed",
+        dest="overrides",
+        action="append",
+        type=_seed_override,
+        metavar="N",
+        help="seed of the simulated world: draws another laboratory and other noise (short for --set world.seed=N)",
+    )
+
+
+def _seed_override(text: str) -> str:
+    if not text.isdecimal() or len(text) > 9:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 999999999, got '{text}'")
+    return f"world.seed={text}"

@@ -1,0 +1,209 @@
+"""What laboratories differ by: numbers of a world file that are written as a distribution, drawn by the seed of the world."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from companion.config.base import Location, Model, Vector2
+from companion.config.document import RANK_VALUE, ConfigError, Document, key_path, problem_lines
+from companion.config.explain import nearest, problem, schema_of, validate, values
+from companion.sitl_config.world import World
+
+NORMAL_ENDS = 3.0
+"""A normal distribution is truncated at this many standard deviations."""
+DISTRIBUTIONS = ("uniform", "normal")
+_DIGITS = 6
+_EXPECTED = "expected a number, {uniform: [low, high]} or {normal: [mean, sigma]}"
+
+
+class Uniform(Model):
+    """A number that is drawn uniformly between two ends."""
+
+    uniform: Vector2
+    """[low, high], low < high."""
+
+
+class Normal(Model):
+    """A number that is drawn from a normal distribution, truncated at 3 sigma."""
+
+    normal: Vector2
+    """[mean, sigma], sigma > 0."""
+
+
+class Range(Model):
+    """One number of the world and its distribution."""
+
+    at: tuple[str | int, ...]
+    """Keys and indices of the number in the world."""
+    distribution: Uniform | Normal
+
+    @property
+    def key(self) -> str:
+        """Location as text, such as `imu.accel_bias_m_s2[0]`."""
+        return key_path(self.at)
+
+    @property
+    def ends(self) -> Vector2:
+        """Smallest and largest number that can be drawn."""
+        if isinstance(self.distribution, Uniform):
+            return self.distribution.uniform
+        mean, sigma = self.distribution.normal
+        return (mean - NORMAL_ENDS * sigma, mean + NORMAL_ENDS * sigma)
+
+    def sample(self, seed: int) -> float:
+        """Draw the number, with six digits; it depends on nothing but the seed and the key."""
+        rng = keyed_generator(seed, self.key)
+        low, high = self.ends
+        if isinstance(self.distribution, Uniform):
+            value = float(rng.uniform(low, high))
+        else:
+            mean, sigma = self.distribution.normal
+            value = math.inf
+            while not low <= value <= high:
+                value = float(rng.normal(mean, sigma))
+        return min(max(float(f"{value:.{_DIGITS}g}"), low), high)
+
+
+class Laboratory(Model):
+    """The file of a world and the numbers that it leaves to the seed."""
+
+    name: str = "ideal"
+    """A built-in world, or a file as the user gave it."""
+    ranges: tuple[Range, ...] = ()
+
+    def drawn(self, world: World) -> dict[str, Any]:
+        """Return the drawn numbers of a world by their keys."""
+        data = world.model_dump(mode="json")
+        return {one.key: _get(data, one.at) for one in self.ranges if _holds(data, one.at)}
+
+    def without(self, keys: Sequence[str]) -> Laboratory:
+        """Return the laboratory in which these keys of the world, with all below them, are not drawn."""
+        return self.model_copy(update={"ranges": tuple(one for one in self.ranges if one.at[0] not in keys)})
+
+
+def keyed_generator(seed: int, key: str) -> np.random.Generator:
+    """Return the random generator of one key of the world."""
+    return np.random.default_rng((seed, zlib.crc32(key.encode())))
+
+
+def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, Any]:
+    """Return a copy of a world's plain data with a sample in the place of each range.
+
+    The same seed is the same laboratory: adding or removing a range changes no other sample.
+
+    Args:
+        data: plain data of a world. A range whose place it lacks (a section that is null, a shorter list) is left out.
+        ranges: what to draw.
+        seed: of the world.
+    """
+    return _filled(data, [(one.at, one.sample(seed)) for one in ranges])
+
+
+def take_ranges(document: Document) -> tuple[Range, ...]:
+    """Return the distributions in a document of a world; invalid ones are appended to the document's problems.
+
+    An invalid one leaves an acceptable number in its place, so that it is reported once.
+    """
+    found: list[Range] = []
+    for at, node, value in list(values(schema_of(World), document.data)):
+        if not isinstance(value, dict) or node is None or node.get("type") != "number":
+            continue
+        try:
+            found.append(Range(at=at, distribution=_distribution(value)))
+        except ValueError as error:
+            document.problems.append(problem(RANK_VALUE, document.origin(at), at, str(error)))
+            _put(document.data, at, _acceptable(node))
+    return tuple(found)
+
+
+def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World:
+    """Draw and validate a world. Both ends of every range must be valid, so that a file is refused whatever the seed.
+
+    Raises:
+        ConfigError: one message per problem.
+    """
+    if ranges:
+        at_ends = []
+        for end in range(2):
+            data = _filled(document.data, [(one.at, one.ends[end]) for one in ranges])
+            ends = replace(document, data=data, problems=list(document.problems))
+            validate(World, ends)
+            at_ends.append(set(ends.problems))
+        everywhere = at_ends[0] & at_ends[1]
+        lines = problem_lines(list(everywhere))
+        for name, problems in zip(("lower", "upper"), at_ends, strict=True):
+            lines += [
+                f"{line} at the {name} end of what is drawn" for line in problem_lines(list(problems - everywhere))
+            ]
+        if lines:
+            raise ConfigError(lines)
+        document.data = draw(document.data, ranges, seed)
+    world = validate(World, document)
+    if world is None:
+        raise ConfigError(problem_lines(document.problems))
+    return world
+
+
+def _distribution(value: dict[str, Any]) -> Uniform | Normal:
+    """Parse a distribution.
+
+    Raises:
+        ValueError: it is none; the text is for the user.
+    """
+    if len(value) != 1:
+        raise ValueError(f"{_EXPECTED}, got a mapping with {len(value)} keys")
+    ((name, pair),) = value.items()
+    if name not in DISTRIBUTIONS:
+        close = nearest(str(name), list(DISTRIBUTIONS))
+        raise ValueError(
+            f"unknown distribution {json.dumps(name)}; " + (f"did you mean {close}?" if close else _EXPECTED)
+        )
+    names = "[low, high] with low < high" if name == "uniform" else "[mean, sigma] with sigma > 0"
+    numbers = isinstance(pair, list) and all(type(x) in (int, float) and math.isfinite(x) for x in pair)
+    if not numbers or len(pair) != 2 or not (pair[0] < pair[1] if name == "uniform" else pair[1] > 0):
+        raise ValueError(f"{name}: expected {names}, got {pair}")
+    first, second = map(float, pair)
+    return Uniform(uniform=(first, second)) if name == "uniform" else Normal(normal=(first, second))
+
+
+def _acceptable(node: dict[str, Any]) -> float:
+    """Return a number within the bounds of a schema node."""
+    low = node.get("minimum", node.get("exclusiveMinimum"))
+    high = node.get("maximum", node.get("exclusiveMaximum"))
+    if low is not None and high is not None:
+        return float(0.5 * (low + high))
+    return float(low + 1.0 if low is not None else high - 1.0 if high is not None else 0.0)
+
+
+def _filled(data: dict[str, Any], numbers: Sequence[tuple[Location, float]]) -> dict[str, Any]:
+    data = copy.deepcopy(data)
+    for at, number in numbers:
+        if _holds(data, at):
+            _put(data, at, number)
+    return data
+
+
+def _holds(data: Any, at: Location) -> bool:
+    try:
+        _get(data, at)
+    except (KeyError, IndexError, TypeError):
+        return False
+    return True
+
+
+def _get(data: Any, at: Location) -> Any:
+    for step in at:
+        data = data[step]
+    return data
+
+
+def _put(data: Any, at: Location, value: float) -> None:
+    _get(data, at[:-1])[at[-1]] = value

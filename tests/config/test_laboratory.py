@@ -1,0 +1,154 @@
+"""Worlds as files: numbers that are drawn by the seed, and the lines that tell what is wrong with a file."""
+
+# ruff: noqa: E501  (the lines are as long as users see them)
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from companion.cli.schema import schema_json
+from companion.config.document import ConfigError
+from companion.config.yaml_strict import read_document
+from companion.sitl_config.laboratory import Normal, Range, Uniform
+from companion.sitl_config.loader import WORLDS, SitlConfig, load_sitl, load_world
+from companion.sitl_config.world import World
+from sitl.campaigns.flights import with_world
+from tests.support import HOVER
+
+FILE = """\
+hover_thrust_error: {uniform: [-0.1, 0.1]}
+rotor_lag_s: {normal: [0.04, 0.005]}
+force_bias_n: [{uniform: [1, 2]}, {uniform: [1, 2]}, 3.0]
+faults:
+  - {kind: force_loss, t_s: {uniform: [0, 40]}}
+px4_params: {MC_ROLLRATE_P: {uniform: [0.1, 0.2]}}
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> str:
+    path = tmp_path / "mine.yaml"
+    path.write_text(FILE)
+    return str(path)
+
+
+def test_every_built_in_world_can_be_drawn_by_any_seed() -> None:
+    for name in WORLDS:
+        for seed in range(5):
+            world, laboratory = load_world([f"world.seed={seed}"], name)
+            assert (world.seed, laboratory.name) == (seed, name)
+
+
+def test_the_ideal_world_is_the_one_without_a_file() -> None:
+    world, laboratory = load_world([], "ideal")
+    assert world == World()
+    assert laboratory.ranges == ()
+
+
+def test_each_number_is_drawn_by_the_seed_and_its_own_name(file: str) -> None:
+    world, laboratory = load_world(["world.seed=3"], file)
+    assert load_world(["world.seed=3"], file) == (world, laboratory)
+    other, _ = load_world(["world.seed=4"], file)
+    drawn, otherwise = laboratory.drawn(world), laboratory.drawn(other)
+    assert list(drawn) == [
+        *("hover_thrust_error", "rotor_lag_s", "force_bias_n[0]", "force_bias_n[1]"),
+        *("faults[0].t_s", "px4_params.MC_ROLLRATE_P"),
+    ]
+    assert all(drawn[key] != otherwise[key] for key in drawn)
+    assert drawn["force_bias_n[0]"] != drawn["force_bias_n[1]"], "same range, different keys"
+    assert world.force_bias_n[2] == 3.0
+    fewer, _ = load_world(["world.seed=3", "world.rotor_lag_s=0.05", "world.faults=[]"], file)
+    assert fewer.rotor_lag_s == 0.05
+    assert (fewer.hover_thrust_error, fewer.force_bias_n) == (world.hover_thrust_error, world.force_bias_n)
+
+
+def test_an_override_may_be_a_distribution() -> None:
+    found = {
+        load_world(["world.rotor_lag_s={uniform: [0.02, 0.03]}", f"world.seed={n}"])[0].rotor_lag_s for n in range(9)
+    }
+    assert len(found) == 9
+    assert 0.02 <= min(found) < max(found) <= 0.03
+
+
+def test_samples_have_the_distribution_of_the_file() -> None:
+    uniform = Range(at=("a",), distribution=Uniform(uniform=(2.0, 4.0)))
+    normal = Range(at=("a",), distribution=Normal(normal=(1.0, 0.5)))
+    flat, bell = [[one.sample(seed) for seed in range(2000)] for one in (uniform, normal)]
+    assert 2.0 <= min(flat) < 2.01 and 3.99 < max(flat) <= 4.0
+    assert statistics.fmean(flat) == pytest.approx(3.0, abs=4 * 2 / math.sqrt(12 * 2000))
+    assert statistics.fmean(bell) == pytest.approx(1.0, abs=4 * 0.5 / math.sqrt(2000))
+    assert statistics.stdev(bell) == pytest.approx(0.493, abs=0.03)
+    assert min(bell) >= -0.5 and max(bell) <= 2.5, "truncated at 3 sigma"
+
+
+def test_another_seed_draws_the_laboratory_anew_but_keeps_what_was_set(file: str) -> None:
+    config = load_sitl(HOVER, overrides=["world.rotor_lag_s=0.05"], world=file)
+    travelled = SitlConfig.model_validate_json(config.model_dump_json())
+    assert travelled == config
+    other = with_world(travelled, {"seed": 9, "payload_kg": 0.1})
+    expected, _ = load_world(["world.rotor_lag_s=0.05", "world.seed=9", "world.payload_kg=0.1"], file)
+    assert other.world == expected
+    assert with_world(other, {"seed": 1, "payload_kg": 0.2}) == config
+    assert with_world(config, {"seed": 9, "hover_thrust_error": 0.02}).world.hover_thrust_error == 0.02
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("rotor_lag_s: {uniform: [2, 1]}", "1:14: rotor_lag_s: uniform: expected [low, high] with low < high, got [2, 1]"),
+        ("rotor_lag_s: {uniform: 2}", "1:14: rotor_lag_s: uniform: expected [low, high] with low < high, got 2"),
+        ("rotor_lag_s: {normal: [1, 0]}", "1:14: rotor_lag_s: normal: expected [mean, sigma] with sigma > 0, got [1, 0]"),
+        ("rotor_lag_s: {unifrom: [1, 2]}", "1:14: rotor_lag_s: unknown distribution \"unifrom\"; did you mean uniform?"),
+        (
+            "rotor_lag_s: {poisson: [1, 2]}",
+            "1:14: rotor_lag_s: unknown distribution \"poisson\"; "
+            "expected a number, {uniform: [low, high]} or {normal: [mean, sigma]}",
+        ),
+        ("rotor_lag_s: {}", "1:14: rotor_lag_s: expected a number, {uniform: [low, high]} or {normal: [mean, sigma]}, got a mapping with 0 keys"),
+        ("rotor_lag_s: {uniform: [-0.1, 0.1]}", "1:14: rotor_lag_s: expected a number > 0, got -0.1 at the lower end of what is drawn"),
+        ("rotor_lag_s: {normal: [0.03, 0.02]}", "1:14: rotor_lag_s: expected a number > 0, got -0.03 at the lower end of what is drawn"),
+        ("mass_error: {uniform: [0, 0.6]}", "1:13: mass_error: expected a number from -0.5 to 0.5, got 0.6 at the upper end of what is drawn"),
+        ("wind_m_s: [0, {uniform: [1, 1]}, 0]", "1:15: wind_m_s[1]: uniform: expected [low, high] with low < high, got [1, 1]"),
+        ("throws: {uniform: [1, 5]}", "1:9: throws: expected a whole number from 1 to 1000, got a mapping"),
+        ("rotor_lg_s: {uniform: [1, 5]}", "1:1: rotor_lg_s: unknown key; did you mean rotor_lag_s?"),
+        ("hand: {uniform: [0, 1]}", "1:7: hand: expected true or false, got a mapping"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_reported_once_with_its_place_whatever_the_seed(tmp_path: Path, text: str, line: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    for seed in (1, 2):
+        with pytest.raises(ConfigError) as refused:
+            load_world([f"world.seed={seed}"], str(path))
+        assert refused.value.lines == (f"{path}:{line}",)
+
+
+def test_an_override_that_cannot_be_drawn_names_the_option() -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_world(["world.rotor_lag_s={uniform: [2, 1]}"])
+    assert refused.value.lines == (
+        "--set world.rotor_lag_s: uniform: expected [low, high] with low < high, got [2, 1]",
+    )
+
+
+def test_a_world_that_does_not_exist_is_refused_with_those_that_do() -> None:
+    with pytest.raises(
+        ConfigError, match=r"--world labb: expected ideal, lab.* or a file, found neither \(did you mean lab\?\)"
+    ):
+        load_world([], "labb")
+    with pytest.raises(ConfigError, match=r"mine\.yaml: no such file"):
+        load_world([], "mine.yaml")
+
+
+def test_the_schema_knows_distributions(file: str) -> None:
+    schema = jsonschema.Draft202012Validator(json.loads(schema_json("world")))
+    schema.validate(read_document(file).data)
+    for wrong in ({"rotor_lag_s": {"unifrom": [1, 2]}}, {"throws": {"uniform": [1, 2]}}):
+        with pytest.raises(jsonschema.ValidationError):
+            schema.validate(wrong)
