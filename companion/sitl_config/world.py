@@ -10,8 +10,11 @@ from pydantic import AfterValidator, Field
 from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
 from companion.config.explain import nearest
 from companion.px4.defaults import PX4_DEFAULTS
+from companion.sitl_config.effects.air import Air
+from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.faults import Fault as Fault
 
 REAL32_MAX = 3.4e38
@@ -148,6 +151,9 @@ class World(Model):
     px4_params: Px4Params = Field(default={})
     """PX4 parameters by name that override those of a set-up vehicle."""
     faults: tuple[Fault, ...] = ()
+    air: Air = Air()
+    downwash: Downwash = Downwash()
+    tether_line: TetherLine = TetherLine()
     machine: Machine = Machine()
     force_sensor: ForceSensor = ForceSensor()
 

@@ -6,6 +6,8 @@ import mujoco
 
 from companion.model.types import Vec3
 
+EFFECT_PERIOD_S = 0.01
+"""Time between two updates of the loads of effects."""
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 

@@ -13,12 +13,16 @@ from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.world import World as WorldConfig
+from sitl.world.effects.air import Air
+from sitl.world.effects.downwash import Downwash
+from sitl.world.effects.tether_line import TetherLine
 from sitl.world.handling import Wrench
-from sitl.world.loads import ZERO, Loads
+from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
 from sitl.world.model import mjcf
 
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
+_EFFECT_STEPS = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
 """Stiffness and damping of a snagged tether."""
 _THROW_LEAD_S = 0.45
@@ -115,7 +119,7 @@ class Effect(Protocol):
     """An effect that loads bodies of the world."""
 
     def apply(self, world: World) -> None:
-        """Set this effect's loads for the next step."""
+        """Set this effect's loads for the next `EFFECT_PERIOD_S`."""
 
     def restart_noise(self) -> None:
         """Start its noise sequence again."""
@@ -177,7 +181,10 @@ class World:
         # Views: looking up MuJoCo's arrays in every step costs more than reading them.
         self._ctrl, self._qpos, self._qvel, self._sensordata = d.ctrl, d.qpos, d.qvel, d.sensordata
         self.loads = Loads(d)
-        self._effects: tuple[Effect, ...] = ()
+        self.effects = self._effects_on()
+        """Effects that load bodies and are on."""
+        self._step = 0
+        """Steps since the noise of the effects began."""
         self.t_s = 0.0
         """World time."""
         self.q: list[float] = []
@@ -186,6 +193,16 @@ class World:
         self._sensors: list[float] | None = None
         """Sensor values of the last step; read from MuJoCo at the first access."""
         self._place(start_position_m, start_yaw_rad, arm_rad)
+
+    def _effects_on(self) -> tuple[Effect, ...]:
+        """Return the effects that are on."""
+        config, vehicle = self._config, self._vehicle
+        effects: tuple[Effect | None, ...] = (
+            Air.of(config.air, config.seed, self._base, self.weight_n),
+            Downwash.of(config.downwash, vehicle, self, config.seed),
+            TetherLine.of(config.tether_line, vehicle.tether, self._base),
+        )
+        return tuple(effect for effect in effects if effect is not None)
 
     def _place(self, position_m: Vec2, yaw_rad: float, arm_rad: Vec2) -> None:
         q = self.data.qpos
@@ -213,8 +230,15 @@ class World:
 
     def restart_noise(self) -> None:
         """Start the noise of all effects again."""
-        for effect in self._effects:
+        self._step = 0
+        for effect in self.effects:
             effect.restart_noise()
+
+    @property
+    def rotor_thrust_n(self) -> Vec4:
+        """Thrust of each rotor, in PX4's quad-x order."""
+        a, b, c, d = self._ctrl[0:4].tolist()
+        return (a, b, c, d)
 
     @property
     def weight_n(self) -> float:
@@ -258,8 +282,11 @@ class World:
             (x, y, z), (px, py, pz) = force_n, self._snag_pull_n(*self.snag)
             force_n = (x + px, y + py, z + pz)
         self.loads.set(self._base, "drag and snag", force_n)
-        for effect in self._effects:
-            effect.apply(self)
+        if self.effects:
+            if self._step % _EFFECT_STEPS == 0:
+                for effect in self.effects:
+                    effect.apply(self)
+            self._step += 1
         self.loads.write()
         mujoco.mj_step(self.model, self.data)
         self.t_s = self.data.time

@@ -15,8 +15,11 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from companion.config.base import Model
+from companion.sitl_config.effects.air import Air
+from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.faults import KINDS, Fault
 from companion.sitl_config.world import Push, Servo, World
 
@@ -39,6 +42,9 @@ EXAMPLES: dict[type[Model], Settings] = {
     Fault: {"kind": "gust", "t_s": 0.1},
     Machine: {"on": True},
     ForceSensor: {"on": True},
+    Air: {"on": True},
+    Downwash: {"on": True},
+    TetherLine: {"on": True},
 }
 """Examples of the parts of the world whose fields are tested."""
 

@@ -1,0 +1,25 @@
+"""Section `air` of the simulated world: gusts of the air that the rotors recirculate in a room."""
+
+from __future__ import annotations
+
+from companion.config.base import Model, NonNegative, Positive
+
+
+class Air(Model):
+    """Gusts on the base. They grow with the rotors' thrust, and are zero while nothing spins."""
+
+    on: bool = False
+    """Whether this effect acts."""
+    force_rms_n: NonNegative = 0.2
+    """RMS of the force along each axis in hover far from the floor (e: 0.1 to 0.4)."""
+    torque_rms_nm: NonNegative = 0.03
+    """RMS of the torque about each horizontal axis in hover far from the floor. Vertical gusts that hit the four rotors independently
+    give `force_rms_n` times the rotors' lever, 0.23 m; gusts that hit all alike give 0 (e: between the two)."""
+    correlation_time_s: Positive = 0.3
+    """Correlation time; the corner frequency of the spectrum is 1 / (2 pi `correlation_time_s`), 0.5 Hz (e: 0.1 to 0.5, which is
+    0.3 to 2 Hz)."""
+    floor_increase: NonNegative = 1.0
+    """Relative increase on the floor; it falls linearly to zero at `floor_range_m` (e; p: hovering in ground effect makes air
+    recirculate among the rotors, Wolf et al., Experiments in Fluids 2024)."""
+    floor_range_m: Positive = 0.7
+    """Height of the base above the floor where the increase ends (e: four rotor radii, the reach of the ground effect)."""

@@ -1,0 +1,31 @@
+"""Section `downwash` of the simulated world: the rotors' wakes on arm, net and payload."""
+
+from __future__ import annotations
+
+from companion.config.base import Model, NonNegative, Positive
+
+
+class Downwash(Model):
+    """The four wakes and what hangs in them."""
+
+    on: bool = False
+    """Whether this effect acts."""
+    rotor_radius_m: Positive = 0.165
+    """Radius of a rotor (m: 13-inch propellers of the Tarot 650 Sport)."""
+    spread: Positive = 0.2
+    """Standard deviation by which a wake's momentum has spread sideways, over the distance below the rotor. The four wakes are one jet
+    from the depth where this is the rotors' distance from the vehicle's planes, 0.23 m: with 0.14 from 2.5 vehicle sizes (p:
+    Bauersfeld et al., arXiv 2403.13321), with 0.44 from three rotor radii (p: a few, Wolf et al., Experiments in Fluids 2024)."""
+    turbulence_intensity: NonNegative = 0.25
+    """RMS of the velocity's fluctuation along each axis, over the local mean velocity (p: 0.25 on the axis of a round turbulent jet,
+    Hussein et al., J. Fluid Mech. 1994)."""
+    correlation_time_s: Positive = 0.03
+    """Correlation time of the fluctuation (e: eddies of a wake's radius that pass with the induced velocity)."""
+    link_width_m: NonNegative = 0.03
+    """Width of the links across the flow (e; m: an XM430 is 28.5 mm wide)."""
+    link_drag_coefficient: NonNegative = 1.1
+    """Drag coefficient of a link across its axis (p: long cylinder below the critical Reynolds number, Hoerner 1965)."""
+    net_drag_area_m2: NonNegative = 0.009
+    """Drag coefficient times area of the net (e: hoop of 8 mm tube 0.005, mesh of solidity 0.15 0.004)."""
+    payload_drag_coefficient: NonNegative = 0.47
+    """Drag coefficient of the payload (p: sphere below the critical Reynolds number, Hoerner 1965)."""

@@ -1,0 +1,57 @@
+"""Gusts on the base: an Ornstein-Uhlenbeck force and torque, scaled with thrust and height above the floor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from companion.model.types import Vec3
+from companion.sitl_config.effects.air import Air as AirConfig
+from sitl.world.effects.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from sitl.world.loads import EFFECT_PERIOD_S
+
+if TYPE_CHECKING:
+    from sitl.world.world import World
+
+_NOISE = 13
+
+
+class Air:
+    """The gusts.
+
+    Args:
+        config: section `air`.
+        seed: of the world.
+        base: MuJoCo's index of the base.
+        weight_n: weight of the vehicle, its thrust in hover.
+    """
+
+    def __init__(self, config: AirConfig, seed: int, base: int, weight_n: float) -> None:
+        self._config, self._seed, self._base, self._weight_n = config, seed, base, weight_n
+        self.restart_noise()
+
+    @classmethod
+    def of(cls, config: AirConfig, seed: int, base: int, weight_n: float) -> Air | None:
+        """Return the effect, or None if it is off."""
+        return cls(config, seed, base, weight_n) if config.on else None
+
+    def restart_noise(self) -> None:
+        """Start the noise sequence again."""
+        self._gust = OrnsteinUhlenbeck(2, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)
+
+    def apply(self, world: World) -> None:
+        """Set the force and torque."""
+        (x, y, z), (roll, pitch, _) = self._gust.step()
+        strength = self.strength(sum(world.rotor_thrust_n), world.q[2])
+        force, torque = strength * self._config.force_rms_n, strength * self._config.torque_rms_nm
+        load: tuple[Vec3, Vec3] = ((force * x, force * y, force * z), (torque * roll, torque * pitch, 0.0))
+        world.loads.set(self._base, "air", *load)
+
+    def strength(self, thrust_n: float, height_m: float) -> float:
+        """Return the gusts' strength relative to hover far from the floor.
+
+        Args:
+            thrust_n: of all rotors.
+            height_m: of the base above the floor.
+        """
+        near = max(0.0, 1.0 - height_m / self._config.floor_range_m)
+        return thrust_n / self._weight_n * (1.0 + self._config.floor_increase * near)

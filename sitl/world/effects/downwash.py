@@ -1,0 +1,157 @@
+"""Force of the rotors' wakes on the links of the arm, the net and the payload.
+
+A wake develops and contracts as momentum theory gives it: at a depth of z rotor radii below the disk the velocity is the induced
+velocity in hover sqrt(T / (2 rho A)) times 1 + z / sqrt(1 + z^2), and the area shrinks by continuity. Turbulence smears its edge and
+keeps its momentum; the momenta of the four wakes add (Reichardt's hypothesis for free turbulence). The cross-section is taken as a
+square of the same area, of which the smeared profile is a product of error functions. All dynamic pressures are proportional to
+thrust, and the density of the air cancels. The flow turns aside above the floor. A link feels the flow across its axis (cross-flow
+principle, Hoerner 1965), acting at its middle; net and payload feel all of it, at their centres of mass.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from companion.config.vehicle import Vehicle
+from companion.model.types import Vec3, Vec4
+from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
+from sitl.world.effects.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from sitl.world.loads import EFFECT_PERIOD_S
+from sitl.world.model import PAYLOAD_RADIUS_M, rotor_offset_m
+
+if TYPE_CHECKING:
+    from sitl.world.world import World
+
+ROTOR_HEIGHT_M = 0.03
+_NOISE = 14
+_ROOT_HALF = math.sqrt(0.5)
+
+
+class Wakes:
+    """Time-averaged dynamic pressure below the four rotors.
+
+    Args:
+        rotor_offset_m: distance of the rotors from the x-z plane and the y-z plane of the body.
+        radius_m: of a rotor.
+        spread: see section `downwash`.
+    """
+
+    def __init__(self, rotor_offset_m: float, radius_m: float, spread: float) -> None:
+        self._offset_m, self._radius_m, self._spread = rotor_offset_m, radius_m, spread
+
+    def pressure_pa(self, thrust_n: Vec4, point_m: Vec3, blur_m: float = 0.0) -> float:
+        """Return the mean dynamic pressure.
+
+        Args:
+            thrust_n: of each rotor, in PX4's quad-x order.
+            point_m: relative to the centre of the four rotors, body FLU.
+            blur_m: standard deviation along x and y of the area over which the pressure is averaged.
+        """
+        x, y, z = point_m
+        if z >= 0.0:
+            return 0.0
+        radius_m, spread_m, offset_m = self._radius_m, self._spread * z, self._offset_m
+        depth = -z / radius_m
+        developed = 0.5 + 0.5 * depth / math.sqrt(1.0 + depth * depth)
+        area_m2 = math.pi * radius_m * radius_m * 0.5 / developed
+        half_m = 0.5 * math.sqrt(area_m2)
+        per_m = _ROOT_HALF / math.sqrt(spread_m * spread_m + blur_m * blur_m)
+        front, back = _smeared(x - offset_m, half_m, per_m), _smeared(x + offset_m, half_m, per_m)
+        left, right = _smeared(y - offset_m, half_m, per_m), _smeared(y + offset_m, half_m, per_m)
+        front_right_n, back_left_n, front_left_n, back_right_n = thrust_n
+        inside_n = front * (front_right_n * right + front_left_n * left)
+        inside_n += back * (back_left_n * left + back_right_n * right)
+        return 0.5 * developed * inside_n / area_m2
+
+
+def _smeared(x_m: float, half_m: float, per_m: float) -> float:
+    """Return the share, 0 to 1, that a smeared strip from -`half_m` to `half_m` has at `x_m`."""
+    return 0.5 * (math.erf((x_m + half_m) * per_m) - math.erf((x_m - half_m) * per_m))
+
+
+class Downwash:
+    """The force of the wakes.
+
+    Args:
+        config: section `downwash`.
+        vehicle: vehicle file.
+        world: the world whose bodies it loads.
+        seed: of the world.
+    """
+
+    def __init__(self, config: DownwashConfig, vehicle: Vehicle, world: World, seed: int) -> None:
+        model, data = world.model, world.data
+        self._config, self._seed = config, seed
+        self._wakes = Wakes(rotor_offset_m(vehicle.airframe), config.rotor_radius_m, config.spread)
+        self._radius_m = config.rotor_radius_m
+        base = model.body("base").id
+        self._base_position, self._base_axes = data.xpos[base], data.xmat[base]
+        area = config.link_drag_coefficient * config.link_width_m
+        self._links = tuple(
+            (body, data.xpos[body], data.xmat[body], data.xipos[body], 0.5 * length_m, area * length_m)
+            for body, length_m in zip(
+                (model.body("link1").id, model.body("link2").id), vehicle.arm.link_lengths_m, strict=True
+            )
+        )
+        names = {model.body(k).name: k for k in range(model.nbody)}
+        payload_m2 = config.payload_drag_coefficient * math.pi * PAYLOAD_RADIUS_M**2
+        self._compact = tuple(
+            (names[name], data.xipos[names[name]], area_m2, radius_m / 2.0)
+            for name, area_m2, radius_m in (
+                ("net", config.net_drag_area_m2, vehicle.tool.net_radius_m),
+                ("payload", payload_m2, PAYLOAD_RADIUS_M),
+            )
+            if name in names
+        )
+        self.restart_noise()
+
+    @classmethod
+    def of(cls, config: DownwashConfig, vehicle: Vehicle, world: World, seed: int) -> Downwash | None:
+        """Return the effect, or None if it is off."""
+        return cls(config, vehicle, world, seed) if config.on else None
+
+    def restart_noise(self) -> None:
+        """Start the noise sequence again."""
+        self._turbulence = OrnsteinUhlenbeck(3, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)
+
+    def apply(self, world: World) -> None:
+        """Set the forces."""
+        gusts = self._turbulence.step()
+        thrust_n = world.rotor_thrust_n
+        origin = self._base_position.tolist()
+        axes = self._base_axes.tolist()
+        down = (-axes[2], -axes[5], -axes[8])
+        intensity = self._config.turbulence_intensity
+        flows = [(down[0] + intensity * x, down[1] + intensity * y, down[2] + intensity * z) for x, y, z in gusts]
+        for (body, joint, matrix, centre, half_m, area_m2), (ux, uy, uz) in zip(self._links, flows, strict=False):
+            ex, ey, ez = matrix[0::3].tolist()
+            x, y, z = joint.tolist()
+            cx, cy, cz = centre.tolist()
+            x, y, z = x + half_m * ex, y + half_m * ey, z + half_m * ez
+            along = ux * ex + uy * ey + uz * ez
+            nx, ny, nz = ux - along * ex, uy - along * ey, uz - along * ez
+            k = (
+                area_m2
+                * self._pressure_pa(thrust_n, origin, axes, (x, y, z), 0.0)
+                * math.sqrt(nx * nx + ny * ny + nz * nz)
+            )
+            fx, fy, fz = k * nx, k * ny, k * nz
+            rx, ry, rz = x - cx, y - cy, z - cz
+            torque = (ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx)
+            world.loads.set(body, "downwash", (fx, fy, fz), torque)
+        ux, uy, uz = flows[2]
+        speed = math.sqrt(ux * ux + uy * uy + uz * uz)
+        for body, centre, area_m2, blur_m in self._compact:
+            x, y, z = centre.tolist()
+            k = area_m2 * speed * self._pressure_pa(thrust_n, origin, axes, (x, y, z), blur_m)
+            world.loads.set(body, "downwash", (k * ux, k * uy, k * uz))
+
+    def _pressure_pa(self, thrust_n: Vec4, origin: list[float], axes: list[float], point: Vec3, blur_m: float) -> float:
+        """Return the mean dynamic pressure at a point in the world frame. The flow stops at the floor, from one radius above it."""
+        px, py, pz = point
+        x, y, z = px - origin[0], py - origin[1], pz - origin[2]
+        a, b, c, d, e, f, g, h, i = axes
+        body: Vec3 = (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z - ROTOR_HEIGHT_M)
+        near = min(1.0, max(0.0, pz / self._radius_m))
+        return near * near * self._wakes.pressure_pa(thrust_n, body, blur_m)

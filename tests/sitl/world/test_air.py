@@ -1,0 +1,100 @@
+"""The gusts of the room: an Ornstein-Uhlenbeck force and torque with the RMS and the correlation time of the section `air`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from companion.sitl_config.effects.air import Air as AirConfig
+from companion.sitl_config.loader import load_sitl
+from companion.sitl_config.world import World as WorldConfig
+from sitl.world.effects.air import Air
+from sitl.world.effects.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from sitl.world.world import PHYSICS_DT_S, World
+from tests.support import CATCH
+
+VEHICLE = load_sitl(CATCH).vehicle
+HOVER = 30.0
+"""Weight and thrust in these tests, N."""
+
+
+def test_the_process_has_unit_rms_and_forgets_exponentially() -> None:
+    period_s, correlation_s = 0.01, 0.05
+    process = OrnsteinUhlenbeck(2, correlation_s, period_s, 1, 13)
+    values = np.array([process.step() for _ in range(25_000)]).reshape(-1, 6)
+    np.testing.assert_allclose(np.sqrt((values**2).mean(axis=0)), 1.0, atol=0.04)
+    for lag in (1, 5, 10):
+        correlation = (values[lag:] * values[:-lag]).mean()
+        assert correlation == pytest.approx(math.exp(-lag * period_s / correlation_s), abs=0.02)
+    between = np.corrcoef(values.T)[~np.eye(6, dtype=bool)]
+    assert np.abs(between).max() < 0.05
+
+
+def air(**settings: float) -> Air:
+    effect = Air.of(AirConfig(on=True, **settings), 1, 0, HOVER)
+    assert effect is not None
+    return effect
+
+
+def test_the_strength_grows_with_the_thrust_and_towards_the_floor() -> None:
+    effect = air(floor_increase=0.8, floor_range_m=0.5)
+    assert effect.strength(HOVER, 1.0) == 1.0
+    assert effect.strength(0.5 * HOVER, 1.0) == 0.5
+    assert effect.strength(HOVER, 0.25) == pytest.approx(1.4)
+    assert effect.strength(HOVER, 0.0) == pytest.approx(1.8)
+    assert effect.strength(0.0, 0.0) == 0.0
+
+
+def gusts(seed: int, rotor_command: float, steps: int = 2000) -> np.ndarray:
+    """Force and torque on the base in a world without drag, in every tenth step."""
+    config = WorldConfig(payload_kg=0.0, seed=seed, air=AirConfig(on=True, correlation_time_s=0.02, floor_increase=0.0))
+    world = World(VEHICLE, config, (0.0, 0.0), 0.0, (1.7, 1.0))
+    base = world.model.body("base").id
+    rows = []
+    for step in range(steps):
+        world.step((rotor_command,) * 4, (0.0, 0.0), drag=False)
+        if step >= 200 and step % 10 == 0:
+            rows.append(world.data.xfrc_applied[base] / (sum(world.rotor_thrust_n) / world.weight_n or 1.0))
+    return np.array(rows)
+
+
+def test_force_and_torque_on_the_base_have_the_rms_of_the_section() -> None:
+    loads = np.concatenate([gusts(seed, 0.2) for seed in range(3)])  # 20 % of the thrust: the vehicle stands
+    rms = np.sqrt((loads**2).mean(axis=0))
+    np.testing.assert_allclose(rms[:3], AirConfig().force_rms_n, rtol=0.12)
+    np.testing.assert_allclose(rms[3:5], AirConfig().torque_rms_nm, rtol=0.12)
+    assert rms[5] == 0.0
+
+
+def test_nothing_blows_while_no_rotor_turns() -> None:
+    assert not gusts(1, 0.0, 300).any()
+
+
+def test_the_seed_alone_decides_the_gusts() -> None:
+    first, again, other = gusts(1, 0.2, 400), gusts(1, 0.2, 400), gusts(2, 0.2, 400)
+    assert (first == again).all() and (first != other).any()
+
+
+def test_gusts_start_again_at_arming() -> None:
+    config = WorldConfig(payload_kg=0.0, air=AirConfig(on=True))
+    loads = []
+    for before in (0, 7):
+        world = World(VEHICLE, config, (0.0, 0.0), 0.0, (1.7, 1.0))
+        for _ in range(before):
+            world.step((0.2,) * 4, (0.0, 0.0), drag=False)
+        world.restart_noise()
+        world.step((0.2,) * 4, (0.0, 0.0), drag=False)
+        loads.append(world.data.xfrc_applied[world.model.body("base").id] / sum(world.rotor_thrust_n))
+    # Standing on its springs, the vehicle sinks a little.
+    np.testing.assert_allclose(loads[0], loads[1], rtol=1e-2)
+    assert loads[0].any()
+
+
+def test_off_there_is_no_effect() -> None:
+    assert Air.of(AirConfig(), 1, 0, HOVER) is None
+    world = World(VEHICLE, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, (1.7, 1.0))
+    for _ in range(round(0.1 / PHYSICS_DT_S)):
+        world.step((0.2,) * 4, (0.0, 0.0), drag=False)
+    assert not world.data.xfrc_applied.any()
