@@ -13,7 +13,9 @@ from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
+from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.faults import Fault as Fault
 
@@ -104,9 +106,6 @@ class World(Model):
     mocap_noise_deg: NonNegative = 0.05
     gyro_noise_rad_s: NonNegative = 0.01
     accel_noise_m_s2: NonNegative = 0.15
-    accel_vibration_m_s2: NonNegative = 0.0
-    """Amplitude of the rotors' vibration in the raw samples of each accelerometer axis; PX4 sends means."""
-    accel_vibration_hz: Positive = 120.0
     force_noise_n: NonNegative = 0.05
     force_bias_n: Vector3 = (1.2, -0.8, 2.5)
     force_scale: Positive = 1.0
@@ -156,6 +155,8 @@ class World(Model):
     tether_line: TetherLine = TetherLine()
     machine: Machine = Machine()
     force_sensor: ForceSensor = ForceSensor()
+    imu: Imu = Imu()
+    mocap: Mocap = Mocap()
 
     def servo(self, joint: int) -> Servo:
         """Return the servo of joint 0 or 1."""

@@ -29,16 +29,18 @@ class MocapMisalignment:
         self._mirror = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         nose_yaw_rad = math.atan2(b, a) if c == 0.0 else 0.0
         roll_deg, pitch_deg = config.mocap_body_tilt_deg
-        off = quat_from_euler_zyx(
-            math.radians(roll_deg), math.radians(pitch_deg), math.radians(config.mocap_body_yaw_deg)
-        )
+        yaw_deg = config.mocap_body_yaw_deg
+        if config.mocap.on:
+            roll_deg, pitch_deg = roll_deg + config.mocap.body_tilt_deg[0], pitch_deg + config.mocap.body_tilt_deg[1]
+            yaw_deg += config.mocap.body_yaw_deg
+        off = quat_from_euler_zyx(math.radians(roll_deg), math.radians(pitch_deg), math.radians(yaw_deg))
         self._zero = quat_multiply(off, quat_conjugate(quat_from_euler_zyx(0.0, 0.0, nose_yaw_rad)))
 
     @classmethod
     def of(cls, config: World) -> MocapMisalignment | None:
         """Return the misalignment of this configuration, or None if there is none."""
         upright = (config.mocap_axes, config.mocap_body_yaw_deg, config.mocap_body_tilt_deg)
-        return None if upright == (("x", "y", "z"), 0.0, (0.0, 0.0)) else cls(config)
+        return None if upright == (("x", "y", "z"), 0.0, (0.0, 0.0)) and not config.mocap.on else cls(config)
 
     def pose(self, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat]:
         """Return position and attitude as streamed."""

@@ -20,6 +20,8 @@ from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample
 from sitl.faults.injector import Faults
 from sitl.world.effects.force_sensor import ForceSensor
+from sitl.world.effects.imu import ImuErrors
+from sitl.world.effects.mocap import MocapErrors
 from sitl.world.handling import Handling, HungWeight
 from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
@@ -69,7 +71,7 @@ def battery_voltage_v(remaining: float) -> float:
 
 
 _MOCAP, _IMU, _FORCE = range(3)
-_PHASES = (0.0, math.tau / 3.0, 2.0 * math.tau / 3.0)
+_IMU_DRIFT = 11
 
 
 class Plant:
@@ -111,6 +113,8 @@ class Plant:
         k = vehicle.arm.torque_per_amp_nm_a
         self._torque_per_amp_nm_a = (k / (1.0 + servo1.torque_per_amp_error), k / (1.0 + servo2.torque_per_amp_error))
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
+        self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, self.world.weight_n / 4.0)
+        self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
         self._spoiled = MocapMisalignment.of(config)
@@ -172,6 +176,10 @@ class Plant:
         if armed and self.armed_t_s is None:
             self.armed_t_s = t_s
             self._seed_noise()
+            if self._imu_errors is not None:
+                self._imu_errors.drift(noise(config.seed, _IMU_DRIFT))
+            if self._mocap_errors is not None:
+                self._mocap_errors.restart(t_s)
         if self.faults is not None:
             self.faults.step(t_s, self.armed_t_s)
         q, v, layout = world.q, world.v, world.layout
@@ -210,23 +218,12 @@ class Plant:
         gyro, accel = config.gyro_noise_rad_s, config.accel_noise_m_s2
         nx, ny, nz = next(self._imu_noise)
         mx, my, mz = next(self._imu_noise)
-        ax, ay, az = s[a] + accel * mx, s[a + 1] + accel * my, s[a + 2] + accel * mz
-        if config.accel_vibration_m_s2 and self.armed_t_s is not None:
-            vx, vy, vz = self._vibration(world.t_s)
-            ax, ay, az = ax + vx, ay + vy, az + vz
-        return ImuSample(
-            world.t_s, (s[g] + gyro * nx, -(s[g + 1] + gyro * ny), -(s[g + 2] + gyro * nz)), (ax, -ay, -az)
-        )
-
-    def _vibration(self, t_s: float) -> Vec3:
-        """Return the mean vibration over the sample's interval, as PX4 integrates raw samples; the axes are 120 deg apart in phase."""
-        interval_s = IMU_EVERY * PHYSICS_DT_S
-        turns = math.tau * self._config.accel_vibration_hz
-        k = self._config.accel_vibration_m_s2 / (turns * interval_s)
-        x, y, z = (
-            k * (math.cos(turns * (t_s - interval_s) + phase) - math.cos(turns * t_s + phase)) for phase in _PHASES
-        )
-        return (x, y, z)
+        rates = (s[g] + gyro * nx, s[g + 1] + gyro * ny, s[g + 2] + gyro * nz)
+        force = (s[a] + accel * mx, s[a + 1] + accel * my, s[a + 2] + accel * mz)
+        if self._imu_errors is not None:
+            rates, force = self._imu_errors.measure(world.thrust_n, rates, force)
+        (p, q, r), (ax, ay, az) = rates, force
+        return ImuSample(world.t_s, (p, -q, -r), (ax, -ay, -az))
 
     def _expose_mocap(self, t_s: float) -> None:
         config, world = self._config, self.world
@@ -243,6 +240,8 @@ class Plant:
             x, y, z = x - since_s * vx, y - since_s * vy, z - since_s * vz
             back = (1.0, -0.5 * since_s * wx, -0.5 * since_s * wy, -0.5 * since_s * wz)
             qw, qx, qy, qz = quat_normalize(quat_multiply((qw, qx, qy, qz), back))
+        if self._mocap_errors is not None:
+            (x, y, z), (qw, qx, qy, qz), valid = self._mocap_errors.pose(t_s, (x, y, z), (qw, qx, qy, qz))
         noise_m, noise_rad = config.mocap_noise_m, self._mocap_noise_rad
         nx, ny, nz = next(self._mocap_noise)
         roll, pitch, yaw = next(self._mocap_noise)
@@ -250,12 +249,16 @@ class Plant:
         position: Vec3 = (x + noise_m * nx, y + noise_m * ny, z + noise_m * nz)
         attitude = quat_multiply((qw, qx, qy, qz), turned)
         if faults is not None:
-            position, attitude, valid = faults.pose(position, attitude)
+            position, attitude, visible = faults.pose(position, attitude)
+            valid = valid and visible
         if self._spoiled is not None:
             position, attitude = self._spoiled.pose(position, attitude)
+        sent_s = t_s + latency_s
+        if self._mocap_errors is not None:
+            sent_s = self._mocap_errors.sent_s(sent_s)
         self._mocap_queue.append(
             (
-                t_s + latency_s,
+                sent_s,
                 MocapFrame(
                     number=self._mocap_number,
                     exposure_t_s=t_s,

@@ -246,6 +246,11 @@ class World:
         return GRAVITY_M_S2 * float(self.model.body_subtreemass[self._base])
 
     @property
+    def thrust_n(self) -> Vec4:
+        """Thrust of each rotor, without a fault's share, in PX4's quad-x order."""
+        return self._thrust
+
+    @property
     def hover_command(self) -> float:
         """True normalised hover thrust without payload."""
         return self.weight_n / self._vehicle.airframe.thrust_max_n

@@ -18,7 +18,9 @@ from companion.config.base import Model
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
+from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.faults import KINDS, Fault
 from companion.sitl_config.world import Push, Servo, World
@@ -45,6 +47,8 @@ EXAMPLES: dict[type[Model], Settings] = {
     Air: {"on": True},
     Downwash: {"on": True},
     TetherLine: {"on": True},
+    Imu: {"on": True},
+    Mocap: {"on": True, "lost_share": 0.2, "wobble_every_s": 0.5},
 }
 """Examples of the parts of the world whose fields are tested."""
 
@@ -76,7 +80,6 @@ TOGETHER: dict[str, Settings] = {
     "hand_tap_n": {**_HANDLED_FOR_LONG, "hand_taps": 3},
     "net_weight_kg": {"net_weight_t_s": 0.4},
     "net_weight_t_s": {"net_weight_kg": 0.5, "net_weight_t_s": 0.4},
-    "accel_vibration_hz": {"accel_vibration_m_s2": 5.0},
     "keep_s": {"throws": 2, "keep_s": 0.2},
     "throws": {"keep_s": 0.2},
 }

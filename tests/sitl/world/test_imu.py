@@ -1,0 +1,149 @@
+"""Errors of the IMU against their closed forms."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from typing import Any
+
+import pytest
+
+from companion.model.types import Vec3, Vec4
+from companion.sitl_config.effects.imu import Imu
+from companion.sitl_config.loader import load_sitl
+from sitl.autopilot.types import ImuSample
+from sitl.server import start_of
+from sitl.servo.drive import ServoDrive
+from sitl.world.effects.imu import ImuErrors
+from sitl.world.noise import noise
+from sitl.world.plant import Plant
+from tests.support import CATCH
+
+G = 9.81
+NOTHING: dict[str, Any] = {
+    "accel_bias_m_s2": (0.0, 0.0, 0.0),
+    "accel_drift_m_s2": 0.0,
+    "gyro_bias_deg_s": (0.0, 0.0, 0.0),
+    "gyro_drift_deg_s": 0.0,
+    "mount_rpy_deg": (0.0, 0.0, 0.0),
+    "vibration_m_s2": 0.0,
+    "gyro_vibration_deg_s": 0.0,
+    "rotor_spread": 0.0,
+    "rectification_m_s2": (0.0, 0.0, 0.0),
+}
+STILL: tuple[Vec3, Vec3] = ((0.0, 0.0, 0.0), (0.0, 0.0, G))
+HOVER: Vec4 = (1.0, 1.0, 1.0, 1.0)
+STOPPED: Vec4 = (0.0, 0.0, 0.0, 0.0)
+
+
+def errors(interval_s: float = 0.004, **settings: Any) -> ImuErrors:
+    found = ImuErrors.of(Imu(on=True, **{**NOTHING, **settings}), interval_s, 1.0)
+    assert found is not None
+    return found
+
+
+def test_off_is_nothing() -> None:
+    assert ImuErrors.of(Imu(), 0.004, 1.0) is None
+
+
+def test_biases_appear_in_px4s_axes() -> None:
+    class Idle:
+        def step(self, imu: ImuSample) -> Vec4:
+            return STOPPED
+
+    config = load_sitl(CATCH, overrides=["world.gyro_noise_rad_s=0", "world.accel_noise_m_s2=0"])
+    settings = {**NOTHING, "accel_bias_m_s2": (0.1, 0.2, 0.3), "gyro_bias_deg_s": (1.0, 2.0, 3.0)}
+    world = config.world.model_copy(update={"imu": Imu(on=True, **settings)})
+    start = config.mission.start
+    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
+    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
+    samples = []
+    for this in (config.world, world):
+        plant = Plant(config.vehicle, this, Idle(), [ServoDrive() for _ in config.vehicle.arm.joints], where)
+        for _ in range(200):
+            plant.step(False)
+        samples.append(plant.sample_imu())
+    ideal, real = samples
+    accel = [b - a for a, b in zip(ideal.accel_frd_m_s2, real.accel_frd_m_s2, strict=True)]
+    gyro = [math.degrees(b - a) for a, b in zip(ideal.gyro_frd_rad_s, real.gyro_frd_rad_s, strict=True)]
+    assert accel == pytest.approx([0.1, -0.2, -0.3])
+    assert gyro == pytest.approx([1.0, -2.0, -3.0])
+
+
+def test_a_tilted_board_feels_gravity_sideways() -> None:
+    pitch_rad = math.radians(0.5)
+    _, (x, y, z) = errors(mount_rpy_deg=(0.0, 0.5, 0.0)).measure(STOPPED, *STILL)
+    assert (x, y, z) == pytest.approx((-G * math.sin(pitch_rad), 0.0, G * math.cos(pitch_rad)))
+    (p, q, r), _ = errors(mount_rpy_deg=(0.0, 0.0, 90.0)).measure(STOPPED, (1.0, 0.0, 0.0), (0.0, 0.0, G))
+    assert (p, q, r) == pytest.approx((0.0, -1.0, 0.0), abs=1e-12)
+
+
+@pytest.mark.parametrize("hz", [40.0, 80.0, 110.0, 130.0])
+def test_a_sample_is_the_mean_of_the_vibration_since_the_last_one(hz: float) -> None:
+    imu = errors(vibration_m_s2=6.0, gyro_vibration_deg_s=5.0, vibration_hz=hz)
+    one: Vec4 = (1.0, 0.0, 0.0, 0.0)  # front right: y < 0, turns the body by -z
+    shake, turn = 3.0, math.radians(2.5)
+    for sample in range(5):
+        (p, q, r), (x, y, z) = imu.measure(one, *STILL)
+        phases = [math.tau * hz * (sample + (k + 0.5) / 1000) * 0.004 for k in range(1000)]
+        forward, left, along = (
+            statistics.fmean(values)
+            for values in (map(math.cos, phases), (-math.sin(a) for a in phases), (math.cos(2 * a) for a in phases))
+        )
+        assert (x, y, z - G) == pytest.approx((shake * forward, shake * left, shake * along), abs=1e-4)
+        assert (p, q, r) == pytest.approx((-turn * along, -turn * along, turn * left), abs=1e-5)
+
+
+def test_the_rotor_speed_follows_the_root_of_the_thrust_and_the_amplitude_the_thrust() -> None:
+    fast, slow = errors(vibration_m_s2=6.0, vibration_hz=30.0), errors(vibration_m_s2=6.0, vibration_hz=60.0)
+    for _ in range(5):
+        _, quadrupled = fast.measure((4.0, 0.0, 0.0, 0.0), *STILL)
+        _, doubled = slow.measure((1.0, 0.0, 0.0, 0.0), *STILL)
+        assert quadrupled[0] == pytest.approx(4.0 * doubled[0])
+
+
+def test_four_rotors_have_the_rms_of_one_sine_behind_the_filter_of_the_mean() -> None:
+    amplitude, hz, interval_s = 6.0, 80.0, 0.004
+    imu = errors(vibration_m_s2=amplitude, vibration_hz=hz, rotor_spread=0.01)
+    samples = [imu.measure(HOVER, *STILL)[1] for _ in range(10000)]
+    for axis, of in ((0, hz), (1, hz), (2, 2.0 * hz)):
+        passed = math.sin(math.pi * of * interval_s) / (math.pi * of * interval_s)
+        rms = statistics.pstdev(sample[axis] for sample in samples)
+        assert rms == pytest.approx(amplitude / math.sqrt(2.0) * passed, rel=0.05)
+
+
+def test_standing_rotors_neither_shake_nor_shift() -> None:
+    imu = errors(vibration_m_s2=6.0, gyro_vibration_deg_s=5.0, rectification_m_s2=(0.1, 0.1, 0.1))
+    assert imu.measure(STOPPED, *STILL) == STILL
+
+
+def test_vibration_shifts_the_mean_with_its_square() -> None:
+    imu = errors(rectification_m_s2=(0.1, -0.2, 0.3))
+    for share in (1.0, 1.5):
+        _, (x, y, z) = imu.measure((share,) * 4, *STILL)
+        assert (x, y, z - G) == pytest.approx((0.1 * share**2, -0.2 * share**2, 0.3 * share**2))
+
+
+def test_the_drift_has_its_spread_and_forgets_with_its_time_constant() -> None:
+    imu = errors(interval_s=0.1, accel_drift_m_s2=0.5, gyro_drift_deg_s=2.0, drift_time_s=10.0)
+    imu.drift(noise(1, 11))
+    accel, gyro = [], []
+    for sample in range(100000):
+        rates, force = imu.measure(STOPPED, *STILL)
+        if sample % 25 == 0:
+            accel.append(force[0])
+            gyro.append(math.degrees(rates[1]))
+    assert statistics.pstdev(accel) == pytest.approx(0.5, rel=0.1)
+    assert statistics.pstdev(gyro) == pytest.approx(2.0, rel=0.1)
+    assert statistics.correlation(accel[4:], accel[:-4]) == pytest.approx(math.exp(-1.0), abs=0.06)
+
+
+def test_the_drift_of_a_flight_depends_on_the_seed_alone() -> None:
+    late, early = (errors(accel_drift_m_s2=0.5) for _ in range(2))
+    for _ in range(70):
+        late.measure(STOPPED, *STILL)
+    for imu in (late, early):
+        imu.drift(noise(3, 11))
+    drifts = [[imu.measure(STOPPED, *STILL) for _ in range(60)] for imu in (late, early)]
+    assert drifts[0] == drifts[1]
+    assert drifts[0][0] != drifts[0][59]

@@ -1,0 +1,123 @@
+"""Errors of motion capture against their closed forms."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+from typing import Any
+
+import pytest
+
+from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx
+from companion.model.types import IDENTITY_QUAT, Vec4
+from companion.sitl_config.effects.mocap import Mocap
+from companion.sitl_config.loader import load_sitl
+from sitl.autopilot.types import ImuSample
+from sitl.server import start_of
+from sitl.servo.drive import ServoDrive
+from sitl.world.effects.mocap import MocapErrors
+from sitl.world.plant import Plant
+from tests.support import CATCH
+
+NOTHING: dict[str, Any] = {
+    "pivot_offset_m": (0.0, 0.0, 0.0),
+    "body_yaw_deg": 0.0,
+    "body_tilt_deg": (0.0, 0.0),
+    "lost_share": 0.0,
+    "wobble_m": 0.0,
+    "wobble_deg": 0.0,
+    "delivery_jitter_s": 0.0,
+}
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+def errors(**settings: Any) -> MocapErrors:
+    found = MocapErrors.of(Mocap(on=True, **{**NOTHING, **settings}), 1)
+    assert found is not None
+    return found
+
+
+def test_off_is_nothing() -> None:
+    assert MocapErrors.of(Mocap(), 1) is None
+
+
+def test_the_pivot_turns_with_the_body() -> None:
+    cameras = errors(pivot_offset_m=(0.01, 0.02, 0.03))
+    left = quat_from_euler_zyx(0.0, 0.0, math.pi / 2.0)
+    position, attitude, tracked = cameras.pose(0.0, (1.0, 2.0, 3.0), left)
+    assert position == pytest.approx((0.98, 2.01, 3.03))
+    assert attitude == left
+    assert tracked
+
+
+def test_the_plant_streams_pivot_yaw_and_tilt() -> None:
+    class Idle:
+        def step(self, imu: ImuSample) -> Vec4:
+            return (0.0, 0.0, 0.0, 0.0)
+
+    config = load_sitl(CATCH, overrides=["world.mocap_noise_m=0", "world.mocap_noise_deg=0"])
+    settings = {**NOTHING, "pivot_offset_m": (0.01, 0.0, 0.0), "body_yaw_deg": 2.0, "body_tilt_deg": (0.5, -0.5)}
+    world = config.world.model_copy(update={"mocap": Mocap(on=True, **settings)})
+    start = config.mission.start
+    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
+    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
+    plant = Plant(config.vehicle, world, Idle(), [ServoDrive() for _ in config.vehicle.arm.joints], where)
+    frames = []
+    for _ in range(20):
+        plant.step(False)
+        frames += plant.take_mocap()
+    (x, y, _), truth = frames[-1].position_world_m, plant.truth
+    assert x - truth.position_world_m[0] == pytest.approx(0.01, abs=1e-4)
+    assert y - truth.position_world_m[1] == pytest.approx(0.0, abs=1e-4)
+    streamed, true = euler_zyx_from_quat(frames[-1].attitude_wxyz), euler_zyx_from_quat(truth.attitude_wxyz)
+    off_deg = [math.degrees(a - b) for a, b in zip(streamed, true, strict=True)]
+    assert off_deg == pytest.approx([0.5, -0.5, 2.0], abs=0.05)
+
+
+def test_bursts_have_their_share_and_their_length() -> None:
+    cameras, period_s = errors(lost_share=0.1, lost_burst_s=0.02), 0.002
+    tracked = [cameras.pose(k * period_s, ORIGIN, IDENTITY_QUAT)[2] for k in range(200000)]
+    lost = tracked.count(False)
+    bursts = sum(a and not b for a, b in itertools.pairwise(tracked))
+    assert lost / len(tracked) == pytest.approx(0.1, rel=0.1)
+    # A burst shorter than a period may fall between two frames: those seen have exp(-period/mean) of a frame more at the end.
+    assert lost * period_s / bursts == pytest.approx(period_s / -math.expm1(-period_s / 0.02), rel=0.1)
+
+
+def test_without_losses_every_frame_is_tracked() -> None:
+    cameras = errors()
+    assert all(cameras.pose(float(k), ORIGIN, IDENTITY_QUAT)[2] for k in range(1000))
+
+
+def test_hidden_markers_move_the_pose_for_a_while() -> None:
+    cameras = errors(wobble_m=0.002, wobble_deg=0.3, wobble_s=0.1, wobble_every_s=0.1)
+    poses = [cameras.pose(k * 0.01, ORIGIN, IDENTITY_QUAT) for k in range(60000)]
+    share = math.sqrt(3.0 / 8.0 * 0.5)  # sin^4 has the mean 3/8, and markers are hidden for half of the time
+    for axis in range(3):
+        assert statistics.pstdev(p[axis] for p, _, _ in poses) == pytest.approx(0.002 * share, rel=0.1)
+        tilts_deg = [2.0 * math.degrees(q[1 + axis]) for _, q, _ in poses]
+        assert statistics.pstdev(tilts_deg) == pytest.approx(0.3 * share, rel=0.1)
+    undisturbed = sum(p == ORIGIN for p, _, _ in poses) / len(poses)
+    assert undisturbed == pytest.approx(0.5, abs=0.05)
+
+
+def test_jitter_delays_frames_and_keeps_their_order() -> None:
+    even = errors(delivery_jitter_s=0.001)
+    delays = [even.sent_s(k * 1.0) - k * 1.0 for k in range(10000)]
+    assert min(delays) >= 0.0
+    assert statistics.fmean(delays) == pytest.approx(0.001, rel=0.05)
+    crowded = errors(delivery_jitter_s=0.02)
+    sent = [crowded.sent_s(k * 0.005) for k in range(1000)]
+    assert sent == sorted(sent)
+
+
+def test_events_of_a_flight_depend_on_the_seed_alone() -> None:
+    late, early = errors(lost_share=0.2, wobble_m=0.002), errors(lost_share=0.2, wobble_m=0.002)
+    for k in range(500):
+        late.pose(k * 0.005, ORIGIN, IDENTITY_QUAT)
+    seen = []
+    for cameras, start_s in ((late, 2.5), (early, 0.0)):
+        cameras.restart(start_s)
+        seen.append([cameras.pose(start_s + k * 0.0051, ORIGIN, IDENTITY_QUAT)[2] for k in range(400)])
+    assert seen[0] == seen[1]
