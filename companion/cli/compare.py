@@ -13,6 +13,9 @@ from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
 from companion.sitl_config.loader import SitlConfig, load_sitl
 
+_OPTIONS = {"world.payload_kg": "--payloads", "world.seed": "--seeds", "world.model_error": "--model-error"}
+"""Options in the place of overrides of keys that the grid sets."""
+
 
 def add_parser(commands: Any) -> None:
     """Add `compare` to the sub-parsers of `companion`."""
@@ -32,6 +35,11 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--seeds", type=count, default=5, metavar="N", help="number of seeds per cell (default: 5)")
     parser.add_argument("--first-seed", type=count, default=1, metavar="N", help="the first of them (default: 1)")
     parser.add_argument(
+        "--model-error", type=_model_errors, metavar="SHARE,...",
+        help="shares by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3, e.g. 0,0.1,0.2,0.3 "
+        "(default: that of the world)",
+    )  # fmt: skip
+    parser.add_argument(
         "--ablation", action="store_true", help="also fly adaptive/recommended with one thing at a time removed"
     )
     parser.add_argument("--mission", default=DEFAULT_MISSION, metavar="FILE")
@@ -40,12 +48,20 @@ def add_parser(commands: Any) -> None:
 
 
 def _payloads(text: str) -> tuple[float, ...]:
+    return _numbers(text, 2.0, "masses in kg from 0 to 2")
+
+
+def _model_errors(text: str) -> tuple[float, ...]:
+    return _numbers(text, 0.3, "shares from 0 to 0.3")
+
+
+def _numbers(text: str, most: float, what: str) -> tuple[float, ...]:
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = (math.nan,)
-    if not all(0 <= value <= 2 for value in values):
-        raise argparse.ArgumentTypeError(f"expected masses in kg from 0 to 2 with commas between them, got '{text}'")
+    if not all(0 <= value <= most for value in values):
+        raise argparse.ArgumentTypeError(f"expected {what} with commas between them, got '{text}'")
     return tuple(dict.fromkeys(values))
 
 
@@ -61,7 +77,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         ConfigError: one line per problem.
     """
     for override in arguments.overrides:
-        for key, option in (("world.payload_kg", "--payloads"), ("world.seed", "--seeds")):
+        for key, option in _OPTIONS.items():
             if override.partition("=")[0].strip() == key:
                 raise ConfigError([f"companion compare: --set {key}: the grid sets it; use {option}"])
     try:
@@ -87,11 +103,13 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
             # A problem of the first variant is usually one of all; a problem of a later one is its own.
             raise ConfigError([f"{variant.label}: {line}" if configs else line for line in error.lines]) from None
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    model_errors = arguments.model_error or (configs[0].world.model_error,)
     return Compare(
         configs=configs,
-        flights=flights_of(variants, arguments.payloads, seeds),
+        flights=flights_of(variants, arguments.payloads, seeds, model_errors),
         **common(arguments),
         variants=variants,
         payloads_kg=arguments.payloads,
         seeds=seeds,
+        model_errors=model_errors,
     )

@@ -25,6 +25,16 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--draws", type=count, default=500, metavar="N", help="number of flights (default: 500)")
     parser.add_argument("--seed", type=count, default=1, metavar="N", help="seed of the draws (default: 1)")
     parser.add_argument("--first", type=_number, default=0, metavar="N", help="number of the first draw (default: 0)")
+    parser.add_argument(
+        "--model-error",
+        dest="overrides",
+        action="append",
+        default=[],
+        type=_model_error_override,
+        metavar="SHARE",
+        help="share by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3 "
+        "(short for --set world.model_error=SHARE)",
+    )
     parser.add_argument("--cases", metavar="FILE", help="fly the cases of this file instead of draws")
     parser.add_argument("--case", action="append", default=[], metavar="NAME", help="only this case of --cases")
     parser.add_argument(
@@ -38,6 +48,10 @@ def _number(text: str) -> int:
     if not text.isdecimal() or len(text) > 9:
         raise argparse.ArgumentTypeError(f"expected a number from 0 on, got '{text}'")
     return int(text)
+
+
+def _model_error_override(text: str) -> str:
+    return f"world.model_error={text}"
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -23,6 +23,7 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
         "--seed",
         dest="overrides",
         action="append",
+        default=[],
         type=_seed_override,
         metavar="N",
         help="seed of the simulated world: draws another laboratory and other noise (short for --set world.seed=N)",

@@ -1,4 +1,4 @@
-"""What laboratories differ by: numbers of a world file that are written as a distribution, drawn by the seed of the world."""
+"""What laboratories differ by: numbers of a world file that are distributions, and the signs of the model error, drawn by the seed."""
 
 from __future__ import annotations
 
@@ -15,8 +15,19 @@ import numpy as np
 from companion.config.base import Location, Model, Vector2
 from companion.config.document import RANK_VALUE, ConfigError, Document, key_path, problem_lines
 from companion.config.explain import nearest, problem, schema_of, validate, values
+from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.world import World
 
+_FAULTLESS = Machine(
+    on=True,
+    centre_of_mass_m=(0.0, 0.0, 0.0),
+    inertia_error=(0.0, 0.0, 0.0),
+    shoulder_offset_m=(0.0, 0.0, 0.0),
+    shoulder_rpy_deg=(0.0, 0.0, 0.0),
+    link_length_error_m=(0.0, 0.0),
+    link_com_error_m=(0.0, 0.0),
+)
+"""The machine as the vehicle file describes it."""
 NORMAL_ENDS = 3.0
 """A normal distribution is truncated at this many standard deviations."""
 DISTRIBUTIONS = ("uniform", "normal")
@@ -60,7 +71,7 @@ class Range(Model):
 
     def sample(self, seed: int) -> float:
         """Draw the number, with six digits; it depends on nothing but the seed and the key."""
-        rng = keyed_generator(seed, self.key)
+        rng = _generator(seed, self.key)
         low, high = self.ends
         if isinstance(self.distribution, Uniform):
             value = float(rng.uniform(low, high))
@@ -89,8 +100,7 @@ class Laboratory(Model):
         return self.model_copy(update={"ranges": tuple(one for one in self.ranges if one.at[0] not in keys)})
 
 
-def keyed_generator(seed: int, key: str) -> np.random.Generator:
-    """Return the random generator of one key of the world."""
+def _generator(seed: int, key: str) -> np.random.Generator:
     return np.random.default_rng((seed, zlib.crc32(key.encode())))
 
 
@@ -105,6 +115,33 @@ def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, 
         seed: of the world.
     """
     return _filled(data, [(one.at, one.sample(seed)) for one in ranges])
+
+
+def with_model_error(world: World) -> World:
+    """Return the world whose errors of base mass, inertia, link masses and torque constants include its `model_error`."""
+    if world.model_error == 0.0:
+        return world
+
+    def off(error: float, key: str) -> float:
+        sign = 1.0 if _generator(world.seed, f"model_error.{key}").random() < 0.5 else -1.0
+        return (1.0 + error) * (1.0 + sign * world.model_error) - 1.0
+
+    machine, servos = world.machine if world.machine.on else _FAULTLESS, (world.servo(0), world.servo(1))
+    link1, link2 = world.link_mass_error
+    x, y, z = machine.inertia_error
+    return world.model_copy(
+        update={
+            "mass_error": off(world.mass_error, "mass"),
+            "link_mass_error": (off(link1, "link1"), off(link2, "link2")),
+            "machine": machine.model_copy(
+                update={"inertia_error": (off(x, "inertia"), off(y, "inertia"), off(z, "inertia"))}
+            ),
+            "servos": tuple(
+                servo.model_copy(update={"torque_per_amp_error": off(servo.torque_per_amp_error, f"servo{index}")})
+                for index, servo in enumerate(servos)
+            ),
+        }
+    )
 
 
 def take_ranges(document: Document) -> tuple[Range, ...]:

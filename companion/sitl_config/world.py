@@ -125,6 +125,9 @@ class World(Model):
     """Relative error of the vehicle file's base mass against the truth."""
     link_mass_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
     """Relative error of the vehicle file's link masses against the truth; the base's mass does not change."""
+    model_error: Annotated[float, Field(ge=0, le=0.3)] = 0.0
+    """Error by which the true base mass, inertia, link masses and torque constants differ from the vehicle file, in addition to the
+    other errors: each is multiplied by 1 plus or minus this share, with a sign drawn by the seed (the moments of inertia share one)."""
     battery_start: Fraction = 1.0
     battery_life_s: Positive = 900.0
     """Time from arming until a full battery is empty."""

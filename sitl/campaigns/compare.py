@@ -1,4 +1,4 @@
-"""Flights of `companion compare`: {controller, preset, payload_kg, seed, series}; `series` asks for a time series."""
+"""Flights of `companion compare`: {controller, preset, payload_kg, seed, model_error, series}; `series` asks for a time series."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns.flights import fly_to_end, row_of, with_world
+from sitl.campaigns.flights import fly_to_end, laboratory_of, row_of, with_world
 from sitl.campaigns.runner import Data
 
 SERIES_EVERY = 4
@@ -25,10 +25,14 @@ def prepare(job: Data, _: Sequence[SitlConfig]) -> list[Data]:
 
 def fly(config: SitlConfig, flight: Data) -> Data:
     """Fly one flight; return its row (see `companion.campaigns.compare.aggregate`) and its time series."""
-    flown = fly_to_end(with_world(config, {"payload_kg": flight["payload_kg"], "seed": flight["seed"]}))
+    changes = {key: flight[key] for key in ("payload_kg", "seed", "model_error")}
+    flown = fly_to_end(with_world(config, changes))
     row, log = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error)
     head = {key: flight[key] for key in ("controller", "preset", "payload_kg", "seed")}
-    return {"row": {**head, **row}, "series": series_of(log) if flight["series"] and log.inputs else None}
+    return {
+        "row": {**head, **laboratory_of(flown.config), **row},
+        "series": series_of(log) if flight["series"] and log.inputs else None,
+    }
 
 
 def series_of(log: FlightLog) -> Data:

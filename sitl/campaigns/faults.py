@@ -11,7 +11,7 @@ from companion.model.frames import quat_rotate, tilt_rad
 from companion.model.types import Outcome
 from companion.safety.touchdown import HEIGHT_MARGIN_M
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns.flights import Flown, fly_to_end, with_world
+from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, with_world
 from sitl.campaigns.runner import CampaignError, Data
 from sitl.fast.loop import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
@@ -38,7 +38,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
     """Fly one flight; return its row (see `companion.campaigns.faults.judge`)."""
     variant, phase = Variant(flight["kind"], flight["size"], flight["duration_s"]), flight["phase"]
     flown = fly_to_end(with_world(config, {"faults": [variant.fault(phase)]}))
-    return {"row": row_of(variant, phase, record_of(flown), config.vehicle)}
+    return {"row": {**row_of(variant, phase, record_of(flown), config.vehicle), **laboratory_of(flown.config)}}
 
 
 def record_of(flown: Flown) -> FaultFlight:

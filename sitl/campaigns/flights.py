@@ -52,6 +52,11 @@ def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
     return config.model_copy(update={"world": world, "laboratory": laboratory})
 
 
+def laboratory_of(config: SitlConfig) -> Data:
+    """Return what a row says about the world of its flight."""
+    return {"world_seed": config.world.seed, "model_error": config.world.model_error}
+
+
 def fly_to_end(config: SitlConfig) -> Flown:
     """Fly the mission. An exception ends this flight as it would end the flight process, not the campaign."""
     try:

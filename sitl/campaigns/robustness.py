@@ -20,7 +20,7 @@ from companion.mission.plan import Plan
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Outcome, PhaseKind, SafetyAction
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns.flights import Flown, fly_to_end, row_of, with_world
+from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, row_of, with_world
 from sitl.campaigns.runner import CampaignError, Data
 from sitl.world.world import _THROW_LEAD_S
 
@@ -174,6 +174,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
     return {
         "row": {
             **{key: flight[key] for key in ("name", "number", "world")},
+            **laboratory_of(flown.config),
             **_graded(flown),
             "thrown": flown.fast is not None and flown.fast.plant.world.thrown_t_s is not None,
             "caught": caught_t_s is not None,

@@ -14,6 +14,7 @@ from companion.config.vehicle import Joint, Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
 from companion.model.types import Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.faults import Fault, FaultKind
+from companion.sitl_config.laboratory import with_model_error
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
@@ -98,6 +99,7 @@ class Plant:
     ) -> None:
         self._between_steps = between_steps
         position_m, yaw_rad, arm_rad = start
+        config = with_model_error(config)
         self._config = config
         self._px4 = px4
         self._drives = (drives[0], drives[1])

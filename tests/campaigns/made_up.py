@@ -51,6 +51,8 @@ def compare_row(flight: dict[str, Any], e_p_m: float | None = 0.1, **changes: An
     post = {"e_p_m": e_p_m, "e_q_deg": None if ended else 3.0, "e_alpha_deg": None if ended else 2.0}
     return {
         **{key: flight[key] for key in ("controller", "preset", "payload_kg", "seed")},
+        "world_seed": flight["seed"],
+        "model_error": flight.get("model_error", 0.0),
         "outcome": "crashed" if ended else "completed",
         "error": None,
         "catch_t_s": 6.5,

@@ -15,10 +15,15 @@ import pytest
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
 from companion.config.yaml_strict import read_document
-from companion.sitl_config.laboratory import Normal, Range, Uniform
+from companion.model.constants import GRAVITY_M_S2
+from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.laboratory import Normal, Range, Uniform, with_model_error
 from companion.sitl_config.loader import WORLDS, SitlConfig, load_sitl, load_world
 from companion.sitl_config.world import World
 from sitl.campaigns.flights import with_world
+from sitl.fast.loop import FastFlight
+from sitl.server import Ports, Sitl, start_of
+from sitl.world.model import base_mass_kg, link_masses_kg
 from tests.support import HOVER
 
 FILE = """\
@@ -152,3 +157,52 @@ def test_the_schema_knows_distributions(file: str) -> None:
     for wrong in ({"rotor_lag_s": {"unifrom": [1, 2]}}, {"throws": {"uniform": [1, 2]}}):
         with pytest.raises(jsonschema.ValidationError):
             schema.validate(wrong)
+
+
+# -- the model error ---------------------------------------------------------------------------------------------------
+
+
+def test_a_model_error_multiplies_what_the_laboratory_errs_by_already() -> None:
+    machine = {"on": True, "inertia_error": (0.1, -0.1, 0.0)}
+    usual = World.model_validate({"mass_error": 0.03, "link_mass_error": (0.05, -0.05), "machine": machine})
+    factors = set()
+    for seed in range(20):
+        off = with_model_error(usual.model_copy(update={"seed": seed, "model_error": 0.2}))
+        assert off == with_model_error(usual.model_copy(update={"seed": seed, "model_error": 0.2}))
+        before = (0.03, 0.05, -0.05, 0.1, -0.1, 0.0, 0.0, 0.0)
+        torque = [off.servo(joint).torque_per_amp_error for joint in range(2)]
+        after = (off.mass_error, *off.link_mass_error, *off.machine.inertia_error, *torque)
+        factor = [round((1.0 + now) / (1.0 + then), 9) for then, now in zip(before, after, strict=True)]
+        assert set(factor) <= {0.8, 1.2}
+        assert len(set(factor[3:6])) == 1, "a body's moments stay possible"
+        factors.add(tuple(factor))
+    assert len(factors) > 10, "signs are drawn one by one"
+    assert with_model_error(usual) is usual
+
+
+def test_a_model_error_without_the_section_machine_changes_nothing_else_of_the_machine() -> None:
+    off = with_model_error(World(model_error=0.3)).machine
+    assert {abs(round(error, 9)) for error in off.inertia_error} == {0.3}
+    assert off.model_copy(update={"inertia_error": (0.0, 0.0, 0.0)}) == Machine(
+        on=True,
+        inertia_error=(0.0, 0.0, 0.0),
+        centre_of_mass_m=(0.0, 0.0, 0.0),
+        shoulder_offset_m=(0.0, 0.0, 0.0),
+        shoulder_rpy_deg=(0.0, 0.0, 0.0),
+        link_length_error_m=(0.0, 0.0),
+        link_com_error_m=(0.0, 0.0),
+    )
+
+
+def test_both_loops_fly_the_machine_with_the_model_error() -> None:
+    config = load_sitl(HOVER, overrides=["world.model_error=0.2"])
+    true, believed = (FastFlight(c).plant.world.weight_n for c in (config, load_sitl(HOVER)))
+    plant = Sitl(
+        config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (90.0, 90.0)), Ports(), lambda message: None
+    ).plant
+    assert plant.world.weight_n == true
+    tool, errs = config.vehicle.tool, with_model_error(config.world)
+    links_kg = link_masses_kg(config.vehicle, errs)
+    true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.net_mass_kg
+    assert true == pytest.approx(GRAVITY_M_S2 * true_kg, rel=1e-6)
+    assert true != pytest.approx(believed, rel=0.05)

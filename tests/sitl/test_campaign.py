@@ -40,6 +40,7 @@ FLIGHT: dict[str, Any] = {
     "preset": "recommended",
     "payload_kg": 0.2,
     "seed": 3,
+    "model_error": 0.0,
     "series": True,
 }
 
@@ -78,7 +79,8 @@ def seen() -> Seen:
 
 def test_a_row_is_what_the_flight_was(seen: Seen) -> None:
     row, result = seen.made["row"], seen.result
-    head = {key: FLIGHT[key] for key in ("controller", "preset", "payload_kg", "seed")}
+    head = {key: FLIGHT[key] for key in ("controller", "preset", "payload_kg", "seed", "model_error")}
+    head["world_seed"] = FLIGHT["seed"]
     assert {key: row[key] for key in head} == head
     assert (seen.flown.config.world.payload_kg, seen.flown.config.world.seed) == (0.2, 3)
     assert (row["outcome"], row["error"]) == ("completed", None)

@@ -1,8 +1,9 @@
 """Means and deviations of a comparison over the seeds.
 
-A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, outcome, error, catch_t_s, rms {pre|post:
-e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m, torque_activity_nm. A figure is None if its
-part of the flight was not flown to the end: errors on the way to a crash say nothing about the controller.
+A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome, error,
+catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,
+torque_activity_nm. A figure is None if its part of the flight was not flown to the end: errors on the way to a crash say nothing about
+the controller.
 """
 
 from __future__ import annotations
@@ -44,11 +45,12 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """All seeds of one variant with one payload."""
+    """All seeds of one variant with one payload and one model error."""
 
     controller: str
     preset: str
     payload_kg: float
+    model_error: float
     rows: Sequence[Row]
 
     @property
@@ -86,6 +88,7 @@ class Group:
             "controller": self.controller,
             "preset": self.preset,
             "payload_kg": self.payload_kg,
+            "model_error": self.model_error,
             "flights": len(self.rows),
             "completed": sum(row["outcome"] == COMPLETED for row in self.rows),
             "failures": self.failures,
@@ -97,10 +100,11 @@ class Group:
 
 
 def aggregate(rows: Iterable[Row]) -> list[Group]:
-    """Group the rows by controller, preset and payload, in the order of their first appearance."""
-    groups: dict[tuple[str, str, float], list[Row]] = {}
+    """Group the rows by controller, preset, payload and model error, in the order of their first appearance."""
+    groups: dict[tuple[str, str, float, float], list[Row]] = {}
     for row in rows:
-        groups.setdefault((row["controller"], row["preset"], row["payload_kg"]), []).append(row)
+        key = (row["controller"], row["preset"], row["payload_kg"], row["model_error"])
+        groups.setdefault(key, []).append(row)
     return [Group(*key, group) for key, group in groups.items()]
 
 

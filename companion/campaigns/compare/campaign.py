@@ -39,7 +39,7 @@ _COMPLIANCE = (
 
 @dataclass(kw_only=True)
 class Compare(Campaign):
-    """A grid of controllers, presets, payloads and seeds."""
+    """A grid of controllers, presets, payloads, model errors and seeds."""
 
     name = "compare"
     csv_name = "compare.csv"
@@ -47,6 +47,7 @@ class Compare(Campaign):
     variants: Sequence[Variant]
     payloads_kg: Sequence[float]
     seeds: Sequence[int]
+    model_errors: Sequence[float] = (0.0,)
 
     def settings(self) -> dict[str, Any]:
         """Return what was flown, for the record."""
@@ -54,6 +55,7 @@ class Compare(Campaign):
             **super().settings(),
             "payloads_kg": list(self.payloads_kg),
             "seeds": list(self.seeds),
+            "model_errors": list(self.model_errors),
             "variants": [
                 {
                     "controller": variant.controller,
@@ -69,7 +71,8 @@ class Compare(Campaign):
 
     def label(self, row: Row) -> str:
         """Return what tells a flight from the others."""
-        return f"{row['controller']}/{row['preset']} {row['payload_kg']:g} kg seed {row['seed']}"
+        error = f" model error {row['model_error']:g}" if row["model_error"] else ""
+        return f"{row['controller']}/{row['preset']} {row['payload_kg']:g} kg{error} seed {row['seed']}"
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return the means and deviations over seeds."""
@@ -91,10 +94,11 @@ class Compare(Campaign):
         )
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Write the time series and the overview."""
+        """Write the time series and the overview, with the first model error."""
         from companion.campaigns.compare.plots import write_pictures
 
-        return write_pictures(messages, aggregate(message["row"] for message in messages), out)
+        shown = [message for message in messages if message["row"]["model_error"] == self.model_errors[0]]
+        return write_pictures(shown, aggregate(message["row"] for message in shown), out)
 
     def show(self, rows: Sequence[Row], console: Console) -> None:
         """Print both tables."""
@@ -106,8 +110,8 @@ class Compare(Campaign):
 
 
 def by_payload(groups: Sequence[Group]) -> list[Group]:
-    """Sort the groups by payload."""
-    return sorted(groups, key=lambda group: group.payload_kg)
+    """Sort the groups by payload and model error."""
+    return sorted(groups, key=lambda group: (group.payload_kg, group.model_error))
 
 
 def print_tables(groups: Sequence[Group], console: Console) -> None:
@@ -152,7 +156,9 @@ def _table(title: str, columns: Sequence[Column], groups: Sequence[Group]) -> Ta
             left=True,
         ),
     ]
-    return table([*head, *columns], groups, title=title, group=lambda group: group.payload_kg)
+    if any(group.model_error for group in groups):
+        head.insert(1, Column("model\nerror", lambda group: f"{group.model_error:.0%}"))
+    return table([*head, *columns], groups, title=title, group=lambda group: (group.payload_kg, group.model_error))
 
 
 def _ours(name: str, title: str, unit: str, digits: int, deviation: bool, *, failures: bool) -> Column:

@@ -1,4 +1,4 @@
-"""The grid of a comparison: controllers with their presets, payloads and seeds."""
+"""The grid of a comparison: controllers with their presets, payloads, model errors and seeds."""
 
 from __future__ import annotations
 
@@ -91,18 +91,27 @@ def variants_of(
     return found
 
 
-def flights_of(variants: Sequence[Variant], payloads_kg: Sequence[float], seeds: Sequence[int]) -> list[Message]:
-    """Return the flights in the order of the table: payload, variant, seed. The first seed's flights record a time series."""
+def flights_of(
+    variants: Sequence[Variant],
+    payloads_kg: Sequence[float],
+    seeds: Sequence[int],
+    model_errors: Sequence[float] = (0.0,),
+) -> list[Message]:
+    """Return the flights in the order of the table: payload, model error, variant, seed. The first seed's flights with the first model
+    error record a time series.
+    """
     return [
         {
             "variant": position,
             "controller": variant.controller,
             "preset": variant.preset,
             "payload_kg": payload_kg,
+            "model_error": model_error,
             "seed": seed,
-            "series": seed == seeds[0],
+            "series": (seed, model_error) == (seeds[0], model_errors[0]),
         }
         for payload_kg in payloads_kg
+        for model_error in model_errors
         for position, variant in enumerate(variants)
         for seed in seeds
     ]

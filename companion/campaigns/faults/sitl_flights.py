@@ -22,6 +22,7 @@ from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
 from companion.safety.touchdown import HEIGHT_MARGIN_M
 from companion.sitl_config.faults import FlightPhase
+from companion.sitl_config.loader import SitlConfig
 
 FLIGHT_TIMEOUT_S = 240.0
 LEAVE_TIMEOUT_S = 60.0
@@ -48,7 +49,7 @@ class WireFlights:
         self,
         flights: Sequence[tuple[Variant, FlightPhase]],
         options: Sequence[str],
-        config: FlightConfig,
+        config: SitlConfig,
         out: Path,
         jobs: int,
     ) -> None:
@@ -105,6 +106,7 @@ class WireFlights:
         else:
             record = flown(folder, self._config)
         row = row_of(variant, phase, record, self._config.vehicle)
+        row |= {"world_seed": self._config.world.seed, "model_error": self._config.world.model_error}
         return {"index": number, "row": row, "wall_s": time.monotonic() - begun_s}
 
     @staticmethod
