@@ -16,7 +16,9 @@ from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.effects.mocap import Mocap
+from companion.sitl_config.effects.net import Net
 from companion.sitl_config.effects.tether_line import TetherLine
+from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import Fault as Fault
 
 REAL32_MAX = 3.4e38
@@ -160,6 +162,8 @@ class World(Model):
     force_sensor: ForceSensor = ForceSensor()
     imu: Imu = Imu()
     mocap: Mocap = Mocap()
+    net: Net = Net()
+    thrower: Thrower = Thrower()
 
     def servo(self, joint: int) -> Servo:
         """Return the servo of joint 0 or 1."""

@@ -15,10 +15,12 @@ from companion.model.types import Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
 from sitl.world.effects.downwash import Downwash
+from sitl.world.effects.net import Net
 from sitl.world.effects.tether_line import TetherLine
+from sitl.world.effects.thrower import Thrower
 from sitl.world.handling import Wrench
 from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
-from sitl.world.model import mjcf
+from sitl.world.model import PAYLOAD_RADIUS_M, mjcf
 
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
@@ -95,7 +97,7 @@ class WorldEvent:
 
     t_s: float
     kind: str
-    """thrown, caught, taken (out of the net), missed or crashed."""
+    """thrown, caught, taken (out of the net), missed, bounced_out (of the bag) or crashed."""
 
 
 class Ball(NamedTuple):
@@ -144,6 +146,7 @@ class World:
         )
         self._base = m.body("base").id
         self._net = m.body("net").id
+        self._thrower = Thrower.of(config.thrower, config.seed)
         self._has_payload = config.payload_kg > 0
         if self._has_payload:
             self._payload = Ball.of(m, "payload", "catch")
@@ -181,6 +184,7 @@ class World:
         # Views: looking up MuJoCo's arrays in every step costs more than reading them.
         self._ctrl, self._qpos, self._qvel, self._sensordata = d.ctrl, d.qpos, d.qvel, d.sensordata
         self.loads = Loads(d)
+        self._bag = Net.of(config.net, m, d, self.loads, vehicle.tool.net_radius_m, PAYLOAD_RADIUS_M)
         self.effects = self._effects_on()
         """Effects that load bodies and are on."""
         self._step = 0
@@ -292,8 +296,13 @@ class World:
                 for effect in self.effects:
                     effect.apply(self)
             self._step += 1
-        self.loads.write()
-        mujoco.mj_step(self.model, self.data)
+        if self._bag is None:
+            self.loads.write()
+            mujoco.mj_step(self.model, self.data)
+        else:
+            self._bag.step(self.q, self.v, self.t_s)
+            for _ in range(self._bag.take_bounces()):
+                self._events.append(WorldEvent(self.t_s, "bounced_out"))
         self.t_s = self.data.time
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()
         self._sensors = None
@@ -326,13 +335,18 @@ class World:
                 self._throw()
             self._last_x = ahead
             return
-        if self.catch(self._payload):
+        caught_s = self._caught_s(self._payload)
+        if caught_s is not None:
             self.catches += 1
             if self.throws == 1:
-                self.caught_t_s = self.t_s
-            self._flies_since_s, self._kept_since_s = None, self.t_s
+                self.caught_t_s = caught_s
+            self._flies_since_s, self._kept_since_s = None, caught_s
             self._events.append(WorldEvent(self.t_s, "caught"))
-        elif not self._missed and self.t_s - self._flies_since_s > 2 * _THROW_LEAD_S:
+        elif (
+            not self._missed
+            and self.t_s - self._flies_since_s > 2 * _THROW_LEAD_S
+            and not (self._bag is not None and self._bag.in_bag(self._payload.body))
+        ):
             self._missed = True
             self.missed = self.missed or self.throws == 1
             self._events.append(WorldEvent(self.t_s, "missed"))
@@ -352,8 +366,8 @@ class World:
     def _take_out(self) -> None:
         """Take the payload out of the net, so that it can be thrown again."""
         ball, d = self._payload, self.data
+        self.drop()
         self._kept_since_s = None
-        d.eq_active[ball.catch] = 0
         d.qpos[ball.q : ball.q + 7] = self.model.qpos0[ball.q : ball.q + 7]
         d.qvel[ball.v : ball.v + 6] = 0.0
         self._await_pass()
@@ -364,19 +378,35 @@ class World:
         self._last_x = self.q[0] + self.v[0] * _THROW_LEAD_S
 
     def throw(self, ball: Ball, aside_m: float = 0.0) -> None:
-        """Launch a ball so that it meets a point `aside_m` to the left (world y) of the net."""
-        d = self.data
-        target = d.xpos[self._net] + d.qvel[0:3] * _THROW_LEAD_S + np.array([0.0, aside_m, 0.0])
+        """Launch a ball so that it meets a point `aside_m` to the left (world y) of the net; a person misses that point."""
+        d, thrower = self.data, self._thrower
+        lead_s = _THROW_LEAD_S if thrower is None else _THROW_LEAD_S + thrower.prediction_error_s()
+        target = d.xpos[self._net] + d.qvel[0:3] * lead_s + np.array([0.0, aside_m, 0.0])
         arrival = np.array(self._config.throw_velocity_m_s)
         gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
         velocity = arrival - gravity * _THROW_LEAD_S
+        point = target - velocity * _THROW_LEAD_S - 0.5 * gravity * _THROW_LEAD_S**2
         q, v = ball.q, ball.v
-        d.qpos[q : q + 3] = target - velocity * _THROW_LEAD_S - 0.5 * gravity * _THROW_LEAD_S**2
+        if thrower is None:
+            d.qpos[q : q + 3], d.qvel[v : v + 3] = point, velocity
+        else:
+            d.qpos[q : q + 3], d.qvel[v : v + 3] = thrower.release(point.tolist(), velocity.tolist(), _THROW_LEAD_S)
         d.qpos[q + 3 : q + 7] = (1, 0, 0, 0)
-        d.qvel[v : v + 3] = velocity
         d.qvel[v + 3 : v + 6] = 0.0
+        if self._bag is not None:
+            self._bag.watch(ball.body, ball.q, ball.v)
+
+    def _caught_s(self, ball: Ball) -> float | None:
+        """Return the time of the catch if the ball is caught; otherwise None."""
+        if self._bag is not None:
+            return self._bag.caught_s(ball.body, self.t_s)
+        return self.t_s if self._attach(ball) else None
 
     def catch(self, ball: Ball) -> bool:
+        """Return whether the ball is caught: it touches the net, which then holds it, or it has settled in the bag."""
+        return self._caught_s(ball) is not None
+
+    def _attach(self, ball: Ball) -> bool:
         """Attach the ball to the net if it touches it; return whether it does."""
         d = self.data
         gap = d.xpos[ball.body] - d.xpos[self._net]
@@ -392,6 +422,8 @@ class World:
         """Let the payload fall out of the net, if it is in there."""
         if self._kept_since_s is not None:
             self.data.eq_active[self._payload.catch] = 0
+            if self._bag is not None:
+                self._bag.let_go(self._payload.body)
 
     @property
     def attachment_world_m(self) -> Vec3:

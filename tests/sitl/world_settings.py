@@ -21,7 +21,9 @@ from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.effects.mocap import Mocap
+from companion.sitl_config.effects.net import Net
 from companion.sitl_config.effects.tether_line import TetherLine
+from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import KINDS, Fault
 from companion.sitl_config.world import Push, Servo, World
 
@@ -49,6 +51,8 @@ EXAMPLES: dict[type[Model], Settings] = {
     TetherLine: {"on": True},
     Imu: {"on": True},
     Mocap: {"on": True, "lost_share": 0.2, "wobble_every_s": 0.5},
+    Net: {"on": True},
+    Thrower: {"on": True},
 }
 """Examples of the parts of the world whose fields are tested."""
 
@@ -84,6 +88,9 @@ TOGETHER: dict[str, Settings] = {
     "throws": {"keep_s": 0.2},
 }
 """Further settings of both worlds that make the setting act early in a flight."""
+
+BESIDE_PART: dict[str, Settings] = {"net": {"catch_at_m": (0.2, 0.0)}}
+"""Settings of both worlds beside a part: at this place the short catch does not accelerate, and the throw meets the net's middle."""
 
 TOGETHER_IN_PART: dict[str, Settings] = {
     "faults.phase": {"t_s": None, "phase": "line"},
@@ -137,6 +144,7 @@ def _acts(setting: str) -> int:
 
 def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
     wide = 2 if part is Servo else 1
+    beside = BESIDE_PART.get(name, {})
     for key, inner in part.model_fields.items():
         if (name, key) == ("faults", "kind"):
             continue  # `fault_pairs`
@@ -147,8 +155,8 @@ def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
                 suffix = f" of {place + 1}" if wide > 1 else ""
                 yield Pair(
                     path + number + suffix,
-                    {name: _placed(field, part, usual, place)},
-                    {name: _placed(field, part, {**usual, **changed}, place)},
+                    {**beside, name: _placed(field, part, usual, place)},
+                    {**beside, name: _placed(field, part, {**usual, **changed}, place)},
                     _acts(path),
                 )
 

@@ -1,0 +1,27 @@
+"""The section `net`: how a payload enters, settles and swings in the net."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from companion.config.base import Fraction, Model, Positive
+
+
+class Net(Model):
+    """A hoop with a bag of elastic mesh. Without it the payload is fixed to the net where it enters."""
+
+    on: bool = False
+    """Whether this effect acts."""
+    bag_depth_m: Annotated[float, Field(ge=0.05, le=0.5)] = 0.10
+    """Distance from the hoop to the payload's centre at which the mesh is taut without load; length of the pendulum (e)."""
+    bag_stiffness_n_m: Annotated[float, Field(gt=0, le=5000)] = 500.0
+    """Stiffness of the mesh: it stops 0.1 to 0.3 kg in 20 to 40 ms (e)."""
+    restitution: Fraction = 0.3
+    """Speed at which the mesh and the hoop return a payload over the speed at which it arrived (e)."""
+    pocket: Fraction = 0.5
+    """Share of the payload's distance from the centre, where it enters, that remains when it has settled: 0 if it slides to the
+    middle of the bag, 1 if the mesh forms a pocket where it entered (e)."""
+    swing_damping_ratio: Positive = 0.15
+    """Damping ratio of the settled payload's swing (e)."""

@@ -1,0 +1,22 @@
+"""The section `thrower`: the scatter of a person's throws."""
+
+from __future__ import annotations
+
+from companion.config.base import Model, NonNegative
+
+
+class Thrower(Model):
+    """A person who throws the payload. Every value is a standard deviation; each throw draws anew. Without it each throw meets the
+    predicted position of the net with `throw_velocity_m_s`."""
+
+    on: bool = False
+    """Whether this effect acts."""
+    speed_error: NonNegative = 0.02
+    """Relative error of the release speed. Skilled basketball players: 0.05 to 0.13 m/s of about 7 m/s (p: Slegers et al. 2021)."""
+    direction_error_deg: NonNegative = 1.3
+    """Error of the release direction, sideways and in elevation. Skilled basketball players: 1.3 (p: Slegers et al. 2021)."""
+    release_error_m: NonNegative = 0.05
+    """Scatter of the release point on each axis. The person aims from there, so that it changes the payload's speed and direction
+    at the net, not the point of arrival (e)."""
+    prediction_error_s: NonNegative = 0.05
+    """Error of the time for which the person extrapolates the vehicle's motion (e)."""

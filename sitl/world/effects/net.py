@@ -1,0 +1,245 @@
+"""Contact of a thrown payload with the net: a hoop with a bag of elastic mesh.
+
+The hoop lies in the x-y plane of link 2 about the net's centre and opens towards +z, which points up in the catch pose. The mesh is a
+membrane in the hoop, slack up to the bag's depth: a payload that crosses the plane inside the hoop from above is in the bag; one that
+crosses it from below lifts the mesh and falls back. The taut mesh acts as a one-sided spring between the payload and a point of the
+plane, the pocket, about which the payload swings. It presses with the full stiffness while it is stretched and with
+restitution^2 of it while it relaxes, which returns the payload with `restitution` times its speed whatever its mass (Walton and Braun
+1986, J. Rheology 30: 949). The hoop is a ring with the same law.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+
+from companion.model.constants import GRAVITY_M_S2
+from companion.model.types import Vec3
+from companion.sitl_config.effects.net import Net as NetConfig
+from sitl.world.loads import ZERO, Loads
+
+RIM_STIFFNESS_N_M = 3000.0
+SETTLED_S = 0.4
+"""A payload is caught when it has been in the bag for this time; one that bounces out leaves within 0.2 s."""
+_TURN_M_S = 0.1
+"""The stiffness changes between stretching and relaxing over this speed, which damps a payload at rest."""
+_NEAR_M2 = 1.0
+"""Square of the distance from the vehicle's origin within which contact is computed; the arm with the bag reaches 0.65 m."""
+
+
+class Bag:
+    """Contact of one payload with the hoop and its mesh, in the frame of the hoop (m, m/s, N)."""
+
+    def __init__(self, config: NetConfig, hoop_radius_m: float, payload_radius_m: float) -> None:
+        self._hoop_m, self._payload_m = hoop_radius_m, payload_radius_m
+        self._depth_m, self._stiffness_n_m, self._pocket = config.bag_depth_m, config.bag_stiffness_n_m, config.pocket
+        returned = config.restitution**2
+        self._mean, self._half = 0.5 * (1.0 + returned), 0.5 * (1.0 - returned)
+        # Friction over normal force and speed; at rest, with the weight as normal force, it gives the damping ratio.
+        self._friction_s_m = 2.0 * config.swing_damping_ratio / math.sqrt(GRAVITY_M_S2 * config.bag_depth_m)
+        self.side = 0
+        """1 if the payload is in the bag, -1 if it lifts the mesh from below, 0 if it is outside."""
+        self.pivot_m = (0.0, 0.0)
+        """x and y of the point about which the payload swings."""
+        self.entered_s: float | None = None
+        """Time at which the payload came into the bag; None if it is not in there."""
+        self.touched_s: float | None = None
+        """Time of the first contact with hoop or mesh since the throw or since it bounced out."""
+        self.bounced = False
+        """Whether the payload has left the bag again after it touched the mesh; reset by the reader."""
+        self._above: bool | None = None
+
+    def caught_s(self, t_s: float) -> float | None:
+        """Return the time of the first contact if the payload is caught; otherwise None."""
+        if self.entered_s is None or t_s - self.entered_s < SETTLED_S:
+            return None
+        return self.touched_s
+
+    def force_n(self, position: Vec3, velocity: Vec3, t_s: float) -> Vec3 | None:
+        """Return the force on the payload, or None without contact.
+
+        Args:
+            position: of the payload's centre from the centre of the hoop.
+            velocity: of the payload against the point of the net's frame at its centre.
+            t_s: world time.
+        """
+        x, y, z = position
+        vx, vy, vz = velocity
+        radial = math.sqrt(x * x + y * y)
+        self._cross_plane(x, y, z, radial, t_s)
+        fx = fy = fz = 0.0
+        if self.side != 0:
+            dx, dy = x - self.pivot_m[0], y - self.pivot_m[1]
+            distance = math.sqrt(dx * dx + dy * dy + z * z)
+            if distance > self._depth_m:
+                nx, ny, nz = -dx / distance, -dy / distance, -z / distance
+                fx, fy, fz = self._pressed(self._stiffness_n_m, distance - self._depth_m, nx, ny, nz, vx, vy, vz)
+        across = radial - self._hoop_m
+        to_wire2 = across * across + z * z
+        if 0.0 < to_wire2 < self._payload_m * self._payload_m and radial > 0.0:
+            to_wire = math.sqrt(to_wire2)
+            out = across / (to_wire * radial)
+            rx, ry, rz = self._pressed(
+                RIM_STIFFNESS_N_M, self._payload_m - to_wire, out * x, out * y, z / to_wire, vx, vy, vz
+            )
+            fx, fy, fz = fx + rx, fy + ry, fz + rz
+        if fx == fy == fz == 0.0:
+            return None
+        if self.touched_s is None:
+            self.touched_s = t_s
+        return (fx, fy, fz)
+
+    def _cross_plane(self, x: float, y: float, z: float, radial: float, t_s: float) -> None:
+        above = z > 0.0
+        if self.side == 0:
+            if self._above is not None and above is not self._above and radial < self._hoop_m:
+                self.side = -1 if above else 1
+                self.pivot_m = (self._pocket * x, self._pocket * y)
+                self.entered_s = None if above else t_s
+            self._above = above
+        elif above is (self.side > 0) and radial < self._hoop_m:
+            self.bounced = self.side > 0 and self.touched_s is not None
+            self.side, self._above, self.entered_s, self.touched_s = 0, above, None, None
+
+    def _pressed(
+        self, stiffness: float, depth: float, nx: float, ny: float, nz: float, vx: float, vy: float, vz: float
+    ) -> Vec3:
+        """Return the force of a surface with the unit normal n that the payload presses in by `depth`, with friction."""
+        along = vx * nx + vy * ny + vz * nz
+        stretching = -along / _TURN_M_S
+        stretching = 1.0 if stretching > 1.0 else -1.0 if stretching < -1.0 else stretching
+        normal = stiffness * depth * (self._mean + self._half * stretching)
+        slip = normal * self._friction_s_m
+        push = normal + slip * along
+        return (push * nx - slip * vx, push * ny - slip * vy, push * nz - slip * vz)
+
+
+class Net:
+    """The net of one vehicle.
+
+    Args:
+        config: section `net`.
+        model: the model with the bodies base, sensor and net.
+        data: its data.
+        loads: external forces and torques on the bodies.
+        hoop_radius_m: radius of the hoop.
+        payload_radius_m: radius of the payloads.
+    """
+
+    def __init__(
+        self,
+        config: NetConfig,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        loads: Loads,
+        hoop_radius_m: float,
+        payload_radius_m: float,
+    ) -> None:
+        self._config, self._radii_m = config, (hoop_radius_m, payload_radius_m)
+        self._model, self._data, self._loads = model, data, loads
+        base, link, self._net = (model.body(name).id for name in ("base", "sensor", "net"))
+        self._centre, self._axes, self._velocity = data.xpos[self._net], data.xmat[link], data.cvel[self._net]
+        self._com, self._net_com = data.subtree_com[base], data.xipos[self._net]
+        self._bags: dict[int, tuple[Bag, int, int]] = {}
+        self._touching: set[int] = set()
+
+    @classmethod
+    def of(
+        cls,
+        config: NetConfig,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        loads: Loads,
+        hoop_radius_m: float,
+        payload_radius_m: float,
+    ) -> Net | None:
+        """Return the net, or None if the effect is off."""
+        return cls(config, model, data, loads, hoop_radius_m, payload_radius_m) if config.on else None
+
+    def watch(self, body: int, q: int, v: int) -> None:
+        """Let the net act on a payload that is thrown: its body and its first places in qpos and qvel."""
+        self.let_go(body)
+        self._bags[body] = (Bag(self._config, *self._radii_m), q, v)
+
+    def let_go(self, body: int) -> None:
+        """Let the net no longer act on a payload."""
+        self._bags.pop(body, None)
+        self._release(body)
+
+    def caught_s(self, body: int, t_s: float) -> float | None:
+        """Return the time of the first contact if the payload is caught; otherwise None."""
+        bag = self._bags.get(body)
+        return None if bag is None else bag[0].caught_s(t_s)
+
+    def in_bag(self, body: int) -> bool:
+        """Return whether the payload is in the bag, settled or not."""
+        return body in self._bags and self._bags[body][0].side > 0
+
+    def take_bounces(self) -> int:
+        """Return the number of payloads that have bounced out since the last call."""
+        bounced = [bag for bag, _, _ in self._bags.values() if bag.bounced]
+        for bag in bounced:
+            bag.bounced = False
+        return len(bounced)
+
+    def step(self, q: list[float], v: list[float], t_s: float) -> None:
+        """Advance MuJoCo by one step, with all loads.
+
+        Args:
+            q: qpos before the step.
+            v: qvel before the step.
+            t_s: world time before the step.
+        """
+        near = [(body, of) for body, of in self._bags.items() if _is_near(q, of[1])]
+        if not near:
+            self._loads.write()
+            mujoco.mj_step(self._model, self._data)
+            return
+        # The first half brings the net's pose and velocity up to date: forces of the step before would add energy.
+        mujoco.mj_step1(self._model, self._data)
+        for body, (bag, at_q, at_v) in near:
+            self._press(body, bag, (q[at_q], q[at_q + 1], q[at_q + 2]), (v[at_v], v[at_v + 1], v[at_v + 2]), t_s)
+        self._loads.write()
+        mujoco.mj_step2(self._model, self._data)
+
+    def _press(self, body: int, bag: Bag, position: Vec3, velocity: Vec3, t_s: float) -> None:
+        """Load the payload at this position, with this velocity in the world, and the net against it."""
+        px, py, pz = position
+        cx, cy, cz = self._centre.tolist()
+        xx, yx, zx, xy, yy, zy, xz, yz, zz = self._axes.tolist()
+        wx, wy, wz, ux, uy, uz = self._velocity.tolist()
+        ox, oy, oz = self._com.tolist()
+        gx, gy, gz = px - cx, py - cy, pz - cz
+        # MuJoCo gives the net's velocity at the vehicle's centre of mass.
+        lx, ly, lz = px - ox, py - oy, pz - oz
+        ux = velocity[0] - ux - wy * lz + wz * ly
+        uy = velocity[1] - uy - wz * lx + wx * lz
+        uz = velocity[2] - uz - wx * ly + wy * lx
+        force = bag.force_n(
+            (xx * gx + xy * gy + xz * gz, yx * gx + yy * gy + yz * gz, zx * gx + zy * gy + zz * gz),
+            (xx * ux + xy * uy + xz * uz, yx * ux + yy * uy + yz * uz, zx * ux + zy * uy + zz * uz),
+            t_s,
+        )
+        if force is None:
+            self._release(body)
+            return
+        a, b, c = force
+        fx, fy, fz = xx * a + yx * b + zx * c, xy * a + yy * b + zy * c, xz * a + yz * b + zz * c
+        mx, my, mz = self._net_com.tolist()
+        gx, gy, gz = px - mx, py - my, pz - mz
+        self._touching.add(body)
+        self._loads.set(body, "net", (fx, fy, fz))
+        torque_nm = (gz * fy - gy * fz, gx * fz - gz * fx, gy * fx - gx * fy)
+        self._loads.set(self._net, f"payload {body}", (-fx, -fy, -fz), torque_nm)
+
+    def _release(self, body: int) -> None:
+        if body in self._touching:
+            self._touching.discard(body)
+            self._loads.set(body, "net", ZERO)
+            self._loads.set(self._net, f"payload {body}", ZERO)
+
+
+def _is_near(q: list[float], at: int) -> bool:
+    x, y, z = q[at] - q[0], q[at + 1] - q[1], q[at + 2] - q[2]
+    return x * x + y * y + z * z < _NEAR_M2

@@ -1,0 +1,299 @@
+"""The net: a hoop with a bag, against closed-form mechanics and conservation laws."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from companion.config.loader import load_vehicle
+from companion.config.vehicle import Vehicle
+from companion.model.constants import GRAVITY_M_S2
+from companion.model.types import Outcome, Vec2, Vec3
+from companion.sitl_config.effects.net import Net
+from companion.sitl_config.faults import Fault
+from companion.sitl_config.loader import load_sitl
+from companion.sitl_config.world import World as WorldConfig
+from sitl.fast.loop import FastFlight
+from sitl.world.effects.net import SETTLED_S, Bag
+from sitl.world.model import PAYLOAD_RADIUS_M, SECOND, SECOND_CATCH
+from sitl.world.world import PHYSICS_DT_S, Ball, World
+
+Array = NDArray[np.float64]
+HOOP_M = 0.09
+CATCH_POSE = (math.radians(100), math.radians(60))
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> Vehicle:
+    return load_vehicle("configs/vehicles/tarot650_2r.yaml")
+
+
+@dataclass
+class Point:
+    """A payload at a net that is held still, upright, integrated as MuJoCo does."""
+
+    bag: Bag
+    mass_kg: float
+    position: Vec3
+    velocity: Vec3
+    gravity: float = GRAVITY_M_S2
+    t_s: float = 0.0
+    force: Vec3 | None = None
+
+    def step(self) -> None:
+        self.force = self.bag.force_n(self.position, self.velocity, self.t_s)
+        fx, fy, fz = self.force or (0.0, 0.0, 0.0)
+        k = PHYSICS_DT_S / self.mass_kg
+        vx, vy, vz = self.velocity
+        self.velocity = (vx + k * fx, vy + k * fy, vz + k * fz - self.gravity * PHYSICS_DT_S)
+        x, y, z = (p + PHYSICS_DT_S * v for p, v in zip(self.position, self.velocity, strict=True))
+        self.position = (x, y, z)
+        self.t_s += PHYSICS_DT_S
+
+    def run(self, duration_s: float) -> None:
+        for _ in range(round(duration_s / PHYSICS_DT_S)):
+            self.step()
+
+
+def falling(
+    speed_m_s: float,
+    mass_kg: float = 0.2,
+    at: Vec2 = (0.0, 0.0),
+    gravity: float = GRAVITY_M_S2,
+    z_m: float = 0.05,
+    **net: float,
+) -> Point:
+    bag = Bag(Net(on=True, **net), HOOP_M, PAYLOAD_RADIUS_M)
+    return Point(bag, mass_kg, (*at, z_m), (0.0, 0.0, -speed_m_s), gravity)
+
+
+@pytest.mark.parametrize("mass_kg", [0.1, 0.2, 0.3])
+def test_the_bag_stops_the_payload_in_a_quarter_period_of_its_spring(mass_kg: float) -> None:
+    payload = falling(2.7, mass_kg, gravity=0.0)
+    forces = []
+    while payload.t_s < 0.15:
+        payload.step()
+        forces.append(math.hypot(*payload.force) if payload.force else 0.0)
+    duration_s = sum(force > 0.1 * max(forces) for force in forces) * PHYSICS_DT_S
+    assert duration_s == pytest.approx(0.5 * math.pi * math.sqrt(mass_kg / 500.0), abs=3 * PHYSICS_DT_S)
+    assert 0.018 <= duration_s <= 0.08
+    assert max(forces) == pytest.approx(2.7 * math.sqrt(mass_kg * 500.0), rel=0.06)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.6])
+def test_the_bag_returns_the_restitution_of_the_speed(restitution: float) -> None:
+    payload = falling(2.0, gravity=0.0, restitution=restitution)
+    payload.run(0.5)
+    assert payload.velocity[2] == pytest.approx(2.0 * restitution, abs=0.12)
+
+
+def test_a_settled_payload_swings_with_the_period_of_the_pendulum() -> None:
+    payload = falling(0.0, swing_damping_ratio=0.01)
+    bag = payload.bag
+    payload.position = (0.01, 0.0, -bag._depth_m - 0.006)
+    bag.side, bag.entered_s = 1, 0.0
+    crossings = []
+    while payload.t_s < 5.0:
+        before = payload.position[0]
+        payload.step()
+        if before < 0.0 <= payload.position[0]:
+            crossings.append(payload.t_s)
+    length_m = -payload.position[2]
+    assert length_m > bag._depth_m
+    period_s = (crossings[-1] - crossings[0]) / (len(crossings) - 1)
+    assert period_s == pytest.approx(math.tau * math.sqrt(length_m / GRAVITY_M_S2), rel=0.01)
+
+
+def test_the_swing_decays_with_its_damping_ratio() -> None:
+    payload = falling(0.0, swing_damping_ratio=0.1)
+    payload.bag.side, payload.bag.entered_s = 1, 0.0
+    payload.position = (0.01, 0.0, -payload.bag._depth_m - 0.006)
+    peaks: list[float] = []
+    while payload.t_s < 2.0:
+        before = payload.velocity[0]
+        payload.step()
+        if before > 0.0 >= payload.velocity[0]:
+            peaks.append(payload.position[0])
+    decrement = math.log(peaks[0] / peaks[1])
+    assert decrement == pytest.approx(math.tau * 0.1 / math.sqrt(1 - 0.1**2), rel=0.1)
+
+
+@pytest.mark.parametrize("mass_kg", [0.02, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("at", [(0.0, 0.0), (0.05, 0.03), (0.0, 0.085)])
+def test_ten_seconds_of_settling_add_no_energy(mass_kg: float, at: Vec2) -> None:
+    payload = falling(2.0, mass_kg, at)
+    before = energy = mass_kg * (0.5 * 2.0**2 + GRAVITY_M_S2 * payload.position[2])
+    while payload.t_s < 10.0:
+        payload.step()
+        if payload.force is None:
+            now = mass_kg * (0.5 * math.hypot(*payload.velocity) ** 2 + GRAVITY_M_S2 * payload.position[2])
+            assert now <= energy + 0.01 * mass_kg, "energy in free flight: never more than before"
+            energy = min(energy, now)
+    assert energy < before
+    assert math.hypot(*payload.velocity) < 0.02
+    assert payload.bag.side == 1
+
+
+def test_a_payload_that_is_too_fast_bounces_out() -> None:
+    payload = falling(7.0, 0.1)
+    payload.run(0.5)
+    assert payload.bag.bounced
+    assert payload.bag.caught_s(payload.t_s) is None
+    slow = falling(2.7, 0.1)
+    slow.run(0.5)
+    assert not slow.bag.bounced
+    assert slow.bag.touched_s is not None
+    assert slow.bag.caught_s(slow.t_s) == slow.bag.touched_s
+
+
+def test_a_catch_counts_when_the_payload_has_settled() -> None:
+    payload = falling(2.0, z_m=PHYSICS_DT_S)
+    payload.run(SETTLED_S - 0.02)
+    assert payload.bag.side == 1
+    assert payload.bag.caught_s(payload.t_s) is None
+    payload.run(0.04)
+    assert payload.bag.caught_s(payload.t_s) is not None
+
+
+def test_a_payload_beside_the_hoop_is_not_touched() -> None:
+    payload = falling(2.7, at=(HOOP_M + PAYLOAD_RADIUS_M + 0.002, 0.0))
+    payload.run(0.3)
+    assert payload.bag.touched_s is None
+    assert payload.velocity[0:2] == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("offset_m", "outwards"), [(0.02, True), (-0.02, False)])
+def test_the_hoop_deflects_a_payload_away_from_its_wire(offset_m: float, outwards: bool) -> None:
+    payload = falling(1.0, at=(HOOP_M + offset_m, 0.0))
+    payload.run(0.12)
+    assert payload.bag.touched_s is not None
+    assert (payload.velocity[0] > 0.05) if outwards else (payload.velocity[0] < -0.05)
+
+
+def test_a_payload_from_below_falls_back() -> None:
+    payload = falling(-2.7, z_m=-0.05)
+    highest_m = 0.0
+    while payload.t_s < 0.6:
+        payload.step()
+        highest_m = max(highest_m, payload.position[2])
+    assert 0.05 < highest_m < 0.2, "the mesh stops it"
+    assert payload.position[2] < -0.1
+    assert not payload.bag.bounced
+
+
+def thrown_at(world: World, ball: Ball, ball_from_net_m: Vec3, velocity_m_s: Vec3) -> None:
+    """Place a payload in the frame of the hoop and let the net act on it."""
+    m, d = world.model, world.data
+    mujoco.mj_forward(m, d)
+    axes = d.xmat[m.body("sensor").id].reshape(3, 3)
+    d.qpos[ball.q : ball.q + 3] = d.xpos[m.body("net").id] + axes @ np.array(ball_from_net_m)
+    d.qvel[ball.v : ball.v + 3] = axes @ np.array(velocity_m_s)
+    mujoco.mj_forward(m, d)
+    world.q, world.v = d.qpos.tolist(), d.qvel.tolist()
+    assert world._bag is not None
+    world._bag.watch(*ball[0:3])
+    world.throws, world._flies_since_s = 1, world.t_s
+
+
+@pytest.mark.parametrize("payload_kg", [0.1, 0.3])
+def test_an_off_centre_catch_conserves_both_momenta(vehicle: Vehicle, payload_kg: float) -> None:
+    """In weightlessness, without air: the vehicle takes up the payload's change of momentum."""
+    config = WorldConfig(payload_kg=payload_kg, joint_friction_nm=0.0, joint_damping_nms=0.0, net=Net(on=True))
+    world = World(vehicle, config, (0.0, 0.0), 0.0, CATCH_POSE)
+    world.release_arm()
+    m, d = world.model, world.data
+    m.opt.gravity[:] = 0
+    d.qpos[2] = 1.5
+    thrown_at(world, world._payload, (0.05, -0.03, 0.1), (0.3, 0.1, -2.7))
+
+    def momenta() -> tuple[Array, Array]:
+        mujoco.mj_forward(m, d)
+        mujoco.mj_subtreeVel(m, d)
+        return np.array(m.body_subtreemass[0] * d.subtree_linvel[0]), np.array(d.subtree_angmom[0])
+
+    linear, angular = momenta()
+    payload_before = payload_kg * d.qvel[world._payload.v : world._payload.v + 3]
+    for _ in range(round(0.2 / PHYSICS_DT_S)):
+        world.step((0, 0, 0, 0), (0, 0), False, drag=False)
+    linear_after, angular_after = momenta()
+    payload_after = payload_kg * d.qvel[world._payload.v : world._payload.v + 3]
+    assert np.linalg.norm(payload_after - payload_before) > 0.5 * np.linalg.norm(payload_before), "an impact"
+    assert np.linalg.norm(linear_after - linear) <= 0.01 * np.linalg.norm(linear)
+    assert np.linalg.norm(angular_after - angular) <= 0.01 * np.linalg.norm(angular)
+
+
+def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehicle) -> None:
+    """On the floor, the arm held out level: the sensor reads the weight, and the weight times its lever."""
+    config = WorldConfig(payload_kg=0.2, net=Net(on=True, pocket=1.0))
+    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    thrown_at(world, world._payload, (-0.02, 0.06, 0.05), (0.0, 0.0, -1.0))
+    for _ in range(round(4.0 / PHYSICS_DT_S)):
+        world.step((0, 0, 0, 0), (0, 0), False)
+    assert [event.kind for event in world.take_events()] == ["caught"]
+    truth = world.truth()
+    net_weight_n = vehicle.tool.net_mass_kg * GRAVITY_M_S2
+    weight_n = 0.2 * GRAVITY_M_S2
+    assert truth.force_sensor_n[2] == pytest.approx(-weight_n - net_weight_n, rel=0.01)
+    lever_x_m, lever_y_m = world.data.xpos[world._payload.body][0:2] - world.data.xpos[world._net][0:2]
+    assert lever_y_m == pytest.approx(0.06, abs=0.01)
+    assert truth.torque_sensor_nm[0] == pytest.approx(-weight_n * lever_y_m, rel=0.02)
+    assert truth.torque_sensor_nm[1] == pytest.approx(weight_n * lever_x_m, rel=0.05)
+
+
+def test_what_bounces_out_is_an_event_and_no_catch(vehicle: Vehicle) -> None:
+    config = WorldConfig(payload_kg=0.1, net=Net(on=True))
+    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    thrown_at(world, world._payload, (0.0, 0.0, 0.1), (0.0, 0.0, -9.0))
+    for _ in range(round(0.6 / PHYSICS_DT_S)):
+        world.step((0, 0, 0, 0), (0, 0), False)
+    assert [event.kind for event in world.take_events()] == ["bounced_out"]
+    assert world.caught_t_s is None
+
+
+def test_a_payload_falls_out_of_the_bag_when_it_is_dropped_and_can_be_thrown_again(vehicle: Vehicle) -> None:
+    config = WorldConfig(throws=2, keep_s=1.0, net=Net(on=True))
+    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    lay = world.data.xpos[world._payload.body].copy()
+    thrown_at(world, world._payload, (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
+    seen = []
+    for step in range(round(1.3 / PHYSICS_DT_S)):
+        world.step((0, 0, 0, 0), (0, 0), False)
+        seen += [event.kind for event in world.take_events()]
+        if step == round(0.7 / PHYSICS_DT_S):
+            assert seen == ["caught"]
+            world.drop()
+        if step == round(0.95 / PHYSICS_DT_S):
+            assert world.data.xpos[world._payload.body][2] < 0.06, "on the floor"
+    assert seen == ["caught", "taken"]
+    assert world.data.xpos[world._payload.body] == pytest.approx(lay, abs=0.01)
+
+
+def test_two_payloads_lie_in_the_bag(vehicle: Vehicle) -> None:
+    config = WorldConfig(faults=(Fault(kind="payload_double", t_s=0.0),), net=Net(on=True))
+    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    second = Ball.of(world.model, SECOND, SECOND_CATCH)
+    thrown_at(world, second, (0.02, 0.0, 0.04), (0.0, 0.0, -1.0))
+    thrown_at(world, world._payload, (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
+    assert not world.catch(second)
+    for _ in range(round(3.0 / PHYSICS_DT_S)):
+        world.step((0, 0, 0, 0), (0, 0), False)
+    assert world.catch(second)
+    assert world.catches == 1
+    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + vehicle.tool.net_mass_kg)
+    assert world.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)
+
+
+def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> None:
+    missed = "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 12, size: 0.5}]"
+    overrides = ("mission.repeat=2", "world.throws=2", "world.net.on=true", missed)
+    flight = FastFlight(load_sitl("configs/missions/catch.yaml", overrides=overrides))
+    result, world = flight.run(), flight.plant.world
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert (world.throws, world.catches, world.missed, world.caught_t_s) == (2, 1, True, None)
+    ids = [event.id for output in result.outputs for event in output.events]
+    assert ids == ["takeoff", "catch", "touchdown"]
