@@ -48,6 +48,7 @@ CATCH_RAD: Vec2 = (math.radians(100), math.radians(60))
 
 CONFIG: dict[str, Any] = {
     "vehicle": {
+        "arm": {"link_lengths_m": [0.2, 0.2]},
         "name": "test rig",
         "tether": {"anchor_world_m": [-2.0, 0.0, 3.0], "length_m": 4.5, "attachment_body_m": [0.0, 0.0, 0.1]},
         "airframe": {"mass_kg": 3.0},

@@ -196,24 +196,43 @@ def test_stale_or_invalid_mocap_is_not_graded() -> None:
 
 
 def test_the_impedance_error_of_a_known_motion_is_what_the_formula_gives() -> None:
+    """A sine on x and on joint 2 without force: |M_d s^2 + K_d s + K_p| of the common target; 11.5 s are 5.75 periods."""
     omega, size = 2 * math.pi * 0.5, 0.02
 
     def swing(i: Inputs, o: Outputs, s: Sent) -> Row:
         if o.control is None:
             return i, o, s
-        row = size * math.sin(omega * o.mission_t_s)
-        return i, replace(o, control=replace(o.control, sliding=(row, 0.0, 0.0, 9.0, 9.0, 9.0, 0.0, row))), s
+        e, rate = (size * math.sin(omega * o.mission_t_s), size * omega * math.cos(omega * o.mission_t_s))
+        still = replace(o.control, force_ext_world_n=(0.0, 0.0, 0.0))
+        moved = replace(still, error=(e, 0.0, 0.0, 9.0, 9.0, 9.0, 0.0, e), error_rate=(rate, 0, 0, 9, 9, 9, 0, rate))
+        return i, replace(o, control=moved), s
 
     position_n, arm_nm = metrics.impedance_error(changed(swing))
-    # |M_d s' + (K_d - M_d Phi) s| of a sine; an odd number of half periods would not average out, 11.5 s is 5.75 periods.
-    gains = CONFIG["controller"]
 
-    def rms(row: int) -> float:
-        inertia, damping, phi = (gains[name][row] for name in ("inertia_md", "damping_kd", "phi"))
-        return size * math.hypot(inertia * omega, damping - inertia * phi) / math.sqrt(2.0)
+    def rms(inertia: float, damping: float, stiffness: float) -> float:
+        return size * math.hypot(stiffness - inertia * omega**2, damping * omega) / math.sqrt(2.0)
 
-    assert position_n == pytest.approx(rms(0), rel=0.03)
-    assert arm_nm == pytest.approx(rms(7), rel=0.03)
+    assert position_n == pytest.approx(rms(1.0, 40.0, 144.0), rel=0.03)
+    assert arm_nm == pytest.approx(rms(0.1, 0.7, 1.225), rel=0.03)
+
+
+def test_a_load_that_stays_is_no_impedance_error_and_an_impact_is() -> None:
+    """A payload's weight from t = 7 s on, an arm that does not move: dI is J'(F - F_d), which dies out within seconds."""
+
+    def loaded(i: Inputs, o: Outputs, s: Sent) -> Row:
+        if o.control is None:
+            return i, o, s
+        force = (0.0, 0.0, -2.0 if o.mission_t_s > since_s else 0.0)
+        still = replace(o.control, force_ext_world_n=force, error=(0.0,) * 8, error_rate=(0.0,) * 8)
+        return i, replace(o, control=still), s
+
+    since_s = 0.0
+    _, always_nm = metrics.impedance_error(changed(loaded))
+    since_s = 8.0
+    _, impact_nm = metrics.impedance_error(changed(loaded))
+    assert always_nm is not None
+    assert impact_nm is not None
+    assert always_nm < 0.01 < impact_nm
 
 
 def test_the_zero_phase_lowpass_halves_a_sine_at_its_cutoff_and_leaves_slow_ones_in_place() -> None:

@@ -20,9 +20,9 @@ from companion.campaigns.runner import Campaign, Row
 
 EXPLAINED = (
     "RMS, mean ± standard deviation over seeds. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
-    "control law. Impedance: RMS after the catch of M_d e'' + K_d e' + K_p e - e_tau with the gains of each preset, which is the "
-    "deviation from the desired impedance; PSC defines none for the base. Torque activity: RMS change of the commanded joint torques "
-    "from one tick to the next. A flight that was not completed is counted, but its errors are not averaged."
+    "control law. Impedance: RMS after the catch of M_d e'' + K_d e' + K_p e - e_tau, the deviation from one target for every law, the "
+    "paper's table. Torque activity: RMS change of the commanded joint torques from one tick to the next. A flight that was not "
+    "completed is counted, but its errors are not averaged."
 )
 _PARTS = {"pre": "before", "post": "after"}
 _E_P, _E_Q, _E_ALPHA = ("e_p_m", "‖e_p‖", "m", 4), ("e_q_deg", "‖e_q‖", "deg", 2), ("e_alpha_deg", "‖e_α‖", "deg", 2)
