@@ -21,7 +21,7 @@ from sitl.autopilot.navigator import Navigator
 from sitl.autopilot.params import Params
 from sitl.autopilot.position_control import heading_rad
 from sitl.autopilot.setpoints import OffboardTarget, PositionTarget, RateTarget
-from sitl.autopilot.types import AttitudeTarget, Estimate, Fusion, ImuSample, RotorCommands
+from sitl.autopilot.types import AttitudeTarget, Estimate, Fusion, ImuSample, LearnedBias, RotorCommands
 
 Command7 = tuple[float, float, float, float, float, float, float]
 
@@ -102,10 +102,17 @@ class Px4Stub:
         estimator: substitute for EKF2.
         cascade: attitude loop, rate loop and mixer.
         setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop.
+        learned: biases that PX4 knows from the time before the world begins; None for an IMU without bias.
     """
 
     def __init__(
-        self, params: Params, estimator: Estimator, cascade: Cascade, *, setpoint_delay_s: float = 0.0
+        self,
+        params: Params,
+        estimator: Estimator,
+        cascade: Cascade,
+        *,
+        setpoint_delay_s: float = 0.0,
+        learned: LearnedBias | None = None,
     ) -> None:
         self.params = params
         self.commander = Commander(params)
@@ -118,6 +125,7 @@ class Px4Stub:
         """STATUSTEXTs that wait to be sent; the oldest are dropped if the queue is full."""
         self.t_s = 0.0
         self.imu: ImuSample | None = None
+        """The newest sample, without the learned biases, as in HIGHRES_IMU."""
         self.estimate: Estimate | None = None
         self.target = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0)
         """Setpoint of the attitude loop (ATTITUDE_TARGET)."""
@@ -127,6 +135,7 @@ class Px4Stub:
         self._estimator = estimator
         self._cascade = cascade
         self._setpoint_delay_s = setpoint_delay_s
+        self._learned = learned
         self.refuses_offboard = False
         """Fault: PX4 refuses OFFBOARD, and leaves it."""
         self.refuses_arming = False
@@ -184,6 +193,8 @@ class Px4Stub:
     def step(self, imu: ImuSample) -> RotorCommands:
         """Advance to the sample's world time and return normalised rotor commands; all are zero while disarmed."""
         t_s = imu.t_s
+        if self._learned is not None:
+            imu = _without(imu, self._learned)
         dt_s = t_s - self.imu.t_s if self.imu is not None else 0.0
         self.imu = imu
         self.t_s = t_s
@@ -387,3 +398,8 @@ class Px4Stub:
     def heading_rad(self) -> float:
         """Estimated yaw, rad."""
         return heading_rad(self.estimate.attitude_ned_frd) if self.estimate is not None else 0.0
+
+
+def _without(imu: ImuSample, learned: LearnedBias) -> ImuSample:
+    (p, q, r), (x, y, z), (bp, bq, br) = imu.gyro_frd_rad_s, imu.accel_frd_m_s2, learned.gyro_frd_rad_s
+    return ImuSample(imu.t_s, (p - bp, q - bq, r - br), (x, y, z - learned.accel_down_m_s2))

@@ -19,6 +19,13 @@ class ImuSample(NamedTuple):
     """Specific force: (0, 0, -9.81) at rest, level."""
 
 
+class LearnedBias(NamedTuple):
+    """Biases that PX4 has learned at rest and subtracts from every IMU sample."""
+
+    gyro_frd_rad_s: Vec3
+    accel_down_m_s2: float
+
+
 class Estimate(NamedTuple):
     """Output of the estimator."""
 

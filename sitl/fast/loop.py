@@ -130,10 +130,11 @@ class _RecordedImu:
 
     def step(self, imu: ImuSample) -> Vec4:
         """Step PX4 by one IMU sample and add it to `total`, which restarts when PX4 reboots."""
+        rotors = self._px4.step(imu)
         boot_s = imu.t_s - self._px4.booted_at_s
-        if boot_s >= 0.0:
-            self.total.add(boot_s, imu.accel_frd_m_s2)
-        return self._px4.step(imu)
+        if boot_s >= 0.0 and self._px4.imu is not None:
+            self.total.add(boot_s, self._px4.imu.accel_frd_m_s2)
+        return rotors
 
 
 class FastFlight:

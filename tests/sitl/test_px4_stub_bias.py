@@ -1,0 +1,52 @@
+"""What the stub does with a biased IMU, as EKF2 does."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.model.constants import GRAVITY_M_S2
+from companion.model.frames import euler_zyx_from_quat
+from companion.model.types import IDENTITY_QUAT
+from companion.sitl_config.effects.imu import Imu
+from companion.sitl_config.world import World
+from sitl.autopilot.backend import stub_of
+from sitl.autopilot.estimator import Estimator
+from sitl.autopilot.types import ImuSample
+
+
+def test_the_stub_knows_the_biases_that_show_at_rest_and_no_others() -> None:
+    bias = Imu(on=True, accel_bias_m_s2=(0.1, 0.2, 0.3), gyro_bias_deg_s=(1.0, 2.0, 3.0))
+    stub = stub_of(World(imu=bias))
+    rates = (math.radians(1.0), math.radians(-2.0), math.radians(-3.0))
+    stub.step(ImuSample(1.0, rates, (0.1, -0.2, -GRAVITY_M_S2 - 0.3)))
+    assert stub.imu is not None
+    assert stub.imu.gyro_frd_rad_s == pytest.approx((0.0, 0.0, 0.0))
+    assert stub.imu.accel_frd_m_s2 == pytest.approx((0.1, -0.2, -GRAVITY_M_S2))
+
+
+def test_a_bias_above_ekf2s_limit_is_learned_up_to_it() -> None:
+    stub = stub_of(World(imu=Imu(on=True, accel_bias_m_s2=(0.0, 0.0, 1.0), gyro_bias_deg_s=(0.0, 0.0, 0.0))))
+    stub.step(ImuSample(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, -GRAVITY_M_S2 - 1.0)))
+    assert stub.imu is not None
+    assert stub.imu.accel_frd_m_s2[2] == pytest.approx(-GRAVITY_M_S2 - 0.6)
+
+
+def test_without_errors_the_stub_takes_samples_as_they_are() -> None:
+    stub, sample = stub_of(World()), ImuSample(1.0, (0.1, 0.2, 0.3), (0.4, 0.5, -9.0))
+    stub.step(sample)
+    assert stub.imu is sample
+
+
+def test_a_sideways_bias_stays_a_tilt_whatever_vision_says() -> None:
+    estimator, bias = Estimator(), 0.1
+    for k in range(2500):
+        estimator.predict(ImuSample(k * 0.004, (0.0, 0.0, 0.0), (bias, 0.0, -GRAVITY_M_S2)))
+        if k % 2 == 0:
+            estimator.fuse_vision(k * 0.004, (0.0, 0.0, 0.0), IDENTITY_QUAT)
+    estimate = estimator.estimate()
+    roll, pitch, _ = euler_zyx_from_quat(estimate.attitude_ned_frd)
+    assert roll == pytest.approx(0.0, abs=1e-6)
+    assert pitch == pytest.approx(math.atan2(bias, GRAVITY_M_S2), rel=1e-3)
+    assert estimate.position_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
