@@ -299,10 +299,8 @@ class World:
         if self._bag is None:
             self.loads.write()
             mujoco.mj_step(self.model, self.data)
-        else:
-            self._bag.step(self.q, self.v, self.t_s)
-            for _ in range(self._bag.take_bounces()):
-                self._events.append(WorldEvent(self.t_s, "bounced_out"))
+        elif self._bag.step(self.q, self.v, self.t_s):
+            self._events.append(WorldEvent(self.t_s, "bounced_out"))
         self.t_s = self.data.time
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()
         self._sensors = None

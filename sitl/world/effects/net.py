@@ -47,8 +47,8 @@ class Bag:
         self.touched_s: float | None = None
         """Time of the first contact with hoop or mesh since the throw or since it bounced out."""
         self.bounced = False
-        """Whether the payload has left the bag again after it touched the mesh; reset by the reader."""
-        self._above: bool | None = None
+        """Whether the payload has just left the bag after it touched the mesh."""
+        self._above = True
 
     def caught_s(self, t_s: float) -> float | None:
         """Return the time of the first contact if the payload is caught; otherwise None."""
@@ -66,8 +66,11 @@ class Bag:
         """
         x, y, z = position
         vx, vy, vz = velocity
-        radial = math.sqrt(x * x + y * y)
-        self._cross_plane(x, y, z, radial, t_s)
+        above = z > 0.0
+        if above is not self._above:
+            self._cross(x, y, above, t_s)
+        elif self.bounced:
+            self.bounced = False
         fx = fy = fz = 0.0
         if self.side != 0:
             dx, dy = x - self.pivot_m[0], y - self.pivot_m[1]
@@ -75,14 +78,8 @@ class Bag:
             if distance > self._depth_m:
                 nx, ny, nz = -dx / distance, -dy / distance, -z / distance
                 fx, fy, fz = self._pressed(self._stiffness_n_m, distance - self._depth_m, nx, ny, nz, vx, vy, vz)
-        across = radial - self._hoop_m
-        to_wire2 = across * across + z * z
-        if 0.0 < to_wire2 < self._payload_m * self._payload_m and radial > 0.0:
-            to_wire = math.sqrt(to_wire2)
-            out = across / (to_wire * radial)
-            rx, ry, rz = self._pressed(
-                RIM_STIFFNESS_N_M, self._payload_m - to_wire, out * x, out * y, z / to_wire, vx, vy, vz
-            )
+        if -self._payload_m < z < self._payload_m:
+            rx, ry, rz = self._rim_n(position, velocity)
             fx, fy, fz = fx + rx, fy + ry, fz + rz
         if fx == fy == fz == 0.0:
             return None
@@ -90,17 +87,28 @@ class Bag:
             self.touched_s = t_s
         return (fx, fy, fz)
 
-    def _cross_plane(self, x: float, y: float, z: float, radial: float, t_s: float) -> None:
-        above = z > 0.0
+    def _rim_n(self, position: Vec3, velocity: Vec3) -> Vec3:
+        x, y, z = position
+        radial = math.hypot(x, y)
+        to_wire = math.hypot(radial - self._hoop_m, z)
+        if not 0.0 < to_wire < self._payload_m or radial == 0.0:
+            return ZERO
+        out = (radial - self._hoop_m) / (to_wire * radial)
+        return self._pressed(RIM_STIFFNESS_N_M, self._payload_m - to_wire, out * x, out * y, z / to_wire, *velocity)
+
+    def _cross(self, x: float, y: float, above: bool, t_s: float) -> None:
+        if x * x + y * y >= self._hoop_m * self._hoop_m:
+            if self.side == 0:  # beside the hoop; in the mesh it would still be held
+                self._above = above
+            return
+        self._above = above
         if self.side == 0:
-            if self._above is not None and above is not self._above and radial < self._hoop_m:
-                self.side = -1 if above else 1
-                self.pivot_m = (self._pocket * x, self._pocket * y)
-                self.entered_s = None if above else t_s
-            self._above = above
-        elif above is (self.side > 0) and radial < self._hoop_m:
+            self.side = -1 if above else 1
+            self.pivot_m = (self._pocket * x, self._pocket * y)
+            self.entered_s = None if above else t_s
+        else:
             self.bounced = self.side > 0 and self.touched_s is not None
-            self.side, self._above, self.entered_s, self.touched_s = 0, above, None, None
+            self.side, self.entered_s, self.touched_s = 0, None, None
 
     def _pressed(
         self, stiffness: float, depth: float, nx: float, ny: float, nz: float, vx: float, vy: float, vz: float
@@ -176,15 +184,8 @@ class Net:
         """Return whether the payload is in the bag, settled or not."""
         return body in self._bags and self._bags[body][0].side > 0
 
-    def take_bounces(self) -> int:
-        """Return the number of payloads that have bounced out since the last call."""
-        bounced = [bag for bag, _, _ in self._bags.values() if bag.bounced]
-        for bag in bounced:
-            bag.bounced = False
-        return len(bounced)
-
-    def step(self, q: list[float], v: list[float], t_s: float) -> None:
-        """Advance MuJoCo by one step, with all loads.
+    def step(self, q: list[float], v: list[float], t_s: float) -> bool:
+        """Advance MuJoCo by one step, with all loads; return whether a payload bounces out of the bag.
 
         Args:
             q: qpos before the step.
@@ -195,17 +196,19 @@ class Net:
         if not near:
             self._loads.write()
             mujoco.mj_step(self._model, self._data)
-            return
+            return False
         # The first half brings the net's pose and velocity up to date: forces of the step before would add energy.
         mujoco.mj_step1(self._model, self._data)
         for body, (bag, at_q, at_v) in near:
-            self._press(body, bag, (q[at_q], q[at_q + 1], q[at_q + 2]), (v[at_v], v[at_v + 1], v[at_v + 2]), t_s)
+            self._press(body, bag, q[at_q : at_q + 3], v[at_v : at_v + 3], t_s)
         self._loads.write()
         mujoco.mj_step2(self._model, self._data)
+        return any(bag.bounced for _, (bag, _, _) in near)
 
-    def _press(self, body: int, bag: Bag, position: Vec3, velocity: Vec3, t_s: float) -> None:
+    def _press(self, body: int, bag: Bag, position_m: list[float], velocity_m_s: list[float], t_s: float) -> None:
         """Load the payload at this position, with this velocity in the world, and the net against it."""
-        px, py, pz = position
+        px, py, pz = position_m
+        vx, vy, vz = velocity_m_s
         cx, cy, cz = self._centre.tolist()
         xx, yx, zx, xy, yy, zy, xz, yz, zz = self._axes.tolist()
         wx, wy, wz, ux, uy, uz = self._velocity.tolist()
@@ -213,9 +216,9 @@ class Net:
         gx, gy, gz = px - cx, py - cy, pz - cz
         # MuJoCo gives the net's velocity at the vehicle's centre of mass.
         lx, ly, lz = px - ox, py - oy, pz - oz
-        ux = velocity[0] - ux - wy * lz + wz * ly
-        uy = velocity[1] - uy - wz * lx + wx * lz
-        uz = velocity[2] - uz - wx * ly + wy * lx
+        ux = vx - ux - wy * lz + wz * ly
+        uy = vy - uy - wz * lx + wx * lz
+        uz = vz - uz - wx * ly + wy * lx
         force = bag.force_n(
             (xx * gx + xy * gy + xz * gz, yx * gx + yy * gy + yz * gz, zx * gx + zy * gy + zz * gz),
             (xx * ux + xy * uy + xz * uz, yx * ux + yy * uy + yz * uz, zx * ux + zy * uy + zz * uz),
