@@ -12,7 +12,7 @@ from companion.analysis.animation import movie_of, player_html
 from companion.analysis.log import FlightLog
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.plots import write_plots
-from companion.analysis.summary import effective_config
+from companion.analysis.summary import effective_config, world_text
 from companion.analysis.table import Cell, Column, Table, table
 
 
@@ -26,6 +26,7 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
         (log.config.get("vehicle") or {}).get("name", ""),
         f"{summary['controller']}, preset {summary['preset']}",
         "" if payload_kg is None else f"payload {payload_kg:g} kg (known to the simulated world only)",
+        world_text(summary.get("world")),
     )
     versions = [
         (name.removeprefix("version_"), value)

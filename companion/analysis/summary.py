@@ -111,7 +111,24 @@ def summarise(
 def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
     """Return the log's configuration, with that of the simulated world if the summary holds it; empty if the log has none."""
     world = summary.get("world")
-    return {**log.config, "world": world} if log.config and world else log.config
+    if not log.config or not world:
+        return log.config
+    # The drawn values are in the configuration, too.
+    return {**log.config, "world": {key: value for key, value in world.items() if key != "drawn"}}
+
+
+def world_text(world: dict[str, Any] | None) -> str:
+    """Return name, seed and model error of a simulated world on one line; empty for a flight on the vehicle.
+
+    Args:
+        world: of a summary or an effective configuration; older ones have no name.
+    """
+    if not world:
+        return ""
+    parts = [f"world {world['name']}" if "name" in world else "", f"seed {world.get('seed', '–')}"]
+    if world.get("model_error"):
+        parts.append(f"model error {world['model_error']:.0%}")
+    return ", ".join(part for part in parts if part)
 
 
 def write_summary(summary: dict[str, Any], path: Path) -> None:

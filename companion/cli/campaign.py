@@ -25,7 +25,7 @@ PIPED_WIDTH = 132
 CAMPAIGN_WIDTH = 168
 
 
-def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str = DEFAULT_WORLD) -> None:
+def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | None = DEFAULT_WORLD) -> None:
     """Add the options that all campaigns share.
 
     Args:

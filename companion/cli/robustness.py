@@ -17,9 +17,8 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "robustness",
         help="fly a mission in many worlds drawn at random",
-        description="Fly a mission in the fast closed loop in worlds drawn at random: payload, throw, catch point, delays, wind, "
-        "wrong masses, a biased or missing force sensor. A key of world. that --set sets is not drawn. Exit code 5 if any flight "
-        "crashed or was lost.",
+        description="Fly a mission in the fast closed loop in worlds drawn at random: payload, throw and catch point, and all that the "
+        "world leaves to its seed. A key of world. that --set sets is not drawn. Exit code 5 if any flight crashed or was lost.",
     )
     parser.add_argument("mission", nargs="?", help=f"mission file, YAML (default: {DEFAULT_MISSION})")
     parser.add_argument("--draws", type=count, default=500, metavar="N", help="number of flights (default: 500)")
@@ -40,7 +39,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--keep", metavar="FILE", help="write the ten worst draws, or the flown cases, and their results to FILE"
     )
-    add_options(parser, one_law=True)
+    add_options(parser, one_law=True, world=None)
     parser.set_defaults(run=run)
 
 
@@ -78,9 +77,11 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
     # The preset of the file belongs to its law.
     preset = arguments.preset or (kept.preset if kept is not None and arguments.controller is None else None)
     law = arguments.controller or (kept.controller if kept is not None else None)
+    # A case holds its whole world.
+    world = arguments.world or ("robustness" if kept is None else "ideal")
     numbers = range(arguments.first, arguments.first + arguments.draws)
     return Robustness(
-        configs=[checked(mission, arguments.vehicle, law, preset, arguments.overrides, world=arguments.world)],
+        configs=[checked(mission, arguments.vehicle, law, preset, arguments.overrides, world=world)],
         flights=[{"variant": 0, "name": case.name, "number": None, "world": case.knobs()} for case in cases]
         or [{"variant": 0, "name": f"draw {n}", "number": n, "world": None} for n in numbers],
         **common(arguments),

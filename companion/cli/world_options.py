@@ -7,13 +7,13 @@ import argparse
 from companion.sitl_config.loader import DEFAULT_WORLD, WORLDS
 
 
-def add_world(parser: argparse.ArgumentParser, default: str = DEFAULT_WORLD) -> None:
-    """Add `--world`."""
+def add_world(parser: argparse.ArgumentParser, default: str | None = DEFAULT_WORLD) -> None:
+    """Add `--world`; without a default it belongs to `companion robustness`."""
     parser.add_argument(
         "--world",
         default=default,
         metavar=f"{'|'.join(WORLDS)}|FILE",
-        help=f"the simulated world, built in or from a file (default: {default})",
+        help=f"the simulated world, built in or from a file (default: {default or 'robustness; with --cases: ideal'})",
     )
 
 

@@ -1,6 +1,7 @@
 """Flights of `companion robustness`: {name, number, world}; a flight without a `world` is drawn at random by its number.
 
-The job also has `seed` (seed of the random draws) and `fixed` (names of world keys that keep their configured values).
+Payload, throw and catch point are drawn here, because they depend on the mission; the rest is drawn by the world's file. The job
+also has `seed` (seed of the random draws) and `fixed` (names of world keys that keep their configured values).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from companion.analysis import metrics
 from companion.analysis.log import FlightLog
+from companion.campaigns.robustness.draws import DRAWN
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
@@ -28,16 +30,6 @@ PAYLOAD_KG = (0.05, 0.4)
 THROW_SPEED_M_S = (0.5, 4.0)
 """Horizontal speed at the catch, from any side; the descent adds to it."""
 DESCENT_MAX_M_S = 2.5
-HOVER_THRUST_ERROR = 0.10
-LINK_MASS_ERROR = 0.20
-SETPOINT_DELAY_S = (0.005, 0.060)
-ARM_DELAY_S = (0.002, 0.010)
-ROTOR_LAG_S = (0.020, 0.060)
-WIND_MAX_M_S = 3.0
-FORCE_BIAS_N = (3.0, 12.0)
-"""Larger than the default."""
-FORCE_BIASED, FORCE_MISSING = 0.5, 0.75
-"""Shares of the draws, cumulative: the force sensor is biased, or silent from arming on; in the rest it falls silent later."""
 
 ALONG_MIN_M_S = 0.08
 """Least speed of the vehicle in the direction of +x at a catch point."""
@@ -101,7 +93,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
 
 
 def draw(seed: int, number: int, places: list[Throw]) -> Data:
-    """Draw a world; return its keys, rounded so that a command line can repeat them exactly.
+    """Draw payload, throw, catch point and the seed of the world, which draws the rest; return these keys of the world, rounded.
 
     Args:
         seed: of the whole campaign.
@@ -113,38 +105,22 @@ def draw(seed: int, number: int, places: list[Throw]) -> Data:
     def between(span: tuple[float, float], digits: int = 4) -> float:
         return round(float(rng.uniform(*span)), digits)
 
-    # Every quantity is drawn every time and in this order, so that an unused one does not change the others.
     payload_kg = between(PAYLOAD_KG, 3)
     speed, to_rad = between(THROW_SPEED_M_S), between((-math.pi, math.pi))
     # Uniform in position, not in time: otherwise most catches would be at the slow ends of the line.
     x_m = between((places[0].at_m[0], places[-1].at_m[0]))
     place = min(places, key=lambda one: abs(one.at_m[0] - x_m))
     descent = between(place.descent_m_s)
-    wind, wind_to_rad = between((0.0, WIND_MAX_M_S)), between((-math.pi, math.pi))
-    bias = rng.standard_normal(3)
-    bias *= between(FORCE_BIAS_N) / float(np.linalg.norm(bias))
-    sensor, lost_s = float(rng.uniform()), between((0.0, 20.0), 2)
-    knobs: Data = {
+    return {
         "payload_kg": payload_kg,
         "throw_velocity_m_s": [round(speed * math.cos(to_rad), 3), round(speed * math.sin(to_rad), 3), -descent],
         "catch_at_m": [x_m, round(place.at_m[1], 4)],
-        "hover_thrust_error": between((-HOVER_THRUST_ERROR, HOVER_THRUST_ERROR)),
-        "link_mass_error": [between((-LINK_MASS_ERROR, LINK_MASS_ERROR)) for _ in range(2)],
-        "setpoint_delay_s": between(SETPOINT_DELAY_S),
-        "arm_delay_s": between(ARM_DELAY_S),
-        "rotor_lag_s": between(ROTOR_LAG_S),
-        "wind_m_s": [round(wind * math.cos(wind_to_rad), 3), round(wind * math.sin(wind_to_rad), 3), 0.0],
         "seed": int(rng.integers(1, 1_000_000)),
     }
-    if sensor < FORCE_BIASED:
-        knobs["force_bias_n"] = [round(float(value), 2) for value in bias]
-    else:
-        knobs["faults"] = [{"kind": "force_loss", "t_s": 0.0 if sensor < FORCE_MISSING else lost_s}]
-    return knobs
 
 
 def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
-    """Return the flights of the job, each with its world.
+    """Return the flights of the job, each with the keys of its world that differ from the configuration.
 
     Raises:
         CampaignError: nothing can be thrown at the vehicle in this mission.
@@ -152,11 +128,10 @@ def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
     (config,), flights = configs, job["flights"]
     draws = any(flight["world"] is None for flight in flights)
     places = throws(config.mission, config.vehicle) if draws else []
-    fixed = {key: job["configs"][0]["world"][key] for key in job["fixed"]}
 
     def world_of(flight: Data) -> Data:
-        world: Data = draw(job["seed"], flight["number"], places) if flight["world"] is None else flight["world"]
-        return world | fixed
+        world = draw(job["seed"], flight["number"], places) if flight["world"] is None else flight["world"]
+        return {key: value for key, value in world.items() if key not in job["fixed"]}
 
     return [{**flight, "world": world_of(flight)} for flight in flights]
 
@@ -164,16 +139,19 @@ def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
 def fly(config: SitlConfig, flight: Data) -> Data:
     """Fly one flight; return its row.
 
-    The row has: name, number (of the draw), world (the keys drawn), outcome, why (event that ended the mission early), error (exception
-    that ended the flight), thrown, caught (truly), felt (the force sensor still worked), caught_s and noticed_s (mission clock), e_p_m
-    (RMS after the catch, or of the whole flight if nothing was caught), pre_e_p_m, e_q_deg, e_alpha_deg, peak_e_p_m, final_e_z_m,
-    tilt_max_deg, slack_min_m, home_m (distance of the landing from the start), events. A value that was not measured is None.
+    The row has: name, number (of the draw), world (every key that is not at its default, and those of `DRAWN`), world_seed,
+    model_error, outcome, why (event that ended the mission early), error (exception that ended the flight), thrown, caught (truly),
+    felt (the force sensor still worked), caught_s and noticed_s (mission clock), e_p_m (RMS after the catch, or of the whole flight
+    if nothing was caught), pre_e_p_m, e_q_deg, e_alpha_deg, peak_e_p_m, final_e_z_m, tilt_max_deg, slack_min_m, home_m (distance of
+    the landing from the start), events. A value that was not measured is None.
     """
     flown = fly_to_end(with_world(config, flight["world"]))
     caught_t_s = flown.caught_t_s
     return {
         "row": {
-            **{key: flight[key] for key in ("name", "number", "world")},
+            "name": flight["name"],
+            "number": flight["number"],
+            "world": _world_of(flown.config),
             **laboratory_of(flown.config),
             **_graded(flown),
             "thrown": flown.fast is not None and flown.fast.plant.world.thrown_t_s is not None,
@@ -182,6 +160,11 @@ def fly(config: SitlConfig, flight: Data) -> Data:
             "caught_s": _mission_s(flown, caught_t_s),
         }
     }
+
+
+def _world_of(config: SitlConfig) -> Data:
+    whole = config.world.model_dump(mode="json")
+    return config.world.model_dump(mode="json", exclude_defaults=True) | {key: whole[key] for key in DRAWN}
 
 
 def _felt(flown: Flown, caught_t_s: float) -> bool:

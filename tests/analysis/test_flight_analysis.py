@@ -354,6 +354,7 @@ def test_without_a_catch_the_whole_flight_is_before_it() -> None:
 
 def test_the_report_is_one_file_with_plots_results_and_events(flight: FlightLog, tmp_path: Path) -> None:
     summary = summarise(flight, outcome="completed", controller="adaptive", preset="recommended", payload_kg=0.2)
+    summary["world"] = {"name": "lab", "drawn": {"mass_error": 0.01}, "mass_error": 0.01, "seed": 7, "model_error": 0.2}
     path = write_report(flight, summary, tmp_path)
     page = path.read_text(encoding="utf-8")
     pictures = {p.stem for p in tmp_path.glob("*.png")}
@@ -363,6 +364,7 @@ def test_the_report_is_one_file_with_plots_results_and_events(flight: FlightLog,
     assert not re.search(r"""(?:src|href)=['"](?!data:)""", page)
     assert f"{summary['rms']['post']['e_p_m']:.4f}" in page
     assert "payload in the net" in page
+    assert "world lab, seed 7, model error 20%" in page
     assert "version_" not in page
     assert "numpy" in page
 

@@ -84,7 +84,8 @@ WORLD: dict[str, Any] = {
 def draw_row(number: int, e_p_m: float | None, outcome: str = "completed", caught: bool = True, **world: Any) -> Row:
     """The row of a draw: `WORLD` with changes."""
     return {
-        "name": f"draw {number}", "number": number, "world": {**WORLD, **world}, "outcome": outcome, "why": None, "error": None,
+        "name": f"draw {number}", "number": number, "world": {**WORLD, **world}, "world_seed": 12, "model_error": 0.0,
+        "outcome": outcome, "why": None, "error": None,
         "thrown": True, "caught": caught, "felt": caught, "caught_s": 6.5 if caught else None, "noticed_s": None, "e_p_m": e_p_m,
         "events": ["takeoff", "touchdown"],
     }  # fmt: skip

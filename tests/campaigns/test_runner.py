@@ -182,7 +182,7 @@ def test_draws_are_written_as_table_and_cases_and_a_crash_is_exit_code_5(monkeyp
     assert ended.code == EXIT_LOST
     assert "12 worlds: 11 completed, 1 crashed; 12 caught, 0 missed the net" in ended.out
     assert "payload, kg +1.00" in ended.out
-    assert "companion fly" in ended.out and " 'world.faults=[{kind: force_loss, t_s: 7.25}]'" in ended.out
+    assert "--preset recommended --world robustness --set world.payload_kg=" in ended.out
     names = {"draws.csv", "robustness.json", "robustness.html", "worst.yaml", "distribution.png"}
     assert {path.name for path in Path("out").iterdir()} == names
     assert Path("kept.yaml").read_text().count("- name:") == 10

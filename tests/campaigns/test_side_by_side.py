@@ -235,7 +235,7 @@ def test_the_world_of_a_flight_on_the_vehicle_says_nothing() -> None:
     ]
     comparison = compare(flights)
     assert keys(comparison) == set()
-    assert dict(comparison.about)["seed"] == ("–", "–")
+    assert dict(comparison.about)["world"] == ("–", "–")
     assert comparison.cautions == ("The payload of A, B is not known; it may differ.",)
 
 

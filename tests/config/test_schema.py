@@ -65,6 +65,6 @@ def test_every_preset_is_there_once_and_shown_beside_the_other_configurations() 
 
 
 def test_every_world_is_there_once_and_shown_beside_the_other_configurations() -> None:
-    assert {path.name for path in WORLD_DIRECTORY.glob("*.yaml")} == {"ideal.yaml", "lab.yaml"}
+    assert {path.name for path in WORLD_DIRECTORY.glob("*.yaml")} == {"ideal.yaml", "lab.yaml", "robustness.yaml"}
     for path in WORLD_DIRECTORY.glob("*.yaml"):
         assert (CONFIGS / "worlds" / path.name).resolve() == path.resolve()

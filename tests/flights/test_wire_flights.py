@@ -50,6 +50,7 @@ def test_the_catch(the_catch: Flown) -> None:
     assert summary["outcome"] == "completed"
     assert (summary["controller"], summary["preset"], summary["payload_kg"]) == ("adaptive", "recommended", PAYLOAD_KG)
     assert summary["world"]["payload_kg"] == PAYLOAD_KG
+    assert (summary["world"]["name"], summary["world"]["drawn"]) == ("ideal", {})
     assert "world" not in json.loads((the_catch.sandbox.cwd / "out/config.json").read_text(encoding="utf-8"))
     assert summary["autopilot"]["kind"] == "stub"
     assert 6.0 < summary["catch_t_s"] < 7.0

@@ -248,7 +248,9 @@ def test_a_catch_in_a_drawn_world_is_no_drag() -> None:
     """Wind, delays, mass errors and the impact of the payload: one of the flights from which the threshold was chosen."""
     knobs = draw(11, 7, throws(CONFIG.mission, CONFIG.vehicle))
     flight = FastFlight(
-        load_sitl(CATCH, overrides=[f"world.{key}={json.dumps(value)}" for key, value in knobs.items()])
+        load_sitl(
+            CATCH, overrides=[f"world.{key}={json.dumps(value)}" for key, value in knobs.items()], world="robustness"
+        )
     )
     result = flight.run()
     assert result.caught

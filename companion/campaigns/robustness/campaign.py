@@ -13,7 +13,7 @@ from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, number, table
 from companion.campaigns.process import Message
 from companion.campaigns.robustness.cases import Case, Cases, as_cases, fly_command, worse_than, write_cases
-from companion.campaigns.robustness.draws import DRIVERS, SAFE, drivers, influence, thirds, worst
+from companion.campaigns.robustness.draws import DRAWN, DRIVERS, SAFE, drivers, influence, thirds, worst
 from companion.campaigns.runner import Campaign, Row, counted, outcomes
 from companion.model.types import Outcome
 
@@ -73,7 +73,7 @@ class Robustness(Campaign):
     def csv_row(self, row: Row) -> Mapping[str, Any]:
         """Return the results, then what was drawn."""
         results = {key: value for key, value in row.items() if key not in ("world", "events")}
-        return {**results, "events": " ".join(row["events"]), "seed": row["world"].get("seed"), **drivers(row["world"])}
+        return {**results, "events": " ".join(row["events"]), **drivers(row["world"])}
 
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the distribution, its plot and the hardest flights."""
@@ -116,8 +116,9 @@ class Robustness(Campaign):
             if row["outcome"] != Outcome.COMPLETED.value:
                 text = f"{row['name']}: {row['outcome']}: {row['error'] or row['why'] or 'no event gives a reason'}"
                 console.print(text, style="yellow" if row["outcome"] in SAFE else "red", highlight=False, markup=False)
-        sets = [override for override in self.overrides if not world_key(override)]
-        line = fly_command(self.mission, law, preset, worst(rows)[0]["world"], sets)
+        hardest = worst(rows)[0]["world"]
+        keys = hardest if self.cases else {key: hardest[key] for key in DRAWN}
+        line = fly_command(self.mission, law, preset, self.configs[0].laboratory.name, keys, self.overrides)
         console.print(f"the worst one over real wires:\n{line}", highlight=False, markup=False, soft_wrap=True)
 
     def good(self, rows: Sequence[Row]) -> bool:
@@ -208,7 +209,7 @@ def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
         Column("wind\nm/s", drawn("wind_speed_m_s", ".1f")),
         Column("hover", drawn("hover_thrust_error", "+.0%")),
         Column("force sensor", _sensor_text, left=True),
-        Column("seed", lambda row: str(row["world"].get("seed", ""))),
+        Column("seed", lambda row: str(row["world_seed"])),
     ]
     kept = {case.name: case.kept for case in cases}
     if kept:

@@ -110,20 +110,24 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def fly_command(mission: str, controller: str, preset: str, world: Mapping[str, Any], sets: Sequence[str] = ()) -> str:
+def fly_command(
+    mission: str, controller: str, preset: str, name: str, world: Mapping[str, Any], sets: Sequence[str] = ()
+) -> str:
     """Return the command that flies the same world over real wires.
 
     Args:
         mission: file.
         controller: law.
         preset: gains.
-        world: keys of the world.
+        name: built-in world, or its file.
+        world: keys to set in it.
         sets: further overrides.
     """
-    words = ["companion", "fly", mission, "--sitl", "--controller", controller, "--preset", preset, "--set", *sets]
+    words = ["companion", "fly", mission, "--sitl", "--controller", controller, "--preset", preset, "--world", name]
+    words += ["--set", *sets]
     for key, value in world.items():
         text = flow_text(value)
-        words.append(f"world.{key}={text if key == 'faults' else text.replace(' ', '')}")
+        words.append(f"world.{key}={text if '{' in text else text.replace(' ', '')}")
     return shlex.join(words)
 
 

@@ -40,11 +40,15 @@ DRIVERS: dict[str, str] = {
 """The drawn quantities as single numbers, each with its label."""
 
 
+DRAWN = ("payload_kg", "throw_velocity_m_s", "catch_at_m", "seed")
+"""Keys of the world that the campaign draws; the file of the world draws the others."""
+
+
 def drivers(world: Mapping[str, Any]) -> dict[str, float | None]:
     """Return what was drawn, by the keys of `DRIVERS`; None where a quantity does not apply.
 
     Args:
-        world: keys of the world that a draw or a case sets.
+        world: the world of a row.
     """
     vx, vy, vz = world.get("throw_velocity_m_s", (math.nan,) * 3)
     wx, wy, _ = world.get("wind_m_s", (math.nan,) * 3)
@@ -68,10 +72,10 @@ def drivers(world: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def sensor_of(row: Row) -> str:
-    """Return the state of the force sensor at the catch: biased, lost after the catch, or missing at the catch."""
-    if drivers(row["world"])["force_lost_s"] is None:
-        return "biased"
-    return "lost after the catch" if row["felt"] else "missing at the catch"
+    """Return the state of the force sensor: working, lost after the catch, or missing at the catch."""
+    if not row["felt"]:
+        return "missing at the catch"
+    return "lost after the catch" if "force_lost" in row["events"] else "working"
 
 
 def graded(rows: Sequence[Row]) -> list[Row]:

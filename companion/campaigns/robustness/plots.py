@@ -15,7 +15,7 @@ from companion.analysis.plot_style import CATCH, COLOURS, INK, SOFT, dress, figu
 from companion.campaigns.robustness.draws import DRIVERS, drivers, graded, influence, sensor_of
 from companion.campaigns.runner import Row
 
-_COLOURS = dict(zip(("biased", "lost after the catch", "missing at the catch"), COLOURS, strict=False))
+_COLOURS = dict(zip(("working", "lost after the catch", "missing at the catch"), COLOURS, strict=False))
 _AGAINST = ("payload_kg", "throw_speed_m_s", "setpoint_delay_s", "catch_x_m")
 BARS = 10
 

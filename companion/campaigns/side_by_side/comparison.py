@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from companion.analysis.summary import world_text
 from companion.campaigns.runner import flat
 from companion.campaigns.side_by_side.flight import Flight
 from companion.campaigns.side_by_side.settings import Setting, fairness, payload_kg, settings_of, simulated
@@ -200,7 +201,7 @@ def _about(flights: Sequence[Flight]) -> tuple[tuple[str, tuple[str, ...]], ...]
         row("preset", lambda f: f.summary["preset"]),
         row("set by hand", lambda f: " ".join((f.config.get("sources") or {}).get("overrides") or ()) or "–"),
         row("payload", _payload),
-        row("seed", lambda f: (f.config.get("world") or {}).get("seed", "–") if simulated(f.config) else "–"),
+        row("world", lambda f: world_text(f.config.get("world")) or "–" if simulated(f.config) else "–"),
         row("outcome", lambda f: f.summary["outcome"]),
         row("flown", _where),
         row("recorded", _recorded),
