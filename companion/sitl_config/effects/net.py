@@ -10,8 +10,8 @@ from companion.config.base import Fraction, Model, Positive
 
 
 class Net(Model):
-    """A hoop with a bag of elastic mesh. A payload that has been in the bag for 0.4 s counts as caught, at the time of its first contact.
-    Without this effect the payload is fixed to the net where it enters."""
+    """A hoop with a bag of elastic mesh. A payload counts as caught when it has been in the bag for 0.4 s; the time of the catch is
+    that of its first contact. Without this effect the payload is fixed to the net where it enters."""
 
     on: bool = False
     """Whether this effect acts."""
