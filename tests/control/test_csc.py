@@ -128,7 +128,7 @@ def test_it_saturates_and_says_so() -> None:
     assert math.atan2(math.hypot(force[0], force[1]), force[2]) <= math.radians(20) + 1e-9
 
 
-@pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.1, 0.04), (0.2, 0.06), (0.3, 0.08)])
+@pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.2, 0.06), (0.3, 0.08)])
 def test_it_catches_the_payload_and_comes_home(payload_kg: float, limit_m: float) -> None:
     result = flown(f"world.payload_kg={payload_kg}")
     assert result.outputs[-1].outcome is Outcome.COMPLETED

@@ -78,7 +78,7 @@ segments = st.lists(
 
 
 @pytest.mark.parametrize("phase", PHASES)
-@settings(max_examples=25, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=15, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
 @given(segments)
 def test_no_walk_of_inputs_makes_the_core_stop_rotors_that_may_not_be_stopped(
     phase: str, walk: list[dict[str, Any]]

@@ -83,10 +83,10 @@ def test_nothing_thrown_is_no_catch() -> None:
 FOLDED_DEG = (165.0, 140.0)
 
 
-@pytest.mark.parametrize("at_s", [2.0, 3.2, 4.2, 5.2])
+@pytest.mark.parametrize("at_s", [2.0, 4.2])
 @pytest.mark.parametrize("kind", ["mocap_loss", "servo_loss", "link_loss"])
 def test_a_lost_device_lands_it(kind: str, at_s: float) -> None:
-    """In take-off, on the way to the catch, after it, and with the landing to come; `at_s` is the time since arming."""
+    """In take-off and after the catch; `at_s` is the time since arming. At other times: tests/sitl/test_faults.py."""
     result = FastFlight(short(f"world.faults=[{{kind: {kind}, t_s: {at_s}}}]")).run()
     last, truth = result.outputs[-1], result.truth[-1]
     assert last.outcome is Outcome.ABORTED

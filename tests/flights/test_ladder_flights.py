@@ -288,11 +288,3 @@ def test_the_same_inputs_give_the_same_outputs_bit_for_bit_also_through_hold_and
         core = FlightCore(flight.config)
         for i, o in zip(result.inputs, result.outputs, strict=True):
             assert differences(o, core.step(i)) is None
-
-
-@pytest.mark.parametrize(("payload_kg", "wind"), [(0.1, "[3, 0, 0]"), (0.3, "[0, -3, 0]"), (0.3, "[-2, 2, 0.5]")])
-def test_no_monitor_acts_in_an_ordinary_flight(payload_kg: float, wind: str) -> None:
-    result = FastFlight(configured(f"world.payload_kg={payload_kg}", f"world.wind_m_s={wind}")).run()
-    assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert event_ids(result) == ["takeoff", "catch", "touchdown"]
-    assert all(o.action is SafetyAction.NOMINAL and not o.bent_by and o.mocap_trusted for o in result.outputs)

@@ -1,4 +1,4 @@
-"""Every wire survives a few thousand damaged inputs, and every input on which it once failed. `benchmarks/fuzz.py` feeds a million."""
+"""Every wire survives some thousand damaged inputs, and every input on which it once failed. `benchmarks/fuzz.py` feeds a million."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from benchmarks.fuzzing.campaign import feed_watched, run
 from benchmarks.fuzzing.targets import NAMES, target_class
 
 INPUTS = {
-    "natnet": 4000,
-    "dynamixel": 4000,
-    "dynamixel-wire": 60,
-    "force": 4000,
-    "mavlink": 4000,
-    "mavlink-wire": 60,
-    "channels": 4000,
-    "yaml": 2500,
+    "natnet": 2000,
+    "dynamixel": 2000,
+    "dynamixel-wire": 30,
+    "force": 2000,
+    "mavlink": 2000,
+    "mavlink-wire": 30,
+    "channels": 2000,
+    "yaml": 1200,
 }
 SEED = 20
 FOUND = sorted(REGRESSIONS.glob("*.bin"))

@@ -37,7 +37,7 @@ def flown(amplitude_m_s2: float, hz: float, *faults: str) -> tuple[SitlConfig, F
     return config, flight, flight.run()
 
 
-@pytest.mark.parametrize(("amplitude_m_s2", "hz"), [(5.0, 80.0), (10.0, 100.2), (10.0, 149.7), (10.0, 200.0)])
+@pytest.mark.parametrize(("amplitude_m_s2", "hz"), [(10.0, 100.2), (10.0, 149.7)])
 def test_vibration_is_neither_drag_nor_snag(amplitude_m_s2: float, hz: float) -> None:
     """A whole catch flight stays below a third of the limit. At 100 and 150 Hz samples of 200 Hz alias to nearly 0 Hz in
     hover, at 200 Hz those along the rotor axes do."""
