@@ -146,8 +146,12 @@ WRONG = {
 }
 
 
-AT_EACH_DEVICE = ("arm baud rate", "mocap body never seen", "force port that is not there")
-FLOWN = ("malformed autopilot address", *AT_EACH_DEVICE)
+FLOWN = (
+    "malformed autopilot address",
+    "arm baud rate",
+    "mocap body never seen",
+    "force port that is not there",
+)
 
 
 @SHARED
@@ -332,9 +336,9 @@ def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox
 def test_after_refusals_the_same_world_flies_though_its_terminal_goes_away(
     sandbox: Sandbox, world: World, tmp_path: Path
 ) -> None:
-    for case in AT_EACH_DEVICE:
-        with sandbox_in(tmp_path / case) as its:
-            assert_one_line(refused(its, world, *world.addresses(**WRONG[case].but)), WRONG[case].line)
+    last = WRONG["force port that is not there"]
+    with sandbox_in(tmp_path / "refused") as its:
+        assert_one_line(refused(its, world, *world.addresses(**last.but)), last.line)
     with sandbox.start("fly", HOVER, "--out", "out", *world.addresses()) as running:
         running.wait_for("  wait\n")
         running.close_output()

@@ -22,7 +22,17 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_RE
 from companion.model.types import AutopilotRequest, PhaseKind
 from companion.safety.stop import StopModel
 from sitl.px4.process import MODEL, VARIABLE, Instance, find
-from tests.support import CATCH, DEADLINE_S, HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in, set_options
+from tests.support import (
+    CATCH,
+    DEADLINE_S,
+    HOVER,
+    HOVERS_S,
+    SHORT_CATCH,
+    Sandbox,
+    read_summary,
+    sandbox_in,
+    set_options,
+)
 
 REAL = [
     pytest.mark.px4,
@@ -45,6 +55,10 @@ LINE_TO_THE_WALL = (
 """Rotors 0.25 m from the wall at its end; 0.3 s less and the mission check refuses it."""
 NEAREST_STOP_S = 9.6
 """After arming, on that line: the predicted stop is nearest to the wall."""
+ENDED = {
+    "kill_flight": "flight: the flight process was ended by SIGKILL",
+    "stop_flight": "flight: the flight process hung and was killed",
+}
 GUARDIAN_LANDS = ["guardian_land", "guardian_touchdown", "guardian_landed"]
 STOPPED_WITHIN_S = 2.5
 """After a flip was certain, as the flight process hears it: a heartbeat comes once a second, a lost command again after 0.5 s."""
@@ -106,9 +120,11 @@ def test_the_catch(sandbox: Sandbox, autopilot: str) -> None:
 @faults("kill_flight", "stop_flight", on_stub="kill_flight")
 def test_the_guardian_lands_after_the_catch(sandbox: Sandbox, autopilot: str, kind: str) -> None:
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
-    ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)
+    ended = sandbox.run("fly", SHORT_CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
+    assert len(ended.err_lines) == 1, ended.err
+    assert ended.err.startswith(ENDED[kind]) and "; the guardian landed the vehicle; see out/flight.log" in ended.err
     ids = event_ids(read_summary(sandbox.cwd / "out"))
     assert ids[-4:] == ["guardian_took_over", "guardian_land", "guardian_touchdown", "guardian_landed"]
     assert_landed_where_it_was(sandbox)
@@ -148,7 +164,7 @@ def test_through_mavsdks_offboard_plugin_the_guardian_lands_as_well(
     """The other setpoint path. A process that holds the interpreter leaves a thread behind that repeats the last setpoint."""
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
     path = "vehicle.devices.autopilot.setpoint_path=offboard"
-    ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault, path)
+    ended = sandbox.run("fly", SHORT_CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault, path)
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
     assert event_ids(read_summary(sandbox.cwd / "out"))[-3:] == GUARDIAN_LANDS
@@ -166,15 +182,17 @@ def assert_log_reaches_the_take_over(sandbox: Sandbox) -> None:
     assert took_over["t_s"] - log.outputs[-1].t_s < 0.5
 
 
+@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])  # the stub's: in the fast loop
 def test_motion_capture_that_comes_back_too_late_is_a_landing(sandbox: Sandbox, autopilot: str) -> None:
     fault = "world.faults=[{kind: mocap_loss, after: catch, t_s: 0.1, duration_s: 2.0}]"
-    ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)
+    ended = sandbox.run("fly", SHORT_CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
     assert "mocap_lost" in event_ids(read_summary(sandbox.cwd / "out"))
     assert_landed_where_it_was(sandbox)
 
 
+@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])  # the stub's: in the fast loop
 def test_a_dead_link_is_landed_by_px4_itself(sandbox: Sandbox, autopilot: str) -> None:
     """Nothing gets through: the offboard-loss failsafe."""
     fault = f"world.faults=[{{kind: link_loss, t_s: {HOVERS_S}}}]"

@@ -182,26 +182,6 @@ def test_world_that_dies_in_flight_is_named_in_one_line(sandbox: Sandbox) -> Non
     assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
 
 
-@pytest.mark.flight
-def test_flight_process_that_dies_in_flight_is_named_in_one_line(tmp_path: Path) -> None:
-    with sandbox_in(tmp_path, {"PYTHONFAULTHANDLER": "1"}) as sandbox:
-        with sandbox.start(*FLY) as running:
-            running.wait_for("  take-off\n")
-            os.kill(sandbox.pid_of("companion.flight.main"), signal.SIGABRT)
-            ended = running.end()
-        sandbox.assert_nobody_left()
-        assert not (sandbox.cwd / "out/tmp").exists()
-        log = (sandbox.cwd / "out/flight.log").read_text(encoding="utf-8")
-        summary = read_summary(sandbox.cwd / "out")
-        assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
-    assert "Fatal Python error: Aborted" in log
-    assert len(ended.err_lines) == 1, ended.err
-    assert ended.err.startswith("flight: the flight process was ended by SIGABRT")
-    assert ended.err.endswith("; the guardian landed the vehicle; see out/flight.log\n")
-    assert ended.code == EXIT_ABORTED
-    assert summary["outcome"] == "aborted"
-
-
 @pytest.mark.waits
 @pytest.mark.parametrize(
     ("package", "line"),
