@@ -38,7 +38,7 @@ IN_BACKGROUND = ("sh", "-c", 'trap "" INT TERM CHLD; exec "$@"', "sh")
 """Starts a program with signals ignored, as it may inherit them."""
 PREFLIGHT = "vehicle.safety.preflight_s"
 PATIENT: dict[str, object] = {
-    PREFLIGHT: 2.0,
+    PREFLIGHT: 1.0,
     "vehicle.safety.arm_timeout_s": 0.4,
     "vehicle.safety.mocap_timeout_s": 0.3,
     "vehicle.safety.vehicle_timeout_s": 0.5,

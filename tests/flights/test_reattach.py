@@ -18,7 +18,7 @@ from companion.model.types import AutopilotRequest
 from tests.support import HOVER, Running, Sandbox, World, read_summary, sandbox_in, set_options, wait_until
 
 LONG = set_options(
-    **{"mission.phases[1].duration_s": 40.0, "mission.phases[0].height_m": 1.6, "mission.phases[0].duration_s": 5.0}
+    **{"mission.phases[1].duration_s": 40.0, "mission.phases[0].height_m": 1.6, "mission.phases[0].duration_s": 4.0}
 )
 IN_FLIGHT = "  hold\n"
 
