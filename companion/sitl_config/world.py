@@ -11,12 +11,14 @@ from companion.config.base import Fraction, Model, NonNegative, Positive, Relati
 from companion.config.explain import nearest
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.effects.air import Air
+from companion.sitl_config.effects.battery import Battery
 from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.effects.net import Net
+from companion.sitl_config.effects.rotors import Rotors
 from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import Fault as Fault
@@ -164,10 +166,17 @@ class World(Model):
     mocap: Mocap = Mocap()
     net: Net = Net()
     thrower: Thrower = Thrower()
+    rotors: Rotors = Rotors()
+    battery: Battery = Battery()
 
     def servo(self, joint: int) -> Servo:
         """Return the servo of joint 0 or 1."""
         return Servo() if self.servos is None else self.servos[joint]
+
+    @property
+    def thr_mdl_fac(self) -> float:
+        """PX4's THR_MDL_FAC: of `px4_params`, else of `rotors` if that effect is on, else 0, for rotors that are linear."""
+        return self.px4_params.get("THR_MDL_FAC", self.rotors.thr_mdl_fac if self.rotors.on else 0.0)
 
     def overridden_px4_params(self) -> dict[str, float | int]:
         """Return `px4_params` in PX4's types."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from companion.model.frames import quat_multiply
 from companion.model.types import Quat, Vec3
-from sitl.autopilot.cascade import Cascade, CascadeGains
+from sitl.autopilot.cascade import Cascade, CascadeGains, motor_signal
 from sitl.autopilot.commander import Command, Commander, Notice, Result, Severity
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.land_detector import LandDetector
@@ -216,6 +216,10 @@ class Px4Stub:
         self._choose_target(t_s, estimate)
         if dt_s > 0.0:
             self.rotors = self._cascade.step(dt_s, estimate, self.target)
+            factor = self.params.real("THR_MDL_FAC")
+            if factor > 0.0:
+                a, b, c, d = (motor_signal(command, factor) for command in self.rotors)
+                self.rotors = (a, b, c, d)
         return self.rotors
 
     def on_setpoint(self, t_s: float, target: OffboardTarget) -> None:

@@ -95,6 +95,7 @@ def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
         link_delay_s: added to the setpoint delay, for a loop without a wire that takes this time.
     """
     params = Params()
+    params.set("THR_MDL_FAC", config.thr_mdl_fac)
     for name, value in config.overridden_px4_params().items():
         params.set(name, value)
     cascade = Cascade(gains_from_params(params))

@@ -30,6 +30,15 @@ class CascadeGains:
     d_cutoff_hz: float = 30.0
 
 
+def motor_signal(command: float, factor: float) -> float:
+    """Return the motor signal for a normalised thrust command, 0 to 1, by THR_MDL_FAC (FunctionMotors::updateValues): PX4 assumes that
+    thrust is factor signal^2 + (1 - factor) signal."""
+    if factor <= 0.0 or command <= 0.0:
+        return command
+    half = (1.0 - factor) / (2.0 * factor)
+    return math.sqrt(half * half + command / factor) - half
+
+
 class Cascade:
     """PX4's multicopter attitude P loop, rate PID loop and quad-x mixer.
 

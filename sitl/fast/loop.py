@@ -58,7 +58,7 @@ from sitl.force_torque import overloaded, quantised
 from sitl.server import start_of
 from sitl.servo.drive import MODE_CURRENT
 from sitl.servo.from_config import plugged_in, servos_of
-from sitl.world.plant import MocapFrame, Plant, battery_voltage_v
+from sitl.world.plant import MocapFrame, Plant
 from sitl.world.world import Layout, Snapshot, Truth
 
 LINK_DELAY_S = 0.002
@@ -370,14 +370,14 @@ class FastFlight:
 
     def _status(self, t_s: float) -> AutopilotStatus:
         commander = self.px4.commander
-        remaining = self.plant.battery_remaining()
+        battery = self.plant.battery()
         return AutopilotStatus(
             heartbeat_stamp_s=t_s,
             armed=commander.armed,
             mode=_MODES.get(commander.nav_state, FlightMode.OTHER),
             landed=_ON_GROUND if self.px4.land.landed else _IN_AIR,
-            battery_voltage_v=battery_voltage_v(remaining) - self.plant.battery_sag_v(),
-            battery_remaining=remaining,
+            battery_voltage_v=battery.voltage_v,
+            battery_remaining=battery.remaining,
             system_status=system_status(self.px4),
         )
 

@@ -67,7 +67,7 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
         **gains,
         **mixed,
         **rotor_geometry(airframe),
-        "THR_MDL_FAC": 0.0,  # the world's rotors are linear in the command
+        "THR_MDL_FAC": config.thr_mdl_fac,
         "MPC_THR_HOVER": hover_command * (1.0 + config.hover_thrust_error),
         "SIM_BAT_DRAIN": config.battery_life_s,
         "SIM_BAT_MIN_PCT": 0.0,

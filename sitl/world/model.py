@@ -12,6 +12,8 @@ from sitl.world.effects import machine
 PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"
 """Names of the second ball, which a fault throws after the payload, and of its constraint."""
+ROTOR_HEIGHT_M = 0.03
+"""Height of the rotors above the body origin."""
 # In PX4's quad-x order: each rotor's position (body FLU, in units of arm/sqrt 2) and the sign of its reaction torque about z (up).
 ROTORS = ((1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1))
 
@@ -43,11 +45,13 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     offset = rotor_offset_m(airframe)
     clearance = airframe.ground_clearance_m
     rotors = "\n".join(
-        f'<site name="rotor{i}" pos="{x * offset} {y * offset} 0.03"/>' for i, (x, y, _) in enumerate(ROTORS)
+        f'<site name="rotor{i}" pos="{x * offset} {y * offset} {ROTOR_HEIGHT_M}"/>'
+        for i, (x, y, _) in enumerate(ROTORS)
     )
+    yaw_errors = world.rotors.yaw_torque_error if world.rotors.on else (0.0, 0.0, 0.0, 0.0)
     motors = "\n".join(
-        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {s * airframe.yaw_torque_per_thrust_m}"/>'
-        for i, (_, _, s) in enumerate(ROTORS)
+        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {s * airframe.yaw_torque_per_thrust_m * (1.0 + error)}"/>'
+        for i, ((_, _, s), error) in enumerate(zip(ROTORS, yaw_errors, strict=True))
     )
     feet = "\n".join(
         f'<geom name="foot{i}" type="sphere" size="0.02" pos="{x * 0.18} {y * 0.18} {-clearance + 0.02}" contype="1" '

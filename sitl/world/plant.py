@@ -182,6 +182,8 @@ class Plant:
                 self._imu_errors.drift(noise(config.seed, _IMU_DRIFT))
             if self._mocap_errors is not None:
                 self._mocap_errors.restart(t_s)
+            if world.battery is not None:
+                world.battery.restart()
         if self.faults is not None:
             self.faults.step(t_s, self.armed_t_s)
         q, v, layout = world.q, world.v, world.layout
@@ -286,19 +288,13 @@ class Plant:
         return [] if self.fault("mocap_loss") else frames
 
     def battery(self) -> Battery:
-        """Return what the power module measures; the charge falls with the time since arming."""
-        remaining = self.battery_remaining()
-        return Battery(voltage_v=battery_voltage_v(remaining) - self.battery_sag_v(), remaining=remaining)
-
-    def battery_sag_v(self) -> float:
-        """Return the voltage drop by a fault."""
-        return 0.0 if self.faults is None else self.faults.sag_v
-
-    def battery_remaining(self) -> float:
-        """Return the state of charge, 0 to 1."""
+        """Return what the power module measures. Without the battery effect the charge falls with the time since arming."""
+        pack, sag_v = self.world.battery, 0.0 if self.faults is None else self.faults.sag_v
+        if pack is not None:
+            return Battery(pack.voltage_v - sag_v, pack.current_a, pack.remaining, pack.drawn_as / 3.6)
         flown_s = 0.0 if self.armed_t_s is None else self.world.t_s - self.armed_t_s
-        remaining = self._config.battery_start - flown_s / self._config.battery_life_s
-        return remaining if remaining > 0.0 else 0.0
+        remaining = max(0.0, self._config.battery_start - flown_s / self._config.battery_life_s)
+        return Battery(voltage_v=battery_voltage_v(remaining) - sag_v, remaining=remaining)
 
     def force_torque(self) -> tuple[Vec3, Vec3]:
         """Return a reading of the force-torque sensor in N and N m, sensor frame, with noise, bias, faults and scale error."""

@@ -14,13 +14,15 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
+from sitl.world.effects.battery import BatteryPack
 from sitl.world.effects.downwash import Downwash
 from sitl.world.effects.net import Net
+from sitl.world.effects.rotors import Rotors
 from sitl.world.effects.tether_line import TetherLine
 from sitl.world.effects.thrower import Thrower
 from sitl.world.handling import Wrench
 from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
-from sitl.world.model import PAYLOAD_RADIUS_M, mjcf
+from sitl.world.model import PAYLOAD_RADIUS_M, ROTOR_HEIGHT_M, mjcf
 
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
@@ -154,6 +156,9 @@ class World:
         self._parked = True
         self._gain = 1.0 - math.exp(-PHYSICS_DT_S / config.rotor_lag_s)
         self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
+        self._rotors = Rotors.of(config.rotors, vehicle.airframe.rotor_arm_m, PHYSICS_DT_S)
+        self.battery = BatteryPack.of(config.battery, config.battery_start, config.battery_life_s, self.weight_n)
+        """The battery, or None if its effect is off."""
         self._crash_m = 0.6 * vehicle.airframe.ground_clearance_m
         self.wind_m_s = config.wind_m_s
         self.rotor_share: Vec4 | None = None
@@ -251,32 +256,46 @@ class World:
 
     @property
     def thrust_n(self) -> Vec4:
-        """Thrust of each rotor, without a fault's share, in PX4's quad-x order."""
+        """Thrust of each rotor, without ground effect and a fault's share, in PX4's quad-x order."""
         return self._thrust
 
     @property
     def hover_command(self) -> float:
-        """True normalised hover thrust without payload."""
-        return self.weight_n / self._vehicle.airframe.thrust_max_n
+        """True normalised hover thrust without payload, at the battery's start and far from the ground."""
+        linear = self.weight_n / self._vehicle.airframe.thrust_max_n
+        ratio = 1.0 if self.battery is None else self.battery.thrust_ratio(self.battery.hover_v)
+        if self._rotors is None:
+            return linear / ratio
+        return self._rotors.hover_command(self.weight_n / 4.0, self._rotor_max_n * ratio, self._config.thr_mdl_fac)
 
     def step(self, rotor_commands: Vec4, joint_torque_nm: Vec2, airborne: bool = True, *, drag: bool = True) -> None:
         """Advance by one physics step.
 
         Args:
-            rotor_commands: normalised, 0 to 1, in PX4's quad-x order.
+            rotor_commands: motor signals, 0 to 1, in PX4's quad-x order.
             joint_torque_nm: motor torque of both joints.
             airborne: whether a payload may be thrown.
             drag: whether aerodynamic drag and wind act.
         """
-        k, most = self._gain, self._rotor_max_n
-        a, b, c, d = self._thrust
-        to_a, to_b, to_c, to_d = rotor_commands
-        self._thrust = thrust = (
-            a + k * (to_a * most - a),
-            b + k * (to_b * most - b),
-            c + k * (to_c * most - c),
-            d + k * (to_d * most - d),
-        )
+        k, most, rotors, battery = self._gain, self._rotor_max_n, self._rotors, self.battery
+        if battery is not None:
+            most *= battery.thrust_ratio(battery.voltage_v)
+        if rotors is None:
+            a, b, c, d = self._thrust
+            to_a, to_b, to_c, to_d = rotor_commands
+            self._thrust = thrust = (
+                a + k * (to_a * most - a),
+                b + k * (to_b * most - b),
+                c + k * (to_c * most - c),
+                d + k * (to_d * most - d),
+            )
+        else:
+            self._thrust = thrust = rotors.step(rotor_commands, most)
+        if battery is not None:
+            battery.step(PHYSICS_DT_S, thrust)
+        if rotors is not None:
+            (a, b, c, d), near = thrust, rotors.ground_effect(self.q[2] + ROTOR_HEIGHT_M)
+            thrust = (near * a, near * b, near * c, near * d)
         if self.rotor_share is not None:
             a, b, c, d = (force * share for force, share in zip(thrust, self.rotor_share, strict=True))
             thrust = (a, b, c, d)
@@ -286,7 +305,11 @@ class World:
         force_n = ZERO
         if drag:
             (wx, wy, wz), v = self.wind_m_s, self.v
-            force_n = (DRAG_N_PER_M_S * (wx - v[0]), DRAG_N_PER_M_S * (wy - v[1]), DRAG_N_PER_M_S * (wz - v[2]))
+            wx, wy, wz = wx - v[0], wy - v[1], wz - v[2]
+            force_n = (DRAG_N_PER_M_S * wx, DRAG_N_PER_M_S * wy, DRAG_N_PER_M_S * wz)
+            if rotors is not None:
+                (x, y, z), (hx, hy, hz) = force_n, rotors.drag_n(sum(thrust), (wx, wy, wz), self.q)
+                force_n = (x + hx, y + hy, z + hz)
         if self.snag is not None:
             (x, y, z), (px, py, pz) = force_n, self._snag_pull_n(*self.snag)
             force_n = (x + px, y + py, z + pz)

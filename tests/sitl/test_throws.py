@@ -116,9 +116,9 @@ def test_the_battery_lives_as_long_as_it_is_told() -> None:
     plant: Plant = flight.plant
     plant.armed_t_s = 0.0
     plant.world.t_s = 20.0
-    assert plant.battery_remaining() == pytest.approx(0.9 - 20.0 / 50.0)
+    assert plant.battery().remaining == pytest.approx(0.9 - 20.0 / 50.0)
     plant.world.t_s = 60.0
-    assert plant.battery_remaining() == 0.0
+    assert plant.battery().remaining == 0.0
 
 
 def test_the_final_word_counts_throws_and_catches() -> None:

@@ -16,12 +16,14 @@ from pydantic.fields import FieldInfo
 
 from companion.config.base import Model
 from companion.sitl_config.effects.air import Air
+from companion.sitl_config.effects.battery import Battery
 from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.effects.net import Net
+from companion.sitl_config.effects.rotors import Rotors
 from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import KINDS, Fault
@@ -53,6 +55,8 @@ EXAMPLES: dict[type[Model], Settings] = {
     Mocap: {"on": True, "lost_share": 0.2, "wobble_every_s": 0.5},
     Net: {"on": True},
     Thrower: {"on": True},
+    Rotors: {"on": True},
+    Battery: {"on": True},
 }
 """Examples of the parts of the world whose fields are tested."""
 

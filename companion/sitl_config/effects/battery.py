@@ -1,0 +1,20 @@
+"""Section `battery` of the simulated world: internal resistance, charge drawn by the current, thrust over voltage."""
+
+from __future__ import annotations
+
+from companion.config.base import Model, NonNegative, Positive
+
+
+class Battery(Model):
+    """True battery: four lithium-polymer cells. Its capacity is what hovering draws in `world.battery_life_s`."""
+
+    on: bool = False
+    """Whether this effect acts."""
+    resistance_ohm: NonNegative = 0.028
+    """Internal resistance with leads (p: 5 to 8 mohm per cell in good health, new packs 1 to 4, aged packs 8 to 12; e: leads 4)."""
+    full_thrust_v: Positive = 16.0
+    """Voltage at which the vehicle file's `thrust_max_n` is true; thrust goes with the square of the voltage (e)."""
+    power_w_n15: Positive = 3.9
+    """Electrical power of a rotor over thrust^1.5, W/N^1.5 (e: 0.56 of the ideal 2.19 of a 13-inch rotor; 9.5 g/W at 7.4 N)."""
+    electronics_w: NonNegative = 15.0
+    """Power of everything but the rotors (e: companion computer, autopilot, sensors, servos)."""

@@ -1,0 +1,82 @@
+"""The true battery: open-circuit voltage over charge, internal resistance, current by the rotors' power.
+
+Sources: open-circuit voltage of a lithium-polymer cell (Chen and Rincon-Mora, IEEE Trans. Energy Conversion 2006, eq. 2; without its
+RC elements); power of a rotor with thrust^1.5 (momentum theory at a constant figure of merit); thrust at a given motor signal with the
+square of the voltage (ESCs without voltage compensation).
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.model.types import Vec4
+from companion.sitl_config.effects.battery import Battery as BatteryConfig
+
+CELLS = 4
+
+
+def open_circuit_v(charge: float) -> float:
+    """Return the voltage of the battery without load at a state of charge of 0 to 1."""
+    cell_v = 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * math.exp(-35.0 * charge)
+    return CELLS * cell_v
+
+
+class BatteryPack:
+    """The battery; `step` once per physics step.
+
+    Args:
+        config: section `battery`.
+        start: state of charge at arming, 0 to 1.
+        life_s: time in which hovering would empty a full battery.
+        weight_n: weight of the vehicle, for the hover current.
+    """
+
+    def __init__(self, config: BatteryConfig, start: float, life_s: float, weight_n: float) -> None:
+        self._resistance_ohm = config.resistance_ohm
+        self._power_w_n15 = config.power_w_n15
+        self._electronics_w = config.electronics_w
+        self._full_thrust_v = config.full_thrust_v
+        self._start = start
+        hover_w = config.electronics_w + config.power_w_n15 * weight_n * math.sqrt(weight_n / 4.0)
+        self.hover_v = self._loaded_v(open_circuit_v(start), hover_w)
+        """Voltage in hover at the start."""
+        self.capacity_as = hover_w / self._loaded_v(open_circuit_v(0.5), hover_w) * life_s
+        """Charge of the full battery, A s: hover current at half charge times life."""
+        self.restart()
+
+    @classmethod
+    def of(cls, config: BatteryConfig, start: float, life_s: float, weight_n: float) -> BatteryPack | None:
+        """Return the battery, or None if the effect is off."""
+        return cls(config, start, life_s, weight_n) if config.on else None
+
+    def restart(self) -> None:
+        """Set the charge at arming."""
+        self.drawn_as = 0.0
+        """Charge drawn since arming, A s."""
+        self.voltage_v = self._loaded_v(open_circuit_v(self._start), self._electronics_w)
+        """Voltage at the terminals."""
+        self.current_a = self._electronics_w / self.voltage_v
+
+    def _loaded_v(self, open_v: float, power_w: float) -> float:
+        """Return the voltage under a constant power: the upper root of v = open_v - resistance * power / v."""
+        return 0.5 * (open_v + math.sqrt(max(0.0, open_v * open_v - 4.0 * self._resistance_ohm * power_w)))
+
+    @property
+    def remaining(self) -> float:
+        """State of charge, 0 to 1."""
+        return max(0.0, self._start - self.drawn_as / self.capacity_as)
+
+    def thrust_ratio(self, voltage_v: float) -> float:
+        """Return the thrust at this voltage over the thrust that the vehicle file states, at the same motor signal."""
+        ratio = voltage_v / self._full_thrust_v
+        return ratio * ratio
+
+    def step(self, dt_s: float, thrust_n: Vec4) -> None:
+        """Draw current for one physics step with these thrusts of the rotors."""
+        a, b, c, d = thrust_n
+        root = math.sqrt
+        rotors_n15 = a * root(a) + b * root(b) + c * root(c) + d * root(d)
+        power_w = self._electronics_w + self._power_w_n15 * rotors_n15
+        self.voltage_v = voltage_v = self._loaded_v(open_circuit_v(self.remaining), power_w)
+        self.current_a = current_a = power_w / voltage_v
+        self.drawn_as += current_a * dt_s
