@@ -12,6 +12,7 @@ from companion.config.explain import nearest
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.battery import Battery
+from companion.sitl_config.effects.compliance import Compliance
 from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.imu import Imu
@@ -19,6 +20,7 @@ from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.effects.net import Net
 from companion.sitl_config.effects.rotors import Rotors
+from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import Fault as Fault
@@ -168,6 +170,8 @@ class World(Model):
     thrower: Thrower = Thrower()
     rotors: Rotors = Rotors()
     battery: Battery = Battery()
+    servo_mechanics: ServoMechanics = ServoMechanics()
+    compliance: Compliance = Compliance()
 
     def servo(self, joint: int) -> Servo:
         """Return the servo of joint 0 or 1."""

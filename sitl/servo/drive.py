@@ -48,6 +48,10 @@ class ServoDrive:
         """Whether the watchdog has switched the motor off; `start_watchdog` clears it."""
         self.goal_delay_s = 0.0
         """Delay from setting a goal current to its effect."""
+        self.current_loop_s = 0.0
+        """Time constant of the current loop; 0 if the current is the goal at once."""
+        self._current = 0.0
+        """Present current in counts, unrounded, if there is a time constant."""
         self.now_s = 0.0
         """Time of the last `update`."""
         self.angle_rad = shaft_angle_rad
@@ -77,6 +81,7 @@ class ServoDrive:
         Returns:
             Motor current in A, positive towards positive angle; 0 while the motor is off.
         """
+        since_s = t_s - self.now_s
         self.now_s = t_s
         self.angle_rad = shaft_angle_rad
         self.velocity_rad_s = shaft_velocity_rad_s
@@ -96,6 +101,10 @@ class ServoDrive:
             counts = limit if goal > limit else -limit if goal < -limit else goal
         else:
             counts = self._position_loop_counts()
+        if self.current_loop_s > 0.0:
+            self._current -= math.expm1(-since_s / self.current_loop_s) * (counts - self._current)
+            self._current_counts = round(self._current)
+            return self._current * AMP_PER_COUNT * self.direction
         self._current_counts = counts
         return counts * AMP_PER_COUNT * self.direction
 

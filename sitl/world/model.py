@@ -7,7 +7,7 @@ import math
 from companion.config.vehicle import Airframe, Vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.world import World
-from sitl.world.effects import machine
+from sitl.world.effects import machine, transmission
 
 PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"
@@ -66,6 +66,9 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     def xyz(values: tuple[float, float, float]) -> str:
         return " ".join(str(value) for value in values)
 
+    friction_nm, damping_nms, armature = world.joint_friction_nm, world.joint_damping_nms, arm.joint_armature_kg_m2
+    if transmission.acts(world):
+        friction_nm = damping_nms = armature = 0.0
     roll, pitch, yaw = tool.sensor_rpy_deg
     payload = ""
     connect = ""
@@ -99,12 +102,12 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
       {rotors}
       {feet}
       <body name="link1" pos="{xyz(arm.shoulder_body_m)}" euler="{xyz(machine.shoulder_ypr_rad(world.machine))}">
-        <joint name="alpha1" axis="0 1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
-               armature="{arm.joint_armature_kg_m2}"/>
+        <joint name="alpha1" axis="0 1 0" frictionloss="{friction_nm}" damping="{damping_nms}"
+               armature="{armature}"/>
         {rod(m1, arm.link_com_m[0], l1)}
         <body name="link2" pos="{l1} 0 0">
-          <joint name="alpha2" axis="0 -1 0" frictionloss="{world.joint_friction_nm}" damping="{world.joint_damping_nms}"
-                 armature="{arm.joint_armature_kg_m2}"/>
+          <joint name="alpha2" axis="0 -1 0" frictionloss="{friction_nm}" damping="{damping_nms}"
+                 armature="{armature}"/>
           {rod(m2, arm.link_com_m[1], l2)}
           <body name="sensor" pos="{l2} 0 0">
             <inertial pos="0 0 0" mass="{max(tool.sensor_mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>

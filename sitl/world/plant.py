@@ -23,6 +23,7 @@ from sitl.faults.injector import Faults
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.effects.imu import ImuErrors
 from sitl.world.effects.mocap import MocapErrors
+from sitl.world.effects.transmission import transmissions_of
 from sitl.world.handling import Handling, HungWeight
 from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
@@ -113,7 +114,12 @@ class Plant:
         )
         self._servo_zeros_rad = (_zero_rad(first, servo1), _zero_rad(second, servo2))
         k = vehicle.arm.torque_per_amp_nm_a
-        self._torque_per_amp_nm_a = (k / (1.0 + servo1.torque_per_amp_error), k / (1.0 + servo2.torque_per_amp_error))
+        more1, more2 = config.servo_mechanics.torque_per_amp_error if config.servo_mechanics.on else (0.0, 0.0)
+        self._torque_per_amp_nm_a = (
+            k / (1.0 + servo1.torque_per_amp_error) / (1.0 + more1),
+            k / (1.0 + servo2.torque_per_amp_error) / (1.0 + more2),
+        )
+        self._transmissions = transmissions_of(vehicle, config, arm_rad, PHYSICS_DT_S)
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, self.world.weight_n / 4.0)
         self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
@@ -191,8 +197,17 @@ class Plant:
         (sign1, sign2), (zero1, zero2) = self._joint_signs, self._servo_zeros_rad
         drive1, drive2 = self._drives
         k1, k2 = self._torque_per_amp_nm_a
-        torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * q[q1], sign1 * v[v1]) * k1
-        torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * q[q2], sign2 * v[v2]) * k2
+        angle1, angle2, rate1, rate2 = q[q1], q[q2], v[v1], v[v2]
+        transmissions = self._transmissions
+        if transmissions is not None:
+            angle1, rate1 = transmissions[0].encoder(angle1, rate1)
+            angle2, rate2 = transmissions[1].encoder(angle2, rate2)
+        torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * angle1, sign1 * rate1) * k1
+        torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * angle2, sign2 * rate2) * k2
+        if world.parked and torque1 and torque2:
+            world.release_arm()
+        if transmissions is not None:
+            torque1, torque2 = transmissions[0].step(torque1), transmissions[1].step(torque2)
         if self._tick % IMU_EVERY == 0:
             self._rotors = self._px4.step(self._imu_sample or self._imu())
             self._imu_sample = None

@@ -153,7 +153,8 @@ class World:
         if self._has_payload:
             self._payload = Ball.of(m, "payload", "catch")
         self._park = [m.equality(name).id for name in ("park1", "park2")]
-        self._parked = True
+        self.parked = True
+        """Whether a stand holds the arm."""
         self._gain = 1.0 - math.exp(-PHYSICS_DT_S / config.rotor_lag_s)
         self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
         self._rotors = Rotors.of(config.rotors, vehicle.airframe.rotor_arm_m, PHYSICS_DT_S)
@@ -274,6 +275,8 @@ class World:
         Args:
             rotor_commands: motor signals, 0 to 1, in PX4's quad-x order.
             joint_torque_nm: motor torque of both joints.
+            rotor_commands: normalised, 0 to 1, in PX4's quad-x order.
+            joint_torque_nm: torque of the motors or of their gears on both joints.
             airborne: whether a payload may be thrown.
             drag: whether aerodynamic drag and wind act.
         """
@@ -300,8 +303,6 @@ class World:
             a, b, c, d = (force * share for force, share in zip(thrust, self.rotor_share, strict=True))
             thrust = (a, b, c, d)
         self._ctrl[:] = thrust + joint_torque_nm
-        if self._parked and all(joint_torque_nm):
-            self.release_arm()
         force_n = ZERO
         if drag:
             (wx, wy, wz), v = self.wind_m_s, self.v
@@ -332,13 +333,13 @@ class World:
         self._watch_crash()
 
     def release_arm(self) -> None:
-        """Release the arm from the stand that holds it until both servos give torque."""
-        self._parked = False
+        """Release the arm from its stand."""
+        self.parked = False
         self.data.eq_active[self._park] = 0
 
     def hold_arm(self, angle_rad: Vec2) -> None:
         """Hold both joints at these angles until `release_arm`."""
-        self._parked = True
+        self.parked = True
         self.data.eq_active[self._park] = 1
         for park, angle in zip(self._park, angle_rad, strict=True):
             self.model.eq_data[park, 0] = angle

@@ -17,6 +17,7 @@ from pydantic.fields import FieldInfo
 from companion.config.base import Model
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.battery import Battery
+from companion.sitl_config.effects.compliance import Compliance
 from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.imu import Imu
@@ -24,6 +25,7 @@ from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.effects.net import Net
 from companion.sitl_config.effects.rotors import Rotors
+from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import KINDS, Fault
@@ -57,6 +59,8 @@ EXAMPLES: dict[type[Model], Settings] = {
     Thrower: {"on": True},
     Rotors: {"on": True},
     Battery: {"on": True},
+    ServoMechanics: {"on": True},
+    Compliance: {"on": True},
 }
 """Examples of the parts of the world whose fields are tested."""
 

@@ -1,0 +1,27 @@
+"""Section `compliance` of the simulated world: the arm's links bend and its mount yields."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from companion.config.base import Model, NonNegative
+from companion.sitl_config.effects.servo_mechanics import GEAR_MIN_DEG_PER_NM
+
+DegPerNm = Annotated[float, Field(ge=GEAR_MIN_DEG_PER_NM, le=10)]
+
+
+class Compliance(Model):
+    """Springs in the plane of the arm, one in series with each joint, which the servos' encoders do not see."""
+
+    on: bool = False
+    """Whether this effect acts."""
+    mount_deg_per_nm: DegPerNm = 1.0
+    """Tilt of the shoulder servo with its mount under the shoulder's torque, deg per N m (e: 0.5 to 2)."""
+    link_deg_per_nm: DegPerNm = 1.0
+    """Rotation of the tool against the elbow's output shaft under the elbow's torque, deg per N m: horn and bending of link 2
+    (e: 0.5 to 2)."""
+    relaxation_s: NonNegative = 0.0006
+    """Damping over stiffness of both springs, and of the gears with `servo_mechanics` (e: 2 to 4 % of critical damping at the arm's
+    frequencies of 10 to 20 Hz)."""

@@ -1,0 +1,157 @@
+"""Motor, gear and flexible mount of a joint: the effects `servo_mechanics` and `compliance`.
+
+The angle of the joint in MuJoCo is the true angle of the link. The rotor is integrated here, one degree of freedom per joint:
+the motor's torque and the friction act on it, and a spring with backlash connects it to the link. The stiffness of that spring is the
+series of gear and mount (or link), whose masses between are negligible. Springs and rotors inside MuJoCo would need bodies for these
+masses, whose frequencies of several hundred hertz a step of 2 ms does not represent.
+
+Friction: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025 (arXiv 2410.08650),
+model M4, with their update: friction is the torque that would stop the rotor within the step, limited to
+
+    F = friction + load_friction L + exp(-(|v| / stribeck)^exponent) (stiction + load_stiction L) + viscous |v|,
+
+where L = |motor torque - external torque|, and the external torque is what the link exerts on the gear.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.config.vehicle import Vehicle
+from companion.model.types import Vec2
+from companion.sitl_config.effects.servo_mechanics import ServoMechanics
+from companion.sitl_config.world import World
+
+ARMATURE_MIN_KG_M2 = 4e-3
+"""Least inertia of a rotor, felt at the joint, so that its oscillation against the gear is slow enough for the physics step."""
+_WARM_UP_STEPS = 500
+
+
+class Transmission:
+    """One joint; angles and torques in the direction of the joint angle. Call `encoder`, then `step`, once per physics step.
+
+    Args:
+        servo: friction, backlash, gear and warm-up.
+        armature_kg_m2: inertia of the rotor, felt at the joint.
+        gear_rad_per_nm: compliance between the rotor and the encoder.
+        outer_rad_per_nm: compliance between the encoder and the base or the link.
+        outer_relaxation_s: damping over stiffness of the latter.
+        start_rad: angle of the link at the start, with the gear in the middle of its play.
+        dt_s: time from step to step.
+    """
+
+    def __init__(
+        self,
+        servo: ServoMechanics,
+        armature_kg_m2: float,
+        gear_rad_per_nm: float,
+        outer_rad_per_nm: float,
+        outer_relaxation_s: float,
+        start_rad: float,
+        dt_s: float,
+    ) -> None:
+        compliance = gear_rad_per_nm + outer_rad_per_nm
+        self._stiffness_nm = 1.0 / compliance
+        relaxation_s = (servo.gear_relaxation_s * gear_rad_per_nm + outer_relaxation_s * outer_rad_per_nm) / compliance
+        self._damping_nms = relaxation_s / compliance
+        self._outer_share = outer_rad_per_nm / compliance
+        self._half_play_rad = 0.5 * math.radians(servo.backlash_deg)
+        self._armature_kg_m2 = max(armature_kg_m2, ARMATURE_MIN_KG_M2)
+        self._servo = servo
+        self._friction = (servo.friction_nm, servo.stiction_nm, servo.load_friction, servo.load_stiction)
+        self._viscous_nms, self._stribeck_rad_s = servo.viscous_nms, servo.stribeck_rad_s
+        self._exponent = servo.stribeck_exponent
+        self._dt_s = dt_s
+        self._rotor_rad, self._rotor_rad_s = start_rad, 0.0
+        self._stretch_rad = self._stretch_rad_s = 0.0
+        self._step = 0
+        self._torque_share = self._friction_share = 1.0
+
+    def encoder(self, link_rad: float, link_rad_s: float) -> tuple[float, float]:
+        """Take angle and velocity of the link, and return those of the servo's output shaft."""
+        stretch, half = self._rotor_rad - link_rad, self._half_play_rad
+        if stretch > half:
+            stretch -= half
+        elif stretch < -half:
+            stretch += half
+        else:
+            self._stretch_rad = self._stretch_rad_s = 0.0
+            return link_rad, link_rad_s
+        rate = self._rotor_rad_s - link_rad_s
+        self._stretch_rad, self._stretch_rad_s = stretch, rate
+        share = self._outer_share
+        return link_rad + share * stretch, link_rad_s + share * rate
+
+    def friction_nm(self, motor_nm: float, external_nm: float, speed_rad_s: float) -> float:
+        """Return the greatest friction torque at a speed of at least 0 and under a load."""
+        friction, stiction, load_friction, load_stiction = self._friction
+        load = abs(motor_nm - external_nm)
+        rest = math.exp(-((speed_rad_s / self._stribeck_rad_s) ** self._exponent))
+        return self._friction_share * (
+            friction + load_friction * load + rest * (stiction + load_stiction * load) + self._viscous_nms * speed_rad_s
+        )
+
+    def step(self, motor_nm: float) -> float:
+        """Advance the rotor by one physics step under the torque of the cold motor; return the torque on the link in that step."""
+        if self._step % _WARM_UP_STEPS == 0:
+            self._warm_up(self._step * self._dt_s)
+        self._step += 1
+        motor_nm *= self._torque_share
+        stretch, torque_nm = self._stretch_rad, 0.0
+        if stretch != 0.0:
+            torque_nm = self._stiffness_nm * stretch + self._damping_nms * self._stretch_rad_s
+            if torque_nm * stretch < 0.0:  # the tooth lifts off, it does not pull
+                torque_nm = 0.0
+        dt_s, inertia, velocity = self._dt_s, self._armature_kg_m2, self._rotor_rad_s
+        net_nm = motor_nm - torque_nm
+        stop_nm = inertia / dt_s * velocity + net_nm
+        limit_nm = self.friction_nm(motor_nm, -torque_nm, abs(velocity))
+        if stop_nm > limit_nm:
+            self._rotor_rad_s = (stop_nm - limit_nm) * dt_s / inertia
+        elif stop_nm < -limit_nm:
+            self._rotor_rad_s = (stop_nm + limit_nm) * dt_s / inertia
+        else:
+            self._rotor_rad_s = 0.0
+        self._rotor_rad += self._rotor_rad_s * dt_s
+        return torque_nm
+
+    def _warm_up(self, t_s: float) -> None:
+        servo = self._servo
+        warm_k = servo.warm_up_k * -math.expm1(-(servo.warm_since_s + t_s) / servo.warm_up_s)
+        self._torque_share = 1.0 + servo.torque_constant_per_k * warm_k
+        self._friction_share = 1.0 + servo.friction_per_k * warm_k
+
+
+def acts(world: World) -> bool:
+    """Return whether a joint has a rotor of its own; otherwise MuJoCo's joint has the armature, the friction and the damping."""
+    return world.servo_mechanics.on or world.compliance.on
+
+
+def transmissions_of(
+    vehicle: Vehicle, world: World, start_rad: Vec2, dt_s: float
+) -> tuple[Transmission, Transmission] | None:
+    """Return the transmission of each joint for the joint angles at the start, or None if neither effect acts.
+
+    With `compliance` alone the servo has the plain world's constant friction and no backlash.
+    """
+    if not acts(world):
+        return None
+    servo, arm = world.servo_mechanics, world.compliance
+    gear_rad = math.radians(servo.gear_deg_per_nm) if servo.on else 0.0
+    mount_rad = math.radians(arm.mount_deg_per_nm) if arm.on else 0.0
+    link_rad = math.radians(arm.link_deg_per_nm) if arm.on else 0.0
+    if not servo.on:
+        servo = ServoMechanics(
+            friction_nm=world.joint_friction_nm,
+            viscous_nms=world.joint_damping_nms,
+            stiction_nm=0.0,
+            load_friction=0.0,
+            load_stiction=0.0,
+            backlash_deg=0.0,
+            warm_up_k=0.0,
+        )
+    armature = vehicle.arm.joint_armature_kg_m2
+    return (
+        Transmission(servo, armature, gear_rad, mount_rad, arm.relaxation_s, start_rad[0], dt_s),
+        Transmission(servo, armature, gear_rad, link_rad, arm.relaxation_s, start_rad[1], dt_s),
+    )
