@@ -147,7 +147,7 @@ class RealPx4:
         if self._process is None:
             self._progress(
                 f"px4 was not found: looking for {BY_HAND_DEADLINE_S:g} s for one that was started by hand, on TCP "
-                f"{self._link.port}"
+                f"{self._link.port}: {self._by_hand()}"
             )
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._control.version()
@@ -187,7 +187,10 @@ class RealPx4:
         await self._control.await_heartbeat()
 
     def _how(self) -> str:
-        return f"{HOW_TO_GET_IT}; or {HOW_TO_START_IT.format(model=MODEL, number=self.number)}"
+        return f"{HOW_TO_GET_IT}; or start PX4 by hand, then this command again: {self._by_hand()}"
+
+    def _by_hand(self) -> str:
+        return HOW_TO_START_IT.format(model=MODEL, number=self.number)
 
     async def _write_parameters(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
         """Write the parameters that differ and return them, in PX4's types."""

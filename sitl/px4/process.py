@@ -34,9 +34,10 @@ HOW_TO_GET_IT = (
     "set PX4_SITL to its build folder (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
 )
 HOW_TO_START_IT = (
-    "start PX4 by hand, then this command again: PX4_SIM_MODEL={model} px4 -i {number}, always in the same folder, where it keeps its "
-    "parameters, or PX4_SIM_MODEL={model} make px4_sitl_default none"
+    "PX4_SIM_MODEL={model} px4 -i {number}, always in the same folder, where it keeps its parameters, or "
+    "PX4_SIM_MODEL={model} make px4_sitl_default none"
 )
+"""The two commands that start a PX4 by hand."""
 _SIMULATOR, _ONBOARD, _ONBOARD_OWN, _GROUND_OWN = 4560, 14540, 14580, 18570
 _CAMERA, _CAMERA_OWN, _GIMBAL_OWN = 14030, 14280, 13030
 _LOG = "px4.log"

@@ -261,6 +261,9 @@ def test_without_a_px4_the_flight_is_refused_within_seconds_and_told_how_to_get_
         ended = sandbox.run("fly", HOVER, "--sitl=px4", "--out", "out")
         sandbox.assert_nobody_left()
     assert "looking for 10 s for one that was started by hand, on TCP 456" in ended.out
+    waiting = ended.out.partition("started by hand")[2]
+    assert "same folder, where it keeps its parameters" in waiting
+    assert "make px4_sitl_default none" in waiting
     assert ended.code == EXIT_REFUSED, (ended.out, ended.err)
     assert len(ended.err_lines) == 1, ended.err
     for said in (
