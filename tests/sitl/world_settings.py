@@ -15,19 +15,7 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from companion.config.base import Model
-from companion.sitl_config.effects.air import Air
-from companion.sitl_config.effects.battery import Battery
-from companion.sitl_config.effects.compliance import Compliance
-from companion.sitl_config.effects.downwash import Downwash
-from companion.sitl_config.effects.force_sensor import ForceSensor
-from companion.sitl_config.effects.imu import Imu
-from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.effects.mocap import Mocap
-from companion.sitl_config.effects.net import Net
-from companion.sitl_config.effects.rotors import Rotors
-from companion.sitl_config.effects.servo_mechanics import ServoMechanics
-from companion.sitl_config.effects.tether_line import TetherLine
-from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import KINDS, Fault
 from companion.sitl_config.world import Push, Servo, World
 
@@ -48,21 +36,9 @@ EXAMPLES: dict[type[Model], Settings] = {
     Push: {"t_s": 0.1, "duration_s": 0.1, "force_world_n": (0.0, 0.0, -2.0)},
     Servo: {},
     Fault: {"kind": "gust", "t_s": 0.1},
-    Machine: {"on": True},
-    ForceSensor: {"on": True},
-    Air: {"on": True},
-    Downwash: {"on": True},
-    TetherLine: {"on": True},
-    Imu: {"on": True},
     Mocap: {"on": True, "lost_share": 0.2, "wobble_every_s": 0.5},
-    Net: {"on": True},
-    Thrower: {"on": True},
-    Rotors: {"on": True},
-    Battery: {"on": True},
-    ServoMechanics: {"on": True},
-    Compliance: {"on": True},
 }
-"""Examples of the parts of the world whose fields are tested."""
+"""Examples of the parts of the world whose fields are tested; an effect that is not listed is switched on."""
 
 VALUES: dict[str, Any] = {
     "mocap_axes": ("-x", "-y", "z"),
@@ -79,6 +55,9 @@ VALUES: dict[str, Any] = {
     "faults.duration_s": 0.1,
     "faults.size": 3.0,
     "faults.after": "start",
+    # PX4 learns smaller ones before take-off.
+    **{f"imu.gyro_bias_deg_s[{axis}]": 12.0 for axis in range(3)},
+    "imu.accel_bias_m_s2[2]": 1.0,
 }
 """Other values of settings for which type and default do not suffice."""
 
@@ -121,9 +100,7 @@ SIZES: dict[str, float] = {"payload_missed": 0.0, "autopilot_reboot": 0.1}
 def pairs() -> Iterator[Pair]:
     """Return a pair for each setting, for each component of a vector, and for each field of each part."""
     for name, field in World.model_fields.items():
-        parts = [part for part in _models(field.annotation) if part in EXAMPLES]
-        unknown = [part for part in _models(field.annotation) if part not in EXAMPLES]
-        assert not unknown, f"world.{name}: say in EXAMPLES what {unknown} looks like"
+        parts = _models(field.annotation)
         for part in parts:
             yield from _of_part(name, field, part)
         if not parts:
@@ -157,7 +134,7 @@ def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
         if (name, key) == ("faults", "kind"):
             continue  # `fault_pairs`
         path = f"{name}.{key}"
-        usual = {**EXAMPLES[part], **TOGETHER_IN_PART.get(path, {})}
+        usual = {**_example(part), **TOGETHER_IN_PART.get(path, {})}
         for number, changed in _changes(path, inner, usual, part):
             for place in range(wide):
                 suffix = f" of {place + 1}" if wide > 1 else ""
@@ -167,6 +144,11 @@ def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
                     {**beside, name: _placed(field, part, {**usual, **changed}, place)},
                     _acts(path),
                 )
+
+
+def _example(part: type[Model]) -> Settings:
+    assert part in EXAMPLES or "on" in part.model_fields, f"say in EXAMPLES what {part.__name__} looks like"
+    return EXAMPLES.get(part, {"on": True})
 
 
 def _placed(field: FieldInfo, part: type[Model], settings: Settings, place: int) -> Any:
