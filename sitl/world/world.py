@@ -209,7 +209,7 @@ class World:
         config, vehicle = self._config, self._vehicle
         effects: tuple[Effect | None, ...] = (
             Air.of(config.air, config.seed, self._base, self.weight_n),
-            Downwash.of(config.downwash, vehicle, self, config.seed),
+            Downwash.of(config.downwash, config.rotors.radius_m, vehicle, self, config.seed),
             TetherLine.of(config.tether_line, vehicle.tether, self._base),
         )
         return tuple(effect for effect in effects if effect is not None)

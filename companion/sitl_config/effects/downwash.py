@@ -6,12 +6,10 @@ from companion.config.base import Model, NonNegative, Positive
 
 
 class Downwash(Model):
-    """The four wakes and what hangs in them."""
+    """The four wakes and what hangs in them. The radius of a rotor is `rotors.radius_m`, whether or not that effect acts."""
 
     on: bool = False
     """Whether this effect acts."""
-    rotor_radius_m: Positive = 0.165
-    """Radius of a rotor (m: 13-inch propellers of the Tarot 650 Sport)."""
     spread: Positive = 0.2
     """Standard deviation by which a wake's momentum has spread sideways, over the distance below the rotor. The four wakes are one jet
     from the depth where this is the rotors' distance from the vehicle's planes, 0.23 m: with 0.14 from 2.5 vehicle sizes (p:

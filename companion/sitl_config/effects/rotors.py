@@ -30,6 +30,6 @@ class Rotors(Model):
     """Rotor drag (H-force) over thrust, per airspeed across the rotor axis (p: 0.0124 from the coefficients of PX4's Gazebo x500,
     0.0153 from PX4's default EKF2_MCOEF of 0.15 1/s, 0.039 and 0.055 from Faessler et al. 2018, 0.386 and 0.544 1/s)."""
     radius_m: Positive = 0.165
-    """Radius of a rotor, for the ground effect (m: 13-inch propellers of the Tarot 650 Sport)."""
+    """Radius of a rotor, for ground effect and downwash (m: 13-inch propellers of the Tarot 650 Sport)."""
     ground_body_lift: NonNegative = 2.0
     """Body lift coefficient of the ground effect (p: K_b of Sanchez-Cuevas et al. 2017)."""

@@ -18,12 +18,11 @@ from companion.model.types import Vec3, Vec4
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from sitl.world.effects.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from sitl.world.loads import EFFECT_PERIOD_S
-from sitl.world.model import PAYLOAD_RADIUS_M, rotor_offset_m
+from sitl.world.model import PAYLOAD_RADIUS_M, ROTOR_HEIGHT_M, rotor_offset_m
 
 if TYPE_CHECKING:
     from sitl.world.world import World
 
-ROTOR_HEIGHT_M = 0.03
 _NOISE = 14
 _ROOT_HALF = math.sqrt(0.5)
 
@@ -75,16 +74,19 @@ class Downwash:
 
     Args:
         config: section `downwash`.
+        rotor_radius_m: radius of a rotor.
         vehicle: vehicle file.
         world: the world whose bodies it loads.
         seed: of the world.
     """
 
-    def __init__(self, config: DownwashConfig, vehicle: Vehicle, world: World, seed: int) -> None:
+    def __init__(
+        self, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, world: World, seed: int
+    ) -> None:
         model, data = world.model, world.data
         self._config, self._seed = config, seed
-        self._wakes = Wakes(rotor_offset_m(vehicle.airframe), config.rotor_radius_m, config.spread)
-        self._radius_m = config.rotor_radius_m
+        self._wakes = Wakes(rotor_offset_m(vehicle.airframe), rotor_radius_m, config.spread)
+        self._radius_m = rotor_radius_m
         base = model.body("base").id
         self._base_position, self._base_axes = data.xpos[base], data.xmat[base]
         area = config.link_drag_coefficient * config.link_width_m
@@ -107,9 +109,11 @@ class Downwash:
         self.restart_noise()
 
     @classmethod
-    def of(cls, config: DownwashConfig, vehicle: Vehicle, world: World, seed: int) -> Downwash | None:
+    def of(
+        cls, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, world: World, seed: int
+    ) -> Downwash | None:
         """Return the effect, or None if it is off."""
-        return cls(config, vehicle, world, seed) if config.on else None
+        return cls(config, rotor_radius_m, vehicle, world, seed) if config.on else None
 
     def restart_noise(self) -> None:
         """Start the noise sequence again."""

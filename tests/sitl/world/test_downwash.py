@@ -13,8 +13,8 @@ from companion.config.vehicle import Vehicle
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
-from sitl.world.effects.downwash import ROTOR_HEIGHT_M, Downwash, Wakes
-from sitl.world.model import ROTORS, rotor_offset_m
+from sitl.world.effects.downwash import Downwash, Wakes
+from sitl.world.model import ROTOR_HEIGHT_M, ROTORS, rotor_offset_m
 from sitl.world.world import World
 from tests.support import CATCH
 
@@ -174,4 +174,4 @@ def test_nothing_blows_while_no_rotor_turns_and_off_there_is_no_effect() -> None
     world.data.ctrl[0:4] = 0.0
     act(world)
     assert not world.data.xfrc_applied.any()
-    assert Downwash.of(DownwashConfig(), VEHICLE, world, 1) is None
+    assert Downwash.of(DownwashConfig(), RADIUS_M, VEHICLE, world, 1) is None
