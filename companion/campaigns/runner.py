@@ -59,6 +59,11 @@ class Campaign(ABC):
     scheduler: str | None = None
     """Address of a Dask scheduler; None to fly on this machine."""
 
+    @property
+    def world(self) -> str:
+        """Name of the world that is flown."""
+        return self.configs[0].laboratory.name
+
     def job(self) -> Message:
         """Return the job for `sitl.campaigns`."""
         return {
@@ -80,7 +85,7 @@ class Campaign(ABC):
             "command": self.command,
             "mission": sources.mission,
             "vehicle": sources.vehicle,
-            "world": self.configs[0].laboratory.name,
+            "world": self.world,
             "overrides": list(self.overrides),
         }
 

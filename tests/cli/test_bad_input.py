@@ -93,6 +93,28 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("fly", "--sitl", "mission.yaml", "--preset", "papr"),
         (r"--preset papr: .*paper, recommended",),
     ),
+    "no such world": (
+        (*FLY, "--world", "labb"),
+        (r"^--world labb: expected ideal, lab, .* or a file, found neither \(did you mean lab\?\)$",),
+    ),
+    "no such file of a world": ((*FLY, "--world", "nofile.yaml"), (r"^nofile\.yaml: no such file$",)),
+    "negative seed": ((*FLY, "--seed=-1"), (r"^companion fly: argument --seed: expected a whole number from 0",)),
+    "comparison in no such world": (
+        ("compare", "--mission", "mission.yaml", "--world", "labb"),
+        (r"^--world labb: .*did you mean lab",),
+    ),
+    "model error that is too large": (
+        ("compare", "--model-error", "0,0.4"),
+        (r"--model-error: expected shares from 0 to 0\.3",),
+    ),
+    "model error of draws that is too large": (
+        ("robustness", "mission.yaml", "--model-error", "0.4"),
+        (r"^--set world\.model_error: expected a number from 0 to 0\.3, got 0\.4$",),
+    ),
+    "model error set for a comparison": (
+        ("compare", "--set", "world.model_error=0.1"),
+        (r"--set world\.model_error: the grid sets it; use --model-error$",),
+    ),
     "set without a value": ((*FLY, "--set"), (r"^companion fly: argument --set: expected",)),
     "set without =": ((*FLY, "--set", "world.seed"), (r"--set world\.seed: no '='; expected SECTION\.KEY=VALUE",)),
     "set with nothing behind =": ((*FLY, "--set", "world.seed="), (r"--set world\.seed: no value",)),

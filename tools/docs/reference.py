@@ -22,8 +22,9 @@ _INTRO = {
     "do: [safety](../safety.md).",
     "controller": "One control law with its gains; which of the three it is says `law`. The law as built: [the control "
     "law](../control-law.md).",
-    "world": "What is true in the simulated world, whatever the companion believes: `--set world.KEY=VALUE`. With examples: "
-    "[the simulated world](../sitl.md#knobs).",
+    "world": "What is true in the simulated world, whatever the companion believes: a file for `--world`, or "
+    "`--set world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, that the "
+    "seed draws. With examples: [the laboratory](../world.md), [the simulated world](../sitl.md#knobs).",
 }
 _UNITS = {
     "kg_m2": "kg m^2", "nm_a": "N m/A", "n_per_m": "N/m", "per_s": "1/s", "m_s": "m/s", "m_s2": "m/s^2", "m_s3": "m/s^3",

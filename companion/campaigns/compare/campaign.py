@@ -90,7 +90,9 @@ class Compare(Campaign):
         seeds = ", ".join(map(str, self.seeds))
         mission = self.configs[0].sources.mission
         return Page(
-            "Comparison of controllers", f"{mission} · {len(rows)} flights in the fast loop · seeds {seeds}", sections
+            "Comparison of controllers",
+            f"{mission} · {len(rows)} flights in the fast loop · world {self.world} · seeds {seeds}",
+            sections,
         )
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:

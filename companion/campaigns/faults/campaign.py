@@ -74,7 +74,7 @@ class Faults(Campaign):
             sections.insert(0, Section("Bad flights", tables=[flights_table(bad, details=True)]))
         return Page(
             "Fault campaign",
-            f"{self.configs[0].sources.mission} · {len(rows)} flights {self._where} · {counted(rows)}",
+            f"{self.configs[0].sources.mission} · {len(rows)} flights {self._where} · world {self.world} · {counted(rows)}",
             sections,
             f"{len(bad)} of {len(rows)} flights did what no flight may do."
             if bad

@@ -81,7 +81,7 @@ class Robustness(Campaign):
         unsafe = sum(row["outcome"] not in SAFE for row in rows)
         return Page(
             "Robustness",
-            f"{self.mission} · {law}/{preset} · {len(rows)} worlds in the fast loop",
+            f"{self.mission} · {law}/{preset} · {len(rows)} draws of world {self.world} in the fast loop",
             [
                 Section("Distribution of the error", self._dependence(rows), [thirds_table(rows)], pictures),
                 Section("Flights", tables=[self._flights_table(rows)]),
