@@ -22,12 +22,16 @@ _GATE_M = 0.5
 _GATE_RESET_S = 1.0
 
 # What EKF2's gains settle to with vision at 100 Hz, EKF2_EVP_NOISE 0.01, EKF2_EVA_NOISE 0.05, EKF2_ACC_NOISE 0.35 and EKF2_GYR_NOISE
-# 0.015 (steady Kalman filter over position, velocity and g times tilt): poles 5.9 rad/s, damped by 0.7, and 0.42 rad/s on the tilt
-# (vertical: accelerometer bias). A tilt of 0.1 deg, which EKF2 has too, is 4 mm of position error to this control law.
+# 0.015 (steady Kalman filter over position, velocity and g times tilt): poles 5.9 rad/s, damped by 0.7, and 0.42 rad/s on the tilt. A
+# tilt of 0.1 deg, which EKF2 has too, is 4 mm of position error to this control law. The vertical accelerometer bias is slower: with
+# EKF2_ABIAS_INIT 0.2 and EKF2_ACC_B_NOISE 0.003 its gain is 1.8, 1.2 and 0.7 m/s^3 per m after 20, 30 and 50 s.
 _L_POSITION = 8.8
 _L_VELOCITY = 38.5
 _L_ACCELERATION = 14.7
+_L_BIAS = 1.0
 _L_YAW = 0.3
+_BIAS_MAX_M_S2 = 0.4
+"""EKF2_ABL_LIM."""
 
 # EKF2's defaults: gate in standard deviations (EKF2_EVP_GATE), accelerometer noise (EKF2_ACC_NOISE). The rest as measured on 1.16.1: a
 # filtered ratio falls by e in 1 s, is 2 at most, and the position is good to 4 mm with vision at 100 Hz and EKF2_EVP_NOISE 0.01.
@@ -146,7 +150,7 @@ class Estimator:
         self._v = (vx + kv * rx, vy + kv * ry, vz + kv * rz)
         # A tilt error shows as a horizontal acceleration error of g x theta.
         self._rotate_world(ka / GRAVITY_M_S2 * ry, -ka / GRAVITY_M_S2 * rx, _L_YAW * dt * yaw_error)
-        self._bias_z = max(-1.0, min(1.0, self._bias_z - ka * rz * 0.3))
+        self._bias_z = max(-_BIAS_MAX_M_S2, min(_BIAS_MAX_M_S2, self._bias_z - _L_BIAS * dt * rz))
 
     def _judge(self, gap_s: float, horizontal2: float, vertical2: float, noise2: float) -> None:
         gate2 = _TEST_GATE**2 * max(noise2 + self._variance_m2, 1e-12)

@@ -50,3 +50,17 @@ def test_a_sideways_bias_stays_a_tilt_whatever_vision_says() -> None:
     assert roll == pytest.approx(0.0, abs=1e-6)
     assert pitch == pytest.approx(math.atan2(bias, GRAVITY_M_S2), rel=1e-3)
     assert estimate.position_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
+
+
+def test_an_upward_bias_that_begins_in_flight_fades_as_slowly_as_in_ekf2() -> None:
+    estimator, bias = Estimator(), 0.1
+    climbs = {}
+    for k in range(-500, 10001):
+        up = bias if k > 0 else 0.0
+        estimator.predict(ImuSample(k * 0.004, (0.0, 0.0, 0.0), (0.0, 0.0, -GRAVITY_M_S2 - up)))
+        if k % 2 == 0:
+            estimator.fuse_vision(k * 0.004, (0.0, 0.0, 0.0), IDENTITY_QUAT)
+        climbs[k] = -estimator.estimate().velocity_ned_m_s[2]
+    # A steady bias leaves the innovation bias/38.5, which the position gain 8.8 turns into velocity; the bias' gain 1.0 empties it.
+    assert climbs[500] == pytest.approx(bias * 8.8 / 38.5, rel=0.1)
+    assert climbs[10000] / climbs[500] == pytest.approx(math.exp(-38.0 * 1.0 / 38.5), rel=0.1)
