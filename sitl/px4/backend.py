@@ -34,6 +34,7 @@ BY_HAND_DEADLINE_S = 10.0
 USER_DEADLINE_S = 300.0
 """Deadline for the user to restart PX4."""
 SAMPLE_S = 0.004
+BATTERY_PERIOD_S = 0.1
 STUB_ONLY_FAULTS: Mapping[FaultKind, str] = {
     "autopilot_reboot": "restarts PX4 in the middle of a step",
     "offboard_refused": "makes PX4 refuse a mode",
@@ -50,16 +51,17 @@ def refuse_what_needs_the_stub(config: WorldConfig) -> None:
     """Reject a world that only the stub can simulate, before a real PX4 is started.
 
     Raises:
-        Px4Error: the world has such a fault, or a battery that does not start full.
+        Px4Error: the world has such a fault, or without the effect `battery` one that does not start full.
     """
     for fault in config.faults:
-        if fault.kind in STUB_ONLY_FAULTS:
+        if fault.kind in STUB_ONLY_FAULTS and not (fault.kind == "battery_sag" and config.battery.on):
             raise Px4Error(
                 f"world.faults: {fault.kind} {STUB_ONLY_FAULTS[fault.kind]}, which only the stub can simulate; run with --sitl"
             )
-    if config.battery_start != 1.0:
+    if config.battery_start != 1.0 and not config.battery.on:
         raise Px4Error(
-            "world.battery_start: PX4's own battery simulator starts full, expected 1.0 with a real PX4; run with --sitl"
+            "world.battery_start: PX4's own battery simulator starts full, expected 1.0 with a real PX4; set world.battery.on, or run "
+            "with --sitl"
         )
 
 
@@ -92,6 +94,7 @@ class RealPx4:
         self._process: Px4Process | None = None
         self._version: Version | None = None
         self._imu: ImuSample | None = None
+        self._next_battery_s = 0.0
         self._flies = False
         """Whether preparation is over, so that a PX4 that disconnects is an error."""
 
@@ -256,7 +259,10 @@ class RealPx4:
         return self._link.rotors
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """Do nothing: PX4 simulates its own battery and streams by itself."""
+        """Send the battery if its effect is on; else PX4 simulates its own. PX4 streams by itself."""
+        if self._config.battery.on and t_s >= self._next_battery_s:
+            self._next_battery_s = t_s + BATTERY_PERIOD_S
+            self._control.send_battery(battery)
 
     def set_link(self, down: bool, delay_s: float) -> None:
         """Apply link faults to the relay."""

@@ -15,6 +15,7 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import development as mavlink  # common, and CURRENT_MODE
 
+from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.modes import NavState, nav_state_from_custom
 from sitl.autopilot.params import MAV_PARAM_TYPE_INT32, Value, decode_bytewise, encode_bytewise
 from sitl.px4.hil_link import Px4Error
@@ -27,6 +28,7 @@ COMMAND_DEADLINE_S = 5.0
 HEARTBEAT_DEADLINE_S = 20.0
 MODE_PERIOD_S = 0.02
 """Period of CURRENT_MODE on this link; heartbeats come once a second, too rarely to time a change of mode."""
+_CELLS = 4
 _AT_ONCE = 20
 """Parameters requested at a time; more would overflow PX4's receive buffer."""
 _OWN_SYSTEM, _OWN_COMPONENT = 254, mavlink.MAV_COMP_ID_SYSTEM_CONTROL
@@ -57,6 +59,7 @@ class ControlLink(UdpEndpoint):
         self._instance = instance
         self._system = instance.number + 1
         self._encoder = mavlink.MAVLink(None, srcSystem=_OWN_SYSTEM, srcComponent=_OWN_COMPONENT)
+        self._battery_encoder = mavlink.MAVLink(None, self._system, mavlink.MAV_COMP_ID_BATTERY)
         self._decoder = mavlink.MAVLink(None)
         self._decoder.robust_parsing = True
         self._handlers: list[Callable[[Any], None]] = []
@@ -209,6 +212,17 @@ class ControlLink(UdpEndpoint):
     def force_disarm(self) -> None:
         """Stop the rotors, wherever the vehicle is."""
         self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, _FORCE_DISARM)
+
+    def send_battery(self, battery: Battery) -> None:
+        """Send BATTERY_STATUS as a battery of PX4's own system does, which PX4 takes in place of its power module
+        (MavlinkReceiver::handle_message_battery_status)."""
+        cells = [round(battery.voltage_v / _CELLS * 1e3)] * _CELLS + [0xFFFF] * (10 - _CELLS)
+        message = mavlink.MAVLink_battery_status_message(
+            0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 2500, cells, round(battery.current_a * 1e2),
+            round(battery.consumed_mah), -1, round(battery.remaining * 1e2),
+        )  # fmt: skip
+        self.send_to(message.pack(self._battery_encoder), self._instance.control_address)
+        self._battery_encoder.seq = (self._battery_encoder.seq + 1) % 256
 
     async def command(self, command: int, *params: float) -> None:
         """Send one MAV_CMD and wait until PX4 accepts it.

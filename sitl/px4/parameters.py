@@ -69,6 +69,7 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
         **rotor_geometry(airframe),
         "THR_MDL_FAC": config.thr_mdl_fac,
         "MPC_THR_HOVER": hover_command * (1.0 + config.hover_thrust_error),
+        "SIM_BAT_ENABLE": int(not config.battery.on),  # with the effect the world sends its battery
         "SIM_BAT_DRAIN": config.battery_life_s,
         "SIM_BAT_MIN_PCT": 0.0,
         "BAT1_N_CELLS": 4,

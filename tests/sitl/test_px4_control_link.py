@@ -9,10 +9,13 @@ import socket
 from collections.abc import AsyncIterator
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.loader import load_vehicle
+from companion.sitl_config.effects.battery import Battery as BatteryConfig
 from companion.sitl_config.faults import Fault
 from companion.sitl_config.world import World
+from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_what_needs_the_stub
@@ -123,6 +126,31 @@ def test_every_other_fault_is_flown() -> None:
     refuse_what_needs_the_stub(World(faults=(Fault(kind="link_delay", t_s=1.0), Fault(kind="kill_flight", t_s=1.0))))
     with pytest.raises(Px4Error, match="battery_start"):
         refuse_what_needs_the_stub(World(battery_start=0.5))
+    sag = Fault(kind="battery_sag", t_s=1.0)
+    refuse_what_needs_the_stub(World(battery_start=0.5, battery=BatteryConfig(on=True), faults=(sag,)))
+
+
+def test_a_battery_of_the_world_takes_the_place_of_px4s_own() -> None:
+    assert parameters(VEHICLE.airframe, World(), 0.5)["SIM_BAT_ENABLE"] == 1
+    assert parameters(VEHICLE.airframe, World(battery=BatteryConfig(on=True)), 0.5)["SIM_BAT_ENABLE"] == 0
+
+
+def test_the_battery_is_sent_as_one_of_px4s_own_system() -> None:
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as px4:
+            px4.bind(instance.control_address)
+            px4.setblocking(False)
+            async with ControlLink(instance) as control, asyncio.timeout(DEADLINE_S):
+                control.send_battery(Battery(15.2, 21.5, 0.8, 640.0))
+                (message,) = mavlink.MAVLink(None).parse_buffer(await loop.sock_recv(px4, 512))
+            assert message.get_type() == "BATTERY_STATUS"
+            assert message.get_srcSystem() == instance.number + 1
+            assert message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1, "PX4 ignores its own"
+        assert message.voltages == [3800] * 4 + [0xFFFF] * 6
+        assert (message.current_battery, message.current_consumed, message.battery_remaining) == (2150, 640, 80)
+
+    asyncio.run(scenario())
 
 
 def test_the_relay_passes_on_both_ways_until_it_is_down() -> None:
