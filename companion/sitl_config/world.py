@@ -102,6 +102,7 @@ class World(Model):
     hover_thrust_error: RelativeError = 0.0
     """Relative error of MPC_THR_HOVER against the truth."""
     rotor_lag_s: Positive = 0.04
+    """Time constant of each rotor's thrust; not with `rotors.on`, which has its own."""
     setpoint_delay_s: NonNegative = 0.010
     """Delay from the arrival of a setpoint to the attitude loop, in addition to the link's."""
     arm_delay_s: NonNegative = 0.0
@@ -136,7 +137,7 @@ class World(Model):
     other errors: each is multiplied by 1 plus or minus this share, with a sign drawn by the seed (the moments of inertia share one)."""
     battery_start: Fraction = 1.0
     battery_life_s: Positive = 900.0
-    """Time from arming until a full battery is empty."""
+    """Time from arming until a full battery is empty; with `battery.on`, in hover."""
     push: Push | None = None
     """A push on the net, for tests of the impedance."""
     natnet_version: Literal["3.0", "4.1"] = "4.1"
