@@ -47,7 +47,7 @@ class Bag:
         self.touched_s: float | None = None
         """Time of the first contact with hoop or mesh since the throw or since it bounced out."""
         self.bounced = False
-        """Whether the payload has just left the bag after it touched the mesh."""
+        """Whether the payload has just left the bag after it touched the mesh, without having been caught."""
         self._above = True
 
     def caught_s(self, t_s: float) -> float | None:
@@ -107,7 +107,7 @@ class Bag:
             self.pivot_m = (self._pocket * x, self._pocket * y)
             self.entered_s = None if above else t_s
         else:
-            self.bounced = self.side > 0 and self.touched_s is not None
+            self.bounced = self.side > 0 and self.touched_s is not None and self.caught_s(t_s) is None
             self.side, self.entered_s, self.touched_s = 0, None, None
 
     def _pressed(

@@ -163,6 +163,17 @@ def test_a_catch_counts_when_the_payload_has_settled() -> None:
     assert payload.bag.caught_s(payload.t_s) is not None
 
 
+def test_a_caught_payload_that_is_taken_out_by_hand_has_not_bounced() -> None:
+    payload = falling(2.0)
+    payload.run(1.0)
+    payload.velocity, payload.gravity = (0.0, 0.0, 1.0), 0.0
+    while payload.position[2] < 0.1:
+        payload.step()
+        assert not payload.bag.bounced
+        assert payload.t_s < 2.0
+    assert payload.bag.side == 0
+
+
 def test_a_payload_beside_the_hoop_is_not_touched() -> None:
     payload = falling(2.7, at=(HOOP_M + PAYLOAD_RADIUS_M + 0.002, 0.0))
     payload.run(0.3)
