@@ -122,7 +122,9 @@ class World(Model):
     net_weight_t_s: NonNegative = 8.0
     """Time from the first reading until the mass hangs there."""
     joint_friction_nm: NonNegative = 0.04
+    """Constant friction of each joint; with `servo_mechanics` that section's friction acts instead."""
     joint_damping_nms: NonNegative = 0.02
+    """Viscous friction of each joint, N m s/rad; the same holds."""
     servos: tuple[Servo, Servo] | None = None
     """null for the defaults of `Servo`."""
     arm_hand: bool = False
