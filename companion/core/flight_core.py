@@ -62,7 +62,7 @@ class FlightCore:
         """Stamp of the newest believed pose, which was passed on to PX4."""
         self._reference: Reference | None = None
         """What the law followed last, as the governor has limited it."""
-        self._bent_by: tuple[str, ...] = ()
+        self._limited_by: tuple[str, ...] = ()
         self._log: ControlLog | None = None
         self._refused: tuple[Refusal, ...] = ()
         """What the gate rejected in the last tick; reported once when it begins."""
@@ -75,7 +75,7 @@ class FlightCore:
         state, request = transition(self._parameters, self._state, observed, observation)
         self._state = state
         self._carry_out(request, i)
-        self._bent_by = ()
+        self._limited_by = ()
         reference, command = self._command(dt_s, i)
         self._log = command.log
         phase, kind = state.phase(t_s)
@@ -112,7 +112,7 @@ class FlightCore:
             outcome=state.over,
             mocap_trusted=self._monitors.mocap_trusted,
             tether=self._situation.tether,
-            bent_by=self._bent_by,
+            bent_by=self._limited_by,
             mocap_innovation_m=self._monitors.mocap_innovation_m,
         )
 
@@ -210,8 +210,8 @@ class FlightCore:
             return None, self._control.wait(i)
         reference = course.plan.reference(0.0) if stage is _SPOOL else course.reference(i.t_s)
         if stage is _PLAN:
-            governed = self._governor.bend(dt_s, reference, self._situation.tether)
-            reference, self._bent_by = governed.reference, governed.bent_by
+            governed = self._governor.constrain(dt_s, reference, self._situation.tether)
+            reference, self._limited_by = governed.reference, governed.limited_by
         self._reference = reference
         return reference, self._control.fly(i, dt_s, reference, state.vertical_scale(i.t_s))
 

@@ -1,14 +1,14 @@
-"""The governor: a reference that cannot leave the tether sphere and the room, whatever it is asked to follow. Pure.
+"""The governor constrains references so that they cannot leave the tether sphere and the room, whatever the input. Pure.
 
 The safe set is convex: a ball about the anchor (length less margin less lever of the attachment) and a box (the room less the rotors).
 A state (p, v) of the reference is *safe* if p, and the point q at which the vehicle would come to rest after a fault
 (`companion.safety.stop`), both lie in the set, and the speed is within its limit. Braking straight at a never moves q outward, and p
 and q stay on the segment from the first p to the first q, which lies in a convex set with its ends: from a safe state braking is always
-possible and stays safe. So it is enough to accept a step towards what is asked only if the state after it is safe, and otherwise to mix
-in as much braking as that takes. No constraint needs a look-ahead, and no reference can break them.
+possible and stays safe. So it is enough to accept a step towards the input reference only if the state after it is safe, and otherwise
+to mix in as much braking as that takes. No constraint needs a look-ahead, and no reference can violate one.
 
-A reference that is safe itself, and goes on from where the last one was, passes untouched: the same object. A plan that was accepted by
-the mission check, which asks the same `SafeSet`, is never bent.
+A safe reference that continues the previous one passes unchanged, as the same object. The mission check uses the same `SafeSet`, so an
+accepted plan is never constrained.
 """
 
 from __future__ import annotations
@@ -22,39 +22,40 @@ from companion.model.types import Reference, TetherState, Vec3
 from companion.safety.stop import StopModel
 
 BODY_TOP_M = 0.15
-"""Rotors and markers above the body's origin."""
+"""Height of rotors and markers above the body's origin."""
 BELOW_STANDING_M = 0.6
 """The set reaches this far below standing height: a landing's reference goes on below the floor until touchdown is detected, and its
 predicted stop lies lower still."""
 JUMP_M = 0.002
-"""A reference that is nowhere farther from where the last one leads goes on from it."""
+"""A reference continues the previous one if its position is within this distance of the extrapolated one."""
 CATCH_UP_PER_S = 2.5
-"""Bent, the reference comes back to what is asked for with this rate. Its velocity follows four times as fast: no overshoot."""
+"""Rate at which a constrained reference returns to the input reference. Its velocity follows four times as fast, so that it does not
+overshoot."""
 SPEED_PER_S = 4.0 * CATCH_UP_PER_S
 INSIDE_M = 0.001
-"""What lies outside is followed to so far inside."""
+"""A target outside the set is replaced by the nearest point this far inside it."""
 _TOLERANCE = 1e-9
 _HALVINGS = 5
 _PROJECTIONS = 6
 
 
 class Governed(Record, frozen=True):
-    """What the controller is to follow."""
+    """The governor's output: the reference that the controller follows."""
 
     reference: Reference
-    bent_by: tuple[str, ...]
-    """Why it is not what was asked for: "tether", "geofence", "speed", "acceleration" (it steps, or the governor is still on its way
-    back to it). Empty: the very same object."""
+    limited_by: tuple[str, ...]
+    """Reasons for a constraint: "tether", "geofence", "speed", "acceleration" (the input steps, or the governor is still returning to
+    it). Empty if the reference is the unchanged input object."""
 
 
 class SafeSet:
-    """Where the body's origin may be: ball and box.
+    """Set of permitted positions of the body's origin: the intersection of a ball and a box.
 
     Args:
         vehicle: tether, room and airframe.
 
     Raises:
-        ValueError: nothing is left of it; one line that says why.
+        ValueError: the set is empty; the message is one line with the cause.
     """
 
     __slots__ = ("anchor_m", "high_m", "low_m", "radius_m")
@@ -81,11 +82,11 @@ class SafeSet:
             )
 
     def holds(self, p: Vec3) -> bool:
-        """Return whether the point lies in ball and box."""
+        """Return whether the point lies in both ball and box."""
         return self.holds_within(p, self.radius_m, self.high_m[2])
 
     def holds_within(self, p: Vec3, radius_m: float, top_m: float) -> bool:
-        """The same for a smaller ball and a lower ceiling."""
+        """Return whether the point lies in a ball of this radius and in the box below this ceiling."""
         low, high, (ax, ay, az) = self.low_m, self.high_m, self.anchor_m
         x, y, z = p
         return (
@@ -97,20 +98,20 @@ class SafeSet:
         )
 
     def breach_walls_m(self, p: Vec3) -> float:
-        """How far a point of the body's origin is outside the box, along one axis; negative: inside."""
+        """Return the largest distance along one axis by which a position is outside the box; negative inside it."""
         return max(max(low - x, x - high) for x, low, high in zip(p, self.low_m, self.high_m, strict=True))
 
     def breach_tether_m(self, p: Vec3) -> float:
-        """How far it is outside the ball; negative: inside."""
+        """Return the distance by which a position is outside the ball; negative inside it."""
         return math.dist(p, self.anchor_m) - self.radius_m
 
 
 class Governor:
-    """Bends a stream of references into the safe set.
+    """Constrains a stream of references to the safe set.
 
     Args:
         vehicle: tether, room, airframe, and the speed of its emergency landing.
-        limits: of the mission.
+        limits: speed and acceleration limits of the mission.
 
     Raises:
         ValueError: nothing is inside both the tether's reach and the room.
@@ -119,10 +120,10 @@ class Governor:
     def __init__(self, vehicle: Vehicle, limits: Limits) -> None:
         self._set = SafeSet(vehicle)
         self.stop_deceleration_m_s2 = vehicle.tether.stop_deceleration_m_s2
-        """With which it brakes."""
+        """Deceleration of braking."""
         self._stop = StopModel(vehicle.tether)
         self.acceleration_max_m_s2 = max(limits.acceleration_max_m_s2, self.stop_deceleration_m_s2)
-        """The velocity of the governed reference never changes faster."""
+        """Largest acceleration of the governed reference."""
         self.speed_max_m_s = max(limits.speed_max_m_s, vehicle.safety.land_speed_m_s)
         self._half_per_a = 0.5 / self.stop_deceleration_m_s2
         self._p: Vec3 | None = None
@@ -132,17 +133,17 @@ class Governor:
         self._restrained = False
 
     def reset(self) -> None:
-        """The next reference begins a new motion: it is not held against the last one."""
+        """Begin a new motion with the next reference: it is not compared with the previous one."""
         self._p = None
         self._v = (0.0, 0.0, 0.0)
 
-    def bend(self, dt_s: float, reference: Reference, tether: TetherState | None) -> Governed:
-        """One tick.
+    def constrain(self, dt_s: float, reference: Reference, tether: TetherState | None) -> Governed:
+        """Return the reference of this tick, constrained to the safe set.
 
         Args:
-            dt_s: since the last call.
-            reference: what is asked for; finite.
-            tether: as it is now; while it is taut or snagged the reference moves neither outward nor up. None: unknown.
+            dt_s: time since the previous call.
+            reference: input reference, with finite values.
+            tether: present state, None if unknown. While the tether is taut or snagged the reference moves neither outward nor up.
         """
         self._restrain(tether is not None and (tether.taut or tether.snagged))
         p, v = reference.position_world_m, reference.velocity_world_m_s
@@ -156,7 +157,7 @@ class Governor:
         if self._restrained:
             self._tighten()
         assert self._p is not None
-        bent = Reference(
+        constrained = Reference(
             position_world_m=self._p,
             velocity_world_m_s=self._v,
             acceleration_world_m_s2=acceleration,
@@ -167,12 +168,12 @@ class Governor:
             arm_acceleration_rad_s2=reference.arm_acceleration_rad_s2,
             jerk_world_m_s3=(0.0, 0.0, 0.0),
         )
-        return Governed(bent, reasons)
+        return Governed(constrained, reasons)
 
     # -- judgement -------------------------------------------------------------------------------------------------
 
     def _reasons(self, dt_s: float, p: Vec3, v: Vec3) -> tuple[str, ...]:
-        """Why a reference cannot pass as it is; empty: it can."""
+        """Return why a reference must be constrained; empty if it may pass unchanged."""
         px, py, pz = p
         vx, vy, vz = v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
@@ -214,12 +215,12 @@ class Governor:
         return tuple(reasons)
 
     def _admits_state(self, p: Vec3, v: Vec3, speed: float) -> bool:
-        """The present set holds p, and the safe set the predicted stop."""
+        """Return whether p lies in the present set and the predicted stop in the safe set."""
         stop = _ahead(p, v, self._stop.time_s(speed))
         return self._set.holds(stop) and self._admits_restrained(p, v, speed)
 
     def _admits_restrained(self, p: Vec3, v: Vec3, speed: float) -> bool:
-        """Ball and ceiling as they are now hold p and the end of straight braking; without restraint the latter follows."""
+        """Return whether p and the end of straight braking lie in the present set; without restraint p in it is enough."""
         return self._admits(p) and (not self._restrained or self._admits(_ahead(p, v, speed * self._half_per_a)))
 
     def _admits(self, p: Vec3) -> bool:
@@ -232,7 +233,7 @@ class Governor:
     # -- taut ------------------------------------------------------------------------------------------------------
 
     def _restrain(self, restrained: bool) -> None:
-        """Begin or end the restraint: while it lasts, ball and ceiling shrink to where the reference is."""
+        """Begin or end the restraint, during which ball and ceiling shrink to the reference's position."""
         if restrained and not self._restrained:
             self._restrained = True
             self._tighten()
@@ -241,7 +242,7 @@ class Governor:
             self._radius_m, self._top_m = self._set.radius_m, self._set.high_m[2]
 
     def _tighten(self) -> None:
-        """The set still holds p and the end of straight braking, so that braking stays possible and nothing farther is."""
+        """Shrink the set to just hold p and the end of straight braking: the reference can brake, but not move farther out."""
         p, v = self._p, self._v
         if p is None:
             return
@@ -253,13 +254,13 @@ class Governor:
     # -- motion ----------------------------------------------------------------------------------------------------
 
     def _begin(self, p: Vec3) -> Vec3:
-        """A new motion that begins with what cannot be: at rest, at the nearest place that can."""
+        """Begin a motion at rest at the nearest permitted position; return the acceleration."""
         self._p = self._nearest(p, 0.0)
         self._v = (0.0, 0.0, 0.0)
         return (0.0, 0.0, 0.0)
 
     def _step(self, dt_s: float, reference: Reference, reasons: tuple[str, ...]) -> Vec3:
-        """Towards the reference as far as the next state is safe, braking for the rest; returns the mean acceleration."""
+        """Move towards the reference as far as the next state is safe, brake otherwise; return the mean acceleration."""
         assert self._p is not None
         v = self._v
         brake_p, brake_v = self._braked(dt_s)
@@ -270,7 +271,7 @@ class Governor:
             if not self._restrained:
                 target = self._nearest(target, INSIDE_M)
         if self._restrained and not self._admits(target):
-            # What is asked for lies outward: sliding along to the place nearest to it would help nobody.
+            # The target lies outward: sliding along the boundary to the nearest point has no use.
             wish_p, wish_v = brake_p, brake_v
         else:
             wish_p, wish_v = self._wished(dt_s, target, follow, feed)
@@ -289,7 +290,7 @@ class Governor:
         return ((self._v[0] - v[0]) / dt_s, (self._v[1] - v[1]) / dt_s, (self._v[2] - v[2]) / dt_s)
 
     def _braked(self, dt_s: float) -> tuple[Vec3, Vec3]:
-        """After straight braking; exact, also if it comes to rest in between."""
+        """Return position and velocity after straight braking; exact even if the reference comes to rest within the step."""
         assert self._p is not None
         (px, py, pz), (vx, vy, vz) = self._p, self._v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
@@ -302,7 +303,7 @@ class Governor:
         return (px + vx * way, py + vy * way, pz + vz * way), (vx * keep, vy * keep, vz * keep)
 
     def _wished(self, dt_s: float, target: Vec3, follow: Vec3, feed: Vec3) -> tuple[Vec3, Vec3]:
-        """After a step of catching up, within the limits of speed and acceleration."""
+        """Return position and velocity after a step towards the target, within the limits of speed and acceleration."""
         assert self._p is not None
         (px, py, pz), (vx, vy, vz) = self._p, self._v
         ex, ey, ez = target[0] - px, target[1] - py, target[2] - pz
@@ -321,7 +322,7 @@ class Governor:
         return (px + half * (vx + nx), py + half * (vy + ny), pz + half * (vz + nz)), (nx, ny, nz)
 
     def _nearest(self, p: Vec3, inside_m: float) -> Vec3:
-        """A point of the present set close to the nearest one: alternating projections, then along the way from a point inside."""
+        """Return a point of the present set close to the nearest: alternating projections, then a step from a point inside."""
         low, anchor = self._set.low_m, self._set.anchor_m
         high = (self._set.high_m[0], self._set.high_m[1], self._top_m)
         radius = max(0.0, self._radius_m - inside_m)
@@ -337,7 +338,7 @@ class Governor:
 
 
 def _share_within(inside: Vec3, p: Vec3, centre: Vec3, radius_m: float) -> float:
-    """Largest share of the way from a point inside a ball to p that stays in it; 0 to 1."""
+    """Return the largest share, 0 to 1, of the segment from a point inside a ball to p that stays in the ball."""
     dx, dy, dz = p[0] - inside[0], p[1] - inside[1], p[2] - inside[2]
     cx, cy, cz = inside[0] - centre[0], inside[1] - centre[1], inside[2] - centre[2]
     a = dx * dx + dy * dy + dz * dz

@@ -90,8 +90,8 @@ def test_committed_missions_pass_untouched(mission: str) -> None:
     g = Governor(flight.vehicle, flight.mission.limits)
     for tick in range(int(plan.duration_s / DT_S)):
         reference = plan.reference(tick * DT_S)
-        governed = g.bend(DT_S, reference, tether())
-        assert governed.bent_by == (), (tick * DT_S, reference)
+        governed = g.constrain(DT_S, reference, tether())
+        assert governed.limited_by == (), (tick * DT_S, reference)
         assert governed.reference is reference
 
 
@@ -136,9 +136,9 @@ def test_any_stream_keeps_inside_and_smooth(
         for tick in range(ticks):
             t_s = tick * dt_s if moving else 0.0
             wanted = asked((p[0] + v[0] * t_s, p[1] + v[1] * t_s, p[2] + v[2] * t_s), v, a)
-            governed = g.bend(dt_s, wanted, now)
-            assert (governed.reference is wanted) == (governed.bent_by == ())
-            assert set(governed.bent_by) <= {"tether", "geofence", "speed", "acceleration"}
+            governed = g.constrain(dt_s, wanted, now)
+            assert (governed.reference is wanted) == (governed.limited_by == ())
+            assert set(governed.limited_by) <= {"tether", "geofence", "speed", "acceleration"}
             reference = governed.reference
             assert (reference.yaw_rad, reference.arm_rad) == (0.3, ARM)
             assert_safe(g, within, reference)
@@ -159,7 +159,7 @@ def test_any_stream_keeps_inside_and_smooth(
 def follow(g: Governor, wanted: Reference, seconds: float, state: TetherState | None = None) -> Governed:
     governed = Governed(wanted, ())
     for _ in range(round(seconds / DT_S)):
-        governed = g.bend(DT_S, wanted, state)
+        governed = g.constrain(DT_S, wanted, state)
     return governed
 
 
@@ -167,7 +167,7 @@ def test_a_step_within_is_followed_to_the_end_and_then_passes() -> None:
     g = governor()
     follow(g, at_rest((-1.0, 0.0, 1.0), 0.0, ARM), 0.1)
     goal = at_rest((1.0, 0.3, 1.2), 0.0, ARM)
-    assert g.bend(DT_S, goal, None).bent_by == ("acceleration",)
+    assert g.constrain(DT_S, goal, None).limited_by == ("acceleration",)
     assert follow(g, goal, 8.0).reference is goal
 
 
@@ -183,7 +183,7 @@ def test_what_lies_outside_is_followed_to_the_edge(to: Vec3, why: str, expected:
     g, within = governor("vehicle.tether.length_m=3.0"), SafeSet(config().vehicle)
     follow(g, at_rest((-1.0, 0.0, 1.0), 0.0, ARM), 0.1)
     governed = follow(g, at_rest(to, 0.0, ARM), 10.0)
-    assert why in governed.bent_by
+    assert why in governed.limited_by
     edge = governed.reference
     assert math.hypot(*edge.velocity_world_m_s) < 1e-3
     nearest = max(within.breach_tether_m(edge.position_world_m), within.breach_walls_m(edge.position_world_m))
@@ -205,16 +205,16 @@ def test_taut_it_stops_at_once_and_may_only_come_home() -> None:
     plan = Plan.build(config().mission, config().vehicle)
     t_s = 0.0
     while t_s < 7.5:
-        last = g.bend(DT_S, plan.reference(t_s), tether()).reference
+        last = g.constrain(DT_S, plan.reference(t_s), tether()).reference
         t_s += DT_S
     speed_m_s = math.hypot(*last.velocity_world_m_s)
     assert speed_m_s > 0.4
     reached = [math.dist(last.position_world_m, anchor)]
     for _ in range(600):
-        governed = g.bend(DT_S, plan.reference(t_s), tether(taut=True))
+        governed = g.constrain(DT_S, plan.reference(t_s), tether(taut=True))
         t_s += DT_S
         reached.append(math.dist(governed.reference.position_world_m, anchor))
-        assert governed.bent_by
+        assert governed.limited_by
         assert governed.reference.position_world_m[2] <= 1.0 + CLOSE
     assert 0.0 < max(reached) - reached[0] <= speed_m_s**2 / (2 * g.stop_deceleration_m_s2)
     top = reached.index(max(reached))
@@ -231,15 +231,15 @@ def test_a_late_tick_is_caught_up_without_a_step() -> None:
     g = governor()
     plan = Plan.build(config().mission, config().vehicle)
     last = plan.reference(0.0)
-    late_s, bent = 0.0, 0
+    late_s, constrained = 0.0, 0
     for tick in range(int(plan.duration_s / DT_S) - 100):
         if tick == 1300:
             late_s = 0.4
-        governed = g.bend(DT_S, plan.reference(tick * DT_S + late_s), None)
+        governed = g.constrain(DT_S, plan.reference(tick * DT_S + late_s), None)
         assert_smooth(g, last, governed.reference, DT_S)
         last = governed.reference
-        bent += bool(governed.bent_by)
-    assert 0 < bent < 3.5 / DT_S
+        constrained += bool(governed.limited_by)
+    assert 0 < constrained < 3.5 / DT_S
 
 
 def test_after_a_reset_a_new_motion_begins_where_it_says() -> None:
@@ -247,7 +247,7 @@ def test_after_a_reset_a_new_motion_begins_where_it_says() -> None:
     follow(g, at_rest((-1.0, 0.0, 1.0), 0.0, ARM), 0.1)
     g.reset()
     there = asked((0.5, 0.0, 1.0), (0.3, 0.0, 0.0))
-    assert g.bend(DT_S, there, None).reference is there
+    assert g.constrain(DT_S, there, None).reference is there
 
 
 @pytest.mark.parametrize(

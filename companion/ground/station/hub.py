@@ -143,7 +143,7 @@ class Hub:
         """Publish the number of rejected messages if it has changed; call once a second."""
         if self._tracker.rejected != self._rejected_sent:
             self._rejected_sent = self._tracker.rejected
-            self._broker |= {"rubbish": self._tracker.rejected, "rubbish_text": self._tracker.rejected_text}
+            self._broker |= {"rejected": self._tracker.rejected, "rejected_text": self._tracker.rejected_text}
             self._publish_broker()
 
     def _publish_broker(self) -> None:

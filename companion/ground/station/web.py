@@ -3,7 +3,7 @@
 WebSocket at ``/ws``, JSON text. Server to page:
 
     {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first message; again when the token came late
-    {"kind": "broker", "connected", "text", "rubbish"?, "rubbish_text"?}             connection to the broker; rejected messages
+    {"kind": "broker", "connected", "text", "rejected"?, "rejected_text"?}           connection to the broker; rejected messages
     {"kind": "state" | "scene" | "preflight" | "events" | "ack", "vehicle", "data"}  records of `companion.ground.protocol.messages`
     {"kind": "stream", "vehicle", "age_s", "data"}                                   age_s: delay until it reached the server
     {"kind": "sent", "vehicle", "command", "nonce"}                                  to the commanding viewer; its `ack` has the nonce

@@ -274,7 +274,7 @@ def test_what_comes_from_outside_is_text(stub: MonitorStub, page: Page) -> None:
         relayed(in_flight(phase=HOSTILE, lights=(light,), bent_by=(HOSTILE,), mode=HOSTILE)),
         events_of(event(1, HOSTILE, id_=HOSTILE, action=HOSTILE)),
         relayed(ack("hold", "f" * 32, HOSTILE, operator=HOSTILE)),
-        {**BROKER, "rubbish": 3, "rubbish_text": HOSTILE},
+        {**BROKER, "rejected": 3, "rejected_text": HOSTILE},
     )
     page.tab.click("#control summary")
     stub.send(relayed(state(), HOSTILE))

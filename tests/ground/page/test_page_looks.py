@@ -107,7 +107,7 @@ def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stub: Mo
             shared.tell({"kind": "refused", "vehicle": shared.shown, "command": command, "text": text})
         shared.run(5.0)
         assert shared.tab.is_visible("#stale") and boxes() == before
-        shared.tell({**BROKER, "rubbish": 7, "rubbish_text": "no JSON"})
+        shared.tell({**BROKER, "rejected": 7, "rejected_text": "no JSON"})
         assert shared.tab.is_visible("#notice") and boxes() == before
         shared.tell(hello(can_command=False, why_not="this monitor was started with --view-only"))
         assert shared.tab.is_visible("#commands-why") and boxes() == before

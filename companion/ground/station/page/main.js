@@ -115,7 +115,7 @@ function update() {
   setText(byId("operator"), hello?.operator && hello.can_command ? `as ${hello.operator}` : "");
   const problem = link.open && broker?.connected !== false ? otherVehicleProblems(vehicle, others) : null;
   setData(byId("notice"), "level", problem === null ? "" : "bad");
-  const text = notice ?? problem ?? (broker?.rubbish ? `${broker.rubbish} messages on the broker were rejected (${broker.rubbish_text ?? ""})` : null);
+  const text = notice ?? problem ?? (broker?.rejected ? `${broker.rejected} messages on the broker were rejected (${broker.rejected_text ?? ""})` : null);
   setHidden(byId("notice"), text === null);
   setText(byId("notice"), text ?? "");
   if (link.open && broker?.connected && verdict.presence === "flying" && verdict.ageS > SILENT_S && now - renewedMs > RENEW_MS) {
