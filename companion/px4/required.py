@@ -247,7 +247,10 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             limits_text="0.05 to `safety.battery_min` less 0.02",
         ),
         Wanted(
-            "COM_FLTT_LOW_ACT", 1, "3 returns by itself when PX4 thinks that the battery's time is up", _WARN, ok=(0, 1)
+            "COM_FLTT_LOW_ACT",
+            1,
+            "3 returns by itself when PX4 thinks that the battery's time is up; 0 was seen to leave OFFBOARD for HOLD",
+            _WARN,
         ),
         Wanted("GF_ACTION", 2, "3 climbs and returns at PX4's own fence, 4 stops the motors", ok=(0, 1, 2, 5)),
         Wanted(
