@@ -157,9 +157,8 @@ def test_a_wrong_parameter_is_flown_out(error: float) -> None:
     assert max(abs(e) for e in height_errors_m(flown(error, adapt=False), 4.0)) > 0.04
 
 
-@pytest.mark.parametrize("error", [-0.1, 0.0, 0.1])
-@pytest.mark.parametrize("preset", ["paper", "recommended"])
-def test_the_log_tells_what_was_used_and_it_ends_near_the_truth(error: float, preset: str) -> None:
+@pytest.mark.parametrize(("preset", "error"), [("paper", 0.1), ("recommended", -0.1), ("recommended", 0.1)])
+def test_the_log_tells_what_was_used_and_it_ends_near_the_truth(preset: str, error: float) -> None:
     result = flown(error, preset=preset)
     used = [outputs.control.hover_thrust for outputs in result.outputs if outputs.control]
     assert used[0] == pytest.approx(true_hover_thrust() * (1.0 + error))

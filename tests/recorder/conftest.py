@@ -9,13 +9,14 @@ from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.recorder.flights import flight_of, record
 from tests.recorder.viewers import Viewed, view
+from tests.support import SHORT_CATCH
 
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The log of a flight of the fast loop with a catch and a commanded landing, written by the recorder."""
-    config = load_sitl("configs/missions/catch.yaml")
-    result = FastFlight(config, land_at_s=13.0).run()
+    config = load_sitl(SHORT_CATCH)
+    result = FastFlight(config, land_at_s=6.5).run()
     assert result.caught
     path = [o.reference.position_world_m for o in result.outputs if o.reference is not None][::40]
     return record(
