@@ -8,15 +8,16 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from companion.config.base import Location, Model, Vector2
 from companion.config.document import RANK_VALUE, ConfigError, Document, key_path, problem_lines
 from companion.config.explain import nearest, problem, schema_of, validate, values
 from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.world import World
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _FAULTLESS = Machine(
     on=True,
@@ -101,6 +102,8 @@ class Laboratory(Model):
 
 
 def _generator(seed: int, key: str) -> np.random.Generator:
+    import numpy as np  # takes a tenth of a second, and a command in the ideal world draws nothing
+
     return np.random.default_rng((seed, zlib.crc32(key.encode())))
 
 
