@@ -52,15 +52,15 @@ class Wanted:
     measured: bool = False
     """Measured on each installation: a value within `limits` that is not PX4's own default is left as it is."""
     only: str = ""
-    """The version that has it, where not both do; on another it is left out, and nothing is wrong with that."""
+    """The only PX4 version that has the parameter; other versions skip it. Empty if all have it."""
 
     @property
     def integer(self) -> bool:
-        """PX4 stores an INT32."""
+        """Whether PX4 stores the parameter as an INT32."""
         return isinstance(self.value, int)
 
     def accepts(self, value: Value, vehicle: Vehicle) -> bool:
-        """PX4's value is one with which this vehicle can fly."""
+        """Return whether this vehicle can fly with the value that PX4 has."""
         if self.ok:
             return value in self.ok
         if self.limits is None:
@@ -72,7 +72,7 @@ class Wanted:
         return low - slack <= value <= high + slack
 
     def text(self, vehicle: Vehicle | None = None) -> str:
-        """What is wanted, in words; without a vehicle file what depends on it is named."""
+        """Return the accepted values for display; without a vehicle file, limits that depend on it are named instead."""
         if self.ok:
             return " or ".join(f"{value}" for value in self.ok)
         if self.limits is None:
@@ -111,9 +111,11 @@ def _above_abort(vehicle: Vehicle) -> tuple[float, float]:
 
 _WARN = Level.WARN
 _RAISES = (
-    "ms; no such sensor is fused, yet PX4 raises EKF2_DELAY_MAX to it when it sees it: hence written before that one"
+    "ms; the sensor is not fused, but PX4 raises EKF2_DELAY_MAX to this delay if it is larger; so it is written first"
 )
-_FOLLOWS = "s; the output follows the delayed filter with it: slower, and the IMU's errors stay in it for longer"
+_FOLLOWS = (
+    "s; time constant with which the output follows the delayed filter; a larger one keeps IMU errors in it for longer"
+)
 _CEILING = "0 to `room.z_m` less 0.3"
 
 GROUPS: dict[str, tuple[Wanted, ...]] = {
@@ -128,7 +130,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "height would follow the barometer, and rotor wash indoors moves that by a metre",
             reboot=True,
         ),
-        Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would pull the machine out of the room"),
+        Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would pull the position estimate out of the room"),
         Wanted(
             "EKF2_BARO_CTRL",
             0,
@@ -138,7 +140,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_MAG_TYPE",
             5,
-            "steel and motors bend the compass; yaw would be torn between it and motion capture",
+            "steel and motors disturb the compass; yaw would switch between it and motion capture",
             reboot=True,
         ),
         Wanted("EKF2_OF_CTRL", 0, "an optical flow sensor sees the arm move and takes it for its own motion", _WARN),
@@ -146,7 +148,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_EV_DELAY",
             5.0,
-            "ms from exposure to arrival; an estimate that is wrong in time swings with the machine",
+            "ms from exposure to arrival; with a wrong delay the estimate oscillates with the vehicle's motion",
             reboot=True,
             limits=_between(0.0, 30.0),
             measured=True,
@@ -160,8 +162,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_DELAY_MAX",
             50.0,
-            "ms; the filter works so far in the past, and its output is led from there to now: with PX4's 200, and 0.25 s "
-            "for the next two, it wanders by 3 to 4 mm",
+            "ms; the filter runs this far in the past, and its output is predicted to the present: with PX4's 200, and "
+            "0.25 s for the next two, the estimate wanders by 3 to 4 mm",
             _WARN,
             reboot=True,
             limits=_between(30.0, 60.0),
@@ -170,18 +172,20 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_EVP_NOISE",
             0.01,
-            "m; with much more the estimate follows the IMU's drift, not motion capture",
+            "m; with a much larger value the estimate follows the IMU's drift, not motion capture",
             _WARN,
             limits=_between(0.005, 0.05),
         ),
         Wanted(
             "EKF2_EVA_NOISE",
             0.05,
-            "rad; with much more yaw lags behind motion capture",
+            "rad; with a much larger value yaw lags behind motion capture",
             _WARN,
             limits=_between(0.01, 0.1),
         ),
-        Wanted("EKF2_EV_QMIN", 0, "VISION_POSITION_ESTIMATE carries no quality: with any minimum nothing is fused"),
+        Wanted(
+            "EKF2_EV_QMIN", 0, "VISION_POSITION_ESTIMATE carries no quality: with any minimum above 0 nothing is fused"
+        ),
         *(
             Wanted(
                 f"EKF2_EV_POS_{axis}",
@@ -191,29 +195,31 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             )
             for axis in "XYZ"
         ),
-        Wanted("SYS_HAS_GPS", 0, "PX4 waits for, and complains of, a GPS that is not used", _WARN, reboot=True),
-        Wanted("SYS_HAS_MAG", 0, "arming is refused for a compass that is missing, or disturbed by steel", reboot=True),
-        Wanted("COM_ARM_WO_GPS", 1, "0 refuses arming without GPS", ok=(1, 2)),
+        Wanted(
+            "SYS_HAS_GPS", 0, "PX4 waits for a GPS that is not used, and warns that it is missing", _WARN, reboot=True
+        ),
+        Wanted("SYS_HAS_MAG", 0, "PX4 refuses to arm if a compass is missing or disturbed by steel", reboot=True),
+        Wanted("COM_ARM_WO_GPS", 1, "with 0 PX4 refuses to arm without GPS", ok=(1, 2)),
     ),
-    "When the companion falls silent": (
+    "Loss of the companion": (
         Wanted(
             "COM_OF_LOSS_T",
             0.5,
-            "s without setpoint until the failsafe; longer and the machine flies on its last attitude, shorter and "
-            "one delayed packet ends the flight",
+            "s without a setpoint until the failsafe; with more the vehicle continues on its last attitude, with less one "
+            "delayed packet ends the flight",
             limits=_between(0.2, 0.5),
         ),
         Wanted(
             "COM_OBL_RC_ACT",
             4,
-            "land; 0 to 2 hand over to sticks that nobody holds, 3 climbs and returns, 6 and 7 drop it",
+            "4 lands; 0 to 2 give control to a radio without a pilot, 3 climbs and returns, 6 and 7 stop the motors",
         ),
     ),
     "The pilot's radio": (
         Wanted(
             RADIO,
             NO_RADIO,
-            "4 switches the pilot's sticks and mode switch off: only where nobody holds a radio",
+            "4 disables the pilot's sticks and mode switch: only for a vehicle without a radio",
             ok=(0, 1, 2, 3, 4),
             fix="set 4 without a radio (configs/px4/no_radio.params), else the one that fits the radio",
             file=False,
@@ -221,7 +227,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "NAV_RCL_ACT",
             3,
-            "the radio is lost: land; 2 climbs and returns across the tether, 5 and 6 drop the machine",
+            "3 lands when the radio is lost; 2 climbs and returns across the tether, 5 and 6 stop the motors",
         ),
         Wanted(
             "COM_RCL_EXCEPT",
@@ -231,11 +237,11 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         ),
     ),
     "Other failsafes": (
-        Wanted("NAV_DLL_ACT", 0, "closing QGroundControl would end the flight, with a climb if it is 2"),
+        Wanted("NAV_DLL_ACT", 0, "with another value closing QGroundControl ends the flight, with 2 by a climb"),
         Wanted(
             "COM_LOW_BAT_ACT",
             2,
-            "land on a critical battery if nobody has landed before; 3 returns, 0 only warns",
+            "2 lands on a critical battery if the vehicle has not landed before; 3 returns, 0 only warns",
             _WARN,
         ),
         Wanted(
@@ -249,21 +255,21 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_FLTT_LOW_ACT",
             1,
-            "3 returns by itself when PX4 thinks that the battery's time is up; 0 was seen to leave OFFBOARD for HOLD",
+            "3 returns when PX4 estimates that the flight time is used up; with 0 PX4 was seen to leave OFFBOARD for HOLD",
             _WARN,
         ),
         Wanted("GF_ACTION", 2, "3 climbs and returns at PX4's own fence, 4 stops the motors", ok=(0, 1, 2, 5)),
         Wanted(
             "RTL_RETURN_ALT",
             1.5,
-            "m; whatever makes PX4 return climbs to this first: into the ceiling, or until the tether holds it",
+            "m; every return of PX4 first climbs to this height: into the ceiling, or until the tether stops it",
             limits=_below_ceiling,
             limits_text=_CEILING,
         ),
         Wanted(
             "CBRK_FLIGHTTERM",
             121212,
-            "else PX4 stops the motors in the air when it thinks that attitude failed",
+            "with another value PX4 stops the motors in the air when it detects an attitude failure",
             _WARN,
             reboot=True,
         ),
@@ -279,15 +285,16 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             )
             for axis in "RP"
         ),
-        Wanted("CBRK_SUPPLY_CHK", 0, "the check of the supply voltage is switched off", _WARN),
+        Wanted("CBRK_SUPPLY_CHK", 0, "with another value the check of the supply voltage is off", _WARN),
         Wanted("SYS_FAILURE_EN", 0, "one stray message could switch off a motor", reboot=True),
-        Wanted("COM_THROW_EN", 0, "picked up and moved fast, an armed machine would start its motors"),
+        Wanted("COM_THROW_EN", 0, "an armed vehicle that is picked up and moved fast would start its motors"),
     ),
     "Arming, take-off and landing": (
         Wanted(
             HOVER,
             None,
-            "PX4 holds and lands with it, and the companion starts from it: too high jumps, too low does not lift",
+            "PX4 holds and lands with it, and the companion starts from it: with too much the vehicle jumps, with too little "
+            "it does not lift",
             limits=_hover,
             limits_text="within 35 % of `airframe.hover_thrust`, or of weight over `airframe.thrust_max_n`",
             fix="measure it (companion hover fit) and set it, or correct airframe.mass_kg and airframe.thrust_max_n",
@@ -296,32 +303,32 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_SPOOLUP_TIME",
             1.0,
-            "s; so long after arming PX4 holds thrust back, and the companion spools up",
+            "s; for this time after arming PX4 limits thrust while the companion spools up",
             limits=_between(0.0, SPOOL_S),
         ),
         Wanted(
             "COM_DISARM_LAND",
             2.0,
-            "s; 0 or less: after PX4's own landing the rotors go on turning",
+            "s; with 0 or less the rotors continue to turn after PX4's own landing",
             limits=_between(0.1, 5.0),
         ),
         Wanted(
             "COM_DISARM_PRFLT",
             10.0,
-            "s; shorter and PX4 disarms while the companion spools up",
+            "s; with less PX4 disarms while the companion spools up",
             limits=_between(5.0, 60.0),
         ),
         Wanted(
             "MPC_LAND_SPEED",
             0.7,
-            "m/s; PX4's own landing comes down that fast, the net first",
+            "m/s; descent speed of PX4's own landing, in which the net touches down first",
             _WARN,
             limits=_between(0.3, 1.0),
         ),
         Wanted(
             "MIS_TAKEOFF_ALT",
             1.0,
-            "m; a pilot's Takeoff mode climbs so high",
+            "m; height to which a pilot's Takeoff mode climbs",
             _WARN,
             limits=_below_ceiling,
             limits_text=_CEILING,
@@ -331,43 +338,51 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "MPC_TILTMAX_AIR",
             25.0,
-            "deg; more lets PX4 dash across the room when it takes over",
+            "deg; with more PX4 may cross the room fast after a takeover",
             _WARN,
             limits=_between(20.0, 45.0),
         ),
         Wanted(
             "MPC_ACC_HOR",
             8.0,
-            "m/s^2; with less LAND stops further ahead, 0.53 m after a take-over with PX4's 3; what is flown stays below "
-            "it by MPC_JERK_AUTO and MPC_TILTMAX_AIR",
+            "m/s^2; with less LAND stops further ahead, 0.53 m after a takeover with PX4's 3; the flown acceleration stays "
+            "below it because of MPC_JERK_AUTO and MPC_TILTMAX_AIR",
             _WARN,
             limits=_between(5.0, 10.0),
         ),
         Wanted(
             "MPC_JERK_AUTO",
             6.0,
-            "m/s^3; less brakes later, with more LAND creeps faster to the place that it has set itself ahead",
+            "m/s^3; with less PX4 brakes later, with more LAND approaches its stop point faster",
             _WARN,
             limits=_between(4.0, 8.0),
         ),
-        Wanted("MPC_XY_VEL_MAX", 2.0, "m/s; more leaves no room to stop", _WARN, limits=_between(0.5, 3.0)),
+        Wanted(
+            "MPC_XY_VEL_MAX",
+            2.0,
+            "m/s; with more there is not enough distance to stop",
+            _WARN,
+            limits=_between(0.5, 3.0),
+        ),
         Wanted(
             "MPC_Z_VEL_MAX_UP",
             1.0,
-            "m/s; more leaves no room to stop below the ceiling",
+            "m/s; with more there is not enough distance to stop below the ceiling",
             _WARN,
             limits=_between(0.5, 2.0),
         ),
     ),
     "Serial link to the companion: TELEM2": (
-        Wanted("MAV_1_CONFIG", 102, "no MAVLink on TELEM2", _WARN, reboot=True, hardware=True),
         Wanted(
-            "MAV_1_MODE", 2, "other modes stream to people: too little, too slowly", _WARN, reboot=True, hardware=True
+            "MAV_1_CONFIG", 102, "with another value there is no MAVLink on TELEM2", _WARN, reboot=True, hardware=True
+        ),
+        Wanted(
+            "MAV_1_MODE", 2, "other modes send too few messages at too low rates", _WARN, reboot=True, hardware=True
         ),
         Wanted(
             "MAV_1_RATE",
             80000,
-            "B/s; 0 stands for half of the wire's bandwidth, and PX4 then slows every stream down",
+            "B/s; 0 means half of the link's bandwidth, at which PX4 reduces the rate of every stream",
             _WARN,
             reboot=True,
             hardware=True,
@@ -376,30 +391,30 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "SER_TEL2_BAUD",
             921600,
-            "the state at full rate does not fit a slower wire",
+            "a slower link cannot carry the state at full rate",
             _WARN,
             reboot=True,
             hardware=True,
         ),
     ),
 }
-"""In the order in which people read them, and in which they are written."""
+"""Parameters by group, in the order of the documentation, which is also the order of writing."""
 
 WANTED: tuple[Wanted, ...] = tuple(one for group in GROUPS.values() for one in group)
 BY_NAME = {one.name: one for one in WANTED}
 
 
 def names() -> tuple[str, ...]:
-    """Every parameter that the preflight reads."""
+    """Return the names of all parameters that the preflight reads."""
     return tuple(BY_NAME)
 
 
 def file_values() -> dict[str, Value]:
-    """What configs/px4/indoor_mocap.params holds."""
+    """Return the content of configs/px4/indoor_mocap.params."""
     return {one.name: one.value for one in WANTED if one.file and one.value is not None}
 
 
 def simulated_values() -> dict[str, Value]:
-    """What a simulated PX4 is set to: the file without the serial port, and nobody holds a radio."""
+    """Return the parameters of a simulated PX4: the file without the serial port and without a radio."""
     values = {one.name: one.value for one in WANTED if one.file and not one.hardware and one.value is not None}
     return {**values, RADIO: NO_RADIO}

@@ -23,9 +23,11 @@ def kinds_markdown() -> str:
     """Return the table of the kinds of faults."""
     rows = []
     for name, kind in KINDS.items():
-        told = ", ".join(f"`{event}`" for event in kind.named_by) or "nothing: it needs no answer"
-        rows.append((f"`{name}`", kind.what, size_meaning(kind.size, kind.unit), number(kind.default, "g"), told))
-    return markdown(("kind", "what happens", "size", "default", "told by"), rows)
+        reported_by = ", ".join(f"`{event}`" for event in kind.named_by) or "none: no reaction is needed"
+        rows.append(
+            (f"`{name}`", kind.what, size_meaning(kind.size, kind.unit), number(kind.default, "g"), reported_by)
+        )
+    return markdown(("kind", "what happens", "size", "default", "reported by"), rows)
 
 
 def outcomes_markdown(rows: Sequence[Row]) -> str:

@@ -24,11 +24,11 @@ ROOMS: dict[str, Sequence[Check]] = {
 
 
 def checks_table(checks: Sequence[Check]) -> str:
-    """One row per check."""
-    lines = ["| row | what is looked at | wanted | otherwise |", "|---|---|---|---|"]
+    """Return a table with one row per check."""
+    lines = ["| row | quantity | expected | consequence of a failure |", "|---|---|---|---|"]
     for check in checks:
-        told = f"{check.why}{' (warns only)' if check.warns else ''}"
-        lines.append(f"| `{check.id}` | {check.title} | {check.wanted} | {told} |")
+        consequence = f"{check.why}{' (warns only)' if check.warns else ''}"
+        lines.append(f"| `{check.id}` | {check.title} | {check.wanted} | {consequence} |")
     return "\n".join(lines)
 
 

@@ -39,7 +39,7 @@ def indoor_mocap_text() -> str:
         "companion px4 params --write, which writes only what differs and keeps the old values in a file.",
         "",
         f"Not in here: MPC_THR_HOVER, which is measured on each vehicle, and {RADIO}, because {NO_RADIO} switches the",
-        f"pilot's radio off ({NO_RADIO_FILE}, for machines that nobody holds a radio for).",
+        f"pilot's radio off ({NO_RADIO_FILE}, for vehicles without a radio).",
         "",
     ]
     return params_file.text(file_values(), heading, comments)
@@ -49,18 +49,18 @@ def no_radio_text() -> str:
     """configs/px4/no_radio.params."""
     return params_file.text(
         {RADIO: NO_RADIO},
-        ["Only where nobody holds a radio: PX4 then ignores sticks and mode switch.", ""],
+        ["Only for vehicles without a radio: PX4 then ignores sticks and mode switch.", ""],
     )
 
 
 def table_markdown() -> str:
-    """The parameters, for docs/px4.md."""
+    """Return the table of parameters for docs/px4.md."""
     lines = []
     for title, group in GROUPS.items():
         lines += [
             f"**{title}**",
             "",
-            "| parameter | set | accepted | if not | reboot | why |",
+            "| parameter | set | accepted | if not | reboot | reason |",
             "|---|---|---|---|---|---|",
         ]
         for wanted in group:

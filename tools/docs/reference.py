@@ -61,7 +61,7 @@ def page(kind: str) -> str:
         "Keys carry their unit in their name. `companion schema "
         + kind
         + "` prints the same for editors. What keys ask of each",
-        "other is checked when the file is read, and told with file, line and column.",
+        "other is checked when the file is read, and reported with file, line and column.",
     ]
     definitions: dict[str, Schema] = schema.get("$defs", {})
     queue: list[tuple[str, Schema]] = list(_members("", schema, definitions)) if _choices(schema) else [("", schema)]
