@@ -48,7 +48,7 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
         return []
     makers: tuple[tuple[str, str, str, Callable[[FlightLog], Figure | None]], ...] = (
         ("tracking", "Tracking", "Position and attitude by motion capture against the reference.", _tracking),
-        ("actuation", "Actuation", "What the law asked for and what was sent.", _actuation),
+        ("actuation", "Actuation", "Commands of the law and the values that were sent.", _actuation),
         ("adaptation", "Adaptation", "Switching gain and its adapted parameters.", _adaptation),
         (
             "load",

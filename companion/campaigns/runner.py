@@ -91,11 +91,11 @@ class Campaign(ABC):
 
     @abstractmethod
     def label(self, row: Row) -> str:
-        """Return what tells a flight from the others."""
+        """Return the label that distinguishes a flight from the others."""
 
     @abstractmethod
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return what stands beside `rows` in the JSON output."""
+        """Return the entries of the JSON output other than `rows`."""
 
     def csv_row(self, row: Row) -> Mapping[str, Any]:
         """Return the row as columns of the CSV file."""

@@ -26,7 +26,7 @@ def add_parser(commands: Any) -> None:
     setup = add_tool(
         parts, "setup", _TOOLS,
         help="set the servos up: id, baud rate, return delay, mode, limits",
-        description="Bring each servo to what the companion needs. Torque is off; what is written is shown before, asked for, and read "
+        description="Bring each servo to what the companion needs. Torque is off; the values are shown, confirmed, written and read "
         "back. Exit 0: all is set up; 3: not.",
     )  # fmt: skip
     setup.add_argument(

@@ -20,7 +20,7 @@ def add_parser(commands: Any) -> None:
         "nothing is wrong; 3: something is wrong.",
     )  # fmt: skip
     check.add_argument(
-        "--weight", type=number(0.1, 5.0, " kg"), metavar="KG", help="mass to be hung on the net when asked for"
+        "--weight", type=number(0.1, 5.0, " kg"), metavar="KG", help="mass that the user hangs on the net when prompted"
     )
     tare = add_tool(
         parts, "tare", _TOOLS, write="",

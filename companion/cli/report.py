@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None and not arguments.out.strip():
         raise _refusal("--out: expected the name of a folder, got an empty one")
     if len(logs) > FLIGHTS_MAX:
-        raise _refusal(f"{len(logs)} logs: expected at most {FLIGHTS_MAX}, more cannot be told apart in one plot")
+        raise _refusal(f"{len(logs)} logs: expected at most {FLIGHTS_MAX}, more cannot be distinguished in one plot")
     if arguments.align is not None and len(logs) == 1:
         raise _refusal("--align: expected two or more logs, got one")
     if arguments.gif is not None and len(logs) > 1:

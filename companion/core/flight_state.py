@@ -54,16 +54,16 @@ class FlightState:
     supervisor: SupervisorState = field(default_factory=SupervisorState)
     outcome: Outcome | None = None
     plan: Plan | None = None
-    """The mission's, from the measured start."""
+    """Plan of the mission from the measured start."""
     course: Course | None = None
-    """What is flown and its clock; None before arming."""
+    """Flown course with its clock; None before arming."""
     aborting: bool = False
-    """The course is not the mission's."""
+    """Whether the course is an abort's, not the mission's."""
     mission_start_s: float | None = None
     armed_by_others: bool = False
-    """PX4 was armed without a request of the companion: nothing is sent to the rotors, not even zero thrust."""
+    """PX4 was armed without a request of the companion: no setpoint is sent."""
     arm_requested_s: float = -math.inf
-    """When ARM was requested last."""
+    """Time of the last request to arm."""
     zero_thrust: bool = False
     """The landing by PX4 needs level setpoints with zero thrust."""
     waiting: Waiting = Waiting()
@@ -98,7 +98,7 @@ class FlightState:
         return self.course.progress(t_s) if self.stage is Stage.PLAN else 1.0
 
     def vertical_scale(self, t_s: float) -> float:
-        """Return the share of the vertical force that the law may give: rotors spool up and down on the ground."""
+        """Return the share of the vertical force that the law may command: rotors spool up and down on the ground."""
         assert self.entered_s is not None
         elapsed_s = t_s - self.entered_s
         if self.stage is Stage.SPOOL:

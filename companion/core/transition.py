@@ -90,7 +90,7 @@ class Transition:
         self.pose_s = observation.pose_s
         """Stamp of the newest pose that was passed on to PX4."""
         self.start_asked = False
-        """The operator asked for take-off in this tick."""
+        """Whether the operator commanded take-off in this tick."""
         self.tare: list[Tare] = []
         self.resumed = False
 

@@ -153,7 +153,7 @@ class ForceTorque(Device, Protocol):
         """Return the newest sample as measured, or None before the first."""
 
     def counts(self) -> ForceCounts:
-        """Return the numbers of samples and bad packets since the device was opened."""
+        """Return the numbers of samples and invalid packets since the device was opened."""
 
 
 class GroundLink(Device, Protocol):
@@ -161,7 +161,7 @@ class GroundLink(Device, Protocol):
 
     @property
     def line(self) -> str:
-        """Where MAVLink is forwarded to, one line for the operator."""
+        """Destination of the forwarded MAVLink, as one line for the operator."""
 
     def tell(self, inputs: Inputs, outputs: Outputs) -> None:
         """Report one control tick to the ground station."""

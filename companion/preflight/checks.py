@@ -10,7 +10,7 @@ from companion.model.negative_zero import without_negative_zero
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One check."""
+    """Identity and texts of one check."""
 
     id: str
     """Id of its row."""
@@ -38,7 +38,7 @@ class Check:
         return self._row(False, read, wanted, fix, Level.WARN)
 
     def row(self, ok: bool, read: str, wanted: str, fix: str) -> Row:
-        """Return `good` if it is ok, else `bad`."""
+        """Return the row of `good` if `ok` is True, else that of `bad`."""
         return self.good(read, wanted) if ok else self.bad(read, wanted, fix)
 
     def _row(self, ok: bool, read: str, wanted: str, fix: str, level: Level) -> Row:

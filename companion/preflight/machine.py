@@ -88,14 +88,14 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
 
 
 _PERMIT = (
-    "sudo companion install --systemd permits it to the service and to people in dialout; by hand, `{}` in "
+    "sudo companion install --systemd permits it to the service and to users in the group dialout; by hand, `{}` in "
     "/etc/security/limits.conf; then log in again"
 )
 
 
 def _memory_lock(machine: Machine, computer: Computer) -> Row:
     if not computer.lock_memory:
-        return MEMORY_LOCK.good("computer.lock_memory is false: not asked for")
+        return MEMORY_LOCK.good("computer.lock_memory is false: not requested")
     if machine.memory_lock is None:
         return MEMORY_LOCK.good("permitted", "RLIMIT_MEMLOCK unlimited")
     return MEMORY_LOCK.bad(

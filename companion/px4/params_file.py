@@ -67,7 +67,7 @@ def parse(text: str, source: str) -> list[Entry]:
         try:
             entry = _entry(line, number)
             if entry.name in entries:
-                raise _WrongError(f"{entry.name} is there already, in line {entries[entry.name].line}")
+                raise _WrongError(f"{entry.name} is a duplicate of line {entries[entry.name].line}")
         except _WrongError as error:
             problems.append(f"{source}:{number}: {error}")
         else:

@@ -80,10 +80,10 @@ class TelemetryThread:
             self.dropped += 1
 
     def end(self, *, in_order: bool) -> None:
-        """End the session: no more packets come. Does not wait.
+        """End the session after the last packet, without waiting.
 
         Args:
-            in_order: the flight ended normally; False if its process died.
+            in_order: True if the flight ended normally, False if its process died.
         """
         self._ending = in_order
 

@@ -67,7 +67,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class RecorderSide:
-    """The rest of the recorder."""
+    """Interface of the telemetry link to the rest of the recorder."""
 
     flight: FlightSide
     packets: deque[tuple[float, bytes]]

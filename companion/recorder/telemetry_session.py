@@ -210,10 +210,10 @@ class TelemetrySession:
         )
 
     def end(self, *, in_order: bool) -> None:
-        """End the session: no more ticks come.
+        """End the session after the last tick.
 
         Args:
-            in_order: the flight ended normally; False if its process died.
+            in_order: True if the flight ended normally, False if its process died.
         """
         if self._over:
             return

@@ -260,7 +260,7 @@ def _due(t_s: float, last_s: float, period_s: float) -> bool:
 
 
 def timestamp(stamp_ns: int) -> Timestamp:
-    """Return a wall clock in ns as a Foxglove time stamp."""
+    """Return a wall-clock time in ns as a Foxglove time stamp."""
     return Timestamp(stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
 
 

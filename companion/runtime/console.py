@@ -53,7 +53,7 @@ class SteadyStream:
 
 
 class _PlainNumbers(SteadyStream):
-    """A steady stream that prints no negative zeros."""
+    """Stream that prints negative zeros as zero and ignores that its reader has gone."""
 
     def write(self, text: str) -> int:
         """Write the text without negative zeros."""

@@ -1,4 +1,4 @@
-"""Progress bars for people, and single keys read from a terminal."""
+"""Progress bars for the user, and single keys read from a terminal."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Bars:
 
 @contextlib.contextmanager
 def raw_keys() -> Iterator[int | None]:
-    """Yield the descriptor from which keys are read as they are pressed; None if standard input is no terminal."""
+    """Yield the descriptor from which keys are read as they are pressed; None if standard input is not a terminal."""
     if sys.stdin is None or not sys.stdin.isatty():
         yield None
         return

@@ -1,4 +1,4 @@
-"""The arm's servos and the force sensor at its end: what is tracked of them, and the predicates of their rules."""
+"""The arm's servos and the force sensor at its end: trackers of their state, and the predicates of their rules."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ WATCHDOG_RESTARTED = 0x80
 ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 """Bits of register 70, Hardware Error Status, of the XM430."""
 AT_LIMIT = 0.97
-"""A joint is at its torque limit from this share of it on."""
+"""Share of the torque limit from which on a joint counts as at its limit."""
 DRIFT_TIME_S = 1.0
 """Time constant of the mean force."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
@@ -30,7 +30,7 @@ def error_text(errors: tuple[int, int]) -> str:
 
 
 class ArmTracker:
-    """Both servos."""
+    """Tracks the joint state of both servos."""
 
     def __init__(self) -> None:
         self._age = Age()
@@ -38,13 +38,13 @@ class ArmTracker:
         self.arm: ArmState | None = None
         """Joint state of this tick."""
         self.before: ArmState | None = None
-        """The joint state before it, if this tick's is a new one."""
+        """Previous joint state; None if this tick has no new one."""
         self.age_s = 0.0
         self.hottest_c = -math.inf
         """Temperature of the hotter servo; -inf without a joint state."""
 
     def update(self, i: Inputs, awake_s: float) -> None:
-        """Take a tick."""
+        """Update with the inputs of one tick."""
         arm = self.arm = i.arm
         self.age_s = self._age.update(awake_s, arm.stamp_s if arm else None)
         self.before, self.hottest_c = None, -math.inf
@@ -118,7 +118,7 @@ def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:
 
 
 def joint_rate(a: ArmTracker, rate_max_rad_s: float) -> Values | None:
-    """A joint turns faster than it can."""
+    """A joint speed exceeds the threshold."""
     if a.arm is None:
         return None
     w1, w2 = a.arm.velocity_rad_s
@@ -138,7 +138,7 @@ def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, Vec2]
 
 
 class ForceTracker:
-    """The force-torque sensor.
+    """Tracks the samples of the force-torque sensor.
 
     Args:
         stuck_s: hold time after which samples that repeat themselves count as lost, `safety.force_stuck_s`.
@@ -154,14 +154,14 @@ class ForceTracker:
         """Sample of this tick."""
         self.age_s = 0.0
         self.stuck = False
-        """Samples repeat themselves although the vehicle moves."""
+        """Whether samples repeat themselves although the vehicle moves."""
         self.trusted = True
-        """Samples are measurements: they are passed on."""
+        """Whether samples are passed on; False while they repeat themselves."""
         self.mean_n: Vec3 = _NO_FORCE
         """Low-passed external force in the world frame while the law flies with an empty net; else 0."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, dt_s: float, moving: bool) -> None:
-        """Take a tick; `moving`: PX4's velocity or rates show that the vehicle moves."""
+        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
         force = self.force = i.force
         self.age_s = self._age.update(awake_s, force.stamp_s if force else None)
         self.stuck = False

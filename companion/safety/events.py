@@ -238,7 +238,7 @@ RULES: tuple[Rule, ...] = (
         message="joint torques {:.1f} and {:.1f} N m are at the limit",
     ),
     Rule(
-        id="joint_rate", subject=Subject.ARM, what="a joint speed that no joint can have", predicate=arm.joint_rate,
+        id="joint_rate", subject=Subject.ARM, what="joint speed implausibly high", predicate=arm.joint_rate,
         thresholds=("joint_rate_max_deg_s",), hold_time=0.05, ground=_LAND, air=_LAND,
         message="joint speeds {:.0f} and {:.0f} deg/s (limit {:.0f} deg/s)",
     ),
@@ -356,7 +356,7 @@ RULES: tuple[Rule, ...] = (
         message="would come to rest with {:.2f} m of tether left (limit {:.2f} m)",
     ),
     Rule(
-        id="tether_taut", subject=Subject.TETHER, what="the tether pulls, or is used up", predicate=flight.tether_taut,
+        id="tether_taut", subject=Subject.TETHER, what="the tether pulls, or no slack is left", predicate=flight.tether_taut,
         tracked_by=("tether.taut_slack_m", "tether.pull_min_n"), hold_time=0.05, ground=None, air=_RETRACT,
         message="the tether is taut: {:.2f} m left, pull {:.0f} N",
     ),

@@ -41,7 +41,7 @@ class FlightTracker:
         """Counts up while the vertical force is limited and down while it is not, because noise makes it flicker."""
 
     def update(self, i: Inputs, situation: Situation, dt_s: float) -> None:
-        """Take a tick in the air; `i` holds only inputs that are believed."""
+        """Update with the inputs of one tick in the air; `i` holds only trusted inputs."""
         self._inputs, vehicle = i, i.vehicle
         self.vehicle = vehicle
         self.tilt_rad = 0.0

@@ -1,6 +1,6 @@
-"""Motion capture: which poses are believed, and the predicates of its rules.
+"""Motion capture: which poses are trusted, and the predicates of its rules.
 
-A pose is believed when it is where PX4's velocity and rates say that the body should be by now. A pose that is not believed counts as
+A pose is trusted when it is where PX4's velocity and rates say that the body should be by now. A pose that is not trusted counts as
 not arrived and is not passed on to PX4: an estimator that was fed with another body's pose is of no use in a landing.
 """
 
@@ -21,9 +21,9 @@ FUSED_WITHIN_RAD = math.radians(8.0)
 CONTINUOUS_S = 0.1
 """After a longer gap a pose is compared with PX4's position, not with the pose before."""
 FORGET_S = 1.0
-"""After a gap this long the next frame is believed: `mocap_lost` has reported the gap."""
+"""After a gap this long the next frame is trusted: `mocap_lost` has reported the gap."""
 DRIFT_M_S = 0.3
-"""PX4's position may be off by this much more for every second without a believed pose."""
+"""PX4's position may be off by this much more for every second without a trusted pose."""
 RATE_WINDOW_S = 1.0
 
 
@@ -45,10 +45,10 @@ def unfused(i: Inputs) -> str | None:
 
 
 class MocapTracker:
-    """Judges each frame once: is it believed, does it repeat the one before, does it move as the IMU measures?
+    """Judges each frame once: is it trusted, does it repeat the previous one, does it move as the IMU measures?
 
     Args:
-        safety: thresholds for a pose that is believed.
+        safety: thresholds for a trusted pose.
     """
 
     def __init__(self, safety: Safety) -> None:
@@ -68,7 +68,7 @@ class MocapTracker:
         """End of the newest of them, flight clock."""
         self._px4_clock, self._server_clock = RemoteClock(), RemoteClock()
         self._against_imu = False
-        """The newest believed pose does not move as the IMU measures."""
+        """The newest trusted pose does not move as the IMU measures."""
         self._window_awake_s: float | None = None
         self._window_frames = 0
         self.pose: MocapPose | None = None
@@ -76,28 +76,28 @@ class MocapTracker:
         self.frame: MocapPose | None = None
         """The newest frame, valid or not."""
         self.frame_age_s = self.believed_age_s = math.inf
-        """Awake time since the newest frame, and since the newest believed pose."""
+        """Awake time since the newest frame, and since the newest trusted pose."""
         self.plausible = True
-        """The newest valid pose is believed."""
+        """Whether the newest valid pose is trusted."""
         self.off = (0.0, 0.0)
-        """How far the newest pose that was not believed is off: m and deg."""
+        """Deviation of the newest rejected pose: m and deg."""
         self.frozen = False
         """New frames repeat the same pose while the vehicle moves in the air, for longer than `safety.mocap_frozen_s`."""
         self.two_streams = False
         self.dragged = False
         """In the air, while the companion commanded, poses did not move as the IMU measured. Latched: the observer soon follows the
-        drag, and the poses must not be believed again. Not judged once PX4 lands for another reason: behind a late link the check can
+        drag, and the poses must not be trusted again. Not judged once PX4 lands for another reason: behind a late link the check can
         be wrong, and PX4 needs the poses."""
         self.rate_hz: float | None = None
         self.compared: tuple[MocapPose, VehicleState] | None = None
-        """A fresh, believed pose and PX4's state in the air; else None."""
+        """A fresh, trusted pose and PX4's state in the air; else None."""
         self.trusted = True
-        """The newest pose is of this body and of now."""
+        """Whether the newest pose is plausible and fresh."""
         self.repeats = False
         """The newest pose repeats the one before bit for bit: in the air no measurement does."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
-        """Take a tick; `moving`: PX4's velocity or rates show that the vehicle moves."""
+        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
         pose, vehicle, s = i.mocap, i.vehicle, self._s
         self.pose = pose
         self._moved = self._moved or moving
@@ -128,11 +128,11 @@ class MocapTracker:
         return self._inertial.innovation_m
 
     def unbelieved(self, timeout_s: float) -> bool:
-        """Frames arrive, but none was believed for longer than the timeout."""
+        """Frames arrive, but none was trusted for longer than the timeout."""
         return self.believed_age_s > timeout_s and not self.frame_age_s > timeout_s
 
     def _predict(self, vehicle: VehicleState, boot_s: float) -> None:
-        """All IMU samples that came since the last tick; `boot_s` is the time of the newest."""
+        """Integrate all IMU samples since the last tick; `boot_s` is the time of the newest."""
         before = self._imu
         if before is not None and boot_s == before.imu_boot_s:
             return
@@ -148,7 +148,7 @@ class MocapTracker:
         self._inertial.imu(vehicle.imu_stamp_s, dt_s, (x, y, z - GRAVITY_M_S2 * dt_s))
 
     def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float) -> None:
-        """A new frame."""
+        """Judge a new frame."""
         before, believed = self.frame, self._believed
         gone_s = awake_s - self._frame_awake_s
         self.frame, self._frame_awake_s = pose, awake_s
@@ -180,7 +180,7 @@ class MocapTracker:
             self._against_imu = False
 
     def _age_s(self, pose: MocapPose) -> float:
-        """Time from the exposure of a pose to the newest IMU sample, limited; negative if the pose is newer."""
+        """Return the time from the exposure of a pose to the newest IMU sample, limited; negative if the pose is newer."""
         latency_s, sent_s = pose.latency_s or 0.0, pose.stamp_s
         if pose.exposure_server_s is not None:
             sent_s = self._server_clock.local_s(pose.exposure_server_s + latency_s, sent_s)
@@ -227,17 +227,17 @@ def mocap_lost(m: MocapTracker, timeout_s: float) -> Values | None:
 
 
 def mocap_invalid(m: MocapTracker, timeout_s: float) -> Values | None:
-    """Frames arrive, but none was believed for longer than the timeout, and the newest has no valid pose."""
+    """Frames arrive, but none was trusted for longer than the timeout, and the newest has no valid pose."""
     return (timeout_s,) if m.unbelieved(timeout_s) and m.frame is not None and not m.frame.tracking_valid else None
 
 
 def mocap_swapped(m: MocapTracker, timeout_s: float) -> Values | None:
-    """Poses arrive, but none was believed for longer than the timeout."""
+    """Poses arrive, but none was trusted for longer than the timeout."""
     return m.off if m.unbelieved(timeout_s) and m.frame is not None and m.frame.tracking_valid else None
 
 
 def mocap_jump(m: MocapTracker, timeout_s: float) -> Values | None:
-    """The newest pose is not believed, but one within the timeout was."""
+    """The newest pose is rejected, but one within the timeout was trusted."""
     return m.off if not m.plausible and m.believed_age_s <= timeout_s else None
 
 

@@ -55,7 +55,7 @@ class Monitors:
         self._last_t_s: float | None = None
         self._airborne = False
         self.trusted: Inputs | None = None
-        """The inputs of the last tick without what is not believed; the same object if all of it is."""
+        """Inputs of the last tick without records that are not trusted; the same object if all are trusted."""
 
     @property
     def mocap_trusted(self) -> bool:
@@ -72,11 +72,11 @@ class Monitors:
         self._evaluation.forget()
 
     def standing(self) -> str | None:
-        """Return what the vehicle must hold for, as of the last tick; None if nothing has asked for it for a second."""
+        """Return the reason to hold as of the last tick; None if no active rule has requested a HOLD for a second."""
         return self._evaluation.standing()
 
     def check(self, inputs: Inputs, situation: Situation) -> tuple[Event, ...]:
-        """Take a tick and return the events that begin."""
+        """Update with the inputs of one tick and return the events that begin."""
         self._airborne = airborne = situation.airborne
         gap_s = inputs.t_s - self._last_t_s if self._last_t_s is not None else 0.0
         self._last_t_s = inputs.t_s

@@ -16,12 +16,12 @@ class ProcessTracker:
         self.command = OperatorCommand.NONE
         """The command that begins in this tick: one that lasts for several ticks counts once."""
         self.gap_s = 0.0
-        """Time since the tick before."""
+        """Time since the previous tick."""
         self.recorder_dropped = 0
         self.guardian_ready: bool | None = None
 
     def update(self, i: Inputs, gap_s: float) -> None:
-        """Take a tick."""
+        """Update with the inputs of one tick."""
         begins, self._command = i.command is not self._command, i.command
         self.command = i.command if begins else OperatorCommand.NONE
         self.gap_s, self.recorder_dropped, self.guardian_ready = gap_s, i.recorder_dropped, i.guardian_ready

@@ -1,4 +1,4 @@
-"""PX4: what is tracked of its state, clock and status, and the predicates of its rules."""
+"""PX4: tracker of its state, clock and status, and the predicates of its rules."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ DISARMED_ABOVE_M = 0.15
 """Margin over standing height below which PX4's own disarm after a landing is no fault."""
 CLOCK_BACK_S = 1.0
 LAG_FORGOTTEN_S_PER_S = 0.05
-"""A lag that lasts is forgotten at this rate: then it is an offset between the clocks."""
+"""Rate at which a lasting lag is reduced, because it is an offset between the clocks."""
 
 
 class Px4Tracker:
-    """Age, lag and repetition of PX4's state, restarts, mode.
+    """Tracks age, lag and repetition of PX4's state, its restarts and its mode.
 
     Args:
         clearance_m: height of the body's origin when the vehicle stands.
@@ -36,18 +36,18 @@ class Px4Tracker:
         self.status: AutopilotStatus | None = None
         self.situation = Situation(False, False, None)
         self.state_age_s = self.heartbeat_age_s = 0.0
-        """Of the oldest of position, attitude and IMU sample; of the newest heartbeat."""
+        """Ages: of the oldest of position, attitude and IMU sample; of the newest heartbeat."""
         self.lag_s = 0.0
-        """How much later PX4's state arrives than at best; 0 without PX4's clock."""
+        """Lag of PX4's state beyond the smallest one seen; 0 without PX4's clock."""
         self.rebooted_s: float | None = None
-        """PX4's clock, in the tick in which it went back."""
+        """PX4's clock in the tick in which it stepped back."""
         self.repeats = False
         """PX4 sends new positions with the same values although the vehicle moves in the air."""
         self.left_offboard: AutopilotStatus | None = None
         """PX4's status if PX4 should be in OFFBOARD and is not; else None."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
-        """Take a tick; `moving`: PX4's velocity or rates show that the vehicle moves."""
+        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
         v = self.vehicle = i.vehicle
         status = self.status = i.status
         self.lag_s, self.rebooted_s, self.repeats = 0.0, None, False
@@ -97,12 +97,12 @@ def reattached(p: Px4Tracker, _: None) -> Values | None:
 
 
 def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:
-    """PX4's clock has gone back."""
+    """PX4's clock has stepped back."""
     return None if p.rebooted_s is None else (p.rebooted_s,)
 
 
 def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:
-    """PX4's state arrives later than at best by more than the threshold."""
+    """The lag of PX4's state exceeds the smallest one seen by more than the threshold."""
     return (p.lag_s * 1e3, lag_max_s * 1e3) if p.lag_s > lag_max_s else None
 
 

@@ -14,7 +14,7 @@ There are three cases:
 
 No sound flight is taken for a vehicle that is tipped over. The law's setpoints stay within `airframe.tilt_max_deg`, PX4's own landing
 within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by more than
-8 m/s^2, and PX4, told to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. One other way to stay so
+8 m/s^2, and PX4, commanded to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. One other way to stay so
 tilted so low is a tether that pulls the vehicle over; it then falls by `LOW_WITHIN_M` at most.
 """
 
@@ -67,7 +67,7 @@ def is_ours(i: Inputs) -> bool:
 
 
 def seems_flipped(i: Inputs) -> bool:
-    """Two sources say in this tick that the vehicle is tilted by more than `FLIPPED_TILT_RAD`.
+    """Return whether two sources report in this tick that the vehicle is tilted by more than `FLIPPED_TILT_RAD`.
 
     PX4's attitude must say so. Motion capture decides whether that is true; without a fresh pose the accelerometer does, which
     confirms a vehicle that lies on its side or back or falls freely, not one whose rotors still push against gravity.
@@ -102,13 +102,13 @@ class RotorStop:
     """Flight time of the newest pose that PX4 has had; -inf if that is not known."""
     sinking: Sinking = field(default_factory=Sinking)
     rest: tuple[float, Places] | None = None
-    """Since when the vehicle stands still, and where; None if it does not."""
+    """Time since which the vehicle stands still, and its position by each source; None if it does not."""
     flipped_since_s: float | None = None
     tipped_since_s: float | None = None
     may_disarm: bool = False
-    """DISARM may be requested now."""
+    """Whether DISARM may be requested now."""
     may_force: bool = False
-    """FORCE_DISARM of a vehicle that stands may be requested now."""
+    """Whether FORCE_DISARM of a standing vehicle may be requested now."""
     flipped: bool = False
     tipped: bool = False
 
@@ -174,7 +174,7 @@ def _since(before_s: float | None, t_s: float, holds: bool) -> float | None:
 
 
 def _low_and_still(i: Inputs, pose: MocapPose | None, sink_m_s: float | None, low_m: float, pose_s: float) -> Places:
-    """Return where every source that can be trusted sees the vehicle; empty unless all say low and the best one says still."""
+    """Return the position by each trusted source; empty unless all are near the floor and the best source measures no motion."""
     places: Places = {}
     vehicle = i.vehicle
     if vehicle is not None and i.t_s - vehicle.position_stamp_s < STATE_FRESH_S:
@@ -192,5 +192,5 @@ def _low_and_still(i: Inputs, pose: MocapPose | None, sink_m_s: float | None, lo
 
 
 def _moved_m(before: Places, now: Places) -> float:
-    """The furthest that one of the sources, the same in both, says that it has moved."""
+    """Return the largest displacement of any source; both arguments have the same sources."""
     return max(math.dist(before[source], now[source]) for source in now)

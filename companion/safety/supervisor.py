@@ -31,11 +31,11 @@ class LadderTimes:
 
 @dataclass(frozen=True, slots=True)
 class SupervisorState:
-    """The state of the ladder."""
+    """State of the safety ladder."""
 
     action: SafetyAction = SafetyAction.NOMINAL
     cause: str | None = None
-    """Id of the event that asked for the action."""
+    """Id of the event that requested the action."""
     since_s: float = 0.0
 
 

@@ -96,7 +96,7 @@ class TetherWatch:
 
     @property
     def windings(self) -> tuple[float, float]:
-        """The turns about the anchor's vertical, and of the line about the vehicle."""
+        """Turns of the vehicle about the anchor's vertical, and of the tether about the vehicle."""
         return self._about_anchor.turns, self._about_vehicle.turns
 
     def update(
@@ -109,16 +109,16 @@ class TetherWatch:
         disturbance_world_n: Vec3 | None,
         tool_force_world_n: Vec3 | None,
     ) -> TetherState:
-        """Take a tick and return the tether's state.
+        """Update with one tick and return the tether's state.
 
         Args:
             t_s: flight clock.
-            position_world_m: of the body's origin.
-            velocity_world_m_s: of the body's origin.
-            attitude_wxyz: body to world.
-            arm_rad: the paper's angles; None if they are unknown: the arm may be anywhere within its reach.
-            disturbance_world_n: force on the vehicle beside rotors and gravity, N; None if unknown, or on the ground.
-            tool_force_world_n: the part of it that acts on the net, tared, N; None if unknown.
+            position_world_m: position of the body's origin.
+            velocity_world_m_s: velocity of the body's origin.
+            attitude_wxyz: rotation from body to world.
+            arm_rad: joint angles as in the paper; None if unknown, and then the arm may be anywhere within its reach.
+            disturbance_world_n: force on the vehicle other than rotor thrust and gravity, N; None if unknown or on the ground.
+            tool_force_world_n: the part of this force that acts on the net, tared, N; None if unknown.
         """
         dt_s = 0.0
         if self._last_t_s is not None:

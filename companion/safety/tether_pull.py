@@ -1,9 +1,10 @@
-"""Pull of the tether, estimated from the force that nothing else explains.
+"""Pull of the tether, estimated from the residual force on the vehicle.
 
 The residual is the disturbance of the whole machine less the force at the net: a caught payload is in both and drops out. What is
 left are wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the
 vertical part of the residual is worth less than the horizontal: the pull is the weighted least-squares fit of a force along the line.
-That is also why a payload is told apart when the force sensor is lost: it pulls down only, and the fit wants the horizontal part too.
+For the same reason a payload is not taken for the tether when the force sensor is lost: it pulls down only, and a pull along the line
+has a horizontal part too.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ HORIZONTAL_N = 0.7
 VERTICAL_N = 2.0
 """Standard deviation of the vertical residual: 7 % of the hover thrust."""
 CERTAIN = 3.0
-"""A pull counts from this many standard deviations of the fit on."""
+"""Number of standard deviations of the fit from which on a pull counts."""
 RELEASE = 0.6
 """A pull ends when it falls below this share of its threshold."""
 SIDEWAYS_N = 6.0
@@ -27,13 +28,13 @@ _FLAT, _STEEP = 1.0 / HORIZONTAL_N**2, 1.0 / VERTICAL_N**2
 """Weights of the fit."""
 GROWTH_S = 0.3
 GROWTH_N_PER_M = 10.0
-"""From this slope of the pull over the range on, the line tightens."""
+"""Slope of the pull over the range from which on the line counts as tightening."""
 GROWTH_SPREAD_M2 = 1e-6
 """Below this variance of the range no slope can be estimated."""
 
 
 class PullEstimate:
-    """Low-pass, fit, and three verdicts with hysteresis.
+    """Estimates the pull from the low-passed residual and decides, with hysteresis, whether the tether pulls, tightens or is snagged.
 
     Args:
         tether: thresholds and time constants.
@@ -83,7 +84,7 @@ class PullEstimate:
         disturbance_world_n: Vec3 | None,
         tool_force_world_n: Vec3 | None,
     ) -> None:
-        """Take a tick; `towards_anchor` is the unit vector from the attachment to the anchor, forces are in the world frame, N."""
+        """Update the pull; `towards_anchor` is the unit vector from the attachment to the anchor, forces are in the world frame, N."""
         if disturbance_world_n is None:
             if self._f is not None:
                 self.forget()

@@ -60,7 +60,7 @@ def low_below_m(clearance_m: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Sinking:
-    """Speed downward by motion capture alone, over `SINK_WINDOW_S`."""
+    """Descent speed by motion capture alone, measured over `SINK_WINDOW_S`."""
 
     seen: tuple[tuple[float, float], ...] = ()
     """Stamp and height of the poses, s and m."""
@@ -79,7 +79,7 @@ class Sinking:
 
     @property
     def speed_m_s(self) -> float | None:
-        """Downward positive; None if motion capture does not tell."""
+        """Descent speed, positive downward; None if the poses do not span enough time."""
         if not self.seen:
             return None
         (first_s, first_m), (last_s, last_m) = self.seen[0], self.seen[-1]
@@ -88,7 +88,7 @@ class Sinking:
 
 @dataclass(frozen=True, slots=True)
 class Touchdown:
-    """Two of three sources, in a landing that the companion flies itself."""
+    """Evidence of touchdown from three sources, of which two must agree, in a landing that the companion flies itself."""
 
     ceiling_m: float
     """Above this height by motion capture, thrust and PX4 prove nothing."""
@@ -98,9 +98,9 @@ class Touchdown:
     alone_since_s: float | None = None
     last_s: float | None = None
     relief: float = 1.0
-    """Share of its thrust that the law may give."""
+    """Share of its thrust that the law may command."""
     certain: bool = False
-    """The vehicle stands."""
+    """Whether touchdown is certain."""
 
     @classmethod
     def begin(cls, clearance_m: float) -> Touchdown:
@@ -121,7 +121,7 @@ class Touchdown:
         Args:
             t_s: flight clock.
             vehicle: PX4's state.
-            pose: motion capture, if it is believed.
+            pose: motion-capture pose, None if it is not trusted.
             reference_height_m: where the law wants the body's origin.
             thrust_share: of hover thrust, in the last command.
             landed: PX4's land detector says that the vehicle stands.

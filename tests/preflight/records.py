@@ -180,7 +180,7 @@ def stream(**changes: object) -> MocapStream:
 
 @cache
 def sound() -> Observations:
-    """A machine in SITL: no hand test is asked for."""
+    """A machine in SITL: no hand test is required."""
     return Observations(
         start_s=START_S,
         duration_s=SPAN_S,

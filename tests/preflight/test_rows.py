@@ -308,7 +308,7 @@ def test_what_the_vehicle_file_does_not_ask_for_is_no_warning() -> None:
     unlocked = replace(r.sound(), machine=r.machine(memory_lock="memory not locked (8 kB)"))
     rows = {row.id: row for row in evaluation.rows(unlocked, config_with({"computer.lock_memory": False}))}
     assert rows["machine.memory_lock"].ok
-    assert "not asked for" in rows["machine.memory_lock"].read
+    assert "not requested" in rows["machine.memory_lock"].read
     own = {row.id: row for row in evaluation.rows(r.sound(), config_with({"computer.cpus": (2, 3)}))}["machine.cpus"]
     assert own.ok and (own.read, own.wanted) == ("computer.cpus 2-3", "among cores 0-3")
 

@@ -62,7 +62,7 @@ def test_a_file_of_qgroundcontrol_is_read() -> None:
         ("1\t1\tEKF2_EVP_NOISE\tnan\t9", "expected a number (type 9), found 'nan'"),
         ("1\t1\tEKF2_EVP_NOISE\t1e39\t9", "a number of single precision, found 1e39"),
         ("1\t1\tEKF2_EVP_NOISE\t1e400\t9", "a number of single precision, found 1e400"),
-        ("1\t1\tA\t1\t6", "A is there already, in line 2"),
+        ("1\t1\tA\t1\t6", "A is a duplicate of line 2"),
     ],
 )
 def test_a_mistake_is_told_with_its_line(line: str, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Whatever is asked for, the governed reference stays in the safe set, can always stop in it, and moves smoothly."""
+"""Whatever the input, the governed reference stays in the safe set, can always stop in it, and moves smoothly."""
 
 from __future__ import annotations
 

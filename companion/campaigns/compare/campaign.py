@@ -70,7 +70,7 @@ class Compare(Campaign):
         }
 
     def label(self, row: Row) -> str:
-        """Return what tells a flight from the others."""
+        """Return the label that distinguishes a flight from the others."""
         error = f" model error {row['model_error']:g}" if row["model_error"] else ""
         return f"{row['controller']}/{row['preset']} {row['payload_kg']:g} kg{error} seed {row['seed']}"
 
@@ -96,7 +96,7 @@ class Compare(Campaign):
         )
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Write the time series and the overview, with the first model error."""
+        """Plot the time series and the overview of the flights with the first model error."""
         from companion.campaigns.compare.plots import write_pictures
 
         shown = [message for message in messages if message["row"]["model_error"] == self.model_errors[0]]
@@ -142,7 +142,7 @@ def tracking_table(groups: Sequence[Group], *, deviation: bool = True) -> Table:
 
 
 def compliance_table(groups: Sequence[Group], *, deviation: bool = True) -> Table:
-    """Return what the tracking errors do not show."""
+    """Return the table of compliance after the catch, which the tracking errors do not show."""
     columns = [_ours(*of, deviation, failures=position == 0) for position, of in enumerate(_COMPLIANCE)]
     return _table("After the catch", columns, groups)
 

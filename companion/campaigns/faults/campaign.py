@@ -45,7 +45,7 @@ class Faults(Campaign):
         return "in the fast closed loop" if self.wires is None else "over real wires"
 
     def label(self, row: Row) -> str:
-        """Return what tells a flight from the others."""
+        """Return the label that distinguishes a flight from the others."""
         return f"{row['fault']} {shown_size(row)}".strip() + f" in {row['phase']}"
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:

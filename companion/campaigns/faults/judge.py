@@ -90,7 +90,7 @@ def row_of(variant: Variant, phase: FlightPhase, flown: FaultFlight, vehicle: Ve
         variant: the fault.
         phase: phase in which it was injected.
         flown: the flight.
-        vehicle: for its limits.
+        vehicle: vehicle file with the limits.
     """
     begun_s = flown.begun_s
     outcome = "landed" if flown.outcome == "aborted" and flown.landed else flown.outcome
@@ -219,5 +219,5 @@ def _outside(position_m: Vec3, vehicle: Vehicle) -> bool:
 
 
 def good(row: Row) -> bool:
-    """Return whether the flight did nothing that no flight may do."""
+    """Return whether the flight has no problems."""
     return not row["problems"]

@@ -128,7 +128,7 @@ def _lost(why: str) -> FaultFlight:
 
 
 def flown(folder: Path, config: FlightConfig) -> FaultFlight:
-    """Read the record of a flight from its folder; a flight that left none is lost."""
+    """Read the record of a flight from its folder; without a record the outcome is `lost`."""
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         world = json.loads((folder / WITNESS).read_text(encoding="utf-8"))

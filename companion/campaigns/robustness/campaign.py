@@ -53,7 +53,7 @@ class Robustness(Campaign):
         return {**super().settings(), **own, "seed": None if self.cases else self.seed, "cases": self.cases_file}
 
     def label(self, row: Row) -> str:
-        """Return what tells a flight from the others."""
+        """Return the label that distinguishes a flight from the others."""
         return str(row["name"])
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:

@@ -45,7 +45,7 @@ class Kept(Model):
 
 
 class Case(Model):
-    """One world that was hard to fly in."""
+    """A world that was difficult to fly in, with its earlier result."""
 
     name: str
     world: World
@@ -132,7 +132,7 @@ def fly_command(
 
 
 def name_of(world: Mapping[str, Any]) -> str:
-    """Return what is hard about a world in a few words, such as `heavy_fast_from_behind_slow_setpoints`."""
+    """Return a name that lists the difficulties of a world, such as `heavy_fast_from_behind_slow_setpoints`."""
     drawn = drivers(world)
 
     def hardness(key: str, middle: float, end: float) -> float:
@@ -157,7 +157,7 @@ def name_of(world: Mapping[str, Any]) -> str:
 
 
 def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
-    """Return rows as cases to keep; a draw is named by what is hard about it."""
+    """Return rows as cases to keep. The name of a draw lists its difficulties."""
     taken: dict[str, int] = {}
     cases = []
     for row in rows:
@@ -175,7 +175,7 @@ def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
 
 
 def worse_than(row: Row, kept: Kept) -> str | None:
-    """Return what is worse than when the case was kept; None if nothing is."""
+    """Return the results that are worse than when the case was kept; None if none are."""
     outcome, why = row["outcome"], row["why"] or row["error"] or "no event gives a reason"
     if outcome != kept.outcome.value and outcome != Outcome.COMPLETED.value:
         return f"{outcome} ({why}), kept as {kept.outcome.value}"

@@ -1,4 +1,4 @@
-"""Compares flights by their logs and summaries: what was flown, which settings differ, every figure, and whether that is fair."""
+"""Compares flights by logs and summaries: what was flown, differing settings, all figures, and whether the comparison is fair."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.campaigns.side_by_side.settings import Setting, fairness, payload
 
 Align = Literal["catch", "takeoff", "start"]
 FLIGHTS_MAX = 6
-"""More flights cannot be told apart in one plot."""
+"""Largest number of flights that can be distinguished in one plot."""
 MARKED_FROM = 0.05
 """Share of the larger value below which a difference is not marked better or worse: single flights scatter."""
 

@@ -121,11 +121,11 @@ def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], Non
 
     Args:
         port: serial device.
-        plans: of one and the same scan.
+        plans: plans from one scan.
         report: called with what is being written.
 
     Raises:
-        DeviceError: no answer, a refusal, or a value that did not stay; what was written until then stays.
+        DeviceError: no answer, a refusal, or a value that was not stored; values written before remain.
     """
     with ServoTalk(port) as talk:
         for one in plans:

@@ -94,7 +94,7 @@ class ZeroGuide:
     """Watch the arm, decide when a pose is held, and find the result in the end.
 
     Args:
-        arm: the vehicle file's; its joint limits decide which poses are asked for.
+        arm: the vehicle file's; its joint limits decide which poses are requested.
 
     Raises:
         ConfigError: the joint limits leave no such poses.
@@ -157,9 +157,9 @@ class ZeroGuide:
             return ""
         most, least = max(map(abs, moved)), min(map(abs, moved))
         if least > ALONE_SHARE * max(most, SWING_MIN_DEG):
-            return "both joints have moved; turn only the one that is asked for, put the other one back"
+            return "both joints have moved; turn only the requested one and return the other"
         if step.exact and abs(most - abs(step.by_deg)) > NEAR_SHARE * abs(step.by_deg):
-            return f"{abs(step.by_deg):.0f} deg are asked for, it has turned by {most:.0f}"
+            return f"{abs(step.by_deg):.0f} deg are requested, it has turned by {most:.0f}"
         if most < SWING_MIN_DEG:
             return f"turn it further, {SWING_MIN_DEG:.0f} deg at least; it has turned by {most:.0f}"
         return ""

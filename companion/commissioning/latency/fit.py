@@ -37,7 +37,7 @@ TAP_ERROR_MAX_S: Final = 0.004
 ERROR_MAX_S: Final = 0.0015
 """Standard error of the result."""
 BEFORE_S, AFTER_S = 0.08, 0.16
-"""Span around a tap in which motion capture is compared."""
+"""Time around a tap in which motion capture is compared."""
 SETTLE_S: Final = 0.35
 """Time after a tap until all of it has arrived, delay included."""
 APART_S: Final = 0.45
@@ -58,7 +58,7 @@ class Tap:
 
 @dataclass(frozen=True, slots=True)
 class TapDelay:
-    """The delay by one tap."""
+    """Delay of motion capture measured with one tap."""
 
     tap: Tap
     delay_s: float
@@ -68,12 +68,12 @@ class TapDelay:
     correlation: float
     """Correlation without the slow part: 1 if the shifted IMU explains all of the motion."""
     problem: str
-    """Why it does not count; empty if it does."""
+    """Reason why the tap is not used; empty if it is."""
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """The delay by all taps."""
+    """Delay of motion capture as the mean of all usable taps."""
 
     delay_s: float
     error_s: float
@@ -104,7 +104,7 @@ def find_taps(imu: Sequence[ImuAt]) -> list[Tap]:
 
 
 def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: tuple[float, float]) -> TapDelay:
-    """Measure the delay by one tap.
+    """Measure the delay with one tap.
 
     Args:
         tap: found in `imu`.

@@ -24,13 +24,13 @@ from companion.px4.required import WANTED
 
 SERVER = Check("mocap.server", "mocap server", why="nothing is streamed to the vehicle")
 OWN = Check("mocap.own", "rigid body of the vehicle", why="the pose of another body would be used")
-STEADY = Check("mocap.steady", "mocap jitter", why="EKF2 subtracts one fixed delay from all of them", warns=True)
+STEADY = Check("mocap.steady", "mocap jitter", why="EKF2 subtracts the same fixed delay from all poses", warns=True)
 DELAY = Check(
     "mocap.delay",
     "mocap latency against EKF2_EV_DELAY",
-    why="PX4 fuses each pose in the wrong place: the estimate swings with the machine",
+    why="PX4 fuses each pose in the wrong place: the estimate oscillates with the vehicle's motion",
 )
-NETWORK = Check("mocap.network", "way to the server", why="Wi-Fi holds frames back in bursts", warns=True)
+NETWORK = Check("mocap.network", "way to the server", why="Wi-Fi delays frames and delivers them in bursts", warns=True)
 CHECKS = (SERVER, OWN, STEADY, DELAY, NETWORK)
 
 MOVED_MIN_M: Final = 0.05

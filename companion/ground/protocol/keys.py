@@ -100,7 +100,7 @@ class OperatorsFile(Model):
             if any(other.name == entry.name for other in before):
                 problems.append((("operators", index, "name"), f"{entry.name} is in the file twice; remove one"))
             elif any(_decoded(other.key) == _decoded(entry.key) for other in before):
-                text = "another operator has the same key, so their commands cannot be told apart; give each operator a different key"
+                text = "another operator has the same key, so their commands cannot be distinguished; give each operator their own key"
                 problems.append((("operators", index, "key"), text))
         refuse("operators", problems)
         return self

@@ -138,7 +138,7 @@ class BodyDefinition:
 
 
 def message_id(datagram: Buffer) -> int | None:
-    """Message id of a datagram; None if it is shorter than a header."""
+    """Return the message id of a datagram, or None if it is shorter than a header."""
     if len(datagram) < _HEADER.size:
         return None
     number: int = _HEADER.unpack_from(datagram)[0]
@@ -146,7 +146,7 @@ def message_id(datagram: Buffer) -> int | None:
 
 
 def encode_message(message: Message, payload: bytes = b"") -> bytes:
-    """A datagram: header and payload (at most 65535 bytes)."""
+    """Return a datagram of header and payload (at most 65535 bytes)."""
     return _HEADER.pack(message, len(payload)) + payload
 
 
@@ -156,7 +156,7 @@ def encode_request(message: Message, text: str = "") -> bytes:
 
 
 def encode_connect(application: str = "companion") -> bytes:
-    """NAT_CONNECT: sSender and connection options that ask for the server's own bitstream version."""
+    """Return a NAT_CONNECT datagram: sSender and connection options that request the server's own bitstream version."""
     sender = _SENDER.pack(application.encode()[: MAX_NAME_BYTES - 1], bytes(4), bytes((4, 1, 0, 0)))
     return encode_message(Message.CONNECT, sender + bytes(_CONNECT_OPTIONS_BYTES))
 
@@ -401,7 +401,7 @@ def _body_definition(data: bytes, offset: int) -> BodyDefinition:
 
 
 def _text(name: bytes) -> str:
-    """A name for messages to people: whatever is in it, it stays one line and steers no terminal."""
+    """Return a name for display: one line without terminal control characters."""
     text = name.decode("utf-8", "replace")
     return "".join(character if character.isprintable() else "?" for character in text)
 
