@@ -1,4 +1,4 @@
-"""Timing of every tick of a flight, small enough to be kept whole where the ticks themselves are not."""
+"""Timing of every tick of a flight. It is small enough to keep for all ticks even if only some of the ticks are kept."""
 
 from __future__ import annotations
 

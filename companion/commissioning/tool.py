@@ -79,7 +79,7 @@ class Session:
 
     Args:
         arguments: the parsed options.
-        family: of the tool.
+        family: family of the tool.
 
     Raises:
         ConfigError: the vehicle file or an override is wrong.

@@ -28,7 +28,7 @@ _NONE = AutopilotRequest.NONE
 
 
 def advance(t: Transition) -> AutopilotRequest:
-    """Move the sequence on and return the request of the present stage."""
+    """Advance the sequence and return the request of the present stage."""
     i, state = t.i, t.state
     assert state.entered_s is not None
     if i.mocap is not None and i.mocap.tracking_valid:

@@ -69,7 +69,7 @@ class Course:
         return now_s, before + rise * rate, rise * slope * once, rise * jerk * twice
 
     def hold(self, t_s: float) -> Course:
-        """Return the course that comes to rest on the planned way from this flight time on."""
+        """Return the course that brakes on the planned path to rest from this flight time on."""
         return self if self.held else self._turned_to(0.0, t_s)
 
     def resume(self, t_s: float) -> Course:

@@ -74,7 +74,7 @@ class Plan:
 
         The take-off ends over the mission's start point, at the mission's yaw and arm angles. The measured start differs from them by
         the start's tolerances at most (`check_mission`), and the difference is removed during the climb. A move with less time than the
-        limits allow is planned in that time all the same; `check_mission` then reports which limit is exceeded, where and when.
+        limits allow is still planned in that time; `check_mission` then reports which limit is exceeded, where and when.
 
         A path takes up to seconds to solve, once per process: its motion is the same from every start and is cached. Build a mission
         with paths once before the first control tick.
@@ -84,7 +84,7 @@ class Plan:
             vehicle: height of the body's origin on the ground, and speed of the joints.
             start_position_world_m: measured, body origin; None for the mission's start, on the floor.
             start_yaw_rad: measured; None for the mission's value.
-            start_arm_rad: measured, the paper's angles; None for the mission's values.
+            start_arm_rad: measured joint angles as in the paper; None for the mission's values.
             progress: called with the completed share of the planning, 0 to 1, while paths are solved.
         """
         start = mission.start

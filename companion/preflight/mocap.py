@@ -20,7 +20,7 @@ RATE = Check(
 )
 JITTER = Check(
     "mocap.jitter",
-    "mocap evenness",
+    "mocap regularity",
     "no frame later than 50 ms after the one before",
     "EKF2 subtracts one fixed delay: frames that come in bursts are fused in the wrong place",
     warns=True,

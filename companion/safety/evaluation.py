@@ -20,11 +20,11 @@ _Bound = tuple[Rule, Any, Any, Any]
 
 
 class Evaluation:
-    """Evaluates the table tick by tick. Its state: since when each rule holds, and which rules are active.
+    """Evaluates the rules in every tick. Its state is the time since which each rule holds, and which rules are active.
 
     Args:
-        vehicle: gives thresholds and hold times.
-        trackers: by subject; the first argument of its rules' predicates.
+        vehicle: vehicle file with thresholds and hold times.
+        trackers: tracker of each subject, which is the first argument of the predicates of its rules.
     """
 
     def __init__(self, vehicle: Vehicle, trackers: Mapping[Subject, object]) -> None:

@@ -1,7 +1,7 @@
 """The last look at everything that leaves: finite, in range, fresh, not jumping. A bad command never leaves.
 
 What is held back is replaced by nothing: then PX4's offboard-loss failsafe and the servos' bus watchdog decide. What is only too much
-is cut: thrust that changes too fast, torque beyond a limit, torque that drives a joint on that is past its wall or too fast already.
+is cut: thrust that changes too fast, torque beyond its limit, torque that drives a joint further beyond its limit or speed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from companion.model.frames import tilt_rad
 from companion.model.types import AttitudeSetpoint, Vec2
 
 SLEW_MEMORY_S = 0.1
-"""After so long without a setpoint, which is what PX4 forgets the last one after, the next may be any."""
+"""After this time without a setpoint, when PX4 has discarded the previous one, the next may have any value."""
 ARM_FRESH_S = 0.05
-"""Oldest joint state that a torque may answer."""
+"""Largest age of a joint state from which a torque may be computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Gate:
         state_age_s: float = 0.0,
         arm_rate_rad_s: Vec2 = (0.0, 0.0),
     ) -> Verdict:
-        """The commands that may leave.
+        """Return the commands that may be sent.
 
         Args:
             attitude: wanted setpoint.
@@ -72,7 +72,7 @@ class Gate:
             arm_rad: joint angles now; None if unknown.
             arm_fresh: the joint state is fresh enough to close a loop on.
             t_s: flight clock.
-            state_age_s: of the attitude that the setpoint was computed from.
+            state_age_s: age of the attitude that the setpoint was computed from.
             arm_rate_rad_s: joint speeds now.
         """
         refused: list[Refusal] = []
@@ -139,7 +139,7 @@ class Gate:
         )
 
     def _limited(self, index: int, torque_nm: float, angle_rad: float, rate_rad_s: float) -> float:
-        """Clipped to the joint's limit; past a wall, or too fast, only torque that leads back."""
+        """Return the torque clipped to its limit; beyond the angle or speed limit only torque that drives the joint back is kept."""
         limit, (low, high), fast = self._torque_max_nm[index], self._walls_rad[index], self._speed_max_rad_s[index]
         if torque_nm > limit:
             torque_nm = limit

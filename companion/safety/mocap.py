@@ -92,7 +92,7 @@ class MocapTracker:
         self.compared: tuple[MocapPose, VehicleState] | None = None
         """A fresh, trusted pose and PX4's state in the air; else None."""
         self.trusted = True
-        """Whether the newest pose is plausible and fresh."""
+        """Whether poses are trusted: the newest one is plausible, and they are not frozen, dragged or of two servers."""
         self.repeats = False
         """The newest pose repeats the one before bit for bit: in the air no measurement does."""
 

@@ -72,7 +72,7 @@ class Monitors:
         self._evaluation.forget()
 
     def standing(self) -> str | None:
-        """Return the reason to hold as of the last tick; None if no active rule has requested a HOLD for a second."""
+        """Return the message of the most severe active rule, as of the last tick; None if no active rule requires HOLD or more."""
         return self._evaluation.standing()
 
     def check(self, inputs: Inputs, situation: Situation) -> tuple[Event, ...]:

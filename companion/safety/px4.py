@@ -102,7 +102,7 @@ def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:
 
 
 def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:
-    """The lag of PX4's state exceeds the smallest one seen by more than the threshold."""
+    """The lag of PX4's state exceeds the threshold."""
     return (p.lag_s * 1e3, lag_max_s * 1e3) if p.lag_s > lag_max_s else None
 
 

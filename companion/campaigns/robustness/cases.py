@@ -116,11 +116,11 @@ def fly_command(
     """Return the command that flies the same world over real wires.
 
     Args:
-        mission: file.
-        controller: law.
-        preset: gains.
-        name: built-in world, or its file.
-        world: keys to set in it.
+        mission: mission file.
+        controller: name of the control law.
+        preset: name of the preset.
+        name: name of a built-in world, or a world file.
+        world: keys of the world to set.
         sets: further overrides.
     """
     words = ["companion", "fly", mission, "--sitl", "--controller", controller, "--preset", preset, "--world", name]

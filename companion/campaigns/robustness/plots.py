@@ -24,7 +24,7 @@ def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
     """Draw the plot; return False if no flight caught its payload and was completed.
 
     Args:
-        rows: of all flights.
+        rows: rows of all flights.
         title: what was flown.
         path: PNG file.
     """

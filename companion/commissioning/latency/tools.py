@@ -51,7 +51,7 @@ DELAY = Check(
 LONG = Check(
     "latency.long",
     "delay of motion capture",
-    why="the filter works that far in the past; every loop that depends on it becomes slower",
+    why="the filter runs this far in the past, and every loop that depends on it becomes slower",
 )
 
 

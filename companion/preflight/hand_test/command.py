@@ -55,7 +55,7 @@ async def run_hand_test(
         config: the effective configuration.
         console: terminal of the operator.
         json: keep standard output free: everything for the operator goes to standard error.
-        record: where a passed test is recorded (`hand_record.record_path()`); None for nowhere, as in SITL.
+        record: where a passed test is recorded (`hand_record.record_path()`); None if it is not recorded, as in SITL.
     """
     outcome = await perform(devices, config, console, json)
     if isinstance(outcome, str):
