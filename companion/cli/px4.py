@@ -115,7 +115,7 @@ def _back_up(path: Path, differences: Sequence[Difference], firmware: str, sourc
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        return f"--backup {path}: is there already; choose another name (nothing was written)"
+        return f"--backup {path}: already exists; choose another name (nothing was written)"
     except OSError as error:
         return (
             f"--backup {path}: {error.strerror or error}; choose a place that can be written to (nothing was written)"

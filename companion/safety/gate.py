@@ -1,7 +1,7 @@
-"""The last look at everything that leaves: finite, in range, fresh, not jumping. A bad command never leaves.
+"""The last check of everything that is sent: values must be finite, in range, fresh and without jumps. A bad command is never sent.
 
-What is held back is replaced by nothing: then PX4's offboard-loss failsafe and the servos' bus watchdog decide. What is only too much
-is cut: thrust that changes too fast, torque beyond its limit, torque that drives a joint further beyond its limit or speed.
+A rejected command is not replaced: PX4's offboard-loss failsafe and the servos' bus watchdog then decide. An excess is
+reduced: thrust that changes too fast, torque beyond its limit, torque that drives a joint further beyond its limit or speed.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def test_old_values_are_kept_before_anything_is_written(mine: Path, capsys: pyte
     port = free_udp_port()
     with Px4Peer(port) as peer:
         assert params(port, "--write", str(mine), "--backup", str(mine)) == EXIT_BAD_INPUT
-        assert "is there already; choose another name (nothing was written)" in capsys.readouterr().err
+        assert "already exists; choose another name (nothing was written)" in capsys.readouterr().err
         assert peer.of("PARAM_SET") == []
 
 

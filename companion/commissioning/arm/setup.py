@@ -175,7 +175,7 @@ class Done:
 
 
 def set_up(session: Session) -> Done:
-    """Scan, show what would be written, ask, write, scan again; one servo after the other if they cannot be told apart.
+    """Scan, show what would be written, ask, write, scan again; one servo at a time if they cannot be distinguished.
 
     Raises:
         DeviceError: a servo does not answer any more; scan again.
