@@ -66,7 +66,7 @@ def summarise(
         log: the flight.
         outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
         controller: adaptive, csc or psc.
-        preset: paper, recommended or the name of a user's preset.
+        preset: a built-in one or the name of a user's preset.
         payload_kg: truth from SITL; None on hardware.
         recorder: the recorder's own report (samples, dropped, error); None to count from the log.
 

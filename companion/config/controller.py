@@ -172,5 +172,9 @@ LAWS: dict[str, type[AdaptiveConfig] | type[CscConfig] | type[PscConfig]] = {
     "csc": CscConfig,
     "psc": PscConfig,
 }
-PRESETS: dict[str, tuple[str, ...]] = {"adaptive": ("paper", "recommended"), "csc": ("tuned",), "psc": ("tuned",)}
+PRESETS: dict[str, tuple[str, ...]] = {
+    "adaptive": ("paper", "paper_slow_leakage", "model_free", "recommended"),
+    "csc": ("tuned",),
+    "psc": ("tuned",),
+}
 """Built-in presets of each law, the default last."""

@@ -67,7 +67,7 @@ def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPa
         return compare_row(flight, None if flight["preset"] == "paper" else 0.05, error=EVIL)
 
     fly_made_up(monkeypatch, row, series=SERIES)
-    ended = run_here(*COMPARE, "--seeds", "2", "--first-seed", "7", "--json")
+    ended = run_here(*COMPARE, "--presets", "paper,recommended", "--seeds", "2", "--first-seed", "7", "--json")
     assert (ended.code, ended.err) == (EXIT_OK, ""), "a crash is a result"
     table = json.loads(ended.out)
     assert list(table) == ["rows", "aggregate"]

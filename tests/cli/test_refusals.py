@@ -318,7 +318,7 @@ def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world:
         ended = refused(sandbox, fresh_world, *fresh_world.addresses())
     for pattern in (
         r"^EKF2_EV_CTRL: 0, wanted 11 or 15; set EKF2_EV_CTRL to 11 \(companion px4 params --write\)$",
-        r"^EKF2 fuses motion capture: the estimator reports no valid .*, wanted fused for 2 s; check EKF2_EV_CTRL = 11",
+        r"^EKF2 fuses motion capture: the estimator reports no valid .*, wanted fused for 1 s; check EKF2_EV_CTRL = 11",
     ):
         assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
 

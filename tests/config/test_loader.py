@@ -261,7 +261,7 @@ def test_unknown_controller_and_preset(project: Path) -> None:
         "--preset paper: no such preset of 'psc'; available: tuned"
     ]
     assert lines_of(lambda: load_sitl(CATCH, preset="papr")) == [
-        "--preset papr: no such preset of 'adaptive'; available: paper, recommended"
+        "--preset papr: no such preset of 'adaptive'; available: paper, paper_slow_leakage, model_free, recommended"
     ]
 
 
@@ -276,7 +276,7 @@ BAD_LAW_IN_MISSION = [
     ),
     (
         "{preset: tuned}",
-        "controller.preset: no such preset of 'adaptive', got \"tuned\"; available: paper, recommended",
+        "controller.preset: no such preset of 'adaptive', got \"tuned\"; available: paper, paper_slow_leakage, model_free, recommended",
     ),
 ]
 
