@@ -274,8 +274,6 @@ class World:
 
         Args:
             rotor_commands: motor signals, 0 to 1, in PX4's quad-x order.
-            joint_torque_nm: motor torque of both joints.
-            rotor_commands: normalised, 0 to 1, in PX4's quad-x order.
             joint_torque_nm: torque of the motors or of their gears on both joints.
             airborne: whether a payload may be thrown.
             drag: whether aerodynamic drag and wind act.

@@ -54,7 +54,9 @@ def test_jog_stops_when_gravity_does_not_explain_the_load(held: Rig) -> None:
     heavy = ("--set", "vehicle.tool.net_mass_kg=0.5")
     code, done = held.json("jog", "--joint", "2", "--to", "125", "--yes", *heavy)
     assert code == EXIT_REFUSED
-    assert "beside gravity; look for what is in its way" in done["stopped"] or "from its reference" in done["stopped"]
+    # Three limits are passed within a few milliseconds; which of them the next read sees first is the computer's.
+    reasons = ("beside gravity; look for what is in its way", "from its reference", "runs away; unless it was pulled")
+    assert any(reason in done["stopped"] for reason in reasons), done["stopped"]
 
 
 def test_keys_at_a_terminal_move_the_arm_and_q_lets_go(held: Rig) -> None:
