@@ -170,7 +170,7 @@ async def watch_drift(session: Session) -> Tared:
     clock, device = flight_clock(), vehicle.devices.force
     async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
         if arguments.clear:
-            sensor.set_bias(False)
+            await sensor.set_bias(False)
         session.say(f"force sensor: {device.port}; {_EMPTY} for {arguments.seconds:g} s")
         first = await sensor.tare_samples(TARE_S)
         samples = list(first)
@@ -179,8 +179,7 @@ async def watch_drift(session: Session) -> Tared:
         seen = Tared(samples, first, await angles_rad())
         if not arguments.sensor:
             return seen
-        sensor.set_bias(True)
-        await sensor.tare_samples(0.1)  # samples that were on their way
+        await sensor.set_bias(True)
         return replace(seen, zeroed=await sensor.tare_samples(TARE_S))
 
 

@@ -19,6 +19,7 @@ from companion.preflight.force import mean_force_n
 from companion.runtime.clock import Clock
 
 WEIGHT_TIMEOUT_S: Final = 90.0
+_ON_THEIR_WAY_S: Final = 0.2
 _LOOK_S: Final = 0.5
 _STILL_S: Final = 1.5
 _STILL_N: Final = 0.3
@@ -31,9 +32,16 @@ _CHANGE_SHARE: Final = 0.15
 class FtSensor(RobotousForceTorque):
     """The force sensor's driver, with the one command that no flight uses."""
 
-    def set_bias(self, on: bool) -> None:
-        """Make the present reading zero (SET_BIAS 1), or undo that (0). The sensor does not acknowledge it: check what it reads."""
+    async def set_bias(self, on: bool) -> None:
+        """Make the present reading zero (SET_BIAS 1), or undo that (0), and drop the samples that were on their way.
+
+        The sensor does not acknowledge it: check what it reads.
+
+        Raises:
+            DeviceError: the sensor went silent.
+        """
         self._send(Command.SET_BIAS, int(on))
+        await self.tare_samples(_ON_THEIR_WAY_S)
 
 
 def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:
