@@ -74,8 +74,9 @@ class LoadAdaptation:
         (u1, u2), (t1, t2) = self._levers, self._turning
 
         def updated(value: float, rate: float, error: float, low: float, high: float) -> float:
-            value = decay * value - step * rate * error
-            return low if value < low else high if value > high else value
+            new = decay * value - step * rate * error
+            # NaN fails every comparison and leaves the value as it is: an estimate has no way back from it.
+            return new if low <= new <= high else low if new < low else high if new > high else value
 
         (x, y, z), (rx, ry, rz), n = self.force_n, self._rate_xyz, self._max_n
         self.force_n = (updated(x, rx, s0, -n, n), updated(y, ry, s1, -n, n), updated(z, rz, s2, -n, n))

@@ -104,6 +104,15 @@ def test_nothing_is_learned_in_saturation() -> None:
     assert (load.force_n, load.moments_kg_m, load.friction_nm) == ((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 
 
+def test_a_sample_that_is_not_a_number_leaves_the_estimates() -> None:
+    load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0))
+    load.joint_torque_nm((1.0, 1.0), (1.0, 1.0))
+    load.advance(DT_S, (-1.0, -1.0, -1.0, -1.0, -1.0), True)
+    before = (load.force_n, load.moments_kg_m, load.friction_nm)
+    load.advance(DT_S, (math.nan,) * 5, True)
+    assert (load.force_n, load.moments_kg_m, load.friction_nm) == before
+
+
 def test_the_paper_bound_of_h_holds_for_slow_leakage() -> None:
     bound = (1.0, 2.0, 3.0, 4.0)
     adaptation = Adaptation(law(nu=(0.1, 0.1, 0.1, 0.1), h_max=bound))
