@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 import os
 import threading
@@ -137,6 +138,19 @@ def refused(servos: list[ServoModel], config: ArmConfig | None = None, **device:
 
 
 # --- flight ---------------------------------------------------------------------------------------------------------------
+
+
+def test_an_arm_opens_although_every_second_packet_is_damaged() -> None:
+    async def main() -> None:
+        servos, number = new_servos(), itertools.count()
+        async with ServoBus(servos) as bus:
+            bus.damaged = lambda: next(number) % 2 == 0
+            async with DynamixelArm(device_on(bus.path), arm_config(), flight_clock()) as arm:
+                assert arm.latest() is not None
+                assert [register(servo, 64) for servo in servos] == [1, 1]
+
+    asyncio.run(main())
+    assert_nothing_left()
 
 
 def test_joint_state_arrives_in_the_papers_angles() -> None:

@@ -39,8 +39,8 @@ _REPLY_TIMEOUT_MS: Final = 100.0
 """An FTDI adapter with its factory latency timer delays an answer by 16 ms, a busy computer by more."""
 _ERROR_NUMBER: Final = 0x7F
 _CRC_ERROR: Final = 3
-_ATTEMPTS: Final = 3
-"""Number of times that a read or write is sent: a line with interference loses or damages single packets."""
+_ATTEMPTS: Final = 10
+"""Number of times that a read or write is sent: interference damages single packets, and a busy computer delays an answer."""
 
 
 class _CountingPort(dxl.ServoPort):

@@ -17,7 +17,7 @@ from typing import Self, TypeVar
 from msgspec.structs import replace
 
 from companion.config.vehicle import Arm, ArmDevice
-from companion.io.dynamixel.bus import ArmBus, Pair
+from companion.io.dynamixel.bus import SETUP_ATTEMPTS, ArmBus, Pair
 from companion.io.dynamixel.registers import WATCHDOG_ERROR, WATCHDOG_TRIPPED, Block, JointScale
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
@@ -213,7 +213,10 @@ class DynamixelArm:
         try:
             self._scales = bus.open(_OPEN_TIMEOUT_S)
             self._servos = bus.reports
-            self._read_once(bus)
+            for _ in range(SETUP_ATTEMPTS):
+                self._read_once(bus)
+                if self._state is not None:
+                    break
         except DeviceError as error:
             return error
         except Exception as error:  # an unplugged port raises whatever its driver likes; preflight wants one line of it

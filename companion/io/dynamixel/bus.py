@@ -21,6 +21,9 @@ _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """Reply timeout in flight, the longest delay caused by an absent servo."""
 _USB_LATENCY_MAX_MS = 4
 _ERROR_NUMBER = 0x7F
+_CRC_ERROR = 3
+SETUP_ATTEMPTS = 5
+"""Number of times that set-up sends a read or write: interference damages single packets, and a busy computer delays an answer."""
 
 Pair = tuple[int, int]
 
@@ -60,7 +63,7 @@ class ArmBus:
             self._check_identity(joint)
         self._touched = True
         scales = tuple(self._set_up(joint) for joint in self._joints)
-        blocks = self.read()
+        blocks = next((pair for pair in (self.read() for _ in range(SETUP_ATTEMPTS)) if pair is not None), None)
         if blocks is None:
             raise self._error(
                 "servos", self._ids, "answered one by one, but not to a sync read; look for a loose cable"
@@ -158,9 +161,12 @@ class ArmBus:
             )
 
     def _check_identity(self, joint: Joint) -> None:
-        self._check_time()
-        self._port.is_using = False
-        model, result, _ = self._protocol.ping(self._port, joint.servo_id)
+        for _ in range(SETUP_ATTEMPTS):
+            self._check_time()
+            self._port.is_using = False
+            model, result, error = self._protocol.ping(self._port, joint.servo_id)
+            if _arrived(result, error):
+                break
         if result != COMM_SUCCESS:
             answered, _ = self._protocol.broadcastPing(self._port)
             others = (
@@ -251,9 +257,12 @@ class ArmBus:
         return int.from_bytes(data, "little", signed=register.signed)
 
     def _read_bytes(self, joint: Joint, register: Register) -> bytes:
-        self._check_time()
-        self._port.is_using = False
-        data, result, error = self._protocol.readTxRx(self._port, joint.servo_id, register.address, register.size)
+        for _ in range(SETUP_ATTEMPTS):
+            self._check_time()
+            self._port.is_using = False
+            data, result, error = self._protocol.readTxRx(self._port, joint.servo_id, register.address, register.size)
+            if _arrived(result, error):
+                break
         self._check_answer(joint, f"reading {register}", result, error)
         return bytes(data)
 
@@ -261,10 +270,13 @@ class ArmBus:
         self._write_bytes(joint, register, list(value.to_bytes(register.size, "little", signed=register.signed)))
 
     def _write_bytes(self, joint: Joint, register: Register, data: list[int]) -> None:
-        """Write and read back."""
-        self._check_time()
-        self._port.is_using = False
-        result, error = self._protocol.writeTxRx(self._port, joint.servo_id, register.address, len(data), data)
+        """Write and read back; a lost or damaged packet is repeated, as in `_read_bytes`."""
+        for _ in range(SETUP_ATTEMPTS):
+            self._check_time()
+            self._port.is_using = False
+            result, error = self._protocol.writeTxRx(self._port, joint.servo_id, register.address, len(data), data)
+            if _arrived(result, error):
+                break
         self._check_answer(joint, f"writing {register}", result, error)
         found = self._read_bytes(joint, register)
         if found != bytes(data):
@@ -297,3 +309,8 @@ class ArmBus:
         elif ids is not None:
             what = f"{what} {ids} (joint {self._ids.index(ids) + 1})"
         return DeviceError(f"arm bus {self._device.port}: {what}: {text}")
+
+
+def _arrived(result: int, error: int) -> bool:
+    """Return whether request and answer arrived undamaged."""
+    return bool(result == COMM_SUCCESS and error & _ERROR_NUMBER != _CRC_ERROR)
