@@ -77,10 +77,8 @@ def measure(folder: Path, hover_s: float, say: Callable[[str], None]) -> Figures
         raise PartError("no broker: apt install mosquitto")
     with contextlib.ExitStack() as stack:
         broker = stack.enter_context(loopback_broker(folder))
-        person = stack.enter_context(
-            _beside("person", folder, "-m", "benchmarks.brokering.load", "person", broker.url, "any")
-        )
-        _await_viewer(person, folder / "person.txt")
+        watching = stack.enter_context(_beside("viewer", folder, "-m", "benchmarks.measuring.viewer", broker.url))
+        _await_viewer(watching, folder / "viewer.txt")
         empty = stack.enter_context(_beside("empty", folder, *_loop("empty", folder / "empty.npy")))
         stack.enter_context(_beside("plain", folder, *_loop("plain", folder / "plain.npy")))
         flight = start_hover(folder, hover_s, broker.url, report=False)
@@ -94,16 +92,16 @@ def measure(folder: Path, hover_s: float, say: Callable[[str], None]) -> Figures
         bare = stack.enter_context(_beside("bare", folder, *_loop("bare", folder / "bare.json"), str(frames)))
         say(f"hovering for {hover_s:g} s")
         samples, machine = _watch(flight, empty.pid, bare, hover_s, say)
-        viewer = _viewer(person, folder / "person.txt")
+        viewer = _viewer(watching, folder / "viewer.txt")
     say("reading the log")
     return _judge(folder, flight.returncode, samples, machine, viewer, to_wall_s)
 
 
-def _await_viewer(person: subprocess.Popen[bytes], said: Path) -> None:
+def _await_viewer(process: subprocess.Popen[bytes], said: Path) -> None:
     """Wait until the monitor's page is open, so that the start of the browser is not measured."""
     deadline_s = time.monotonic() + START_TIMEOUT_S
     while not said.stat().st_size:
-        if person.poll() is not None or time.monotonic() > deadline_s:
+        if process.poll() is not None or time.monotonic() > deadline_s:
             raise PartError("no viewer: the monitor's page did not open")
         time.sleep(0.1)
 
@@ -187,9 +185,9 @@ def machine_cpu() -> tuple[float, float, float]:
     return sum(fields), fields[3] + fields[4], fields[7]
 
 
-def _viewer(person: subprocess.Popen[bytes], said: Path) -> str:
+def _viewer(process: subprocess.Popen[bytes], said: Path) -> str:
     lines = said.read_text(encoding="utf-8", errors="replace").splitlines()
-    if person.poll() is not None:
+    if process.poll() is not None:
         return f"none: the viewer ended by itself: {lines[-1] if lines else 'it said nothing'}"
     return ", ".join(lines) or "none: nothing was shown"
 

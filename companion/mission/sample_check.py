@@ -25,7 +25,7 @@ ARM_RADIUS_M = 0.03
 """Half the thickness of servos and links, m."""
 FLOOR_GAP_M = 0.01
 TRACKING_M = 0.10
-"""Largest expected distance from the plan, m; measured in winds of 3 m/s (benchmarks/missions.py)."""
+"""Largest expected distance from the plan, m; measured over random missions in winds of 3 m/s."""
 CATCH_M = 0.20
 """The same from the catch until the impact has decayed, m."""
 CATCH_NEAR_M = 0.05

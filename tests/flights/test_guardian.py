@@ -1,4 +1,4 @@
-"""The flight process is killed or hung in the air, over real wires: the guardian lands the vehicle. benchmarks/guardian.py measures."""
+"""The flight process is killed or hung in the air, over real wires: the guardian lands the vehicle."""
 
 from __future__ import annotations
 

@@ -1,32 +1,35 @@
-"""Every wire survives some thousand damaged inputs, and every input on which it once failed. `benchmarks/fuzz.py` feeds a million."""
+"""Every wire survives some thousand damaged inputs, and every input on which it once failed. `make explore` feeds many more."""
 
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Iterator
+from pathlib import Path
+from random import Random
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from benchmarks.fuzz import REGRESSIONS
-from benchmarks.fuzzing.campaign import feed_watched, run
-from benchmarks.fuzzing.targets import NAMES, target_class
+from tests.fuzz.channels import ChannelsTarget
+from tests.fuzz.config import YamlTarget
+from tests.fuzz.dynamixel import DynamixelTarget, DynamixelWireTarget
+from tests.fuzz.force import ForceTarget
+from tests.fuzz.mavlink import MavlinkTarget, MavlinkWireTarget
+from tests.fuzz.natnet import NatNetTarget
+from tests.fuzz.target import Target, feed_watched
 
-INPUTS = {
-    "natnet": 2000,
-    "dynamixel": 2000,
-    "dynamixel-wire": 30,
-    "force": 2000,
-    "mavlink": 2000,
-    "mavlink-wire": 30,
-    "channels": 2000,
-    "yaml": 1200,
+TARGETS: dict[str, type[Target]] = {
+    target.name: target
+    for target in (
+        *(NatNetTarget, DynamixelTarget, DynamixelWireTarget, ForceTarget, MavlinkTarget, MavlinkWireTarget),
+        *(ChannelsTarget, YamlTarget),
+    )
 }
-SEED = 20
+REGRESSIONS = Path(__file__).parents[1] / "regressions" / "fuzz"
 FOUND = sorted(REGRESSIONS.glob("*.bin"))
-
-
-def target_of_file(stem: str) -> str:
-    return stem.rsplit("-", 2)[0]
+"""Inputs on which a wire once failed, as TARGET-PLACE-DAMAGE.bin."""
 
 
 @pytest.fixture(autouse=True)
@@ -39,20 +42,33 @@ def quiet() -> Iterator[None]:
     logger.setLevel(before)
 
 
-def test_every_target_is_fed_here() -> None:
-    assert set(INPUTS) == set(NAMES)
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.hypothesis
+@pytest.mark.parametrize("name", TARGETS)
 def test_damaged_input_is_borne(name: str) -> None:
-    with target_class(name)() as target:
-        stretch = run(target, SEED, 0, INPUTS[name])
-    assert stretch.inputs == INPUTS[name]
-    # Memory is judged over a million inputs, where caches and the interpreter's arenas are filled.
-    assert [str(finding) for finding in stretch.findings if finding.index is not None] == []
+    with TARGETS[name]() as target:
+
+        @given(seed=st.integers(0, 2**32 - 1))
+        def feed(seed: int) -> None:
+            rng = Random(seed)
+            for _ in range(target.inputs):
+                data = target.make(rng)
+                found = feed_watched(target, data)
+                assert found is None, f"{found}; keep the input as {REGRESSIONS}/{name}-PLACE-DAMAGE.bin: {data!r}"
+
+        files = len(os.listdir("/proc/self/fd"))
+        feed()
+        assert len(os.listdir("/proc/self/fd")) <= files, "open files pile up"
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_the_same_seed_makes_the_same_inputs(name: str) -> None:
+    one, other, third = Random(3), Random(3), Random(4)
+    inputs = [TARGETS[name]().make(one) for _ in range(3)]
+    assert [TARGETS[name]().make(other) for _ in range(3)] == inputs
+    assert [TARGETS[name]().make(third) for _ in range(3)] != inputs
 
 
 @pytest.mark.parametrize("stem", [path.stem for path in FOUND])
 def test_what_was_found_once_is_borne(stem: str) -> None:
-    with target_class(target_of_file(stem))() as target:
+    with TARGETS[stem.rsplit("-", 2)[0]]() as target:
         assert feed_watched(target, (REGRESSIONS / f"{stem}.bin").read_bytes()) is None

@@ -9,12 +9,12 @@ from pathlib import Path
 from random import Random
 from typing import ClassVar, Self
 
-from benchmarks.fuzzing.campaign import Target, Wrong, one_line
-from benchmarks.fuzzing.mutate import mutated
 from companion.config.document import ConfigError, Origin
 from companion.config.loader import load_flight, load_vehicle
 from companion.config.overrides import parse_overrides
 from companion.config.yaml_strict import SIZE_MAX_BYTES, parse_value, read_document
+from tests.fuzz.mutate import mutated
+from tests.fuzz.target import Target, Wrong, one_line
 
 _ROOT = Path(__file__).parents[2]
 _MISSION = _ROOT / "configs/missions/catch.yaml"

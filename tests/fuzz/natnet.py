@@ -10,8 +10,6 @@ import struct
 from random import Random
 from typing import ClassVar, Self
 
-from benchmarks.fuzzing.campaign import Target, Wrong, one_line
-from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
@@ -20,6 +18,8 @@ from companion.io.protocols import DeviceError
 from companion.io.px4.messages import vision_ned
 from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, NatNetServer, encode_frame, encode_model_definitions
+from tests.fuzz.mutate import mutated
+from tests.fuzz.target import Target, Wrong, one_line
 
 VERSIONS: tuple[NatNetVersion, NatNetVersion] = ("3.0", "4.1")
 _BODY_ID = 1

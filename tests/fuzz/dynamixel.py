@@ -12,8 +12,6 @@ from collections.abc import Callable
 from random import Random
 from typing import ClassVar, Self
 
-from benchmarks.fuzzing.campaign import Endless, Target, Wrong, one_line
-from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import Arm, ArmDevice, Joint
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
@@ -21,6 +19,8 @@ from companion.io.dynamixel.bus import ArmBus
 from sitl.servo.bus import ServoBus, ServoLine
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import ALERT, Instruction, fast_status, packet, status
+from tests.fuzz.mutate import mutated
+from tests.fuzz.target import Endless, Target, Wrong, one_line
 
 IDS = (11, 12)
 _WATCHDOG_MS = 100
@@ -239,7 +239,7 @@ class DynamixelWireTarget(Target):
     """An input is noise on a real pty, before or during a read by the driver."""
 
     name: ClassVar[str] = "dynamixel-wire"
-    share: ClassVar[float] = 0.01
+    inputs: ClassVar[int] = 1
 
     def __init__(self) -> None:
         self._corpus = _corpus()

@@ -14,14 +14,14 @@ from typing import Any, ClassVar, Self
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from benchmarks.fuzzing.campaign import Target, Wrong, one_line
-from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import AutopilotDevice
 from companion.guardian.link import Link, UdpWire
 from companion.guardian.px4 import Px4State
 from companion.io.px4 import messages
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.types import FlightMode, VehicleState
+from tests.fuzz.mutate import mutated
+from tests.fuzz.target import Target, Wrong, one_line
 from tests.io.px4_peer import Px4Peer, free_udp_port
 
 _SIZE_MAX_BYTES = 1500
@@ -111,7 +111,7 @@ class MavlinkWireTarget(Target):
     """An input is a datagram from the autopilot's address to the port of a running driver."""
 
     name: ClassVar[str] = "mavlink-wire"
-    share: ClassVar[float] = 0.02
+    inputs: ClassVar[int] = 1
 
     def __init__(self) -> None:
         self._corpus = corpus()

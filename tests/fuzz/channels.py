@@ -7,13 +7,13 @@ import socket
 from random import Random
 from typing import ClassVar, Self
 
-from benchmarks.fuzzing.campaign import Target, Wrong, one_line
-from benchmarks.fuzzing.mutate import mutated
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
 from companion.model.types import OperatorCommand
 from companion.recorder.client import RecorderClient
 from tests.analysis.synthetic_flight import synthetic_flight
+from tests.fuzz.mutate import mutated
+from tests.fuzz.target import Target, Wrong, one_line
 
 _SIZE_MAX_BYTES = 4000
 _TICK = next(iter(synthetic_flight()))

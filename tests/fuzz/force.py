@@ -9,13 +9,13 @@ import time
 from random import Random
 from typing import ClassVar, Self
 
-from benchmarks.fuzzing.campaign import Target, Wrong, one_line
-from benchmarks.fuzzing.mutate import mutated
 from companion.config.vehicle import ForceDevice
 from companion.io.force_torque import rft
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import RATE_CODES, Command, Wrench
 from sitl.force_torque import ForceTorqueServer
+from tests.fuzz.mutate import mutated
+from tests.fuzz.target import Target, Wrong, one_line
 
 _SIZE_MAX_BYTES = 3000
 """A pty buffers 4095 bytes."""
