@@ -22,6 +22,8 @@ from sitl.world.world import PHYSICS_DT_S, World
 from tests.support import CATCH
 
 REPEATS = 5
+NO_LOADS = {"load_rate_xyz": (0.0, 0.0, 0.0), "moment_rate": 0.0, "friction_rate": 0.0}
+"""Settings that switch the adaptive loads off."""
 _RAW_STARTS, _RAW_STEPS = 100, 50
 
 LawCall = tuple[float, PlantState, Reference, float]
@@ -35,12 +37,14 @@ def measure(say: Callable[[str], None], repeats: int = REPEATS, mission: Path = 
     """
     say("flights in the fast closed loop")
     tick_us, flight, result = flight_us(load_sitl(mission), repeats)
+    plain = flight.config.controller.model_copy(update=NO_LOADS)
     say("core, law, raw MuJoCo")
     raw_us = raw_step_us(flight.config, flight.plant.world, result, repeats)
     return {
         "core_ms": asdict(Latency.of(core_s(flight.config, result.inputs))),
         "tick_us": tick_us,
         "law_us": law_us(flight.config, result.inputs, repeats),
+        "law_without_loads_us": law_us(flight.config.model_copy(update={"controller": plain}), result.inputs, repeats),
         "raw_step_us": raw_us,
         "raw_tick_us": raw_us * TICK_PERIOD_S / PHYSICS_DT_S,
     }

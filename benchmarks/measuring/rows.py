@@ -210,6 +210,7 @@ def _core(hover: Figures, core: Figures) -> Section:
     why = _why(core)
     tick = _us(_at(core, "core_ms"))
     law, whole = _at(core, "law_us"), _at(core, "tick_us")
+    plain = _at(core, "law_without_loads_us")
     rows = [
         Row(
             what="FlightCore.step, us",
@@ -224,6 +225,14 @@ def _core(hover: Figures, core: Figures) -> Section:
             beside="raw MuJoCo",
             figures={} if law is None else {"p50": law},
             beside_figures=raw_us,
+            target=None,
+            why_not=why,
+        ),
+        Row(
+            what="the law with adaptive loads, us",
+            beside="without them",
+            figures={} if law is None else {"p50": law},
+            beside_figures={} if plain is None else {"p50": plain},
             target=None,
             why_not=why,
         ),

@@ -145,7 +145,7 @@ class AdaptiveController:
         clipped_before = sent.any_clipped
         acceleration = self._acceleration.step(dt_s, state)
         force = self._force.step(dt_s, state.force_ext_world_n)
-        learn = vertical_scale >= 1.0 and not clipped_before
+        learn = state.airborne and not clipped_before
         self._compensation.observe(dt_s, state, learn)
         body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
         error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))

@@ -50,6 +50,7 @@ class LoadAdaptation:
         """Estimated dry friction of the joints."""
         self._levers: Vec2 = (0.0, 0.0)
         self._turning: Vec2 = (0.0, 0.0)
+        self._wanted_rate_rad_s: Vec2 = (0.0, 0.0)
 
     def joint_torque_nm(self, levers_m_s2: Vec2, wanted_rate_rad_s: Vec2) -> Vec2:
         """Return the torque of the estimated gravity and friction.
@@ -62,11 +63,15 @@ class LoadAdaptation:
             return (0.0, 0.0)
         (m1, m2), (u1, u2), (f1, f2), (r1, r2) = self.moments_kg_m, levers_m_s2, self.friction_nm, wanted_rate_rad_s
         t1, t2 = self._turning = (math.tanh(r1 / FRICTION_RATE_RAD_S), math.tanh(r2 / FRICTION_RATE_RAD_S))
-        self._levers = levers_m_s2
+        self._levers, self._wanted_rate_rad_s = levers_m_s2, wanted_rate_rad_s
         return (m1 * u1 + m2 * u2 + f1 * t1, f2 * t2 - m2 * u2)
 
     def advance(self, dt_s: float, s: Rows, learn: bool) -> None:
-        """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation."""
+        """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation.
+
+        The friction of a joint changes only while the joint turns as it is meant to. At rest static friction takes any value up to its
+        limit, so s tells nothing about that limit, and s phi = -s tanh(s / 0.1) would only raise the estimate.
+        """
         if not self.on or not learn:
             return
         decay, step = self._held[dt_s]
@@ -85,5 +90,9 @@ class LoadAdaptation:
             updated(m1, rate, s6 * u1, -most, most),
             updated(m2, rate, (s6 - s7) * u2, -most, most),
         )
-        (f1, f2), rate, most = self.friction_nm, self._rate_friction, self._max_nm
-        self.friction_nm = (updated(f1, rate, s6 * t1, 0.0, most), updated(f2, rate, s7 * t2, 0.0, most))
+        (f1, f2), (r1, r2), rate, most = self.friction_nm, self._wanted_rate_rad_s, self._rate_friction, self._max_nm
+        if (r1 + s6) * t1 > FRICTION_RATE_RAD_S * abs(t1):  # r + s is the measured rate
+            f1 = updated(f1, rate, s6 * t1, 0.0, most)
+        if (r2 + s7) * t2 > FRICTION_RATE_RAD_S * abs(t2):
+            f2 = updated(f2, rate, s7 * t2, 0.0, most)
+        self.friction_nm = (f1, f2)

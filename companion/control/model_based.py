@@ -67,7 +67,7 @@ class ModelBasedLaw:
     ) -> None:
         """Compensate force and torques, and convert them to commands."""
         compensation, sent = self._compensation, self._actuation
-        compensation.observe(dt_s, state, vertical_scale >= 1.0 and not sent.any_clipped)
+        compensation.observe(dt_s, state, state.airborne and not sent.any_clipped)
         sent.step(
             dt_s,
             compensation.base_force_n(wanted_n, force_world_n, reference),

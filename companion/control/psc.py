@@ -69,11 +69,11 @@ class PscController(ModelBasedLaw):
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
-        flying = vertical_scale >= 1.0
+        airborne = state.airborne
         felt = state.acceleration_world_m_s2
         body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
         specific_z = collective_n((felt[0], felt[1], felt[2] + GRAVITY_M_S2), body_z)
-        payload_kg = self._estimator.step(dt_s, self._commanded_n, specific_z, flying)
+        payload_kg = self._estimator.step(dt_s, self._commanded_n, specific_z, airborne)
 
         force = self._force.step(dt_s, state.force_ext_world_n)
         error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
@@ -82,7 +82,7 @@ class PscController(ModelBasedLaw):
         self._send(dt_s, state, reference, wanted, torque, force, vertical_scale)
         sent = self._actuation
         self._commanded_n = sent.collective_n
-        self._integrate(dt_s, error, flying, sent.clipped)
+        self._integrate(dt_s, error, airborne, sent.clipped)
         rows = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau)
         return self._end(dt_s, error, error_rate, rows, force, payload_kg)
 
@@ -97,11 +97,11 @@ class PscController(ModelBasedLaw):
         )
         return (x, y, z + mass_kg * GRAVITY_M_S2)
 
-    def _integrate(self, dt_s: float, error: Vec8, flying: bool, clipped: tuple[bool, bool, bool]) -> None:
+    def _integrate(self, dt_s: float, error: Vec8, airborne: bool, clipped: tuple[bool, bool, bool]) -> None:
         """Integrate the position error, except on the ground and while the actuators are saturated."""
         limit = self._c.integral_max_m_s2
         for i, held in enumerate((clipped[1], clipped[1], clipped[0])):
-            if flying and not held:
+            if airborne and not held:
                 grown = self._integral_m_s2[i] + dt_s * self._c.position_ki_xyz[i] * error[i]
                 self._integral_m_s2[i] = max(-limit, min(limit, grown))
 

@@ -21,6 +21,8 @@ class PlantState(Record, frozen=True, kw_only=True):
     arm_rate_rad_s: Vec2
     force_ext_world_n: Vec3 | None = None
     """Force on the net, tared, without the net's weight, not filtered; None without a valid sample."""
+    airborne: bool = True
+    """Whether only the rotors carry the machine. While the ground may carry a part of it, no integrator of a law changes."""
 
 
 class Wrench(Record, frozen=True, kw_only=True):

@@ -131,6 +131,7 @@ class VehicleControl:
         force = None
         if i.force is not None and i.t_s - i.force.stamp_s <= self._force_timeout_s:
             force = self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
+        airborne = vertical_scale >= 1.0 and off_the_ground(i, self._ground_clearance_m)
         state = PlantState(
             position_world_m=vehicle.position_world_m,
             velocity_world_m_s=vehicle.velocity_world_m_s,
@@ -140,10 +141,10 @@ class VehicleControl:
             arm_rad=arm_rad,
             arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
             force_ext_world_n=force,
+            airborne=airborne,
         )
         self._state = state
         if self._hover_adapts:
-            airborne = off_the_ground(i, self._ground_clearance_m)
             self._hover.step(dt_s, self._thrust_sent, state, airborne, self._catch.caught_s is not None)
         self._watch_disturbance(dt_s, state, vertical_scale)
         self._law.hover_thrust = hover = self._hover.value

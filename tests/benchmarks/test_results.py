@@ -33,7 +33,7 @@ def process(cpu_percent: float, rss_mb: float) -> dict[str, float]:
 
 
 GOOD: dict[str, Any] = {
-    "core": {"core_ms": spread(0.08, 0.2), "law_us": 12.0, "tick_us": 200.0, "raw_tick_us": 20.0},
+    "core": {"core_ms": spread(0.08, 0.2), "law_us": 12.0, "law_without_loads_us": 10.0, "tick_us": 200.0, "raw_tick_us": 20.0},
     "joints": {
         "alone": {"cycle_ms": spread(0.4, 0.6), "command_ms": spread(0.02, 0.03), "wire_ms": 0.26, "request_bytes": 16,
                   "answer_bytes": 42, "write_bytes": 20, "baud_bps": 3_000_000},

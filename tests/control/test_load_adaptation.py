@@ -9,19 +9,32 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import load_flight
-from companion.control.adaptive import Adaptation
+from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.load_adaptation import LoadAdaptation
 from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import IDENTITY_QUAT, Vec2
+from companion.model.types import IDENTITY_QUAT, ControlLog, Reference, Vec2
+from tests.control.states import POSE, ZERO, at
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")
 DT_S = 0.005
 MASS_KG, DAMPING = 3.0, 9.0
 """A row M s' = -Lambda s + load - theta."""
+REFERENCE = Reference(
+    position_world_m=(0.0, 0.0, 1.0),
+    velocity_world_m_s=ZERO,
+    acceleration_world_m_s2=ZERO,
+    yaw_rad=0.0,
+    yaw_rate_rad_s=0.0,
+    arm_rad=POSE,
+    arm_rate_rad_s=(0.0, 0.0),
+    arm_acceleration_rad_s2=(0.0, 0.0),
+    jerk_world_m_s3=ZERO,
+)
 
 
 def law(**changes: Any) -> AdaptiveConfig:
@@ -82,6 +95,28 @@ def test_the_levers_of_gravity_times_the_moments_are_the_gravity_torque() -> Non
     assert (first * u1 + second * u2, -second * u2) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("held_nm", [0.15, -0.15])
+def test_static_friction_that_holds_a_joint_with_an_error_does_not_raise_the_friction_estimate(held_nm: float) -> None:
+    """At rest s = Phi e is constant and the wanted rate is -s, so that s times tanh(wanted rate) has one sign for either error."""
+    load = LoadAdaptation(law(friction_rate=0.5))
+    s = held_nm
+    for _ in range(400):
+        load.joint_torque_nm((0.0, 0.0), (-s, -s))
+        load.advance(DT_S, (0.0, 0.0, 0.0, s, s), True)
+    assert load.friction_nm == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("rate_rad_s", [0.4, -0.4])
+def test_friction_of_a_joint_that_turns_slower_than_wanted_grows_by_the_integral_of_its_lag(rate_rad_s: float) -> None:
+    load = LoadAdaptation(law(friction_rate=0.5))
+    s = -0.05 * math.copysign(1.0, rate_rad_s)
+    for _ in range(200):
+        load.joint_torque_nm((0.0, 0.0), (rate_rad_s - s, rate_rad_s - s))
+        load.advance(DT_S, (0.0, 0.0, 0.0, s, s), True)
+    grown_nm = 0.5 * 200 * DT_S * 0.05 * math.tanh(0.45 / 0.1)
+    assert load.friction_nm == pytest.approx((grown_nm, grown_nm), rel=1e-9)
+
+
 row = st.floats(-1e3, 1e3)
 
 
@@ -95,6 +130,26 @@ def test_estimates_stay_inside_their_bounds_for_any_input(inputs: list[tuple[flo
         assert max(map(abs, load.force_n)) <= config.load_max_n
         assert max(map(abs, load.moments_kg_m)) <= config.moment_max_kg_m
         assert 0.0 <= min(load.friction_nm) <= max(load.friction_nm) <= config.friction_max_nm
+
+
+def test_adaptive_loads_and_observer_hold_while_the_ground_may_carry_a_part_of_the_weight() -> None:
+    config = law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=0.05, disturbance_time_xyz_s=(0.5, 0.5, 0.5))
+    controller = AdaptiveController(config, CONFIG.vehicle, 0.5)
+
+    def pressed(airborne: bool) -> ControlLog:
+        """One second 0.1 m above the reference, as on the ground at the end of a landing."""
+        state = replace(at(position=(0.0, 0.0, 1.1), arm=(POSE[0], POSE[1] + 0.05)), airborne=airborne)
+        for _ in range(200):
+            log = controller.step(DT_S, state, REFERENCE, 1.0).log
+        return log
+
+    flown = pressed(True)
+    assert flown.load_estimate_n is not None
+    assert flown.load_estimate_n[2] < -5.0
+    stood = pressed(False)
+    assert stood.load_estimate_n == flown.load_estimate_n
+    assert stood.moment_estimate_kg_m == flown.moment_estimate_kg_m
+    assert stood.tau[2] == pytest.approx(flown.tau[2], abs=0.1), "only the robust term still moves"
 
 
 def test_nothing_is_learned_in_saturation() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from companion.analysis.log import FlightLog
 from companion.analysis.replay import flight_core, replay
@@ -112,7 +113,7 @@ def test_the_integral_part_ends_a_lasting_error_and_is_bounded() -> None:
     assert after - before == pytest.approx(gained, rel=1e-3, abs=1e-6)
     grounded = controller(config)
     for _ in range(400):
-        grounded.step(0.005, low, REFERENCE, 0.99)
+        grounded.step(0.005, replace(low, airborne=False), REFERENCE, 1.0)
     assert grounded.step(0.005, low, REFERENCE, 1.0).collective_n == pytest.approx(before, abs=1e-9)
 
 
@@ -165,7 +166,7 @@ def test_the_estimate_is_in_the_log_and_comes_out_of_a_replay_bit_for_bit(tmp_pa
     log = FlightLog.read(record(log_of(flight.config.flight, flight.run(), None), tmp_path / "flight.mcap"))
     estimates = [o.control.payload_estimate_kg for o in log.outputs if o.control is not None]
     assert None not in estimates
-    assert len(set(estimates)) > 900
+    assert len(set(estimates)) > 700
     assert replay(log, flight_core).first_difference is None
 
 
