@@ -27,6 +27,8 @@ Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
 _TOPICS = tuple(_RECORDS)
 """Topics in the order of a tick's records in the file."""
+_FORMER_KEY, _KEY = b'"bent_by"', b'"limited_by"'
+"""A key of /outputs in logs of the previous release, and its present name."""
 
 
 class LogError(Exception):
@@ -74,7 +76,7 @@ class FlightLog:
                 elif isinstance(record, Message):
                     topic = channels[record.channel_id]
                     if topic in _RECORDS:
-                        rows.take(topic, from_json(_RECORDS[topic], record.data))
+                        rows.take(topic, from_json(_RECORDS[topic], record.data.replace(_FORMER_KEY, _KEY)))
                 elif isinstance(record, Metadata):
                     metadata[record.name] = dict(record.metadata)
                 elif isinstance(record, Footer):

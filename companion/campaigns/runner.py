@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.campaigns.process import CampaignError, CampaignProcess, Message
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 from companion.sitl_config.loader import SitlConfig
 
 Row = dict[str, Any]
@@ -152,7 +152,7 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
     if flown.messages:
         _publish(campaign, flown, out, console)
     for note in flown.notes:
-        tell(f"companion {campaign.name}: {note}")
+        print_error(f"companion {campaign.name}: {note}")
     if flown.messages and not campaign.good(flown.rows):
         return EXIT_LOST
     return flown.code
@@ -212,7 +212,7 @@ def _publish(campaign: Campaign, flown: Flown, out: Path, console: Console | Non
     try:
         _write(campaign, flown, table, out)
     except OSError as error:
-        tell(f"companion {campaign.name}: {error.filename or out}: cannot be written: {error.strerror}")
+        print_error(f"companion {campaign.name}: {error.filename or out}: cannot be written: {error.strerror}")
         flown.code = flown.code or EXIT_LOST
     if console is None:
         sys.stdout.write(to_json(table))
@@ -229,7 +229,7 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     try:
         pictures = campaign.draw(flown.messages, out)
     except ImportError:
-        tell(f"companion {campaign.name}: plots need matplotlib: pip install 'companion[analysis]'")
+        print_error(f"companion {campaign.name}: plots need matplotlib: pip install 'companion[analysis]'")
         pictures = []
     page = campaign.page(rows, pictures)
     record = {

@@ -13,7 +13,7 @@ from companion.config.document import ConfigError
 from companion.ground.protocol.keys import user_name
 from companion.ground.protocol.messages import Topic
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 
 if TYPE_CHECKING:
     from companion.ground.broker.check import CheckResult
@@ -78,16 +78,16 @@ def _init(arguments: argparse.Namespace) -> int:
     except ImportError as error:
         if (error.name or "").partition(".")[0] != "cryptography":
             raise
-        tell("companion broker init: certificates need cryptography: pip install 'companion[ground]'")
+        print_error("companion broker init: certificates need cryptography: pip install 'companion[ground]'")
         return EXIT_REFUSED
     if not arguments.folder.strip():
-        tell("companion broker init: DIR: expected the name of a folder, got an empty name")
+        print_error("companion broker init: DIR: expected the name of a folder, got an empty name")
         return EXIT_BAD_INPUT
     folder = Path(arguments.folder).absolute()
     now = datetime.datetime.now(datetime.UTC)
     if arguments.renew_certificates:
         if arguments.operator or arguments.viewer or arguments.vehicle:
-            tell(
+            print_error(
                 "companion broker init: --renew-certificates creates no users: remove --operator, --viewer and --vehicle"
             )
             return EXIT_BAD_INPUT
@@ -107,7 +107,7 @@ def _init(arguments: argparse.Namespace) -> int:
     try:
         broker_setup.create(folder, users, now)
     except broker_setup.SetupError as error:
-        tell(f"companion broker init: {error}")
+        print_error(f"companion broker init: {error}")
         return EXIT_REFUSED
     print("\n".join(_instructions(folder, users, str(broker_setup.certificate_expiry(folder)))))
     return EXIT_OK
@@ -170,7 +170,7 @@ def _check(arguments: argparse.Namespace) -> int:
     try:
         found = check(access, arguments.vehicle)
     except CheckError as error:
-        tell(error)
+        print_error(error)
         return EXIT_REFUSED
     who = access.username or "anonymous (no login)"
     print(f"{access.address}: connected as {who}{', ' + found.tls if found.tls else ', not encrypted'}")

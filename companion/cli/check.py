@@ -38,7 +38,7 @@ from companion.preflight.hand_test.record import record_path
 from companion.preflight.px4 import PARAM_ID
 from companion.recorder.client import RecorderProcess
 from companion.runtime.clock import flight_clock
-from companion.runtime.console import console_on, tell
+from companion.runtime.console import console_on, print_error
 from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.loader import SitlConfig
 
@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> i
     try:
         rows = _rows(task, tuple(found), scratch, people)
     except LaunchError as error:  # it names a log, which stays
-        tell(f"companion check: {error}")
+        print_error(f"companion check: {error}")
         return EXIT_REFUSED
     except BaseException:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> i
 
 def _plan_only(arguments: argparse.Namespace, config: FlightConfig, found: list[str]) -> int:
     for line in found:
-        tell(line)
+        print_error(line)
     if found:
         return EXIT_BAD_INPUT
     print(f"{arguments.mission}: mission {config.mission.name!r} can be flown by {config.vehicle.name}")
@@ -163,7 +163,9 @@ async def _unless_interrupted(look: Coroutine[Any, Any, list[Row]]) -> list[Row]
 async def _look(task: Task, config: FlightConfig, known: Observations, line: _Line, people: Console) -> list[Row]:
     clock, sitl = flight_clock(), task.sitl is not None
     async with open_available(config, clock, lambda device: line(f"opening: {device}")) as devices:
-        rows = await preflight.preflight(devices, config, clock, out=Path("flights"), tell=line, known=known, sitl=sitl)
+        rows = await preflight.preflight(
+            devices, config, clock, out=Path("flights"), progress=line, known=known, sitl=sitl
+        )
         if task.hand:
             line.stop()
             rows += await run_hand_test(devices, config, people, task.json, record=None if sitl else record_path())
@@ -203,7 +205,7 @@ class _Line:
         """Show a message of the simulated world while it starts."""
         if message.get("type") == "progress":
             if self._status is None:
-                tell(f"companion check: {message['text']}")
+                print_error(f"companion check: {message['text']}")
             self(str(message["text"]))
 
     def stop(self) -> None:

@@ -18,7 +18,7 @@ from companion.ground.station.link import BrokerRefused
 from companion.ground.station.station import Station
 from companion.ground.station.vehicles import LIVE_S
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 from companion.runtime.tasks import until_first
 
 FOUND_S = 5.0
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         asyncio.run(until_first(station.run(), commander.command(station)))
     except BrokerRefused as error:
-        tell(f"companion command: {error}")
+        print_error(f"companion command: {error}")
         return EXIT_REFUSED
     return commander.code
 
@@ -128,7 +128,7 @@ class _Commander:
                         names = []  # a retained state is no proof of a flight
                     elif len(proven := station.tracker.proven(time.monotonic())) == 1:
                         others = ", ".join(name for name in names if name not in proven)
-                        tell(
+                        print_error(
                             f"companion command: sent to {proven[0]}; no proven messages from: {others}; "
                             "to command another: --vehicle NAME"
                         )
@@ -162,8 +162,8 @@ class _Commander:
         if isinstance(note, Sent):
             self._sent = True
         else:
-            tell(f"companion command: {note.vehicle}: {note.command.value}: {note.text}")
+            print_error(f"companion command: {note.vehicle}: {note.command.value}: {note.text}")
 
     def _end(self, code: int, text: str) -> None:
         self.code = code
-        tell(f"companion command: {text}")
+        print_error(f"companion command: {text}")

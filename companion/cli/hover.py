@@ -10,7 +10,7 @@ from typing import Any
 from companion.analysis.hover_fit import SLOPE_MIN_V, HoverFit, HoverFitError, fit_hover_thrust
 from companion.analysis.log import FlightLog, LogError
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 
 _DIGITS = 4
 """Digits of a printed or written hover thrust: 0.01 % of full thrust."""
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         log = FlightLog.read(arguments.log)
         fit = fit_hover_thrust(log)
     except (LogError, HoverFitError) as error:
-        tell(error)
+        print_error(error)
         return EXIT_BAD_INPUT
     if arguments.json:
         print(json.dumps(jsonable(fit), indent=2, allow_nan=False))

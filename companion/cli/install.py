@@ -23,7 +23,7 @@ from companion.install.plan import Plan, Settings, isolation, plan
 from companion.install.record import RECORD_PATH, load, under_root
 from companion.install.state import InstallError
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 
 USER = "companion"
 MISSION = "/etc/companion/mission.yaml"
@@ -86,22 +86,24 @@ def run(arguments: argparse.Namespace) -> int:
     """Plan, show, ask and apply; returns the exit code."""
     root = Path(os.path.abspath(arguments.root))
     if not root.is_dir():
-        tell(f"companion install: --root {arguments.root}: expected a folder that holds a system")
+        print_error(f"companion install: --root {arguments.root}: expected a folder that holds a system")
         return EXIT_BAD_INPUT
     if arguments.json and not (arguments.yes or arguments.dry_run):
-        tell("companion install: --json cannot ask: add --yes or --dry-run")
+        print_error("companion install: --json cannot ask: add --yes or --dry-run")
         return EXIT_BAD_INPUT
     if root == Path("/") and os.geteuid() != 0 and not arguments.dry_run:
-        tell(f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; --dry-run does not")
+        print_error(
+            f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; --dry-run does not"
+        )
         return EXIT_REFUSED
     try:
         with _terminable():
             return _undo(arguments, root) if arguments.undo else _install(arguments, root)
     except InstallError as error:
-        tell(f"companion install: {error}")
+        print_error(f"companion install: {error}")
         return EXIT_REFUSED
     except (KeyboardInterrupt, EOFError):
-        tell("companion install: cancelled")
+        print_error("companion install: cancelled")
         return EXIT_ABORTED
 
 
@@ -119,7 +121,7 @@ def _install(arguments: argparse.Namespace, root: Path) -> int:
     if not arguments.json:
         print("\n".join([*explanations, *(line for _, line in _summary(wanted, found, live))]), flush=True)
     if not arguments.yes and not _agreed("Apply these changes?"):
-        tell("companion install: cancelled; nothing was changed")
+        print_error("companion install: cancelled; nothing was changed")
         return EXIT_ABORTED
     say = (lambda _: None) if arguments.json else print
     changed = apply.install(root, wanted, settings.user, say)
@@ -147,7 +149,7 @@ def _undo(arguments: argparse.Namespace, root: Path) -> int:
                 print(f"removes the user {user}")
         return EXIT_OK
     if not arguments.yes and not _agreed(f"Restore {len(paths)} files as they were?"):
-        tell("companion install: cancelled; nothing was changed")
+        print_error("companion install: cancelled; nothing was changed")
         return EXIT_ABORTED
     apply.undo(root, (lambda _: None) if arguments.json else print)
     if arguments.json:

@@ -20,7 +20,7 @@ from companion.config.loader import FlightConfig
 from companion.install.extras import missing_extra
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from companion.runtime.console import tell, terminal_console
+from companion.runtime.console import print_error, terminal_console
 from companion.runtime.subprocesses import use_default_signals
 from companion.sitl_config.loader import SitlConfig, load_sitl
 
@@ -61,25 +61,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = _normalised(list(sys.argv[1:] if argv is None else argv))
     arguments, unknown = _parser(words[:1]).parse_known_args(words)
     if unknown:
-        tell(
+        print_error(
             f"companion {arguments.command}: unknown arguments: {' '.join(unknown)}; see companion {arguments.command} --help"
         )
         return EXIT_BAD_INPUT
     arguments.command_line = shlex.join(["companion", *words])
     missing = missing_extra(arguments)
     if missing is not None:
-        tell(missing)
+        print_error(missing)
         return EXIT_REFUSED
     try:
         code: int = arguments.run(arguments)
     except ConfigError as error:
         for line in error.lines:
-            tell(line)
+            print_error(line)
         return EXIT_BAD_INPUT
     except BrokenPipeError:
         return EXIT_OK
     except KeyboardInterrupt:
-        tell(f"companion {arguments.command}: interrupted")
+        print_error(f"companion {arguments.command}: interrupted")
         return EXIT_ABORTED
     return code
 
@@ -212,7 +212,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from companion.cli import check as check_command  # with it comes MAVSDK
 
     if arguments.sitl not in (None, "stub", "px4"):
-        tell(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
+        print_error(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
     hardware = arguments.sitl is None and not arguments.plan_only
     return check_command.run(arguments, _load(arguments, hardware=hardware), _problems)
@@ -223,10 +223,10 @@ def _fly(arguments: argparse.Namespace) -> int:
     from companion.launcher.run import run_flight
 
     if arguments.sitl not in (None, "stub", "px4"):
-        tell(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
+        print_error(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
     if arguments.out is not None and not arguments.out.strip():
-        tell("companion fly: --out: expected the name of a folder, got an empty one")
+        print_error("companion fly: --out: expected the name of a folder, got an empty one")
         return EXIT_BAD_INPUT
     if arguments.mqtt is not None:
         off = arguments.mqtt == "off"
@@ -239,13 +239,13 @@ def _fly(arguments: argparse.Namespace) -> int:
     problems = [*_problems(config), *_nobody_could_start(config)]
     if problems:
         for line in problems:
-            tell(line)
+            print_error(line)
         return EXIT_BAD_INPUT
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     out = Path(arguments.out) if arguments.out else Path("flights") / f"{stamp}-{config.mission.name}"
     problem = why_unusable(out, "flight.mcap")
     if problem is not None:
-        tell(f"companion fly: --out {out}: {problem}")
+        print_error(f"companion fly: --out {out}: {problem}")
         return EXIT_BAD_INPUT
     return run_flight(config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report)
 

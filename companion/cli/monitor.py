@@ -21,7 +21,7 @@ from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import signer_of
 from companion.ground.station.link import BrokerRefused
 from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 from companion.runtime.tasks import until_first
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             _serve(arguments)
     except (_Refusal, BrokerRefused) as error:
-        tell(f"companion monitor: {error}")
+        print_error(f"companion monitor: {error}")
         return EXIT_REFUSED
     return EXIT_OK
 
@@ -168,14 +168,14 @@ def _read(paths: Sequence[Path]) -> list[ReplayLog]:
     logs = []
     for number, path in enumerate(paths):
         if sys.stderr.isatty():
-            tell(f"companion monitor: reading {path} ...")
+            print_error(f"companion monitor: reading {path} ...")
         logs.append(read_for_page(path, number))
     return logs
 
 
 def _open(url: str) -> None:
     if not webbrowser.open(url):
-        tell("companion monitor: --open: no browser found; open the address above")
+        print_error("companion monitor: --open: no browser found; open the address above")
 
 
 def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:

@@ -21,7 +21,7 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.px4 import params_file
 from companion.px4.params_file import PACKAGED, Value, value_text
 from companion.runtime.clock import flight_clock
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 
 if TYPE_CHECKING:
     from companion.io.px4.driver import MavsdkAutopilot
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         return asyncio.run(_run(arguments, wanted, device, path.name))
     except DeviceError as error:
-        tell(error)
+        print_error(error)
         return EXIT_REFUSED
 
 
@@ -87,13 +87,15 @@ async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: 
             _print(arguments, comparison, None, None)
             return EXIT_OK if comparison.same else EXIT_REFUSED
         if await _armed(autopilot):
-            tell(f"autopilot {device.address}: expected a disarmed PX4, found it armed; land and disarm before writing")
+            print_error(
+                f"autopilot {device.address}: expected a disarmed PX4, found it armed; land and disarm before writing"
+            )
             return EXIT_REFUSED
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
         backup = arguments.backup or Path(f"px4_{stamp}.params")
         problem = _back_up(backup, comparison.differences, await autopilot.firmware(), source)
         if problem is not None:
-            tell(problem)
+            print_error(problem)
             return EXIT_BAD_INPUT
         result = await write(autopilot, comparison.differences)
     _print(arguments, comparison, result, backup)

@@ -19,7 +19,7 @@ from companion.campaigns.side_by_side.flight import Flight, flight_of
 from companion.config.document import ConfigError
 from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.model.types import Outcome
-from companion.runtime.console import tell
+from companion.runtime.console import print_error
 
 PAGE = "side_by_side.html"
 RESULT = "side_by_side.json"
@@ -156,7 +156,7 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
 
     flight = graded(path)
     if flight.note is not None:
-        tell(flight.note)
+        print_error(flight.note)
     if arguments.gif is not None:
         _write_gif(flight, arguments.gif)
     if arguments.json:
@@ -201,7 +201,7 @@ def _several(paths: Sequence[Path], arguments: argparse.Namespace) -> int:
     for n, (path, name) in enumerate(zip(paths, names_of(paths), strict=True)):
         flight = graded(path)
         if flight.note is not None:
-            tell(flight.note)
+            print_error(flight.note)
         flights.append(flight_of(chr(ord("A") + n), name, str(path), _digest(path), flight.log, flight.summary))
         del flight  # one log at a time: the ticks of a long one take half a GB
     comparison = compare(flights, arguments.align)
@@ -217,7 +217,7 @@ def _several(paths: Sequence[Path], arguments: argparse.Namespace) -> int:
     except ImportError:
         return _no_pictures()
     for line in comparison.cautions:
-        tell(line)
+        print_error(line)
     if not arguments.json:
         print(page)
     return EXIT_OK
@@ -289,5 +289,5 @@ def _unwritable(out: Path, error: OSError) -> ConfigError:
 
 
 def _no_pictures() -> int:
-    tell("companion report: plots need matplotlib: pip install 'companion[analysis]'")
+    print_error("companion report: plots need matplotlib: pip install 'companion[analysis]'")
     return EXIT_REFUSED

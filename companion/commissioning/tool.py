@@ -27,7 +27,7 @@ from companion.io.protocols import DeviceError
 from companion.model.check_row import Level, Row, refusals
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from companion.preflight.checks import Check
-from companion.runtime.console import console_on, tell
+from companion.runtime.console import console_on, print_error
 
 SCHEMA_VERSION: Final = 1
 VEHICLE: Final = "configs/vehicles/tarot650_2r.yaml"
@@ -148,11 +148,11 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
         report = tool.fit(collected, session.vehicle)
     except DeviceError as error:
         if tool.device is None:
-            tell(error)
+            print_error(error)
             return EXIT_REFUSED
         report = Report([tool.device.bad(str(error), "", "")], tool.no_data)
     except GivenUp as end:
-        tell(f"companion {tool.name}: {end}")
+        print_error(f"companion {tool.name}: {end}")
         return EXIT_ABORTED
     patch = propose(arguments.vehicle, report.changes) if report.changes else None
     written = str(patch.write()) if patch and _may_write(session, tool.family, patch) else None

@@ -1,8 +1,8 @@
 """Adaptive impedance control without a model of the coupling (paper, eqs. control_law and adaptive_law_full; corrected, discrete).
 
-The rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. PX4's attitude loop owns the attitude rows: they are masked out of every
-norm and get no torque. The order of the steps is that of docs/control-law.md. The zero-order hold is exact, so H and zeta stay >= 0 for
-any input.
+The rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. PX4's attitude loop controls the attitude rows: they are masked out of
+every norm and get no torque. The order of the steps is that of docs/control-law.md. The zero-order hold is exact, so H and zeta stay >=
+0 for any input.
 
 Sums over the five active rows are written out, with the row in every name (`s0` to `s2` for x y z, `s6` and `s7` for the joints),
 because plain floats are several times as fast as loops or arrays.
@@ -274,7 +274,7 @@ class AdaptiveController:
     ) -> Vec2:
         """Return the joint torques: tau and gravity, plus the configured (M_arm - M_d) alpha''* + C alpha' and friction at alpha'*.
 
-        The star marks what the target impedance asks for now: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d - Phi e +
+        The star marks the target impedance's present request: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d - Phi e +
         gamma = alpha' - s.
         """
         t6, t7 = tau[3], tau[4]

@@ -1,6 +1,6 @@
-"""What a law may compensate beyond its own terms: measured force, estimated disturbances, the attitude loop's delay, joint friction.
+"""Optional compensation for every law: measured force, estimated disturbances, delay of the attitude loop, joint friction.
 
-Every law has the same, so that laws can be compared with the same extras.
+All laws share it, so that they can be compared with the same options.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FRICTION_RATE_RAD_S = 0.1
 
 
 class CompensationConfig(Protocol):
-    """The part of a law's configuration that concerns its extras."""
+    """The part of a law's configuration that sets its compensation."""
 
     @property
     def force_feedforward_xyz(self) -> Vec3:
@@ -47,13 +47,13 @@ class CompensationConfig(Protocol):
 
 
 class Compensation:
-    """Forces and torques to add to those of a law.
+    """Computes forces and torques in addition to those of a law.
 
     Args:
-        config: of the law.
+        config: configuration of the law.
         vehicle: nominal machine.
-        answered_xyz: share of the measured force, per world axis, that the law itself answers, so that the observer leaves it alone.
-        inertia_xy_kg: inertia that the law gives the base along x and y, for the lead.
+        answered_xyz: share of the measured force, per world axis, that the law itself compensates; the observer does not estimate it.
+        inertia_xy_kg: inertia along x and y that the law imposes on the base, used for the feedforward's lead.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Compensation:
         self._observer.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
 
     def base_force_n(self, wanted_n: Vec3, force: Vec3, reference: Reference) -> Vec3:
-        """Return the wanted force with the measured force, the estimated disturbance and the lead compensated, world frame."""
+        """Return the desired force with the measured force, the estimated disturbance and the lead compensated, world frame."""
         (x, y, z), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = wanted_n, force, self._observer.force_n, self._force_share
         x -= c0 * f0 + d0
         y -= c1 * f1 + d1
@@ -93,7 +93,7 @@ class Compensation:
         return (x, y, z)
 
     def joint_torque_nm(self, torque_nm: Vec2, wanted_rate_rad_s: Vec2) -> Vec2:
-        """Return the torques with friction added along the rates that the joints are meant to have. Along the measured rates it would
+        """Return the torques with friction added along the reference joint rates. Along the measured rates it would
         shake a joint at rest.
         """
         if self._friction_nm == 0.0:
@@ -105,6 +105,6 @@ class Compensation:
         )
 
     def remember(self, sent_n: Vec3, force: Vec3) -> None:
-        """Store the known force for the observer. It contains the measured force as far as it is accounted for."""
+        """Store the known force for the observer. It contains the part of the measured force that is accounted for."""
         (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
         self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)

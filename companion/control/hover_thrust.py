@@ -83,10 +83,10 @@ class HoverThrust:
             thrust_sent: normalised thrust sent in the last tick. At its limits the estimate does not change.
             state: state of this tick.
             airborne: whether only the rotors carry the machine.
-            carrying: whether a payload was caught. Without a force sensor the estimate does not change then.
+            carrying: whether a payload was caught; without a force sensor the estimate is then frozen.
         """
         force = state.force_ext_world_n
-        # The filters follow in any case: when learning sets in they must not start from stale values.
+        # The filters are always updated, so that learning does not start from stale values.
         balance = self._balance.step(
             dt_s, thrust_sent, state.acceleration_world_m_s2, force or (0.0, 0.0, 0.0), state.attitude_wxyz
         )

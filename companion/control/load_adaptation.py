@@ -1,13 +1,13 @@
-"""Adaptive estimates of loads that are linear in unknown constants: what the norm-bounding gains of the paper cannot cancel.
+"""Adaptive estimates of loads that are linear in unknown constants, which the paper's norm-bounding gains cannot cancel.
 
     theta' = Gamma phi' s - nu_theta theta,    each theta_i projected to its bounds
 
 phi holds a constant for each of x, y and z (an unknown force: weight, wind, tilt, rotors that lose thrust), the levers of gravity of
-both links (their first moments, payload included), and the direction in which each joint is meant to turn (dry friction). tau contains
+both links (their first moments, payload included), and the commanded direction of each joint (dry friction). tau contains
 the estimated load. With V_theta = (theta - theta*)' Gamma^-1 (theta - theta*) / 2 added to the paper's Lyapunov function, the term
 s' phi (theta* - theta) of V' cancels for constant theta*; leakage, projection and a load that varies leave a bounded remainder, as the
 leakage of H does (eq. adaptive_law_full). s is integrated and not e: at s = 0 the target impedance holds, so a measured force still
-moves the arm as K_d and K_p say.
+moves the arm according to K_d and K_p.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class LoadAdaptation:
 
         Args:
             levers_m_s2: gravity times the cosine of each link's elevation (`Manipulator.gravity_levers_m_s2`).
-            wanted_rate_rad_s: rate of each joint that the target impedance asks for.
+            wanted_rate_rad_s: joint rates that the target impedance requests.
         """
         if not self.on:
             return (0.0, 0.0)
@@ -80,7 +80,7 @@ class LoadAdaptation:
 
         def updated(value: float, rate: float, error: float, low: float, high: float) -> float:
             new = decay * value - step * rate * error
-            # NaN fails every comparison and leaves the value as it is: an estimate has no way back from it.
+            # NaN fails every comparison and leaves the value unchanged: an estimate could never recover from NaN.
             return new if low <= new <= high else low if new < low else high if new > high else value
 
         (x, y, z), (rx, ry, rz), n = self.force_n, self._rate_xyz, self._max_n

@@ -15,7 +15,7 @@ from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec8
 
 
 class ModelBasedConfig(ActuationConfig, CompensationConfig, Protocol):
-    """The part of a model-based law's configuration that concerns the measured force."""
+    """The part of a model-based law's configuration for the measured force."""
 
     @property
     def force_lowpass_hz(self) -> float:
@@ -33,7 +33,7 @@ class ModelBasedLaw:
         config: configuration of the law.
         vehicle: the nominal machine, without payload.
         hover_thrust: normalised thrust that carries it, 0 to 1.
-        answered_xyz: share of the measured force, per world axis, that the law itself answers.
+        answered_xyz: share of the measured force, per world axis, that the law itself compensates.
         model_mass_scale: ratio of the model's masses to the nominal ones.
     """
 

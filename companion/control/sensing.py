@@ -110,7 +110,7 @@ class CatchDetector:
     LEFT_SHARE = 0.3
     """The net is empty when the force, in any direction, is less than this share of the measured payload's weight."""
     LEFT_TIME_S = 0.5
-    """Time for which the force must stay below that share. A bump from below unloads the net for less."""
+    """Time for which the force must stay below that share. A bump from below unloads the net for a shorter time."""
     FALLING_SHARE = 0.6
     """Share of gravity. With less specific force the whole machine falls, and the force of a payload in the net is small as well."""
     LOWPASS_S, WEIGHT_S = 0.05, 1.0
@@ -142,7 +142,7 @@ class CatchDetector:
             return False
         if self._pull / self._samples < -self.PULL_N:
             self.caught_s = self._blow_s
-            self._weight_n = self.PULL_N  # the mean has the blow in it
+            self._weight_n = self.PULL_N  # the mean contains the impact
             self._carried_n, self._last_s, self._light_since_s = force_world_n, t_s, None
             return True
         self._blow_s = None
@@ -160,7 +160,7 @@ class CatchDetector:
 
         Args:
             t_s: flight clock.
-            force_world_n: force on the net, or None if it is not known.
+            force_world_n: force on the net, or None if unknown.
             acceleration_z_m_s2: vertical acceleration of the vehicle, upwards.
         """
         if self.caught_s is None:

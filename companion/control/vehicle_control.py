@@ -103,7 +103,7 @@ class VehicleControl:
     def fold(self, i: Inputs, dt_s: float) -> Command:
         """Return no setpoint for the vehicle and move the arm to its folded pose at a limited rate."""
         goal, step = self.fold_rad, FOLD_RATE_RAD_S * dt_s
-        # Never held yet: from where it is.
+        # Not held before: start from the present angle.
         now = self._arm_target_rad or (i.arm.angle_rad if i.arm is not None else None)
         if now is None:
             return Command()
@@ -178,5 +178,5 @@ class VehicleControl:
         state = self._state
         if self._catch.caught_s is None or state is None:
             return False
-        # Not what the law logs: that is zero while the sensor is silent, too.
+        # Not the law's log record, which is zero while the sensor is silent, too.
         return self._catch.left(t_s, state.force_ext_world_n, state.acceleration_world_m_s2[2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 _MOST = 64
-"""Largest number of stored steps: a simulation has a handful of step lengths, a real clock as many as ticks."""
+"""Largest number of stored steps: a simulation has a few step lengths, a real clock one per tick."""
 
 
 class HoldTable(dict[float, tuple[float, ...]]):

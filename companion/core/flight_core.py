@@ -59,13 +59,13 @@ class FlightCore:
         self._tether_watched = False
         self._last_t_s: float | None = None
         self._pose_s = -math.inf
-        """Stamp of the newest believed pose, which was passed on to PX4."""
+        """Stamp of the newest trusted pose, which was passed on to PX4."""
         self._reference: Reference | None = None
-        """What the law followed last, as the governor has limited it."""
+        """Reference that the law followed last, constrained by the governor."""
         self._limited_by: tuple[str, ...] = ()
         self._log: ControlLog | None = None
         self._refused: tuple[Refusal, ...] = ()
-        """What the gate rejected in the last tick; reported once when it begins."""
+        """Commands that the gate rejected in the last tick; a new rejection is reported once."""
 
     def step(self, inputs: Inputs) -> Outputs:
         """Take one control tick."""
@@ -112,12 +112,12 @@ class FlightCore:
             outcome=state.over,
             mocap_trusted=self._monitors.mocap_trusted,
             tether=self._situation.tether,
-            bent_by=self._limited_by,
+            limited_by=self._limited_by,
             mocap_innovation_m=self._monitors.mocap_innovation_m,
         )
 
     def _dt_s(self, t_s: float) -> float:
-        """Time since the tick before, limited."""
+        """Return the time since the previous tick, limited."""
         last_s, self._last_t_s = self._last_t_s, t_s
         if last_s is None:
             return TICK_PERIOD_S
@@ -126,7 +126,7 @@ class FlightCore:
     # -- observation -----------------------------------------------------------------------------------------------
 
     def _observe(self, inputs: Inputs) -> tuple[tuple[Event, ...], Observation]:
-        """Run the monitors and the tether watch. Return this tick's events, and what the transition reads."""
+        """Run the monitors and the tether watch. Return this tick's events and the observation for the transition."""
         situation, stage = self._situation, self._state.stage
         if stage is not self._situation_stage:
             self._situation_stage = stage
@@ -140,7 +140,7 @@ class FlightCore:
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:
             situation.airborne, situation.found_armed = found_armed(inputs, self._parameters.clearance_m)
-        # The monitors judge the tether of the tick before: what is believed of this tick's state is not known yet.
+        # The monitors evaluate the tether of the previous tick: this tick's state is not validated yet.
         events = self._monitors.check(inputs, situation)
         i = self._monitors.trusted
         assert i is not None
@@ -174,7 +174,7 @@ class FlightCore:
         )
 
     def _carry_out(self, request: Request, i: Inputs) -> None:
-        """Do what a transition requests of the core itself."""
+        """Execute the requests of a transition to the core."""
         if i.mocap is not None and i.mocap.tracking_valid:
             self._pose_s = i.mocap.stamp_s
         if request.resumed:

@@ -1,4 +1,4 @@
-"""The state of one flight, what a transition reads and what it requests: frozen records."""
+"""State of one flight, input and requests of a transition: frozen records."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from companion.safety.touchdown import Touchdown
 
 
 class Tare(Enum):
-    """A step of weighing the net with the force sensor."""
+    """Step of the force sensor's tare."""
 
     BEGIN = "begin"
     COLLECT = "collect"  # add this tick's sample
@@ -29,28 +29,28 @@ class Tare(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """What is known while the vehicle waits on the ground for inputs, estimate, tare and, if the mission says so, its start."""
+    """State while the vehicle waits on the ground for inputs, estimate, tare and, if the mission requires it, a start command."""
 
     tare_start_s: float | None = None
     was_ready: bool = False
-    """It had everything once: what it lost since may come back for as long as the operator waits."""
+    """Everything was ready before: a lost input may return for as long as the operator waits."""
     unready: str = "the inputs have not been checked yet"
-    """Why it is not ready."""
+    """Why the vehicle is not ready."""
     looked_s: float = 0.0
-    """When estimate and place were judged last."""
+    """Time of the last check of estimate and position."""
     settled: SettledEstimate = field(default_factory=SettledEstimate)
 
 
 @dataclass(frozen=True, slots=True)
 class FlightState:
-    """Everything that `companion.core.state_machine` remembers from tick to tick."""
+    """Everything that `companion.core.state_machine` keeps from tick to tick."""
 
     touchdown: Touchdown
     rotor_stop: RotorStop
-    """Of the stages that disarm."""
+    """State of the rotor stop, for the stages that disarm."""
     stage: Stage = Stage.WAIT
     entered_s: float | None = None
-    """When the stage was entered; None before the first tick."""
+    """Flight clock when the stage was entered; None before the first tick."""
     supervisor: SupervisorState = field(default_factory=SupervisorState)
     outcome: Outcome | None = None
     plan: Plan | None = None
@@ -58,7 +58,7 @@ class FlightState:
     course: Course | None = None
     """Flown course with its clock; None before arming."""
     aborting: bool = False
-    """Whether the course is an abort's, not the mission's."""
+    """Whether the course is an abort and no longer the mission."""
     mission_start_s: float | None = None
     armed_by_others: bool = False
     """PX4 was armed without a request of the companion: no setpoint is sent."""
@@ -68,20 +68,20 @@ class FlightState:
     """The landing by PX4 needs level setpoints with zero thrust."""
     waiting: Waiting = Waiting()
     landing: AutopilotLanding | None = None
-    """The landing by PX4, from its begin on."""
+    """Landing by PX4, once it has begun."""
 
     @property
     def pilot_flies(self) -> bool:
-        """A pilot has the vehicle: nothing is sent."""
+        """Return whether a pilot flies the vehicle, so that nothing is sent."""
         return self.stage is Stage.AUTOPILOT_LAND and self.landing is not None and self.landing.pilot
 
     @property
     def over(self) -> Outcome | None:
-        """The outcome, once nothing more is to be done."""
+        """Return the outcome once the flight has ended; None before."""
         return self.outcome if self.stage is Stage.DONE else None
 
     def phase(self, t_s: float) -> tuple[str, PhaseKind]:
-        """Return the name of what is going on, for the operator, and its kind, for programs."""
+        """Return the phase: its name for the operator, its kind for programs."""
         stage = self.stage
         if stage is Stage.PLAN and self.course is not None:
             segment = self.course.segment(t_s)
@@ -111,32 +111,32 @@ class FlightState:
 
 
 class Observation(Record, frozen=True):
-    """What a transition reads beside state and events."""
+    """Input of a transition in addition to state and events."""
 
     inputs: Inputs
-    """Only what is believed of this tick's inputs."""
+    """Validated inputs of this tick."""
     airborne: bool
     """The rotors may lift, or PX4 was found armed and flying."""
     armed_by_others: bool
     """PX4 is armed before the companion has requested it."""
     standing: str | None
-    """What the vehicle must hold for, if the operator asks to resume; None: nothing."""
+    """Rule that forbids to resume, because it still requires a hold; None if there is none."""
     reference: Reference | None
-    """What the law followed in the last tick; None before its first."""
+    """Reference that the law followed in the last tick; None before its first tick."""
     tether: TetherState | None
     thrust_share: float
-    """Of hover thrust, in the last command."""
+    """Share of hover thrust in the last command."""
     pose_s: float
-    """Stamp of the newest believed pose before this tick; -inf before the first."""
+    """Stamp of the newest trusted pose before this tick; -inf before the first."""
 
 
 class Request(Record, frozen=True):
-    """What a transition asks the core to do."""
+    """Requests of a transition to the core."""
 
     autopilot: AutopilotRequest = AutopilotRequest.NONE
     events: tuple[Event, ...] = ()
-    """Those that the transition got, and then its own."""
+    """Events that the transition received, followed by its own."""
     tare: tuple[Tare, ...] = ()
-    """Steps of the tare, in this order."""
+    """Steps of the tare, in order."""
     resumed: bool = False
-    """The operator has ended a HOLD: rules that hold raise their events again."""
+    """The operator has ended a HOLD: active rules raise their events again."""

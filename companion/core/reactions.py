@@ -1,4 +1,4 @@
-"""What the safety state means for the flight: the supervisor's update, and the reaction when the action becomes graver. Pure."""
+"""Effect of the safety state on the flight: updates the supervisor and reacts when its action escalates. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HOLD_ABOVE_M = 0.3
 """Margin over standing height below which the vehicle lands instead of holding."""
 _BY_OPERATOR = (OPERATOR_LAND, OPERATOR_ABORT, notices.CALLED_OFF.id)
 _EXPIRED = {
-    notices.HOLD_EXPIRED.id: (notices.HOLD_EXPIRED, "no command has ended the hold in time; landing"),
+    notices.HOLD_EXPIRED.id: (notices.HOLD_EXPIRED, "no command ended the hold in time; landing"),
     notices.RETRACT_EXPIRED.id: (notices.RETRACT_EXPIRED, "the retract took too long; landing here"),
 }
 # Looking up members of an enum costs time in every tick.
@@ -57,7 +57,7 @@ def _escalate(t: Transition) -> None:
 
 
 def _react(t: Transition) -> None:
-    """React to an action that has become graver."""
+    """React to an escalated action."""
     state, action = t.state, t.state.supervisor.action
     if action.rank < _HOLD.rank:
         return
@@ -89,7 +89,7 @@ def _react(t: Transition) -> None:
 
 
 def _hold_on_ground(t: Transition) -> None:
-    """Call the take-off off. A flight that waits for its start continues to wait."""
+    """Cancel the take-off. A flight that waits for its start continues to wait."""
     waits = t.parameters.waits_for_start and t.state.stage in (Stage.WAIT, Stage.READY)
     if not waits and not t.state.armed_by_others:
         text = "hold commanded before take-off; the vehicle stays on the ground"
@@ -146,7 +146,7 @@ def _land(t: Transition) -> None:
 
 
 def _allowed_velocity(t: Transition, now: Reference) -> Vec3:
-    """Return the velocity that a stop may begin with, m/s: nothing outward or up while the tether pulls."""
+    """Return the start velocity of a stop, m/s, without its outward and upward parts while the tether pulls."""
     tether = t.o.tether
     if tether is not None and (tether.taut or tether.snagged):
         return inward_only(now.velocity_world_m_s, now.position_world_m, t.parameters.vehicle.tether.anchor_world_m)

@@ -1,4 +1,4 @@
-"""The stages of one flight: what each waits for, requests from PX4, and does when it takes too long. Pure."""
+"""The stages of one flight: what each waits for, what it requests from PX4, and its timeout. Pure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from companion.safety.notices import Notice
 ARMED_SHOWN_S = 1.5
 """PX4's HEARTBEAT reports once a second whether it is armed: after a request to arm, an older "not armed" proves nothing."""
 NO_TOUCHDOWN_S = 5.0
-"""Time after the plan's end without a touchdown, until PX4 lands."""
+"""Timeout of the touchdown after the plan's end; then PX4 lands."""
 _NONE = AutopilotRequest.NONE
 
 
@@ -47,7 +47,7 @@ def _wait(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 
 def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
-    """Wait until every input has arrived and PX4 has followed motion capture for as long as the tare takes."""
+    """Wait until every input has arrived and PX4 has followed motion capture for the duration of the tare."""
     i, was_ready = t.i, t.state.waiting.was_ready
     overdue = elapsed_s > seq.WAIT_TIMEOUT_S and not was_ready
     missing = missing_inputs(i)
@@ -95,7 +95,7 @@ def _is_ready(t: Transition) -> None:
 
 
 def _ready(t: Transition, _: float) -> AutopilotRequest:
-    """Wait until the operator starts the take-off, or until something that the flight needs is lost again."""
+    """Wait until the operator starts the take-off or a required input is lost."""
     i, waiting = t.i, t.state.waiting
     missing = missing_inputs(i)
     problem = _nothing_from(missing) if missing else unfused(i)
@@ -134,7 +134,7 @@ def _weigh(t: Transition) -> None:
 
 
 def _misplaced(t: Transition) -> list[str]:
-    """Return in what the vehicle's pose differs from the mission's start; empty if it does not."""
+    """Return how the vehicle's pose differs from the mission's start, or an empty text if it does not."""
     vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
     assert vehicle is not None and arm is not None
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
@@ -142,7 +142,7 @@ def _misplaced(t: Transition) -> list[str]:
 
 
 def _take_off(t: Transition) -> None:
-    """Plan the mission from where the vehicle stands now, and enter OFFBOARD."""
+    """Plan the mission from the present position and enter OFFBOARD."""
     vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
     assert vehicle is not None and arm is not None
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
@@ -152,7 +152,7 @@ def _take_off(t: Transition) -> None:
 
 def _decline_start(t: Transition) -> None:
     waits = t.parameters.waits_for_start
-    text = t.state.waiting.unready if waits else "this flight takes off by itself as soon as it can"
+    text = t.state.waiting.unready if waits else "this flight takes off by itself as soon as it is ready"
     t.report(notices.START_DECLINED, text)
 
 

@@ -17,13 +17,13 @@ from companion.safety.events import OPERATOR_START
 def transition(
     parameters: Parameters, state: FlightState, events: tuple[Event, ...], observation: Observation
 ) -> tuple[FlightState, Request]:
-    """Return the state after a tick, and what it requests. Pure: the same arguments give the same results.
+    """Return the state after a tick, and its requests.
 
     Args:
-        parameters: what does not change during the flight.
-        state: after the tick before; `Parameters.initial_state` in the first tick.
-        events: what the monitors report in this tick.
-        observation: what else is known in this tick.
+        parameters: constants of the flight.
+        state: state after the previous tick; `Parameters.initial_state` in the first tick.
+        events: events of the monitors in this tick.
+        observation: other inputs of this tick.
     """
     t = Transition(parameters, state, events, observation)
     if state.entered_s is None:

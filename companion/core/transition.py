@@ -1,4 +1,4 @@
-"""One transition in progress: the flight's state so far, and what is reported and requested on the way."""
+"""One transition in progress: the flight's state, and the reports and requests collected so far."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Parameters:
 
     @classmethod
     def of(cls, config: FlightConfig) -> Parameters:
-        """Return those of an effective configuration."""
+        """Return the constants of an effective configuration."""
         vehicle, safety = config.vehicle, config.vehicle.safety
         return cls(
             config=config,
@@ -57,7 +57,7 @@ class Parameters:
 
 
 def event_of(notice: Notice, t_s: float, text: str, severity: Severity | None = None) -> Event:
-    """Return the event of a notice; with the severity of its row if none is given."""
+    """Return the event of a notice, by default with the severity of its row."""
     return Event(
         t_s=t_s,
         id=notice.id,
@@ -71,10 +71,10 @@ class Transition:
     """Collects what a transition changes, reports and requests; lives for one tick.
 
     Args:
-        parameters: of the flight.
-        state: before the tick.
-        events: of the monitors in this tick.
-        observation: of this tick.
+        parameters: constants of the flight.
+        state: state before the tick.
+        events: events of the monitors in this tick.
+        observation: other inputs of this tick.
     """
 
     __slots__ = ("events", "i", "o", "parameters", "pose_s", "resumed", "start_asked", "state", "tare")
@@ -103,11 +103,11 @@ class Transition:
         self.state = replace(self.state, waiting=replace(self.state.waiting, **fields))
 
     def report(self, notice: Notice, text: str, severity: Severity | None = None) -> None:
-        """Add an event; with the severity of its row if none is given."""
+        """Add an event, by default with the severity of its row."""
         self.events.append(event_of(notice, self.i.t_s, text, severity))
 
     def report_rule(self, rule_id: str, action: SafetyAction, text: str) -> None:
-        """Add the event of a rule that the sequence finds by itself, with CRITICAL severity."""
+        """Add the event of a rule that the sequence evaluates itself, with CRITICAL severity."""
         self.events.append(
             Event(
                 t_s=self.i.t_s, id=rule_id, severity=Severity.CRITICAL, action=action, text=without_negative_zero(text)
@@ -115,7 +115,7 @@ class Transition:
         )
 
     def enter(self, stage: Stage, *, pilot_flies: bool = False, flipped: bool = False) -> None:
-        """Enter a stage. For a landing by PX4: `pilot_flies` if it is only watched, `flipped` if that is already known."""
+        """Enter a stage. For a landing by PX4: `pilot_flies` if it is only monitored, `flipped` if the vehicle has flipped."""
         p, t_s = self.parameters, self.i.t_s
         if stage is Stage.AUTOPILOT_LAND:
             self.enter_landing(pilot_flies, self.pose_s, flipped)
@@ -125,7 +125,7 @@ class Transition:
             self.change(stage=stage, entered_s=t_s)
 
     def enter_landing(self, pilot_flies: bool, pose_s: float, flipped: bool = False) -> None:
-        """Enter the landing by PX4; `pose_s` is the stamp of the newest pose that PX4 has had, -inf if that is not known."""
+        """Enter the landing by PX4; `pose_s` is the stamp of the newest pose that PX4 received, -inf if unknown."""
         p, t_s = self.parameters, self.i.t_s
         landing = AutopilotLanding.begin(
             t_s, p.clearance_m, p.tilt_max_rad, pilot_flies, pose_s=pose_s, flipped=flipped
@@ -133,7 +133,7 @@ class Transition:
         self.change(stage=Stage.AUTOPILOT_LAND, entered_s=t_s, landing=landing)
 
     def finish(self, outcome: Outcome) -> None:
-        """Set the outcome. A graver one replaces it, a better one never does."""
+        """Set the outcome. A later outcome replaces it only if it is worse."""
         if self.state.outcome in (None, Outcome.COMPLETED) or outcome is Outcome.CRASHED:
             self.change(outcome=outcome)
 
@@ -143,6 +143,6 @@ class Transition:
         self.enter(Stage.STAND_DOWN)
 
     def leave_mission(self, plan: Plan) -> None:
-        """Fly this plan from now on; the mission is over."""
+        """Replace the mission by this plan."""
         self.finish(Outcome.ABORTED)
         self.change(course=Course(plan, self.i.t_s), aborting=True)

@@ -6,7 +6,7 @@ from companion.model.flight_stage import PILOT_FLIES, Stage
 from companion.model.types import OperatorCommand, Outputs, PhaseKind, SafetyAction
 
 Effect = tuple[bool, str]
-"""Whether the command was accepted (it had an effect, or its request is already fulfilled), and what was done or why nothing was."""
+"""Whether the command was accepted (executed, or fulfilled before), and a text with the action or the reason of the refusal."""
 
 _RISING = frozenset({Stage.OFFBOARD.value, Stage.ARM.value, Stage.SPOOL.value})
 """Phases between the start command and the take-off."""
@@ -59,9 +59,9 @@ def _hold(before: Outputs | None, after: Outputs) -> Effect:
     if action is SafetyAction.RETRACT:
         return False, "HOLD rejected: the vehicle is in RETRACT and will land"
     if action.rank > SafetyAction.HOLD.rank or after.phase_kind is PhaseKind.LANDING:
-        return False, "not held: it is landing"
+        return False, "hold rejected: the vehicle is landing"
     held_already = before is not None and before.action is SafetyAction.HOLD
-    return True, "holding already" if held_already else "holding"
+    return True, "already holding" if held_already else "holding"
 
 
 def _resume(before: Outputs | None, after: Outputs) -> Effect:
@@ -74,7 +74,7 @@ def _resume(before: Outputs | None, after: Outputs) -> Effect:
         return False, f"resume refused: {_instead(after)}"
     if after.phase_kind is PhaseKind.LANDING:
         return True, "the landing continues"
-    return True, "going on"
+    return True, "continuing"
 
 
 def _start(before: Outputs | None, after: Outputs) -> Effect:
@@ -86,7 +86,7 @@ def _start(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase in _RISING:
         return True, "taking off"
     if after.phase_kind is PhaseKind.DONE:
-        return False, "start refused: it stands down"
+        return False, "start refused: the vehicle stands down"
     return False, _NOT_GROUNDED
 
 
@@ -95,9 +95,9 @@ def _instead(after: Outputs) -> str:
     if after.phase_kind is PhaseKind.GROUND:
         return "on the ground"
     if after.action is SafetyAction.RETRACT:
-        return "it goes back along the tether and lands"
+        return "the vehicle returns along the tether and lands"
     if after.action.rank > SafetyAction.HOLD.rank or after.phase_kind is PhaseKind.LANDING:
-        return "it is landing"
+        return "the vehicle is landing"
     return "not holding"
 
 
@@ -106,9 +106,9 @@ def _events(outputs: Outputs) -> dict[str, str]:
 
 
 _DOWN = frozenset({OperatorCommand.LAND, OperatorCommand.ABORT})
-_NOT_GROUNDED = "start refused: in the air already"
+_NOT_GROUNDED = "start refused: already in the air"
 _NOTHING = {
-    OperatorCommand.HOLD: "not held",
+    OperatorCommand.HOLD: "hold rejected",
     OperatorCommand.RESUME: "nothing to resume",
     OperatorCommand.START: "start refused",
 }

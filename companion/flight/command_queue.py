@@ -13,7 +13,7 @@ from companion.model.types import GroundCommand, OperatorCommand, Outputs, Safet
 from companion.runtime import ipc
 
 WAITING_MAX = 32
-"""Largest number of queued commands. Of more than that the least severe are refused."""
+"""Largest number of queued commands. Beyond it the least severe are refused."""
 _GRAVEST_FIRST = {
     command: rank
     for rank, command in enumerate(
@@ -78,7 +78,7 @@ class Operator:
         dropped = []
         for asked in commands:
             if asked.command in _STOPS:
-                why = f"a {asked.command.value} was commanded after it"
+                why = f"a {asked.command.value} was commanded later"
                 dropped += [Dropped(one, why) for one in self._waiting if one.command not in _STOPS]
                 self._waiting = [one for one in self._waiting if one.command in _STOPS]
             self._waiting.append(asked)
@@ -90,8 +90,8 @@ class Operator:
     def next(self) -> Turn:
         """Return the commands of this tick.
 
-        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick, and the same
-        one again comes a tick later, because the core counts rising edges. A RESUME that names another hold than the active one is
+        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick, and a
+        repeated one waits another tick, because the core counts rising edges. A RESUME that names another hold than the active one is
         refused.
         """
         waiting = self._waiting
@@ -148,7 +148,7 @@ class Operator:
             await asyncio.wait((task, land), return_when=asyncio.FIRST_COMPLETED)
         finally:
             land.cancel()
-            task.cancel()  # does nothing to one that is done
+            task.cancel()  # has no effect on a finished task
             await asyncio.wait((task, land))  # a device that is opening closes itself again within its own deadline
         if task.cancelled():
             raise GivenUp
@@ -158,7 +158,7 @@ class Operator:
         with contextlib.suppress(BlockingIOError):
             while True:
                 message = ipc.receive(self._channel)
-                if message is None:  # nobody watches any more
+                if message is None:  # no caller waits
                     asyncio.get_running_loop().remove_reader(self._channel)
                     self._land.set()
                     return

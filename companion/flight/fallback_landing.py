@@ -16,7 +16,7 @@ from companion.runtime.clock import Clock
 
 LANDING_TIMEOUT_S = 30.0
 STATUS_MIN_AGE_S = 1.5
-"""PX4 says once a second whether it is armed; an older word does not count."""
+"""PX4 reports once a second whether it is armed; an older report does not count."""
 UNFLOWN_HOVER_THRUST = 0.5
 """Hover thrust for a vehicle that was found in the air: the core requires one, and its law never runs there."""
 
@@ -28,7 +28,7 @@ class Lander(Protocol):
         """Return the latest status."""
 
     def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
-        """Send a setpoint; with None no more setpoints are sent."""
+        """Send a setpoint; None stops the setpoints."""
 
     def request(self, request: AutopilotRequest) -> None:
         """Start a request."""
@@ -37,19 +37,19 @@ class Lander(Protocol):
 async def land_without_core(
     autopilot: Lander, channel: socket.socket, clock: Clock, guardian: FlightGuard | None
 ) -> Outcome:
-    """Ask PX4 to land, and watch; people who fly are left alone, for as long as they do. PX4 disarms by itself: COM_DISARM_LAND.
+    """Command PX4 to land and monitor it, without interfering with a pilot. PX4 disarms by itself (COM_DISARM_LAND).
 
     Args:
-        autopilot: open.
-        channel: to the launcher.
+        autopilot: open driver.
+        channel: channel to the launcher.
         clock: the flight clock.
-        guardian: told that this process is alive.
+        guardian: connection that receives heartbeats of this process.
 
     Returns:
-        ABORTED once PX4 has disarmed, LOST if it has not within `LANDING_TIMEOUT_S`.
+        ABORTED once PX4 has disarmed, LOST if it does not disarm within `LANDING_TIMEOUT_S`.
     """
-    # MAVSDK's Offboard plugin would go on repeating the last setpoint, and PX4's own failsafe would never act.
-    with contextlib.suppress(Exception):  # whatever it is, LAND must be requested
+    # MAVSDK's Offboard plugin would keep repeating the last setpoint, and PX4's own failsafe would never act.
+    with contextlib.suppress(Exception):  # LAND must be requested after any error
         autopilot.send_attitude(None)
     start_s = clock()
     while clock() - start_s < LANDING_TIMEOUT_S:

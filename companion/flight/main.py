@@ -108,7 +108,7 @@ class Flight:
             self._missed += now.lateness_s > self._period_s
             self._report(tick, outputs, sent)
             if self._devices.ground is not None:
-                self._devices.ground.tell(inputs, outputs)
+                self._devices.ground.report_tick(inputs, outputs)
             if self._guardian is not None:
                 self._guardian.tick(inputs, outputs)
             if outputs.outcome is not None:
@@ -138,7 +138,7 @@ class Flight:
         outputs = self._core.step(inputs)
         devices.vision.open = outputs.mocap_trusted
         core_s = self._clock()
-        # The setpoint first: handing over the currents wakes the bus thread, which wants the interpreter for itself.
+        # The setpoint first: passing the currents wakes the bus thread, which competes for the interpreter.
         attitude_sent = devices.autopilot.send_attitude(outputs.attitude)
         setpoint_s = self._clock()
         torque_sent: Vec2 | None = None
@@ -177,9 +177,7 @@ class Flight:
         ipc.send(self._channel, {"type": "command", "t_s": after.mission_t_s, **message})
 
     def _goes_on(self, outputs: Outputs) -> bool:
-        """Return whether a PX4 that was armed when its link was opened still is. If not there is nothing to land and no
-        mission to fly.
-        """
+        """Return whether a PX4 that was found armed is still armed. If not, there is nothing to land and no mission to fly."""
         goes_on = any(event.id == REATTACHED for event in outputs.events)
         lines = [f"landing without it: {line}" for line in self._devices.failures]
         if not goes_on:
@@ -207,14 +205,14 @@ class Flight:
         if self._devices.ground is not None:
             for text in self._devices.ground.take_messages():
                 self._tell_forwarding(outputs.t_s, text)
-        self._tell_ground()
+        self._report_ground()
         ipc.send(self._channel, self._status(tick, outputs, sent))
 
     def _tell_forwarding(self, t_s: float, text: str) -> None:
         self._recorder.client.text(t_s, Severity.INFO, "ground", text)
         ipc.send(self._channel, {"type": "ground", "text": text})
 
-    def _tell_ground(self) -> None:
+    def _report_ground(self) -> None:
         """Report the state of the link to ground stations when it changes."""
         client = self._recorder.client
         gone = client.gone and client.telemetry_status is not None
@@ -293,7 +291,7 @@ async def fly(
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(operator.attention())
         devices = await operator.unless_land(stack.enter_async_context(open_devices(config, clock)))
-        if devices.found_armed:  # it flies, perhaps: nothing is waited for
+        if devices.found_armed:  # the vehicle may be flying: do not wait
             config = unflown(config)
         else:
             checked = await operator.unless_land(check_before_flight(devices, config, clock, out, channel, sitl))
@@ -325,7 +323,7 @@ async def fly(
             if not devices.found_armed:
                 recorder.client.metadata("autopilot", {"firmware": await devices.autopilot.firmware()})
             if checked is not None:
-                checked.tell(recorder.client)
+                checked.log_to(recorder.client)
             guardian = FlightGuard(client, devices.autopilot.identity(), origin_s) if client is not None else None
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
@@ -336,14 +334,14 @@ async def fly(
             ipc.send(channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got})
             try:
                 outcome = await flight.run()
-            except Exception:  # whatever broke in here, the vehicle may be in the air
+            except Exception:  # after any error the vehicle may be in the air
                 with contextlib.suppress(
                     OSError, ValueError
-                ):  # a full disk under flight.log costs the words, not the landing
+                ):  # a full disk under flight.log loses the text, not the landing
                     traceback.print_exc()
                     sys.stderr.flush()
                 if guardian is not None and guardian.would_take_over:
-                    os._exit(EXIT_INTERNAL)  # at once and for good: the guardian lands, and nothing here may disturb it
+                    os._exit(EXIT_INTERNAL)  # end at once: the guardian lands, and this process must not disturb it
                 outcome = await land_without_core(devices.autopilot, channel, clock, guardian)
             if guardian is not None and outcome is not Outcome.LOST:
                 guardian.goodbye(devices.autopilot.status())
@@ -363,7 +361,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--guardian", type=int, required=True, help="socket to the guardian")
     parser.add_argument("--sitl", action="store_true", help="the devices are those of the simulated world")
     arguments = parser.parse_args(argv)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the launcher's: it asks for a landing
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher handles Ctrl-C and requests a landing
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     channel = socket.socket(fileno=arguments.channel)
     channel.setblocking(False)

@@ -40,7 +40,7 @@ class Checked:
     """Plan from the mission's start pose."""
     rows: tuple[Row, ...]
 
-    def tell(self, recorder: RecorderClient) -> None:
+    def log_to(self, recorder: RecorderClient) -> None:
         """Send planned path and preflight to log and ground stations."""
         path = [[round(value, 4) for value in point] for point in path_of(self.plan)]
         recorder.metadata("plan", {"json": json.dumps(path), "mission_s": repr(self.plan.duration_s)})
@@ -64,13 +64,13 @@ async def check_before_flight(
         Refused: a row refuses.
     """
 
-    def tell(text: str, share: float) -> None:
+    def report(text: str, share: float) -> None:
         ipc.send(channel, {"type": "preflight_progress", "text": text, "share": share})
 
-    # A path takes seconds to plan, once in a process: here, where motion capture goes on flowing meanwhile.
+    # A path takes seconds to plan, once in a process: here, while motion capture keeps flowing.
     plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
     known = Observations(start_s=0.0, duration_s=0.0, mission_s=plan.duration_s)
-    rows = await preflight.preflight(devices, config, clock, out=out, tell=tell, known=known, sitl=sitl)
+    rows = await preflight.preflight(devices, config, clock, out=out, progress=report, known=known, sitl=sitl)
     ipc.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
     try:
         preflight.write(rows, out)

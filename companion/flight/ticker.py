@@ -77,7 +77,7 @@ class Ticker:
         if frame_s is not None:
             if self._in_place(frame_s):
                 behind_s = start_s - frame_s
-            # Of the due moment next to it: the frame may have come just after a tick that did not wait for it.
+            # Relative to the nearest deadline: the frame may have arrived just after a tick that did not wait for it.
             error_s = math.remainder(frame_s - self._due_s, self._period_s)
             if -EARLY_S <= error_s <= LATE_S:
                 self._in_place_s = frame_s

@@ -120,7 +120,7 @@ class Guardian:
         self._errors: set[str] = set()
         """Internal errors that have been reported."""
         self._link_reported = False
-        """The link is closed, and that has been reported."""
+        """Whether the closed link has been reported."""
         self._reopen_s = float("-inf")
         """Earliest `time.monotonic` at which a lost link is opened again."""
         self._silent_s = 0.0
@@ -177,7 +177,7 @@ class Guardian:
     def _readiness_problem(self, now_s: float, last: Heartbeat | None) -> str | None:
         """Return why the guardian could not land the vehicle now as well as the flight process could, or None if it could.
 
-        In the air, missing motion capture is no problem of the guardian while the flight process receives none either: both would
+        In the air, missing motion capture does not make the guardian unready while the flight process receives none either: both would
         land without it.
         """
         if self._problem is not None or self._mocap is None:
@@ -211,7 +211,7 @@ class Guardian:
             link.wire.close()
 
     def _open_link(self, last: Heartbeat) -> Link | None:
-        """Open the flight process's link, again and again while another process holds it. None if that fails for LINK_TIMEOUT_S."""
+        """Open the flight process's link, repeatedly while another process holds it. Return None if that fails for LINK_TIMEOUT_S."""
         deadline_s = time.monotonic() + LINK_TIMEOUT_S
         while True:
             wire = self._try_wire(last)
@@ -300,7 +300,7 @@ class Guardian:
 
     @contextlib.contextmanager
     def _contain_errors(self, last: Heartbeat, landing: TakeoverLanding, what: str) -> Iterator[None]:
-        """Report an exception and go on: nothing stands behind the guardian."""
+        """Report an exception and continue, because the guardian has no backup."""
         try:
             yield
         except Exception as error:

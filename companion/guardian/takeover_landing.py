@@ -32,7 +32,7 @@ HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1
 """PX4 sends its mode once a second on its own; the guardian requests it more often."""
 LINK_TIMEOUT_S = 1.0
-"""On a `udpin` link PX4 is heard before anything can be sent to it; after this timeout the landing starts without having heard it."""
+"""On a `udpin` link PX4's address is unknown before its first message; after this timeout the landing starts without it."""
 MODE_TIMEOUT_S = 0.15
 """PX4's mode is requested first, because a pilot may fly; without an answer for this long PX4 is commanded to land."""
 REPEAT_S = 0.25
@@ -44,7 +44,7 @@ TOUCH_DOWN = "touchdown"
 DISARMED_AFTER_S = 1.5
 """PX4 reports once a second whether it is armed; a status from before the takeover is ignored for this long."""
 ATTEMPTS_MAX = 4
-"""Landing attempts of 30 s each, as long as PX4 is heard, before the vehicle counts as lost."""
+"""Landing attempts of 30 s each, while PX4 sends messages, before the vehicle counts as lost."""
 _STREAMS = (
     (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50.0),
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 50.0),
@@ -103,7 +103,7 @@ class TakeoverLanding:
         self._requested_s = float("-inf")
         self._notified: set[str] = set()
         self.overturned = False
-        """The vehicle was flipped or tipped over, and its rotors were commanded to stop."""
+        """Whether the rotors were commanded to stop because the vehicle was flipped or tipped over."""
         self.landed: bool | None = None
         """None while the landing runs. True: on the ground and disarmed (or PX4 does not answer). False: no landing was confirmed."""
 
@@ -113,7 +113,7 @@ class TakeoverLanding:
         return self._pose
 
     def status(self) -> AutopilotStatus | None:
-        """Return PX4's newest status, or None if it was never heard."""
+        """Return PX4's newest status, or None before its first HEARTBEAT."""
         return self._px4.status()
 
     def take_poses(self, poses: Iterable[MocapPose]) -> None:

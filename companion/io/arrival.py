@@ -20,7 +20,7 @@ of that.
 
 
 def stamp_arrivals(opened: socket.socket) -> None:
-    """Make the kernel timestamp datagrams on arrival (SO_TIMESTAMPNS). Where it cannot, `arrived_s` returns the time of the read."""
+    """Make the kernel timestamp datagrams on arrival (SO_TIMESTAMPNS). If it cannot, `arrived_s` returns the time of the read."""
     with contextlib.suppress(OSError):
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 

@@ -1,4 +1,4 @@
-"""Opens the devices of the vehicle: all of them for a flight, those that can be opened for a check."""
+"""Opens the devices of the vehicle: all of them for a flight; for a check, those that can be opened."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ARM_TIMEOUT_S = 1.5
 
 @dataclass(slots=True)
 class VisionFilter:
-    """Forwards poses of motion capture to PX4 while it is open; the core closes it while it does not trust them."""
+    """Forwards motion-capture poses to PX4 while it is open; the core closes it while it does not trust them."""
 
     open: bool = True
     watch: Callable[[MocapPose], None] | None = None
@@ -37,7 +37,7 @@ class VisionFilter:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """All devices of a flight, open. None only if PX4 was found armed: then it lands with what could be opened."""
+    """All open devices of a flight. A device is None only if PX4 was found armed and the device could not be opened."""
 
     vision: VisionFilter
     autopilot: Autopilot
@@ -54,7 +54,7 @@ class Devices:
 
 @dataclass(slots=True)
 class AvailableDevices:
-    """The devices that could be opened; None for the others."""
+    """Devices that could be opened; the others are None."""
 
     vision: VisionFilter
     autopilot: Autopilot | None = None
@@ -102,7 +102,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
                 failures.append(f"arm {config.vehicle.devices.arm.port}: not open within {ARM_TIMEOUT_S:g} s")
             if ground_address is not None:
                 failures.append(
-                    f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded in a flight found under way"
+                    f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded because PX4 was found armed"
                 )
             yield Devices(
                 vision=vision,
@@ -126,21 +126,21 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
 
 @contextlib.asynccontextmanager
 async def open_available(
-    config: FlightConfig, clock: Clock, tell: Callable[[str], None] = lambda _: None
+    config: FlightConfig, clock: Clock, show: Callable[[str], None] = lambda _: None
 ) -> AsyncIterator[AvailableDevices]:
     """Open the devices that can be opened and list the errors of the others.
 
     Args:
         config: addresses and settings.
         clock: the flight clock.
-        tell: called with the name of each device before it is opened, for the operator.
+        show: called with the name of each device before it is opened, for the operator.
     """
     available = AvailableDevices(VisionFilter())
     async with contextlib.AsyncExitStack() as stack:
 
         @contextlib.contextmanager
         def noted(device: str, name: str) -> Iterator[None]:
-            tell(name)
+            show(name)
             try:
                 yield
             except DeviceError as error:
@@ -158,7 +158,7 @@ async def open_available(
 
 
 async def _is_armed(autopilot: Autopilot) -> bool:
-    """Wait for PX4's status; False if none arrives, because then nothing can take off."""
+    """Return whether PX4 is armed; False if no status arrives, because then nothing can take off."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(STATUS_TIMEOUT_S):
             while autopilot.status() is None:  # noqa: ASYNC110 - written by MAVSDK's threads

@@ -1,4 +1,4 @@
-"""The devices of a vehicle as flight and preflight see them. Hardware and SITL differ in addresses only.
+"""Protocols of the vehicle's devices, for flight and preflight. Hardware and SITL differ in addresses only.
 
 A device is an async context manager: entering it opens and checks it within a deadline, leaving it shuts it down safely and never
 raises because the device is gone. Entering raises `DeviceError`. `latest()` never blocks and does no I/O.
@@ -34,7 +34,7 @@ from companion.model.types import (
 
 
 class DeviceError(Exception):
-    """A device is absent or wrong. The text is one line: device, address, what was expected, what was found, how to fix it."""
+    """A device is absent or wrong. The text is one line: device, address, expected, found, and how to fix it."""
 
 
 class Device(Protocol):
@@ -51,19 +51,19 @@ class Autopilot(Device, Protocol):
     """PX4."""
 
     def vehicle(self) -> VehicleState | None:
-        """Return the latest fused state in world ENU / body FLU, or None before the first complete one."""
+        """Return the latest fused state in world ENU / body FLU, or None before the first complete state."""
 
     def status(self) -> AutopilotStatus | None:
-        """Return the latest slow state, or None before the first heartbeat."""
+        """Return the latest status, or None before the first heartbeat."""
 
     def estimator(self) -> EstimatorReport | None:
         """Return the latest report of PX4's estimator, or None before the first."""
 
     def counts(self) -> StateCounts:
-        """Return the numbers of messages of the fast state since the link was opened."""
+        """Return the number of state messages since the link was opened."""
 
     def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
-        """Send a setpoint at once; with None no more setpoints are sent. Return False if nothing was sent."""
+        """Send a setpoint at once; None stops the setpoints. Return False if nothing was sent."""
 
     def send_vision(self, pose: MocapPose) -> bool:
         """Send a pose of motion capture at once. Return False if nothing was sent."""
@@ -72,7 +72,7 @@ class Autopilot(Device, Protocol):
         """Send a request without waiting for the answer, unless the same request is in progress."""
 
     def take_messages(self) -> list[str]:
-        """Return the messages of PX4 and about its link since the last call, oldest first."""
+        """Return PX4's messages and notices about its link since the last call, oldest first."""
 
     def identity(self) -> LinkIdentity:
         """Return the ids of both ends of the link."""
@@ -145,7 +145,7 @@ class ForceTorque(Device, Protocol):
     """The force-torque sensor."""
 
     product_name: str
-    """As the sensor reports it."""
+    """Product name that the sensor reports."""
     firmware: str
     """Version of the sensor's firmware; empty if it does not report one."""
 
@@ -163,7 +163,7 @@ class GroundLink(Device, Protocol):
     def line(self) -> str:
         """Destination of the forwarded MAVLink, as one line for the operator."""
 
-    def tell(self, inputs: Inputs, outputs: Outputs) -> None:
+    def report_tick(self, inputs: Inputs, outputs: Outputs) -> None:
         """Report one control tick to the ground station."""
 
     def take_messages(self) -> list[str]:

@@ -11,7 +11,7 @@ from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
 from companion.model.types import Outcome
-from companion.runtime.console import FlightDisplay, print_result, tell
+from companion.runtime.console import FlightDisplay, print_error, print_result
 from companion.runtime.ipc import Message
 from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.loader import SitlConfig
@@ -41,11 +41,11 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
             except LaunchError as error:
                 result = FlightResult(Outcome.REFUSED, lines=(str(error),))
         for line in result.lines:
-            tell(line)
+            print_error(line)
         try:
             log, summary = _summary(config, result, out)
         except OSError as error:
-            tell(f"{out}: summary.json cannot be written: {error.strerror}")
+            print_error(f"{out}: summary.json cannot be written: {error.strerror}")
             return result.exit_code
     page = None
     if log is not None and report:
@@ -53,9 +53,9 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
             with console.status("writing the report"):
                 page = report_of(log, summary, out)
         except KeyboardInterrupt:
-            tell(f"report cancelled; write it with: companion report {out / 'flight.mcap'}")
+            print_error(f"report cancelled; write it with: companion report {out / 'flight.mcap'}")
         except OSError as error:
-            tell(f"{out}: the report cannot be written: {error.strerror}")
+            print_error(f"{out}: the report cannot be written: {error.strerror}")
     print_result(console, summary, out, page)
     return result.exit_code
 
@@ -68,7 +68,7 @@ def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[Fligh
         try:
             log = FlightLog.read(path, ticks_max=TICKS_MAX)
         except LogError as error:
-            tell(error)
+            print_error(error)
     about: dict[str, Any] = {
         "outcome": result.outcome.value,
         "controller": config.controller.law,

@@ -43,7 +43,7 @@ class Course:
 
     @property
     def held(self) -> bool:
-        """The plan's time stands still, or is slowing down to that."""
+        """Return whether the plan's time stands still or slows down to a standstill."""
         return self.change is not None and self.change.after == 0.0
 
     def pace(self, t_s: float) -> tuple[float, float, float, float]:
@@ -73,7 +73,7 @@ class Course:
         return self if self.held else self._turned_to(0.0, t_s)
 
     def resume(self, t_s: float) -> Course:
-        """Return the course that goes on from where it was held."""
+        """Return the course that continues from the point of the hold."""
         return self._turned_to(1.0, t_s) if self.held else self
 
     def _turned_to(self, after: float, t_s: float) -> Course:
@@ -83,7 +83,7 @@ class Course:
         return replace(self, change=Change(begin_s=t_s, plan_s=plan_s, duration_s=duration_s, before=rate, after=after))
 
     def reference(self, t_s: float) -> Reference:
-        """Return where the vehicle should be at a flight time."""
+        """Return the reference at a flight time."""
         plan_s, rate, change, jerk = self.pace(t_s)
         reference = self.plan.reference(plan_s)
         return reference if rate == 1.0 and change == 0.0 else _paced(reference, rate, change, jerk)

@@ -83,7 +83,7 @@ def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> Arm
     """
     farthest_rad = max(map(abs, delta_rad))
     if not farthest_rad > 0.0:
-        raise ValueError("a move of the arm that goes nowhere")
+        raise ValueError("a move of the arm without displacement")
     jerk_per_s3 = limits.jerk_max_rad_s3 / farthest_rad
     acceleration_per_s2 = limits.acceleration_max_rad_s2 / farthest_rad
     speed_per_s = min(
@@ -108,7 +108,7 @@ def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> Arm
         raise ValueError(f"ruckig finds no motion of the arm over {delta_rad} rad within {limits}: {result.name}")
     profile = trajectory.profiles[0][0]
     planned_s = round(trajectory.duration * unit_s, _DECIMALS)
-    # The least duration comes back with ruckig's rounding in it.
+    # The least duration contains ruckig's rounding.
     return ArmMotion(_share(profile.t, profile.j), planned_s if planned_s > duration_s * (1.0 + 1e-9) else duration_s)
 
 

@@ -58,9 +58,9 @@ class AutopilotLanding:
     clearance_m: float
     """Height of the body's origin when the vehicle stands."""
     pilot: bool
-    """A pilot has taken over: watch only, request nothing."""
+    """Whether a pilot has taken over; the landing is then only monitored."""
     pose_s: float
-    """Flight time of the newest pose that PX4 has had; -inf: its estimate counts for nothing until poses come."""
+    """Flight time of the newest pose that PX4 received; with -inf its estimate does not count until poses arrive."""
     stop: RotorStop
     height: HeightEvidence
     sinking: Sinking = field(default_factory=Sinking)
@@ -70,7 +70,7 @@ class AutopilotLanding:
     landing_since_s: float | None = None
     zero_thrust_since_s: float | None = None
     overturned: bool = False
-    """The vehicle was flipped or tipped over, and its rotors were to be stopped for that."""
+    """Whether a stop of the rotors was requested because the vehicle was flipped or tipped over."""
 
     @classmethod
     def begin(
@@ -89,9 +89,9 @@ class AutopilotLanding:
             start_s: flight time.
             clearance_m: height of the body's origin when the vehicle stands.
             tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
-            pilot: a pilot has taken over. One who takes over later is seen by PX4's mode.
-            pose_s: flight time of the newest pose that PX4 has had; -inf if that is not known.
-            flipped: the vehicle is known to be flipped, and has been for long enough.
+            pilot: a pilot has taken over. PX4's mode shows a later takeover.
+            pose_s: flight time of the newest pose that PX4 received; -inf if unknown.
+            flipped: the vehicle is known to have been flipped for long enough.
         """
         stop = RotorStop.begin(clearance_m, tilt_max_rad, pose_s, flipped=flipped)
         return cls(
@@ -120,7 +120,7 @@ class AutopilotLanding:
             return now, LandingStep(
                 request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=overturned
             )
-        if elapsed > TIMEOUT_S and not (now.pilot and heard):  # a pilot may fly on for as long as they like
+        if elapsed > TIMEOUT_S and not (now.pilot and heard):  # a pilot may fly for any time
             text = "the landing could not be confirmed"
             return now, LandingStep(
                 request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=False, text=text
@@ -166,7 +166,7 @@ class AutopilotLanding:
         return now, mode is FlightMode.MANUAL or (now.was_landing and chosen)
 
     def _watch_touchdown(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """PX4 is landing, its height says that the vehicle stands, and motion capture does not contradict."""
+        """Handle a touchdown: PX4 lands, its height shows a vehicle on the ground, and motion capture does not contradict."""
         pose, vehicle, t_s = fresh_pose(i), i.vehicle, i.t_s
         pose_s = pose.stamp_s if pose is not None else self.pose_s
         sinking = self.sinking.update(t_s, i.mocap)
@@ -190,7 +190,7 @@ class AutopilotLanding:
         return high or sink_m_s is None or sink_m_s > STILL_M_S
 
     def _watch_zero_thrust(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """The vehicle has stood in OFFBOARD without thrust for `FORCE_DISARM_S`, and PX4's land detector has not noticed."""
+        """Handle a vehicle in OFFBOARD without thrust for `FORCE_DISARM_S` whose landing PX4 has not detected."""
         since_s = self.zero_thrust_since_s
         if not in_offboard(i.status):
             since_s = None
@@ -200,7 +200,7 @@ class AutopilotLanding:
         return replace(self, zero_thrust_since_s=since_s), unnoticed
 
     def _watch_standing(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """Motion capture has seen the vehicle at standing height for `STANDING_S`."""
+        """Return whether motion capture has shown the vehicle at standing height for `STANDING_S`."""
         pose, since_s = fresh_pose(i), self.standing_since_s
         if pose is None or pose.position_world_m[2] >= self.clearance_m + HEIGHT_MARGIN_M:
             since_s = None

@@ -76,7 +76,7 @@ def check_mission(
                     worst[violation.limit] = (violation, t_s, reference)
         for limit, (violation, t_s, reference) in worst.items():
             if limit.startswith(STOP) and any(other.startswith(limit.removeprefix(STOP)) for other in worst):
-                continue  # the way itself leads out
+                continue  # the path itself leads out
             if limit in told:
                 if segment.index not in where[limit]:
                     where[limit].add(segment.index)
@@ -132,13 +132,13 @@ def _samples(segment: Segment) -> Iterator[float]:
 def check_start(
     mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2 | None
 ) -> list[str]:
-    """Check only what depends on the measured start. Cheap enough for a control tick. Arguments as in `check_mission`."""
+    """Check only what depends on the measured start. Fast enough for a control tick. Arguments are those of `check_mission`."""
     found = _start(mission, vehicle, position_world_m, yaw_rad, arm_rad)
     return [f"mission '{mission.name}': {text}" for text in found]
 
 
 def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, arm_rad: Vec2 | None) -> Iterator[str]:
-    """Check that the machine stands where and as the mission says."""
+    """Check position, yaw and arm of the machine against the mission's start."""
     start = mission.start
     x_m, y_m = start.position_m
     away_m = math.dist(position[:2], start.position_m)
@@ -175,7 +175,7 @@ def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
     if planned > SPEED_SHARE_MAX * stopped:
         yield (
             f"mission '{mission.name}': limits.speed_max_m_s is {planned:g} m/s, but the flight is stopped at {stopped:g} m/s "
-            f"(safety.speed_max_m_s) and needs a margin of a fifth to that; lower it to {SPEED_SHARE_MAX * stopped:.2f} m/s or less"
+            f"(safety.speed_max_m_s) and needs a margin of one fifth; lower it to {SPEED_SHARE_MAX * stopped:.2f} m/s or less"
         )
 
 

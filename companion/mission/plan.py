@@ -385,7 +385,7 @@ class PlanBuilder:
                 track,
                 Move(start_s=start_s, duration_s=duration_s, origin=self._at[track], delta=delta, profile=profile),
             )
-            self._at[track] = to  # not the last bit's difference: what comes next does not depend on what came before
+            self._at[track] = to  # no difference in the last bit: the next phase does not depend on the previous one
 
     def _append(self, track: int, move: Motion) -> None:
         self._moves[track].append(move)

@@ -12,7 +12,7 @@ from companion.safety.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
 
 
 def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
-    """Return whether the vehicle is treated as flying, and a message with the findings and the action.
+    """Return whether the vehicle is treated as flying, and a message with observation and action.
 
     A vehicle on the ground with turning rotors is disarmed. It counts as flying if a pilot selected its mode, if the mode is neither
     OFFBOARD nor LAND, or if motion capture does not measure its height.
@@ -33,5 +33,5 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     if flown_by_pilot(i.status):
         return True, f"{found}, which a pilot has chosen: only motion capture is sent to PX4"
     if stands:
-        return False, f"{found}, on the ground: the companion disarms it; find out who armed it, then start again"
+        return False, f"{found}, on the ground: the companion disarms it; find out who armed it, then restart"
     return True, f"{found}: PX4 lands; the mission is not flown"

@@ -182,7 +182,7 @@ class Track:
         for before, after in pairwise(moves):
             if after.start_s < before.end_s - 1e-9:
                 raise ValueError(
-                    f"a move starts at {after.start_s} s, before the one before it ends at {before.end_s} s"
+                    f"a move starts at {after.start_s} s, before the previous one ends at {before.end_s} s"
                 )
 
     def at(self, t_s: float) -> Sample:

@@ -27,7 +27,7 @@ FLOOR_GAP_M = 0.01
 TRACKING_M = 0.10
 """Largest expected distance from the plan, m; measured over random missions in winds of 3 m/s."""
 CATCH_M = 0.20
-"""The same from the catch until the impact has decayed, m."""
+"""Largest expected distance from the plan from the catch until the impact has decayed, m."""
 CATCH_NEAR_M = 0.05
 """Largest horizontal distance from the expected place at which the catch can happen, m."""
 CATCH_S = 2.0
@@ -139,7 +139,7 @@ class SampleCheck:
         why = _allowance(off_m)
         for axis, name, span in ((0, "x", room.x_m), (1, "y", room.y_m), (2, "z", room.z_m)):
             if axis == 2 and position[2] < vehicle.airframe.ground_clearance_m:
-                continue  # told as flying into the floor
+                continue  # reported as flying into the floor
             low = min(position[axis] - radius_m, net_m[axis] - net_radius_m) if axis < 2 else position[2] + off_m
             high = max(position[axis] + (radius_m if axis < 2 else BODY_TOP_M), net_m[axis] + net_radius_m)
             for edge, excess, reach in (("low", span[0] - low + off_m, low), ("high", high + off_m - span[1], high)):

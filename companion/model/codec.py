@@ -48,7 +48,7 @@ def to_packet(record: Any) -> bytes:
     """Return the record as MessagePack.
 
     Raises:
-        ValueError, TypeError, OverflowError: a value is none that a record may hold.
+        ValueError, TypeError, OverflowError: a record cannot hold one of the values.
     """
     try:
         return _PACKETS.encode(record)
@@ -57,7 +57,7 @@ def to_packet(record: Any) -> bytes:
 
 
 def from_packet(cls: Any, packet: bytes) -> Any:
-    """Return the record, of this class or of one of this union's classes, that `to_packet` made the bytes of.
+    """Decode the bytes of `to_packet` into a record of this class, or of one of this union's classes.
 
     Raises:
         RecordError: the bytes are damaged or hold something else.
@@ -72,7 +72,7 @@ def to_json(record: Any) -> bytes:
     """Return the record as JSON text in UTF-8, without blanks, with its fields in their declared order.
 
     Raises:
-        ValueError, TypeError: a value is none that a record may hold.
+        ValueError, TypeError: a record cannot hold one of the values.
     """
     try:
         text = _JSON.encode(record)
@@ -83,7 +83,7 @@ def to_json(record: Any) -> bytes:
 
 
 def from_json(cls: type[R], text: bytes) -> R:
-    """Return the record that `to_json` made the text of.
+    """Decode the text of `to_json` into a record.
 
     Raises:
         RecordError: the text is damaged or holds something else.
@@ -100,7 +100,7 @@ def to_jsonable(record: Any) -> Any:
 
 
 def from_jsonable(cls: type[R], data: Any) -> R:
-    """Return the record whose nested dicts are given, as `json.loads` returns them.
+    """Convert nested dicts, as `json.loads` returns them, into a record.
 
     Raises:
         RecordError: unknown or missing field, or a value of the wrong type; a number must be a number, not a string.
@@ -121,7 +121,7 @@ def json_schema(cls: type[Record]) -> dict[str, Any]:
 
 
 def fingerprint(*classes: type[Record]) -> str:
-    """Return a short hash of the classes' fields: a log with another one cannot be replayed."""
+    """Return a short hash of the classes' fields: a log with a different hash cannot be replayed."""
     text = json.dumps([json_schema(cls) for cls in classes], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -151,10 +151,10 @@ def differences(a: object, b: object, path: str = "") -> tuple[str, object, obje
 
 
 def _from_numpy(value: Any) -> Any:
-    """Return a numpy scalar or array that slipped into a record as a Python number or list.
+    """Convert a NumPy scalar or array in a record to a Python number or list.
 
     Raises:
-        TypeError: the value is something else, which no record may hold.
+        TypeError: the value is of another type, which no record may hold.
     """
     tolist = getattr(value, "tolist", None)
     if tolist is None:
@@ -177,7 +177,7 @@ def _json_decoder(cls: Hashable) -> msgspec.json.Decoder[Any]:
 
 
 def _refused(cls: Any, error: Exception) -> RecordError:
-    """Return the error in one printable line; it may quote what was decoded."""
+    """Return the error as one printable line; it may quote the decoded data."""
     text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error)[:_ERROR_CHARACTERS])
     return RecordError(f"{getattr(cls, '__name__', 'packet')}: {text}")
 
@@ -200,7 +200,7 @@ def _schema(hint: Any) -> dict[str, Any]:
     """Return the JSON Schema of one field's type.
 
     Raises:
-        TypeError: no type that a record's field may have.
+        TypeError: a record's field cannot have this type.
     """
     if hint in _LEAVES:
         return {"type": _LEAVES[hint]}

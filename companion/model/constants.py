@@ -12,4 +12,4 @@ TICK_PERIOD_S = 0.005
 """Nominal period of the control loop: 200 Hz. A tick that starts more than this behind its schedule is missed."""
 
 GRADED_POSE_MAX_AGE_S = 0.1
-"""An older pose of motion capture is not compared with the reference, in telemetry and in the analysis of a log."""
+"""Max age of a motion-capture pose that telemetry and log analysis compare with the reference."""

@@ -16,7 +16,7 @@ WAIT_TIMEOUT_S = 15.0
 TARE_S = 1.0
 """Duration of the force sensor's tare. A flight that waits for its start repeats it."""
 LOOK_AGAIN_S = 0.1
-"""Period in which a flight that waits for its start judges estimate and place."""
+"""Period at which a flight that waits for its start checks the estimate and the position."""
 STREAM_BEFORE_OFFBOARD_S = 0.8
 OFFBOARD_TIMEOUT_S = 8.0
 ARM_TIMEOUT_S = 10.0
@@ -71,7 +71,7 @@ def is_armed(status: AutopilotStatus | None) -> bool:
 
 
 def on_ground(status: AutopilotStatus | None) -> bool:
-    """Return whether PX4's land detector reports that the vehicle stands."""
+    """Return whether PX4's land detector reports that the vehicle is on the ground."""
     return status is not None and status.landed is LandedState.ON_GROUND
 
 

@@ -59,7 +59,7 @@ class Machine(Record, frozen=True, kw_only=True):
     cpus: tuple[int, ...]
     """Cores that a process may run on, in ascending order."""
     arm_latency_ms: int | None
-    """FTDI latency timer of the arm's serial port; None if it is not an FTDI port. The next field is that of the force sensor."""
+    """FTDI latency timer of the arm's serial port; None if it is not an FTDI port. The next field is for the force sensor's port."""
     force_latency_ms: int | None
 
 
@@ -73,9 +73,9 @@ class MocapCounts(Record, frozen=True, kw_only=True):
     out_of_order: int
     malformed: int
     foreign: int
-    """Datagrams from another address than the server's."""
+    """Datagrams from addresses other than the server's."""
     problem: str | None
-    """Why the newest rejected datagram was rejected; None if none was."""
+    """Reason of the newest rejected datagram; None if none was rejected."""
     callback_error: str | None
     """First exception that the receiver of the poses raised."""
 
@@ -86,7 +86,7 @@ class MocapServer(Record, frozen=True):
     name: str
     """Program, its version and the protocol, such as `Motive 3.1, NatNet 4.1`."""
     protocol_version: str
-    """Such as `4.1`."""
+    """NatNet version, such as `4.1`."""
 
 
 class ForceCounts(Record, frozen=True, kw_only=True):
@@ -166,7 +166,7 @@ class Observations(Record, frozen=True, kw_only=True):
     state_counts: StateCounts | None = None
     force_stream: ForceStream | None = None
     arm_reads: tuple[int, int] | None = None
-    """Number of bus cycles, and of those without an answer."""
+    """Number of bus cycles, and of cycles without an answer."""
     mission_s: float | None = None
     """Duration of the planned mission."""
     plan: tuple[str, ...] | None = None

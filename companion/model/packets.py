@@ -10,7 +10,7 @@ class Tick(Record, frozen=True, kw_only=True, tag=True):
     """One control tick."""
 
     number: int
-    """Of this packet, counted by the flight process from 0: a gap tells the recorder how many packets were dropped."""
+    """Number of this packet, counted by the flight process from 0: a gap shows the recorder how many packets were dropped."""
     inputs: Inputs
     outputs: Outputs
     sent: Sent
@@ -20,7 +20,7 @@ class LogLine(Record, frozen=True, kw_only=True, tag=True):
     """A line for the log's `/log` channel."""
 
     number: int | None = None
-    """As in `Tick`; None from a process other than the flight process, which counts nothing."""
+    """As in `Tick`; None from processes other than the flight process, which do not count packets."""
     t_s: float
     """Flight clock."""
     severity: Severity
@@ -37,25 +37,25 @@ class Metadata(Record, frozen=True, tag=True):
 
 
 class CommandAnswer(Record, frozen=True, kw_only=True, tag=True):
-    """What became of a command from the ground."""
+    """Result of a command from the ground."""
 
     number: int
     nonce: str
-    """Of the command, and its operator's name."""
+    """Nonce of the command; `operator` is the name of the operator who signed it."""
     operator: str
     command: OperatorCommand
     accepted: bool
-    """It took effect, or what it asks for is done already."""
+    """The command took effect, or the requested state was reached before."""
     text: str
-    """What was done, or why nothing was."""
+    """What was done, or why the command was refused."""
     t_s: float
-    """Flight clock of the tick that judged it; phase and action are those of that tick's `Outputs`."""
+    """Flight clock of the tick that answered; phase and action are from that tick's `Outputs`."""
     phase: str
     action: SafetyAction
 
 
 class Close(Record, frozen=True, tag=True):
-    """The last packet of a flight that ends in order."""
+    """Last packet of a flight that ends normally."""
 
     number: int
     """How many packets the flight process has offered before this one."""
@@ -65,7 +65,7 @@ Packet = Tick | LogLine | Metadata | CommandAnswer | Close
 
 
 def read_packet(data: bytes) -> Packet:
-    """Return the packet that `companion.model.codec.to_packet` made the bytes of.
+    """Decode the bytes of `companion.model.codec.to_packet` into a packet.
 
     Raises:
         RecordError: the bytes are damaged or hold something else.

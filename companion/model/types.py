@@ -281,7 +281,7 @@ class ControlLog(Record, frozen=True, kw_only=True):
     payload_estimate_kg: float | None = None
     """Estimated mass of the payload; None if the law does not estimate it."""
     load_estimate_n: Vec3 | None = None
-    """Force that the rotors give against the load that the law has adapted to, world frame. None if the law adapts to none."""
+    """Rotor force that compensates the adapted load, world frame. None if the law does not adapt loads."""
     moment_estimate_kg_m: Vec2 | None = None
     """Adapted first moments of link 1 and 2 about their joints, in addition to the nominal ones."""
     friction_estimate_nm: Vec2 | None = None
@@ -341,7 +341,7 @@ class Outputs(Record, frozen=True, kw_only=True):
     mocap_trusted: bool
     """Motion capture is plausible. While False no pose must be forwarded to PX4."""
     tether: TetherState | None = None
-    bent_by: tuple[str, ...]
+    limited_by: tuple[str, ...]
     """Reasons for which the governor constrained the reference."""
     mocap_innovation_m: float | None = None
     """Distance between the newest pose and the position predicted from the IMU; 0 while it is not evaluated, None in older logs."""
@@ -362,7 +362,7 @@ class Sent(Record, frozen=True, kw_only=True):
     core_s: float
     setpoint_sent_s: float
     current_sent_s: float
-    """Flight clock when the joint state was read, the core step ended, the setpoint was sent, and the bus thread got the currents."""
+    """Flight clock at four instants: joint state read, core step ended, setpoint sent, currents passed to the bus thread."""
     hold: int | None = None
     """Number of the hold that is active after this tick, counted from 1 in each flight; None if none is. Each HOLD command starts a
     new one, even during a hold."""

@@ -13,7 +13,7 @@ from companion.preflight.checks import Check
 from companion.safety.arm import error_text
 
 DEVICE = Check(
-    "arm.device", "arm bus", "the port opens, both servos answer and take their settings", "the flight needs the arm"
+    "arm.device", "arm bus", "the port opens, both servos answer and accept their settings", "the flight needs the arm"
 )
 MODEL = Check(
     "arm.model", "servos", "XM430-W210 (model 1030)", "other models have another torque constant and other registers"
@@ -28,13 +28,13 @@ MODE = Check(
     "arm.mode",
     "operating mode",
     "current control (register 11 is 0)",
-    "in another mode a torque command means something else",
+    "in another mode a torque command has another meaning",
 )
 RETURN_DELAY = Check(
     "arm.return_delay",
     "return delay",
     "0 us (register 9)",
-    "the factory's 500 us a servo are a fifth of a control tick",
+    "the factory setting of 500 us per servo takes a fifth of a control tick",
 )
 WATCHDOG = Check(
     "arm.watchdog",
@@ -45,7 +45,7 @@ WATCHDOG = Check(
 CURRENT_LIMIT = Check(
     "arm.current_limit",
     "current limit",
-    "what `torque_max_nm` needs (register 38)",
+    "at least the current for `torque_max_nm` (register 38)",
     "the arm would be weaker than the law assumes",
 )
 VOLTAGE = Check(
@@ -128,9 +128,13 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
         yield MODEL.bad(read, "XM430-W210", "install the configured servo, or correct arm.joints[].servo_id")
     yield firmware(FIRMWARE, [servo.firmware for servo in servos])
     modes = [servo.operating_mode for servo in servos]
-    yield _equal(MODE, modes, MODE_CURRENT, _mode, "another program has set it: close that, cycle the servos' power")
+    yield _equal(
+        MODE, modes, MODE_CURRENT, _mode, "another program has changed it: close that program, cycle the servos' power"
+    )
     delays_us = [servo.return_delay_us for servo in servos]
-    yield _equal(RETURN_DELAY, delays_us, 0, "{} us".format, "another program has set it: close that, start again")
+    yield _equal(
+        RETURN_DELAY, delays_us, 0, "{} us".format, "another program has changed it: close that program, start again"
+    )
     watchdogs_ms = [servo.watchdog_ms for servo in servos]
     wanted_ms = vehicle.devices.arm.watchdog_ms
     yield _equal(WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; look for a loose supply")
@@ -139,7 +143,7 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
 
 
 def firmware(check: Check, versions: Sequence[int]) -> Row:
-    """Judge the firmware of the servos."""
+    """Return the row of the servos' firmware."""
     read, wanted = _both(versions), f"{FIRMWARE_MIN} or newer"
     fix = "update with DYNAMIXEL Wizard: Recovery, newest firmware"
     if min(versions) >= FIRMWARE_MIN and len(set(versions)) > 1:
@@ -148,10 +152,10 @@ def firmware(check: Check, versions: Sequence[int]) -> Row:
 
 
 def supply(check: Check, volts: Sequence[float]) -> Row:
-    """Judge the supply voltage of the servos."""
+    """Return the row of the servos' supply voltage."""
     read, wanted = _both([f"{volt:.1f} V" for volt in volts]), f"{VOLTAGE_MIN_V:g} to {VOLTAGE_MAX_V:g} V"
     within = all(VOLTAGE_MIN_V <= volt <= VOLTAGE_MAX_V for volt in volts)
-    return check.row(within, read, wanted, "feed the servos with 12 V from a converter; check its plugs")
+    return check.row(within, read, wanted, "supply the servos with 12 V from a converter; check its plugs")
 
 
 def _current_limit(servos: Sequence[ServoReport], vehicle: Vehicle) -> Row:

@@ -17,7 +17,7 @@ class Check:
     title: str
     """Title of its row."""
     wanted: str = ""
-    """Expected result in general words, for the table of the preflight's checks. The row states it with figures."""
+    """Expected result in general terms, for the table of the preflight's checks. The row states it with figures."""
     why: str = ""
     """Consequence if the check fails."""
     warns: bool = False
@@ -30,11 +30,11 @@ class Check:
         return self._row(True, read, wanted, "", self._level)
 
     def bad(self, read: str, wanted: str, fix: str) -> Row:
-        """Return a row that fails: the machine does not take off. If the check only warns, the operator decides."""
+        """Return a row that fails and forbids take-off, or only warns the operator if `warns` is set."""
         return self._row(False, read, wanted, fix, self._level)
 
     def doubtful(self, read: str, wanted: str, fix: str) -> Row:
-        """Return a row that warns: the machine can fly, and the operator decides."""
+        """Return a row that warns; the operator decides."""
         return self._row(False, read, wanted, fix, Level.WARN)
 
     def row(self, ok: bool, read: str, wanted: str, fix: str) -> Row:

@@ -1,8 +1,8 @@
 """Checks of PX4 by its telemetry: alive, disarmed, fusing motion capture, battery charged. `preflight.px4` checks firmware and
 parameters.
 
-Pure. PX4 accepts poses that it does not fuse without any notice. Evidence of fusion is what its estimator reports about itself and its
-position over the whole observation.
+Pure. PX4 accepts poses that it does not fuse without any notice. Only the estimator's own status and
+position over the whole observation prove fusion.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ BATTERY = Check(
 HOVER = Check(
     "px4.hover_thrust",
     "hover thrust",
-    "within 15 % of weight over `airframe.thrust_max_n`; beyond 35 % refused (PX4's own in its row)",
+    "within 15 % of weight over `airframe.thrust_max_n`; beyond 35 % refused (PX4's own value has its own row)",
     "it sets the thrust in the first second: too high and the vehicle jumps, too low and it does not take off",
 )
 CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, HOVER)
@@ -115,7 +115,7 @@ def _heartbeat(o: Observations, vehicle: Vehicle) -> Row:
     limit_s = vehicle.safety.heartbeat_timeout_s
     wanted = f"newer than {limit_s:g} s"
     if not o.status:
-        return HEARTBEAT.bad("none came", wanted, "check link and baud rate")
+        return HEARTBEAT.bad("no heartbeat", wanted, "check link and baud rate")
     age_s = max(0.0, o.start_s + o.duration_s - o.status[-1].heartbeat_stamp_s)
     if age_s > limit_s:
         return HEARTBEAT.bad(f"none for {age_s:.1f} s", wanted, "check cable, baud rate and PX4's power")
@@ -138,7 +138,7 @@ def _rates(o: Observations) -> Row:
     if min(rates_hz) >= RATE_GOOD_HZ:
         return RATES.good(read, wanted)
     if rates_hz[0] == 0.0:
-        fix = "PX4 sends no position while it fuses no motion capture: see that row"
+        fix = "PX4 sends no position while it does not fuse motion capture: see that row"
     else:
         fix = "make the link faster: 921600 baud, MAV_x_RATE 80000 or more, MAV_x_MODE onboard (docs/px4.md)"
     return (RATES.doubtful if min(rates_hz) >= RATE_MIN_HZ else RATES.bad)(read, wanted, fix)
@@ -168,12 +168,12 @@ def vision(o: Observations) -> Row:
         )
     fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and that the body is tracked; then reboot PX4"
     if not o.mocap:
-        fix = "there is no motion capture to fuse: see its rows first"
+        fix = "motion capture is missing: see its rows first"
     return VISION.bad(missing, wanted, fix)
 
 
 def missing_evidence(o: Observations) -> str | None:
-    """Return what is missing of the evidence that EKF2 fuses vision, or None if it is complete from the start of the observation."""
+    """Return the missing evidence that EKF2 fuses vision, or None if the evidence is complete from the start of the observation."""
     if not o.vehicle:
         return "no LOCAL_POSITION_NED"
     if not o.estimator:
@@ -214,7 +214,7 @@ def agreement(o: Observations) -> Iterator[Row]:
     pairs = list(_pairs(o.vehicle, o.mocap))
     if not pairs:
         fix = "check the rates of PX4's position and of motion capture"
-        yield AGREES.bad("no pair matches in time", "", fix)
+        yield AGREES.bad("no state and pose match in time", "", fix)
         return
     apart = [
         tuple(a - b for a, b in zip(state.position_world_m, pose.position_world_m, strict=True))
@@ -283,5 +283,5 @@ def _hover(hover: float, vehicle: Vehicle) -> Row:
     if abs(off) <= HOVER_GOOD:
         return HOVER.good(read, wanted)
     fix = f"measure it (companion hover fit) and set {source}, or correct airframe.mass_kg and airframe.thrust_max_n"
-    # What is far off in PX4 is refused by the parameter's own row.
+    # The parameter's own row refuses a value in PX4 that is far off.
     return (HOVER.bad if own and abs(off) > HOVER_MAX else HOVER.doubtful)(read, wanted, fix)

@@ -33,7 +33,7 @@ def rows(o: Observations, config: FlightConfig) -> list[Row]:
     link, *state = estimator.rows(o, vehicle)
     return [
         link,
-        *px4.rows(o.firmware, o.params, vehicle),  # before what follows from a wrong parameter
+        *px4.rows(o.firmware, o.params, vehicle),  # before the consequences of a wrong parameter
         *state,
         *mocap.rows(o, vehicle),
         *(frames.rows(o, config.mission, vehicle) if o.mocap and o.vehicle else ()),
@@ -46,9 +46,9 @@ def rows(o: Observations, config: FlightConfig) -> list[Row]:
 
 
 def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
-    """Return what may pass after more time, or None if nothing would.
+    """Return the condition that may pass after more time, or None if waiting is useless.
 
-    If a row fails for good, wait only until the other rows no longer contain the start of motion capture.
+    If a row fails permanently, wait only until the observation of the other rows excludes the start of motion capture.
     """
     refusing = refusals(rows(o, config))
     settling = [_SETTLES[row.id] for row in refusing if row.id in _SETTLES]

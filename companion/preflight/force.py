@@ -1,4 +1,4 @@
-"""Checks of the force-torque sensor at rest: rate, noise, overload, and a tare that an empty net explains. Pure."""
+"""Checks of the force-torque sensor at rest: rate, noise, overload, and a tare that matches an empty net. Pure."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ TARE = Check(
     "force.tare",
     "force sensor tare",
     "bias below 5 % of `devices.force.force_max_n`; above 10 % refused",
-    "every force at rest except the empty net's is removed as bias, so a load on the net would be missing in flight",
+    "the tare removes every force at rest except the empty net's weight, so a load on the net would be missing in flight",
 )
 STILL = Check(
     "force.still",
@@ -93,12 +93,12 @@ def stream_rows(
     Args:
         stream: counters.
         samples: in order of time.
-        duration_s: for how long it was watched.
+        duration_s: duration of the observation.
         vehicle: limits, and the tool whose weight is tared.
-        pose: attitude of the body and joint angles, rad; None if they are unknown: then there is no row of the tare.
+        pose: attitude of the body and joint angles, rad; None if unknown; the row of the tare is then left out.
     """
     if stream.lost is not None:
-        yield DEVICE.bad(stream.lost, "it goes on streaming", "check plug and cable")
+        yield DEVICE.bad(stream.lost, "the sensor keeps streaming", "check plug and cable")
         return
     yield DEVICE.good(stream.product or "answers")
     yield _rate(stream.samples / duration_s, vehicle)

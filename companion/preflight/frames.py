@@ -34,17 +34,17 @@ GRAVITY = Check(
     "frames.gravity",
     "gravity in motion capture's axes",
     "specific force, rotated by motion capture's attitude, points up within 5 deg",
-    "the thrust would be tilted by that angle",
+    "the thrust would be tilted by this angle",
 )
 HEIGHT = Check(
     "frames.height",
     "height at rest",
     "`airframe.ground_clearance_m` within 3 cm; beyond the mission's `start.tolerance_m` refused",
-    "heights are wrong by that, and touchdown is detected early or late",
+    "heights are wrong by the difference, and touchdown is detected early or late",
 )
 PLACE = Check(
     "frames.place",
-    "start place in motion capture's axes",
+    "start position in motion capture's axes",
     "the mission's `start.position_m`",
     "room, tether and path are given in these axes",
 )
@@ -77,7 +77,7 @@ PX4_TILT = Check(
     "frames.px4_tilt",
     "PX4's tilt against motion capture's",
     "within 3 deg",
-    "every attitude setpoint would be wrong by that",
+    "every attitude setpoint would be wrong by this angle",
     settles=True,
 )
 PX4_YAW = Check(
@@ -109,7 +109,7 @@ _RESET = "set the machine level with its nose along the stream's +x and reset th
 
 
 class Pose(NamedTuple):
-    """Pose of the machine by motion capture, in the mission's world as far as the stream is right."""
+    """Pose of the machine by motion capture, in the mission's world if the stream's axes are right."""
 
     position_m: Vec3
     attitude: Quat
@@ -210,8 +210,8 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
 
 
 def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str:
-    """Return which permutation of axes would explain every wrong value at rest, as a line on what to do. Empty if none does, or if
-    nothing is wrong. The likelier permutations come first; the hand test distinguishes those that look alike at rest.
+    """Return one line on the axis permutation that explains every wrong value at rest and its remedy, or an empty text if none does or
+    nothing is wrong. Likelier permutations are tried first; the hand test distinguishes those that look alike at rest.
     """
 
     def fits(position_m: Vec3, attitude: Quat) -> bool:
@@ -234,14 +234,14 @@ def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str
         if fits(axes.inverse.vector(p), quat_multiply(quat_conjugate(axes.quat), q)):
             return f"the world looks turned {_turn(axes)}: {_plane(axes)}{_or_so(axes)}"
     for axes in (*others, *MIRRORINGS):
-        # Who made the body in wrong axes still turned its nose along the stream's x.
+        # An operator who created the body in wrong axes still turned its nose along the stream's x.
         nose = _nose(axes)
         upright = quat_multiply(axes.inverse.rotation(q), nose)
         if fits(axes.inverse.vector(p), upright):
             if axes.determinant < 0:
                 return (
                     f"the stream looks left-handed (its x, y, z are the true {', '.join(axes.names)}): take Motive's right-handed "
-                    "axes, and no axis conversion on the way"
+                    "axes, without axis conversion"
                 )
             return (
                 f"the stream's axes look exchanged (its x, y, z are the true {', '.join(axes.names)}): {_plane(axes)}"
@@ -254,7 +254,7 @@ def _least_turned(axes: AxisMap) -> float:
 
 
 def _nose(axes: AxisMap) -> Quat:
-    """Return the yaw of the level true direction that is the stream's x, or 0 if it is not level."""
+    """Return the true yaw of the stream's x axis, or 0 if that axis is not horizontal."""
     if axes.index[0] == 2:
         return (1.0, 0.0, 0.0, 0.0)
     half = 0.5 * (math.atan2(axes.sign[0], 0.0) if axes.index[0] == 1 else math.atan2(0.0, axes.sign[0]))
@@ -273,8 +273,8 @@ def _turn(axes: AxisMap) -> str:
 
 
 def _or_so(axes: AxisMap) -> str:
-    """Return the note that a rotation about the vertical is possible as well."""
-    return "; unless it truly stands so: then put it as the mission says" if axes.vector(_UP) == _UP else ""
+    """Return the note that the machine itself may be turned about the vertical."""
+    return "; if the machine itself is turned, place it as the mission requires" if axes.vector(_UP) == _UP else ""
 
 
 def _plane(axes: AxisMap) -> str:

@@ -68,7 +68,9 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
             yield _disk(machine.disk_free_bytes, o.mission_s if o.mission_s is not None else DEFAULT_MISSION_S)
         others = sorted({governor for governor in machine.governors if governor != "performance"})
         if others:
-            fix = "sudo companion install --systemd does it for good; until the next boot, cpupower frequency-set -g performance"
+            fix = (
+                "run sudo companion install --systemd; only until the next boot: cpupower frequency-set -g performance"
+            )
             yield GOVERNOR.bad(", ".join(others), "performance", fix)
         else:
             yield GOVERNOR.good("performance" if machine.governors else "no governor is reported", "performance")
@@ -82,9 +84,9 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield _cpus(machine, vehicle.computer)
     if o.recorder is not None:
         if o.recorder:
-            yield RECORDER.bad(o.recorder, "it opens a log", "the line names file and reason")
+            yield RECORDER.bad(o.recorder, "the recorder opens a log", "the line names file and reason")
         else:
-            yield RECORDER.good("opens a log", "it opens a log")
+            yield RECORDER.good("opens a log", "the recorder opens a log")
 
 
 _PERMIT = (
@@ -109,7 +111,7 @@ def _cpus(machine: Machine, computer: Computer) -> Row:
         return CPUS.good(f"all: {there}")
     asked = f"computer.cpus {listed(computer.cpus)}"
     if missing := set(computer.cpus) - set(machine.cpus):
-        fix = f"take {listed(missing)} out of computer.cpus; elsewhere than on the vehicle --set 'vehicle.computer.cpus=[]'"
+        fix = f"take {listed(missing)} out of computer.cpus; on another computer add --set 'vehicle.computer.cpus=[]'"
         return CPUS.bad(there, asked, fix)
     if not set(machine.cpus) - set(computer.cpus):
         fix = "leave a core out of computer.cpus, or all of them: recorder and guardian share them with the flight"

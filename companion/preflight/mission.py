@@ -1,6 +1,4 @@
-"""Checks that the mission can be flown, the arm is as it says, and the machine stands in the room. `frames` checks start position and
-yaw. Pure.
-"""
+"""Checks of the mission, the arm's start pose, and the machine's position in the room. `frames` checks start position and yaw. Pure."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ ARM = Check(
 )
 ROOM = Check(
     "mission.room",
-    "place in the room",
+    "position in the room",
     "body origin and rotors inside `room`",
     "nothing detects the real walls; only the limits in `room` keep the rotors away from them",
 )

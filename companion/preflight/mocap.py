@@ -16,13 +16,13 @@ RATE = Check(
     "mocap.rate",
     "mocap rate",
     "90 % of `devices.mocap.rate_hz`; below `safety.mocap_rate_min_hz` refused",
-    "PX4's estimate becomes slow and noisy; in flight it is a fault",
+    "PX4's estimate becomes slow and noisy; in flight this is a fault",
 )
 JITTER = Check(
     "mocap.jitter",
     "mocap regularity",
-    "no frame later than 50 ms after the one before",
-    "EKF2 subtracts one fixed delay: frames that come in bursts are fused in the wrong place",
+    "no gap between frames longer than 50 ms",
+    "EKF2 subtracts one fixed delay: frames that arrive in bursts are fused at the wrong time",
     warns=True,
 )
 LATENCY = Check(
@@ -46,7 +46,7 @@ TRACKED = Check(
 BODY = Check(
     "mocap.body",
     "rigid body",
-    "`devices.mocap.rigid_body_id`, and nothing else that could be taken for it",
+    "`devices.mocap.rigid_body_id`, and no other body that could be mistaken for it",
     "the pose of another body would be used",
     warns=True,
 )
@@ -59,7 +59,7 @@ ERROR = Check(
 )
 CLOCK = Check(
     "mocap.clock",
-    "mocap clock against ours",
+    "mocap clock against the companion's",
     "frames arrive steadily by their numbers: rate within 1 %, jitter below 20 ms",
     "diverging clocks, or a server that stalls and catches up, make every age wrong",
     warns=True,
@@ -118,13 +118,13 @@ def _jitter(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
 def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     limit_s, worst_s = vehicle.safety.mocap_latency_warn_s, vehicle.safety.mocap_timeout_s
     wanted = f"{limit_s * 1e3:.0f} ms"
-    told_s = sorted(pose.latency_s for pose in poses if pose.latency_s is not None)
-    if not told_s:
+    latency_s = sorted(pose.latency_s for pose in poses if pose.latency_s is not None)
+    if not latency_s:
         return LATENCY.doubtful(
             "the server does not report it", wanted, "use NatNet 3.0 or 4.1 with cameras that stamp exposure"
         )
-    high_s = told_s[int(0.99 * (len(told_s) - 1))]
-    read = f"{told_s[len(told_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"
+    high_s = latency_s[int(0.99 * (len(latency_s) - 1))]
+    read = f"{latency_s[len(latency_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"
     if high_s <= limit_s:
         return LATENCY.good(read, wanted)
     fix = "lower Motive's load: fewer markers and bodies, no video, labelled markers off"
@@ -155,7 +155,7 @@ def _body(stream: MocapStream, vehicle: Vehicle) -> Row:
     if not stream.other_bodies:
         return BODY.good(f"id {number}{name}, no other", f"id {number}")
     others = ", ".join(map(str, stream.other_bodies))
-    fix = "make sure that this is the vehicle's; switch the others off in Motive, or give them another shape"
+    fix = "make sure that this is the vehicle's body; disable the others in Motive, or change their shape"
     return BODY.bad(f"id {number}{name}, and others: {others}", f"id {number} alone", fix)
 
 
@@ -176,15 +176,15 @@ def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     spread = sum((a - mean_n) ** 2 for a in n)
     period_s = sum((a - mean_n) * (b - mean_t) for a, b in zip(n, t, strict=True)) / spread if spread else 0.0
     expected_hz = vehicle.devices.mocap.rate_hz
-    wanted = f"{1e3 / expected_hz:.3f} ms a frame, steady to {WANDER_GOOD_S * 1e3:.0f} ms"
+    wanted = f"{1e3 / expected_hz:.3f} ms per frame, steady within {WANDER_GOOD_S * 1e3:.0f} ms"
     if not period_s > 0.0:
         return CLOCK.bad(
-            "the frame number stands still", wanted, "restart streaming in Motive; it is paused or plays a take"
+            "the frame number does not advance", wanted, "restart streaming in Motive; it is paused or plays a take"
         )
-    # Late frames are jitter; what counts here is where the bulk of a tenth of the time lies.
+    # Late frames are jitter; only the bulk of each tenth of the time counts here.
     off_s = sorted(_medians([b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True)]))
     wander_s = off_s[-1] - off_s[0]
-    read = f"{period_s * 1e3:.3f} ms a frame, jitter {wander_s * 1e3:.1f} ms"
+    read = f"{period_s * 1e3:.3f} ms per frame, jitter {wander_s * 1e3:.1f} ms"
     if abs(period_s * expected_hz - 1.0) <= CLOCK_GOOD and wander_s <= WANDER_GOOD_S:
         return CLOCK.good(read, wanted)
     fix = "set devices.mocap.rate_hz to the camera rate; look for a server that stalls, or time synchronisation that steps"

@@ -1,4 +1,4 @@
-"""Observe the open devices for some seconds and collect what they deliver. The only part of the preflight with I/O."""
+"""Observe the open devices for some seconds and collect their data. This is the only part of the preflight with I/O."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ COUNT_PERIOD_S = 0.1
 TELL_PERIOD_S = 0.5
 GOVERNORS = Path("/sys/devices/system/cpu")
 
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 """Callback for display: the current subject and the elapsed share of the time."""
 Unsettled = Callable[[Observations], Waiting | None]
 
@@ -69,7 +69,7 @@ async def observe(
     out: Path,
     param_names: Iterable[str],
     unsettled: Unsettled,
-    tell: Tell,
+    progress: Progress,
     known: Observations | None = None,
 ) -> Observations:
     """Observe all devices for `safety.preflight_s`, and longer while a check may still pass.
@@ -83,7 +83,7 @@ async def observe(
         out: folder of the flight's files, for the free disk space.
         param_names: PX4's parameters to read.
         unsettled: called after the time, with the last `preflight_s`; see `companion.preflight.evaluation.unsettled`.
-        tell: progress callback.
+        progress: progress callback.
         known: facts from elsewhere: plan, recorder, mission length, hand test.
     """
     watcher = _Watcher(devices, config, clock)
@@ -97,13 +97,13 @@ async def observe(
         try:
             start_s = told_s = clock()
             waiting: Waiting | None = None
-            tell(*_words(None, 0.0, duration_s))
+            progress(*_words(None, 0.0, duration_s))
             while True:
                 await watcher.look()
                 elapsed_s = clock() - start_s
                 if clock() - told_s >= TELL_PERIOD_S:
                     told_s = clock()
-                    tell(*_words(waiting, elapsed_s, duration_s))
+                    progress(*_words(waiting, elapsed_s, duration_s))
                 if elapsed_s < duration_s or (asking is not None and not asking.done()):
                     continue
                 seen = watcher.seen(base, duration_s)
@@ -131,7 +131,7 @@ def _words(waiting: Waiting | None, elapsed_s: float, duration_s: float) -> tupl
 
 @dataclass(frozen=True, slots=True)
 class _Answers:
-    """PX4's replies."""
+    """PX4's replies to the queries."""
 
     firmware: str | None
     params: dict[str, float | int]
@@ -153,7 +153,7 @@ def _with_answers(seen: Observations, answers: _Answers) -> Observations:
 
 
 class _Watcher:
-    """Collector of what the devices deliver. Data before the queried interval is dropped."""
+    """Collects the data of the devices. Data before the queried interval is dropped."""
 
     def __init__(self, devices: Devices | AvailableDevices, config: FlightConfig, clock: Clock) -> None:
         self._devices = devices
@@ -173,7 +173,7 @@ class _Watcher:
         self._poses.append(pose)
 
     async def look(self) -> None:
-        """Collect what is new, with one bus cycle of the arm."""
+        """Collect new data, with one bus cycle of the arm."""
         devices = self._devices
         if devices.arm is not None:
             state = await devices.arm.read(READ_TIMEOUT_S)
@@ -197,7 +197,7 @@ class _Watcher:
         await asyncio.sleep(LOOK_PERIOD_S)
 
     def seen(self, base: Observations, duration_s: float) -> Observations:
-        """Return what arrived in the last `duration_s`, to a tenth of a second."""
+        """Return the data of the last `duration_s`, to a tenth of a second."""
         now = self._count()
         while len(self._counts) > 1 and self._counts[1].t_s <= now.t_s - duration_s:
             self._counts.popleft()

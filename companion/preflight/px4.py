@@ -116,7 +116,7 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
 
 
 def fix_of(wanted: Wanted) -> str:
-    """Return what to do about a value that is not accepted."""
+    """Return the remedy for a value that is not accepted."""
     if wanted.fix:
         fix = wanted.fix
     else:

@@ -15,7 +15,7 @@ from companion.model.check_row import Row, refusals
 from companion.model.observations import Observations
 from companion.preflight import evaluation
 from companion.preflight.hand_test import record as hand_record
-from companion.preflight.observe import Tell, observe
+from companion.preflight.observe import Progress, observe
 from companion.runtime.clock import Clock
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
@@ -29,21 +29,21 @@ async def preflight(
     clock: Clock,
     *,
     out: Path,
-    tell: Tell,
+    progress: Progress,
     known: Observations,
     sitl: bool,
 ) -> list[Row]:
     """Observe the open devices and evaluate the data, with the priority and on the cores of a flight.
 
     Args:
-        devices, config, clock, out, tell, known: as for `companion.preflight.observe.observe`.
+        devices, config, clock, out, progress, known: arguments of `companion.preflight.observe.observe`.
         sitl: in SITL no record of the hand test is required.
     """
     if not sitl and devices.mocap is not None and devices.mocap.server is not None:
         passed, changed = _hand_test(config, devices.mocap.server.protocol_version)
         known = replace(known, hand_test=passed, hand_test_changed=changed)
     computer = config.vehicle.computer
-    # As in flight: else a busy computer is taken for a bad bus and a bad network.
+    # As in flight, so that a busy computer is not mistaken for a bad bus or network.
     claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory)
     seen = await observe(
         devices,
@@ -52,7 +52,7 @@ async def preflight(
         out=out,
         param_names=evaluation.param_names(),
         unsettled=lambda o: evaluation.unsettled(o, config),
-        tell=tell,
+        progress=progress,
         known=known,
     )
     return evaluation.rows(seen, config)

@@ -28,7 +28,7 @@ STRENGTH = Check(
 SLACK = Check(
     "tether.slack",
     "tether slack at the start",
-    "`tether.margin_m` or more, where the machine stands",
+    "`tether.margin_m` or more at the machine's position",
     "a taut tether tips the vehicle over at take-off",
 )
 CHECKS = (LINE, STRENGTH, SLACK)

@@ -70,7 +70,7 @@ def terminal_console() -> Console:
     return console_on(sys.stdout)
 
 
-def tell(text: object) -> None:
+def print_error(text: object) -> None:
     """Print one line to standard error."""
     stream = SteadyStream(sys.stderr)
     stream.write(f"{text}\n")

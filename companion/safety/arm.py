@@ -83,7 +83,7 @@ def arm_let_go(a: ArmTracker, _: None) -> Values | None:
 
 
 def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
-    """A joint has turned further between two reads than the thresholds allow: an angle, and a rate times the time between them."""
+    """A joint has turned further between two reads than the thresholds allow: an angle plus a rate times the interval."""
     before, arm = a.before, a.arm
     if before is None or arm is None:
         return None

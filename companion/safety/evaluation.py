@@ -36,10 +36,10 @@ class Evaluation:
         self._hold_time_s = {rule.id: hold_time_s(rule, vehicle) for rule in RULES}
         self._since_s: dict[str, float] = {}
         self._active: dict[str, tuple[SafetyAction, float, Rule, Values]] = {}
-        """Action, the last time at which the rule held (infinite for a rule that is reported once), and what it found then."""
+        """Action, newest time at which the rule held (infinite for a rule that is reported once), and the values at that time."""
 
     def forget(self) -> None:
-        """Raise the events of all rules that hold again, because the operator has ended what was done about them."""
+        """Make all active rules raise their events again, because the operator has ended the reaction to them."""
         self._active = {id_: active for id_, active in self._active.items() if active[1] == math.inf}
 
     def standing(self) -> str | None:
@@ -52,12 +52,12 @@ class Evaluation:
         return text
 
     def events(self, t_s: float, airborne: bool, waiting: bool) -> tuple[Event, ...]:
-        """Evaluate every rule that counts in this tick and return the events that begin.
+        """Evaluate the rules of this tick and return the new events.
 
         Args:
             t_s: flight clock.
-            airborne: the actions in the air count, and only rules that have one.
-            waiting: only rules with `while_waiting` count.
+            airborne: evaluate only rules with an action in the air, and request that action.
+            waiting: evaluate only rules with `while_waiting`.
         """
         if airborne:
             rows = self._air_waiting if waiting else self._air

@@ -23,7 +23,7 @@ OPERATOR_LAND, OPERATOR_ABORT = "operator_land", "operator_abort"
 
 
 def _invalid(id_: str, field: str, what: str, message: str) -> Rule:
-    """A record with a value that is not finite counts as not arrived; its loss has a rule of its own."""
+    """Return the rule for an invalid record, which counts as not received; another rule covers its loss."""
     return Rule(
         id=id_, subject=Subject.INPUTS, what=what, predicate=invalid(field), ground=_WARN, air=_WARN, message=message,
         while_waiting=True,
@@ -33,7 +33,7 @@ def _invalid(id_: str, field: str, what: str, message: str) -> Rule:
 def _operator(
     command: OperatorCommand, what: str, ground: SafetyAction | None, air: SafetyAction, message: str
 ) -> Rule:
-    """A command lasts one tick; one that lasts longer counts once."""
+    """Return the rule for an operator's command; a command that lasts several ticks counts once."""
     return Rule(
         id=f"operator_{command.value}", subject=Subject.OPERATOR, what=what, predicate=commanded(command), ground=ground,
         air=air, message=message, severity=Severity.INFO, repeat=Repeat.AT_ONCE, while_waiting=True,
@@ -108,7 +108,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id=MOCAP_DRAGGED, subject=Subject.MOCAP,
-        what="poses do not move as the IMU measures: an attacker drags them, or the calibration shifts",
+        what="poses do not move as the IMU measures: an attacker shifts them, or the calibration drifts",
         predicate=mocap.mocap_dragged, thresholds=("mocap_inertial_m",), tracked_by=("mocap_inertial_s",), ground=None,
         air=_PX4_LANDS, repeat=Repeat.NEVER,
         message="motion capture does not move as the IMU measures: {:.0f} mm off (limit {:.0f} mm); PX4 lands without it",
@@ -150,7 +150,7 @@ RULES: tuple[Rule, ...] = (
         message="PX4 restarted: its clock went back to {:.1f} s",
     ),
     Rule(
-        id="link_late", subject=Subject.PX4, what="PX4's state arrives later than at best, by PX4's clock",
+        id="link_late", subject=Subject.PX4, what="PX4's state is delayed: its lag, by PX4's clock, exceeds the smallest lag seen",
         predicate=px4.link_late, thresholds=("link_lag_max_s",), hold_time=0.15, ground=_PX4_LANDS, air=_PX4_LANDS,
         message="messages from PX4 are {:.0f} ms late (limit {:.0f} ms)",
     ),
@@ -324,10 +324,10 @@ RULES: tuple[Rule, ...] = (
         message="the rotors are outside the room at ({:.2f}, {:.2f}, {:.2f}) m",
     ),
     Rule(
-        id="geofence_near", subject=Subject.FLIGHT, what="would come to rest with the rotors outside the room",
+        id="geofence_near", subject=Subject.FLIGHT, what="the vehicle would stop with its rotors outside the room",
         predicate=flight.geofence_near, thresholds=("geofence_tolerance_m",),
         tracked_by=("tether.react_time_s", "tether.stop_deceleration_m_s2"), hold_time=0.05, ground=None, air=_HOLD,
-        message="would come to rest at ({:.2f}, {:.2f}, {:.2f}) m with the rotors outside the room",
+        message="the vehicle would stop at ({:.2f}, {:.2f}, {:.2f}) m with its rotors outside the room",
     ),
     Rule(
         id="tracking_warn", subject=Subject.FLIGHT, what="off the reference", predicate=flight.tracking_warn,
@@ -347,13 +347,13 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="thrust_saturated", subject=Subject.FLIGHT, what="thrust at its upper limit",
         predicate=flight.thrust_saturated, thresholds=("thrust_saturated_s",), ground=None, air=_LAND,
-        message="thrust at its limit of {:.0f} N for more than {:.1f} s: too heavy, or rotors too weak",
+        message="thrust at its limit of {:.0f} N for more than {:.1f} s: the vehicle is too heavy or its rotors are too weak",
     ),
 
     Rule(
-        id="tether_short", subject=Subject.TETHER, what="would come to rest with too little tether left",
+        id="tether_short", subject=Subject.TETHER, what="the vehicle would stop with too little tether left",
         predicate=flight.tether_short, thresholds=("tether_stop_slack_min_m",), hold_time=0.05, ground=None, air=_HOLD,
-        message="would come to rest with {:.2f} m of tether left (limit {:.2f} m)",
+        message="the vehicle would stop with {:.2f} m of tether left (limit {:.2f} m)",
     ),
     Rule(
         id="tether_taut", subject=Subject.TETHER, what="the tether pulls, or no slack is left", predicate=flight.tether_taut,
@@ -363,7 +363,7 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="tether_snagged", subject=Subject.TETHER, what="the tether pulls although there is slack",
         predicate=flight.tether_snagged, tracked_by=("tether.pull_min_n",), hold_time=0.1, ground=None, air=_LAND,
-        message="the tether pulls with {:.0f} N although {:.2f} m are left: it is caught",
+        message="the tether pulls with {:.0f} N although {:.2f} m are left: it is snagged",
     ),
     Rule(
         id="tether_near", subject=Subject.TETHER, what="the tether is close to rotors or arm",
@@ -376,8 +376,8 @@ RULES: tuple[Rule, ...] = (
         message="the tether is wound {:.1f} times about its anchor (limit {:.1f})",
     ),
     Rule(
-        id="tether_separated", subject=Subject.TETHER, what="further away than the tether is long: it is cut",
+        id="tether_separated", subject=Subject.TETHER, what="the distance exceeds the tether's length: it is cut",
         predicate=flight.tether_separated, tracked_by=("tether.separation_m",), hold_time=0.1, ground=None, air=_LAND,
-        repeat=Repeat.NEVER, message="{:.2f} m from the anchor without a pull: the tether is off",
+        repeat=Repeat.NEVER, message="{:.2f} m from the anchor without a pull: the tether is cut or detached",
     ),
 )  # fmt: skip

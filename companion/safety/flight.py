@@ -1,4 +1,4 @@
-"""The vehicle in the air: tilt, tracking, thrust, speed, room and tether. Only the vertical force has a state."""
+"""Rules of the vehicle in the air: tilt, tracking, thrust, speed, room and tether. Only the vertical force is tracked over time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from companion.safety.stop import StopModel
 
 
 class FlightTracker:
-    """One tick in the air.
+    """Tracks the vehicle in the air.
 
     Args:
         vehicle: room, airframe and tether.
@@ -38,7 +38,7 @@ class FlightTracker:
         self.vertical_n: float | None = None
         """Vertical force of the law while it is limited above the weight; else None."""
         self.saturated_s = 0.0
-        """Counts up while the vertical force is limited and down while it is not, because noise makes it flicker."""
+        """Counter that rises while the vertical force is limited and falls otherwise, because noise makes the limit flicker."""
 
     def update(self, i: Inputs, situation: Situation, dt_s: float) -> None:
         """Update with the inputs of one tick in the air; `i` holds only trusted inputs."""
@@ -63,7 +63,7 @@ class FlightTracker:
 
     @property
     def flipped(self) -> bool:
-        """Two sources say in this tick that the vehicle is flipped; meaningful while `tilt_rad` is above 0."""
+        """Return whether two sources report in this tick that the vehicle is flipped; valid while `tilt_rad` is above 0."""
         return self._inputs is not None and seems_flipped(self._inputs)
 
     def stop_s(self, vehicle: VehicleState) -> float:
@@ -145,7 +145,7 @@ def tracking_warn(f: FlightTracker, threshold_m: float) -> Values | None:
 
 
 def thrust_saturated(f: FlightTracker, saturated_max_s: float) -> Values | None:
-    """The vertical force is limited, and has been for longer than the threshold."""
+    """The vertical force has been limited for longer than the threshold."""
     found = f.vertical_n is not None and f.saturated_s > saturated_max_s
     return (f.vertical_n, saturated_max_s) if found else None
 
@@ -181,6 +181,6 @@ def tether_wound(f: FlightTracker, turns_max: float) -> Values | None:
 
 
 def tether_separated(f: FlightTracker, _: None) -> Values | None:
-    """The vehicle is further away than the tether is long, and nothing pulls."""
+    """The distance to the anchor exceeds the tether's length, without a pull."""
     t = f.tether
     return (t.range_m,) if t is not None and t.separated else None

@@ -22,15 +22,15 @@ ARM_FRESH_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """One reason for which a command did not leave as it was."""
+    """One reason why a command was rejected or changed."""
 
     kind: str
-    """The same for the same reason, whatever the numbers."""
+    """Kind of the reason, independent of the numbers in the text."""
     text: str
 
 
 class Verdict(Record, frozen=True):
-    """What may leave, and why the rest may not."""
+    """Commands that may be sent, and the reasons for all rejections and changes."""
 
     attitude: AttitudeSetpoint | None
     arm_torque_nm: Vec2 | None
@@ -38,20 +38,20 @@ class Verdict(Record, frozen=True):
 
 
 class Gate:
-    """Check of each tick's commands against the vehicle file; remembers the last thrust that left."""
+    """Check of each tick's commands against the vehicle file; keeps the last thrust sent."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         safety, joints = vehicle.safety, vehicle.arm.joints
         self._tilt_max_rad = math.radians(vehicle.airframe.tilt_max_deg) + 1e-6
-        self._lean_max = math.sin(0.5 * self._tilt_max_rad) ** 2
+        self._tilt_limit = math.sin(0.5 * self._tilt_max_rad) ** 2
         by_current_nm = safety.servo_current_max_a * vehicle.arm.torque_per_amp_nm_a
         self._torque_max_nm = (min(joints[0].torque_max_nm, by_current_nm), min(joints[1].torque_max_nm, by_current_nm))
-        self._walls_rad = [(math.radians(joint.angle_deg[0]), math.radians(joint.angle_deg[1])) for joint in joints]
+        self._limits_rad = [(math.radians(joint.angle_deg[0]), math.radians(joint.angle_deg[1])) for joint in joints]
         self._speed_max_rad_s = [math.radians(joint.velocity_max_deg_s) for joint in joints]
         self._state_age_max_s = safety.command_state_age_max_s
         self._slew_max_per_s = safety.thrust_slew_max_per_s
         self._last: tuple[float, float] | None = None
-        """When, and which thrust."""
+        """Flight clock and thrust of the last setpoint; None before the first."""
 
     def check(
         self,
@@ -67,8 +67,8 @@ class Gate:
         """Return the commands that may be sent.
 
         Args:
-            attitude: wanted setpoint.
-            arm_torque_nm: wanted joint torques.
+            attitude: requested setpoint.
+            arm_torque_nm: requested joint torques.
             arm_rad: joint angles now; None if unknown.
             arm_fresh: the joint state is fresh enough to close a loop on.
             t_s: flight clock.
@@ -100,38 +100,38 @@ class Gate:
 
     def _attitude_fault(self, setpoint: AttitudeSetpoint, state_age_s: float) -> Refusal | None:
         w, x, y, z = setpoint.attitude_wxyz
-        norm2, lean, thrust = w * w + x * x + y * y + z * z, x * x + y * y, setpoint.thrust
+        norm2, sin2_half_tilt, thrust = w * w + x * x + y * y + z * z, x * x + y * y, setpoint.thrust
         # Written so that NaN fails all of it.
-        if 0.998 < norm2 < 1.002 and lean <= self._lean_max and 0.0 <= thrust <= 1.0:
+        if 0.998 < norm2 < 1.002 and sin2_half_tilt <= self._tilt_limit and 0.0 <= thrust <= 1.0:
             if state_age_s <= self._state_age_max_s:
                 return None
             return Refusal("stale state", f"attitude setpoint from a state {state_age_s * 1e3:.0f} ms old")
         if not (math.isfinite(norm2) and math.isfinite(thrust)):
             return Refusal("setpoint not finite", "attitude setpoint is not finite")
         if not 0.998 < norm2 < 1.002:
-            return Refusal("no rotation", "attitude setpoint is no unit quaternion")
+            return Refusal("no rotation", "attitude setpoint is not a unit quaternion")
         if not 0.0 <= thrust <= 1.0:
             return Refusal("thrust", f"thrust {thrust:.3f} is outside 0 to 1")
         tilt_deg = math.degrees(tilt_rad(setpoint.attitude_wxyz))
         return Refusal("tilt", f"tilt setpoint {tilt_deg:.1f} deg is above the limit")
 
     def _slewed(self, setpoint: AttitudeSetpoint, t_s: float, refused: list[Refusal]) -> AttitudeSetpoint:
-        """Thrust that changes no faster than it may."""
+        """Return the setpoint with its thrust limited to the permitted rate of change."""
         thrust, last = setpoint.thrust, self._last
         if last is not None and t_s - last[0] <= SLEW_MEMORY_S:
             most = self._slew_max_per_s * max(0.0, t_s - last[0])
             if not last[1] - most <= thrust <= last[1] + most:
                 slow = max(last[1] - most, min(last[1] + most, thrust))
-                text = f"thrust {last[1]:.2f} to {thrust:.2f} in one step is cut to {slow:.2f}"
+                text = f"thrust {last[1]:.2f} to {thrust:.2f} in one step is limited to {slow:.2f}"
                 refused.append(Refusal("thrust slew", text))
                 setpoint, thrust = AttitudeSetpoint(setpoint.attitude_wxyz, slow), slow
         self._last = (t_s, thrust)
         return setpoint
 
     def _is_free(self, first_nm: float, second_nm: float, arm_rad: Vec2, arm_rate_rad_s: Vec2) -> bool:
-        """Torques within limits, joints within walls and slow: `_limited` would change nothing. Nearly every tick is so."""
+        """Return whether torques, joint angles and speeds are within their limits, as in nearly every tick."""
         (a1, a2), (w1, w2), (most1, most2) = arm_rad, arm_rate_rad_s, self._torque_max_nm
-        ((low1, high1), (low2, high2)), (fast1, fast2) = self._walls_rad, self._speed_max_rad_s
+        ((low1, high1), (low2, high2)), (fast1, fast2) = self._limits_rad, self._speed_max_rad_s
         return (
             (-most1 <= first_nm <= most1 and -most2 <= second_nm <= most2)
             and (low1 <= a1 <= high1 and low2 <= a2 <= high2)
@@ -140,7 +140,7 @@ class Gate:
 
     def _limited(self, index: int, torque_nm: float, angle_rad: float, rate_rad_s: float) -> float:
         """Return the torque clipped to its limit; beyond the angle or speed limit only torque that drives the joint back is kept."""
-        limit, (low, high), fast = self._torque_max_nm[index], self._walls_rad[index], self._speed_max_rad_s[index]
+        limit, (low, high), fast = self._torque_max_nm[index], self._limits_rad[index], self._speed_max_rad_s[index]
         if torque_nm > limit:
             torque_nm = limit
         elif torque_nm < -limit:

@@ -1,7 +1,7 @@
 """Motion capture: which poses are trusted, and the predicates of its rules.
 
-A pose is trusted when it is where PX4's velocity and rates say that the body should be by now. A pose that is not trusted counts as
-not arrived and is not passed on to PX4: an estimator that was fed with another body's pose is of no use in a landing.
+A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as
+not received and is not passed on to PX4: an estimator that has fused another body's pose is useless in a landing.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from companion.safety.stream_watch import StreamWatch
 FUSED_WITHIN_M = 0.10
 FUSED_WITHIN_RAD = math.radians(8.0)
 CONTINUOUS_S = 0.1
-"""After a longer gap a pose is compared with PX4's position, not with the pose before."""
+"""After a longer gap a pose is compared with PX4's position, not with the previous pose."""
 FORGET_S = 1.0
 """After a gap this long the next frame is trusted: `mocap_lost` has reported the gap."""
 DRIFT_M_S = 0.3
-"""PX4's position may be off by this much more for every second without a trusted pose."""
+"""Drift that is granted to PX4's position without a trusted pose."""
 RATE_WINDOW_S = 1.0
 
 
 def unfused(i: Inputs) -> str | None:
-    """Return why PX4 seems not to fuse vision, or None if position and yaw of its estimate agree with motion capture.
+    """Return why PX4 appears not to fuse vision, or None if position and yaw of its estimate agree with motion capture.
 
     PX4 accepts poses that it does not fuse without a message, so having sent them proves nothing.
     """
@@ -45,7 +45,7 @@ def unfused(i: Inputs) -> str | None:
 
 
 class MocapTracker:
-    """Judges each frame once: is it trusted, does it repeat the previous one, does it move as the IMU measures?
+    """Evaluates each frame once: is it trusted, does it repeat the previous one, does it agree with the IMU?
 
     Args:
         safety: thresholds for a trusted pose.
@@ -56,26 +56,26 @@ class MocapTracker:
         self._jump_rad = math.radians(s.mocap_jump_deg)
         self._jump_cos_half = math.cos(0.5 * self._jump_rad)
         self._frame_awake_s = -math.inf
-        self._believed: MocapPose | None = None
-        self._believed_awake_s = -math.inf
+        self._trusted_pose: MocapPose | None = None
+        self._trusted_awake_s = -math.inf
         self._same_since_s: float | None = None
         self._moved = False
         self._streams = StreamWatch()
         self._inertial = InertialCheck(s.mocap_inertial_m, s.mocap_inertial_s, s.mocap_timeout_s)
         self._imu: VehicleState | None = None
-        """The state whose IMU samples were used last."""
+        """State whose IMU samples were used last."""
         self._imu_s = 0.0
-        """End of the newest of them, flight clock."""
+        """End of the newest IMU sample, flight clock."""
         self._px4_clock, self._server_clock = RemoteClock(), RemoteClock()
         self._against_imu = False
-        """The newest trusted pose does not move as the IMU measures."""
+        """Whether the newest trusted pose disagrees with the IMU."""
         self._window_awake_s: float | None = None
         self._window_frames = 0
         self.pose: MocapPose | None = None
         """Pose of this tick."""
         self.frame: MocapPose | None = None
         """The newest frame, valid or not."""
-        self.frame_age_s = self.believed_age_s = math.inf
+        self.frame_age_s = self.trusted_age_s = math.inf
         """Awake time since the newest frame, and since the newest trusted pose."""
         self.plausible = True
         """Whether the newest valid pose is trusted."""
@@ -85,7 +85,7 @@ class MocapTracker:
         """New frames repeat the same pose while the vehicle moves in the air, for longer than `safety.mocap_frozen_s`."""
         self.two_streams = False
         self.dragged = False
-        """In the air, while the companion commanded, poses did not move as the IMU measured. Latched: the observer soon follows the
+        """In the air, while the companion commanded, poses disagreed with the IMU. Latched: the observer soon follows the
         drag, and the poses must not be trusted again. Not judged once PX4 lands for another reason: behind a late link the check can
         be wrong, and PX4 needs the poses."""
         self.rate_hz: float | None = None
@@ -94,7 +94,7 @@ class MocapTracker:
         self.trusted = True
         """Whether poses are trusted: the newest one is plausible, and they are not frozen, dragged or of two servers."""
         self.repeats = False
-        """The newest pose repeats the one before bit for bit: in the air no measurement does."""
+        """Whether the newest pose equals the previous one bit for bit, which no measurement does in the air."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
@@ -106,7 +106,7 @@ class MocapTracker:
         if pose is not None and (self.frame is None or pose.stamp_s != self.frame.stamp_s):
             self._judge(pose, vehicle, awake_s)
         self.frame_age_s = awake_s - self._frame_awake_s
-        self.believed_age_s = awake_s - self._believed_awake_s
+        self.trusted_age_s = awake_s - self._trusted_awake_s
         self.frozen = (
             self._same_since_s is not None
             and self._moved
@@ -124,12 +124,12 @@ class MocapTracker:
 
     @property
     def innovation_m(self) -> float:
-        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged."""
+        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not evaluated."""
         return self._inertial.innovation_m
 
-    def unbelieved(self, timeout_s: float) -> bool:
+    def untrusted(self, timeout_s: float) -> bool:
         """Frames arrive, but none was trusted for longer than the timeout."""
-        return self.believed_age_s > timeout_s and not self.frame_age_s > timeout_s
+        return self.trusted_age_s > timeout_s and not self.frame_age_s > timeout_s
 
     def _predict(self, vehicle: VehicleState, boot_s: float) -> None:
         """Integrate all IMU samples since the last tick; `boot_s` is the time of the newest."""
@@ -148,13 +148,13 @@ class MocapTracker:
         self._inertial.imu(vehicle.imu_stamp_s, dt_s, (x, y, z - GRAVITY_M_S2 * dt_s))
 
     def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float) -> None:
-        """Judge a new frame."""
-        before, believed = self.frame, self._believed
+        """Evaluate a new frame."""
+        before, accepted = self.frame, self._trusted_pose
         gone_s = awake_s - self._frame_awake_s
         self.frame, self._frame_awake_s = pose, awake_s
         self._window_frames += 1
         self._streams.update(pose.frame_number, (pose.position_world_m, pose.attitude_wxyz), awake_s)
-        # The gap was reported as lost; a rate over it says nothing about this stream.
+        # The gap was reported as a loss; a rate across it does not describe this stream.
         if gone_s > self._s.mocap_timeout_s:
             self._window_awake_s = self.rate_hz = None
         self.repeats = (
@@ -169,11 +169,11 @@ class MocapTracker:
         if not pose.tracking_valid:
             return
         self.plausible = (
-            believed is None or vehicle is None or gone_s > FORGET_S or self._follows(believed, pose, vehicle)
+            accepted is None or vehicle is None or gone_s > FORGET_S or self._follows(accepted, pose, vehicle)
         )
         if self.plausible:
-            self._believed, self._believed_awake_s = pose, awake_s
-            # A repeated pose is judged by mocap_frozen: it is not passed on, and says nothing of how the vehicle moves.
+            self._trusted_pose, self._trusted_awake_s = pose, awake_s
+            # mocap_frozen evaluates repeated poses; they are not passed on, and are no evidence of motion.
             if not self.repeats:
                 self._against_imu = self._inertial.pose(pose.stamp_s, pose.position_world_m, self._age_s(pose))
         else:
@@ -212,7 +212,7 @@ class MocapTracker:
         return False
 
     def _count(self, awake_s: float) -> None:
-        """Frames in each `RATE_WINDOW_S`."""
+        """Count the frames in each `RATE_WINDOW_S`."""
         start_s = self._window_awake_s
         if start_s is None:
             self._window_awake_s, self._window_frames = awake_s, 0
@@ -228,17 +228,17 @@ def mocap_lost(m: MocapTracker, timeout_s: float) -> Values | None:
 
 def mocap_invalid(m: MocapTracker, timeout_s: float) -> Values | None:
     """Frames arrive, but none was trusted for longer than the timeout, and the newest has no valid pose."""
-    return (timeout_s,) if m.unbelieved(timeout_s) and m.frame is not None and not m.frame.tracking_valid else None
+    return (timeout_s,) if m.untrusted(timeout_s) and m.frame is not None and not m.frame.tracking_valid else None
 
 
 def mocap_swapped(m: MocapTracker, timeout_s: float) -> Values | None:
     """Poses arrive, but none was trusted for longer than the timeout."""
-    return m.off if m.unbelieved(timeout_s) and m.frame is not None and m.frame.tracking_valid else None
+    return m.off if m.untrusted(timeout_s) and m.frame is not None and m.frame.tracking_valid else None
 
 
 def mocap_jump(m: MocapTracker, timeout_s: float) -> Values | None:
     """The newest pose is rejected, but one within the timeout was trusted."""
-    return m.off if not m.plausible and m.believed_age_s <= timeout_s else None
+    return m.off if not m.plausible and m.trusted_age_s <= timeout_s else None
 
 
 def mocap_two_streams(m: MocapTracker, _: None) -> Values | None:

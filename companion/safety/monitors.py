@@ -1,4 +1,6 @@
-"""All monitors of one flight: trackers take each tick's inputs, then the loop evaluates the event table. Pure."""
+"""All monitors of one flight: trackers take each tick's inputs, then the loop evaluates the event table. Pure.
+
+A new monitor is a row in `companion.safety.events` and a predicate in the module of its subject (`arm`, `px4`, `mocap`, `flight`)."""
 
 from __future__ import annotations
 
@@ -19,11 +21,11 @@ from companion.safety.validity import InputFilter
 AWAKE_STEP_MAX_S = 0.02
 """A tick adds no more than this to the age of inputs."""
 MOVING_M_S, MOVING_RAD_S = 0.03, 0.05
-"""Above the noise of a vehicle at rest: what it measures must change."""
+"""Motion above the noise of a vehicle at rest: its measurements must change."""
 
 
 class Monitors:
-    """State: the trackers, and since when each rule holds.
+    """Trackers and rules of one flight.
 
     Args:
         vehicle: thresholds, joint limits, room and tether.
@@ -59,16 +61,16 @@ class Monitors:
 
     @property
     def mocap_trusted(self) -> bool:
-        """Poses may be passed on to PX4. In the air a repeated pose may not, long before `mocap_frozen`: PX4 would take it for rest."""
+        """Whether poses may be passed on to PX4. In the air a repeated pose is withheld, long before `mocap_frozen`: it feigns rest."""
         return self._mocap.trusted and not (self._mocap.repeats and self._airborne)
 
     @property
     def mocap_innovation_m(self) -> float:
-        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not judged."""
+        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not evaluated."""
         return self._mocap.innovation_m
 
     def forget(self) -> None:
-        """Raise the events of all rules that hold again: a HOLD was ended."""
+        """Make all active rules raise their events again, because a HOLD was ended."""
         self._evaluation.forget()
 
     def standing(self) -> str | None:
@@ -76,7 +78,7 @@ class Monitors:
         return self._evaluation.standing()
 
     def check(self, inputs: Inputs, situation: Situation) -> tuple[Event, ...]:
-        """Update with the inputs of one tick and return the events that begin."""
+        """Update with the inputs of one tick and return the new events."""
         self._airborne = airborne = situation.airborne
         gap_s = inputs.t_s - self._last_t_s if self._last_t_s is not None else 0.0
         self._last_t_s = inputs.t_s

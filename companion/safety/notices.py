@@ -1,4 +1,4 @@
-"""Events that the flight's state machine and the core report themselves: no rule of `companion.safety.events` watches for them.
+"""Events that the state machine and the core report themselves, without a rule in `companion.safety.events`.
 
 One row each; docs/safety.md is made from them. Ids are stable: logs, summaries and outside scripts name them.
 """
@@ -12,7 +12,7 @@ from companion.model.types import SafetyAction, Severity
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One row."""
+    """One row of the table."""
 
     id: str
     severity: Severity
@@ -45,7 +45,7 @@ OFFBOARD_REFUSED = Notice("offboard_refused", _CRITICAL, _NOMINAL, "PX4 did not 
 ARMING_REFUSED = Notice("arming_refused", _CRITICAL, _NOMINAL, "PX4 did not arm within 10 s: refused")
 NOT_READY = Notice(
     "not_ready", _WARNING, _NOMINAL,
-    "a flight that waits for its start has lost its inputs, its estimate or its place; it waits until they are back",
+    "a flight that waits for its start has lost its inputs, its estimate or its start position; it waits until they return",
 )  # fmt: skip
 START_DECLINED = Notice(
     "start_declined", _WARNING, _NOMINAL, "`start` was commanded before the flight was ready; the text gives the reason"
@@ -65,13 +65,13 @@ PAYLOAD_LEFT = Notice(
     "no pull on the net for 0.5 s without free fall: the net is empty and ready for the next catch",
 )  # fmt: skip
 TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle stands")
-NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "no touch-down 5 s after the plan's end: PX4 lands")
+NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "no touchdown 5 s after the plan's end: PX4 lands")
 DISARM_REFUSED = Notice(
     "disarm_refused", _CRITICAL, _NOMINAL,
     "PX4 did not disarm within 8 s, or left OFFBOARD before: PX4 lands; if the vehicle had not lifted: the crew is asked to "
     "disarm it, and the guardian takes over",
 )  # fmt: skip
-AUTOPILOT_LANDING = Notice("autopilot_landing", _CRITICAL, _PX4_LANDS, "reports of the landing by PX4")
+AUTOPILOT_LANDING = Notice("autopilot_landing", _CRITICAL, _PX4_LANDS, "progress of the landing by PX4")
 GATE = Notice("gate", _WARNING, _WARN, "the gate rejected or limited a command")
 HOLD_EXPIRED = Notice("hold_expired", _CRITICAL, _LAND, "a HOLD lasted longer than `hold_max_s`: it lands")
 RETRACT_EXPIRED = Notice(

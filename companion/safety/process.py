@@ -1,4 +1,4 @@
-"""The companion's own processes and the operator's commands: what is tracked of them, and the predicates of their rules."""
+"""The companion's own processes and the operator's commands: their tracker, and the predicates of their rules."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from companion.safety.situation import HOLDS, Values
 
 
 class ProcessTracker:
-    """The control loop, the recorder, the guardian and the operator."""
+    """Tracks the control loop, the recorder, the guardian and the operator's commands."""
 
     def __init__(self) -> None:
         self._command = OperatorCommand.NONE
@@ -45,12 +45,12 @@ def recorder_drops(p: ProcessTracker, _: None) -> Values | None:
 
 
 def guardian_lost(p: ProcessTracker, _: None) -> Values | None:
-    """There is a guardian, and it is not ready."""
+    """A guardian is configured but not ready."""
     return HOLDS if p.guardian_ready is False else None
 
 
 def commanded(command: OperatorCommand) -> Callable[[ProcessTracker, None], Values | None]:
-    """Return the predicate: this command begins in this tick."""
+    """Return the predicate that holds if this command begins in this tick."""
 
     def predicate(p: ProcessTracker, _: None) -> Values | None:
         return HOLDS if p.command is command else None

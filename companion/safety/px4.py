@@ -9,7 +9,7 @@ from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleSt
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
 DISARMED_ABOVE_M = 0.15
-"""Margin over standing height below which PX4's own disarm after a landing is no fault."""
+"""Margin over standing height below which PX4's own disarm after a landing is not a fault."""
 CLOCK_BACK_S = 1.0
 LAG_FORGOTTEN_S_PER_S = 0.05
 """Rate at which a lasting lag is reduced, because it is an offset between the clocks."""
@@ -36,7 +36,7 @@ class Px4Tracker:
         self.status: AutopilotStatus | None = None
         self.situation = Situation(False, False, None)
         self.state_age_s = self.heartbeat_age_s = 0.0
-        """Ages: of the oldest of position, attitude and IMU sample; of the newest heartbeat."""
+        """Age of the oldest of position, attitude and IMU sample; `heartbeat_age_s` is the age of the newest heartbeat."""
         self.lag_s = 0.0
         """Lag of PX4's state beyond the smallest one seen; 0 without PX4's clock."""
         self.rebooted_s: float | None = None
@@ -44,7 +44,7 @@ class Px4Tracker:
         self.repeats = False
         """PX4 sends new positions with the same values although the vehicle moves in the air."""
         self.left_offboard: AutopilotStatus | None = None
-        """PX4's status if PX4 should be in OFFBOARD and is not; else None."""
+        """PX4's status if PX4 has left OFFBOARD without a request; else None."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
@@ -73,7 +73,7 @@ class Px4Tracker:
             if self._boot_s is not None and v.boot_s < self._boot_s - CLOCK_BACK_S:
                 self.rebooted_s = v.boot_s
                 self._offset_s = math.inf
-            # The difference of the clocks is not known: its least value stands for no lag, and slowly grows.
+            # The clock offset is unknown: its smallest value counts as no lag, and slowly grows.
             offset_s = v.attitude_stamp_s - v.boot_s
             grown_s = LAG_FORGOTTEN_S_PER_S * (awake_s - self._lag_awake_s)
             self._lag_awake_s = awake_s

@@ -1,21 +1,21 @@
-"""When rotors may be stopped: the one rule for every request to disarm, in the flight process and in the guardian. Pure.
+"""Conditions for stopping the rotors, for every disarm request of the flight process and the guardian. Pure.
 
 There are three cases:
 
-* **It stands.** PX4 is in OFFBOARD or LAND, so no pilot flies; every fresh height is near standing height; and the vehicle has
+* **The vehicle stands.** PX4 is in OFFBOARD or LAND, so no pilot flies; every fresh height is near standing height; and the vehicle has
   not moved. All of this must hold without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses in the air, and for
   `FORCE_DISARM_S` by motion capture before FORCE_DISARM, which PX4 does not refuse.
-* **It is flipped.** Beyond `FLIPPED_TILT_RAD` by PX4's attitude, confirmed by motion capture, or by the accelerometer where
+* **The vehicle is flipped.** Beyond `FLIPPED_TILT_RAD` by PX4's attitude, confirmed by motion capture, or by the accelerometer where
   motion capture does not see the body, for `FLIPPED_HOLD_S`. Then PX4's LAND drives it into the floor, so FORCE_DISARM follows
   at once and at any height, unless a pilot flies.
-* **It is tipped over.** For `TIPPED_HOLD_S`, in OFFBOARD or LAND: tilted by more than `safety.tilt_abort_deg` by PX4's attitude and
-  by motion capture, and less than `LOW_WITHIN_M` above standing height by motion capture. It lies on its rotors, and PX4's LAND
-  goes on driving them. Without a fresh pose there is no judgement.
+* **The vehicle is tipped over.** For `TIPPED_HOLD_S`, in OFFBOARD or LAND: tilted by more than `safety.tilt_abort_deg` by PX4's
+  attitude and by motion capture, and less than `LOW_WITHIN_M` above standing height by motion capture. It lies on its rotors, and PX4's
+  LAND goes on driving them. Without a fresh pose this is not evaluated.
 
-No sound flight is taken for a vehicle that is tipped over. The law's setpoints stay within `airframe.tilt_max_deg`, PX4's own landing
-within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by more than
-8 m/s^2, and PX4, commanded to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. One other way to stay so
-tilted so low is a tether that pulls the vehicle over; it then falls by `LOW_WITHIN_M` at most.
+A normal flight is never mistaken for a vehicle that is tipped over. The law's setpoints stay within `airframe.tilt_max_deg`, PX4's own
+landing within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by more than
+8 m/s^2, and PX4, commanded to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. Only a tether that pulls
+the vehicle over can hold it at this tilt so low; it then falls by `LOW_WITHIN_M` at most.
 """
 
 from __future__ import annotations
@@ -30,46 +30,46 @@ from companion.model.types import FlightMode, Inputs, MocapPose, Vec3
 from companion.safety.touchdown import MOCAP_FRESH_S, STILL_M_S, Sinking
 
 LOW_WITHIN_M = 0.25
-"""Margin over standing height: higher than this nothing counts as standing."""
+"""Margin over standing height: above it the vehicle does not count as standing."""
 STILL_WITHIN_M = 0.05
 """A vehicle that has moved further than this since its rest began has not stood still."""
 DISARM_STILL_S = 0.35
 FORCE_DISARM_S = 4.0
-"""At rest for this long without PX4's land detector noticing, the vehicle is disarmed against it."""
+"""Time at rest after which the vehicle is disarmed although PX4's land detector reports no landing."""
 ESTIMATE_TRUSTED_S = 4.2
-"""After the last motion-capture pose: PX4's dead-reckoned height still counts. PX4 gives it up after 4.5 s."""
+"""Time after the last motion-capture pose for which PX4's dead-reckoned height counts. PX4 drops it after 4.5 s."""
 STATE_FRESH_S = 0.3
 FLIPPED_TILT_RAD = math.radians(70.0)
 FLIPPED_HOLD_S = 0.3
 TIPPED_HOLD_S = 0.5
 _UPRIGHT_MIN_M_S2 = GRAVITY_M_S2 * math.cos(FLIPPED_TILT_RAD)
-"""Specific force along body z; anything that stands or hovers less tilted feels more."""
+"""Specific force along body z; a vehicle that stands or hovers with less tilt measures more."""
 Places = dict[str, Vec3]
-"""Position in the world by each source, "mocap" and "PX4"."""
+"""Position in the world frame by source, "mocap" or "PX4"."""
 OWN_MODES = frozenset({FlightMode.OFFBOARD, FlightMode.LAND})
-"""PX4's modes in which the companion or its guardian has the vehicle; a stop of rotors is requested in no other."""
+"""PX4's modes in which the companion or its guardian flies; the rotors are stopped in no other."""
 
 
 def fresh_pose(i: Inputs) -> MocapPose | None:
-    """The motion-capture pose, if the body is in view and the pose is at most `MOCAP_FRESH_S` old."""
+    """Return the motion-capture pose, or None if it is older than `MOCAP_FRESH_S` or the body is not in view."""
     pose = i.mocap
     return pose if pose is not None and pose.tracking_valid and i.t_s - pose.stamp_s < MOCAP_FRESH_S else None
 
 
 def hears_px4(i: Inputs) -> bool:
-    """A heartbeat of PX4 has arrived within `HEARTBEAT_FRESH_S`."""
+    """Return whether a heartbeat of PX4 has arrived within `HEARTBEAT_FRESH_S`."""
     return i.status is not None and i.t_s - i.status.heartbeat_stamp_s < HEARTBEAT_FRESH_S
 
 
 def is_ours(i: Inputs) -> bool:
-    """PX4 is heard, armed, and in a mode of `OWN_MODES`."""
+    """Return whether PX4 sends heartbeats, is armed, and is in a mode of `OWN_MODES`."""
     return hears_px4(i) and i.status is not None and i.status.armed and i.status.mode in OWN_MODES
 
 
 def seems_flipped(i: Inputs) -> bool:
     """Return whether two sources report in this tick that the vehicle is tilted by more than `FLIPPED_TILT_RAD`.
 
-    PX4's attitude must say so. Motion capture decides whether that is true; without a fresh pose the accelerometer does, which
+    PX4's attitude must report it and motion capture confirm it; without a fresh pose the accelerometer does, which
     confirms a vehicle that lies on its side or back or falls freely, not one whose rotors still push against gravity.
     """
     if not _tilted_by_px4(i, FLIPPED_TILT_RAD):
@@ -83,7 +83,7 @@ def seems_flipped(i: Inputs) -> bool:
 
 
 def _tilted_by_px4(i: Inputs, limit_rad: float) -> bool:
-    """PX4's attitude is fresh and tilted by more than `limit_rad`."""
+    """Return whether PX4's attitude is fresh and tilted by more than `limit_rad`."""
     vehicle = i.vehicle
     if vehicle is None or i.t_s - vehicle.attitude_stamp_s >= STATE_FRESH_S:
         return False
@@ -92,14 +92,14 @@ def _tilted_by_px4(i: Inputs, limit_rad: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RotorStop:
-    """Evidence, tick by tick, whether the rotors may be stopped."""
+    """Evidence, updated in every tick, whether the rotors may be stopped."""
 
     low_m: float
     """Below this height the vehicle may stand."""
     tilt_max_rad: float
     """`safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over."""
     pose_s: float = -math.inf
-    """Flight time of the newest pose that PX4 has had; -inf if that is not known."""
+    """Flight time of the newest pose that PX4 received; -inf if unknown."""
     sinking: Sinking = field(default_factory=Sinking)
     rest: tuple[float, Places] | None = None
     """Time since which the vehicle stands still, and its position by each source; None if it does not."""
@@ -121,8 +121,8 @@ class RotorStop:
         Args:
             clearance_m: height of the body's origin when the vehicle stands.
             tilt_max_rad: `safety.tilt_abort_deg`.
-            pose_s: flight time of the newest pose that PX4 has had; -inf if that is not known.
-            flipped: the vehicle is known to be flipped, and has been for long enough.
+            pose_s: flight time of the newest pose that PX4 received; -inf if unknown.
+            flipped: the vehicle is known to have been flipped for long enough.
         """
         return cls(clearance_m + LOW_WITHIN_M, tilt_max_rad, pose_s, flipped_since_s=-math.inf if flipped else None)
 
@@ -150,7 +150,7 @@ class RotorStop:
 
     @property
     def overturned(self) -> bool:
-        """The vehicle is flipped or tipped over: FORCE_DISARM may be requested now."""
+        """Return whether the vehicle is flipped or tipped over, so that FORCE_DISARM may be requested now."""
         return self.flipped or self.tipped
 
     def _rest(self, i: Inputs, places: Places) -> tuple[float, Places] | None:
@@ -162,14 +162,14 @@ class RotorStop:
         return rest
 
     def _lies_tilted(self, i: Inputs, pose: MocapPose | None) -> bool:
-        """In an own mode, low by motion capture, and tilted beyond the limit by motion capture and by PX4, in this tick."""
+        """Return whether, in this tick, PX4 is in an own mode, motion capture shows it low, and both show it tilted too far."""
         if pose is None or pose.position_world_m[2] >= self.low_m or not is_ours(i):
             return False
         return tilt_rad(pose.attitude_wxyz) > self.tilt_max_rad and _tilted_by_px4(i, self.tilt_max_rad)
 
 
 def _since(before_s: float | None, t_s: float, holds: bool) -> float | None:
-    """Return since when a condition has held; None if it does not."""
+    """Return the time since which a condition has held, or None if it does not hold."""
     return (t_s if before_s is None else before_s) if holds else None
 
 

@@ -1,4 +1,4 @@
-"""What a row of the event table is, and how it reads its thresholds from the vehicle file."""
+"""Row of the event table, and access to its thresholds in the vehicle file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.safety.situation import Values
 
 
 class Subject(Enum):
-    """What a rule watches."""
+    """Subject of a rule."""
 
     INPUTS = "inputs"
     OPERATOR = "operator"
@@ -42,24 +42,24 @@ class Rule:
     id: str
     subject: Subject
     what: str
-    """What is found, in words."""
+    """Description of the condition."""
     predicate: Callable[[Any, Any], Values | None]
     """Takes the subject's tracker and the thresholds, as `thresholds_of` returns them. Returns the values for the message if the
     condition holds in this tick, else None. Pure."""
     thresholds: tuple[str, ...] = ()
     """Keys of the vehicle file, below `safety:` if they have no dot, whose values the predicate gets."""
     tracked_by: tuple[str, ...] = ()
-    """Keys by which the tracker has already judged what the predicate reads."""
+    """Keys of thresholds that the tracker applies itself."""
     hold_time: float | str = 0.0
-    """The condition must hold for this long, s; or the key of `safety:` that says so."""
+    """Time for which the condition must hold, s, or the key of `safety:` with this time."""
     ground: SafetyAction | None
     """Action before the rotors may lift: from LAND on the companion stands down. None: not evaluated there."""
     air: SafetyAction | None
     """Action while the rotors may lift. None: not evaluated there."""
     message: str
-    """Text of the event; its braces take the predicate's values."""
+    """Text of the event, with braces for the predicate's values."""
     severity: Severity | None = None
-    """None: CRITICAL for RETRACT and graver actions in the air, else WARNING."""
+    """Severity; if None, CRITICAL for RETRACT and more severe actions in the air, else WARNING."""
     repeat: Repeat = Repeat.AFTER_QUIET
     while_waiting: bool = False
     """Evaluated also while inputs are still missing on the ground."""
@@ -79,7 +79,7 @@ def hold_time_s(rule: Rule, vehicle: Vehicle) -> float:
 
 
 def thresholds_of(rule: Rule, vehicle: Vehicle) -> Any:
-    """Return what the predicate gets: None without a threshold, the value of one, a tuple of several. Angles are in rad."""
+    """Return the thresholds for the predicate: None, a single value, or a tuple of several. Angles are in rad."""
     values = tuple(_value(vehicle, key) for key in rule.thresholds)
     return values if len(values) > 1 else values[0] if values else None
 

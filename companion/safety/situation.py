@@ -1,4 +1,4 @@
-"""What the trackers know beside the inputs: what the core is doing, and how old an input is."""
+"""Context of the trackers in addition to the inputs: activity of the core, and age of an input."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from companion.model.types import ControlLog, TetherState
 
 Values = tuple[object, ...]
-"""What a predicate returns when its condition holds: the values for the braces of the rule's message."""
+"""Values for the braces of the rule's message, returned by a predicate whose condition holds."""
 HOLDS: Values = ()
 """The condition holds, and the message has no braces."""
 
 
 @dataclass(slots=True)
 class Situation:
-    """What the core is doing, as far as rules depend on it. One object that the core keeps up to date."""
+    """Activity of the core, as far as rules depend on it. The core updates one object."""
 
     airborne: bool
     """The rotors may lift: from arming to touchdown."""
@@ -24,12 +24,12 @@ class Situation:
     tracking_error_m: float | None
     """Distance from the reference; None while no plan is flown."""
     control: ControlLog | None = None
-    """What the control law computed in the last tick; None while it does not fly."""
+    """Log record of the control law in the last tick; None while it does not fly."""
     caught: bool = False
     """A payload is on board."""
     tether: TetherState | None = None
     found_armed: str | None = None
-    """PX4 is armed without a request of the companion: what was found. `airborne` then says whether the vehicle flies."""
+    """Description of a PX4 that is armed without a request of the companion; `airborne` then shows whether it flies."""
     waiting: bool = False
     """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
 
@@ -37,8 +37,8 @@ class Situation:
 class Age:
     """Age of an input, counted only while this process was awake.
 
-    When the process itself is held up, every stamp grows old although nothing was lost: what arrived meanwhile is read a moment
-    later. The rules `loop_late` and `loop_stalled` report the hold-up.
+    When the process itself is delayed, all inputs appear stale although nothing was lost: what arrived meanwhile is read a moment
+    later. The rules `loop_late` and `loop_stalled` report the delay.
     """
 
     __slots__ = ("_seen_awake_s", "_stamp_s")

@@ -1,6 +1,6 @@
-"""The distance that the vehicle needs to come to rest after a fault, whoever stops it. Pure.
+"""Stopping distance of the vehicle after a fault, stopped by PX4 or by the governor. Pure.
 
-Two things can stop it. PX4's LAND, requested by the flight process or by the guardian, first sets a stop point
+PX4's LAND, requested by the flight process or by the guardian, first sets a stop point
 `v (0.6 s + v / (2 MPC_ACC_HOR))` ahead (Navigator::preproject_stop_point and computeBrakingDistanceFromVelocity of PX4 1.16; the 0.6 s
 are a constant there) and flies to it. The governor brakes the reference at `tether.stop_deceleration_m_s2`. At every speed the model
 assumes the slower of the two decelerations: its distance D(v) is never shorter than either, and because dD/dv >= v / a, braking at
@@ -14,7 +14,7 @@ import math
 from companion.config.vehicle import Tether
 
 LAND_AHEAD_S = 0.6
-"""PX4 sets the stop point of LAND this far ahead, besides the braking distance. Measured as well: docs/px4.md."""
+"""PX4 sets the stop point of LAND this far ahead, in addition to the braking distance. Confirmed by measurement: docs/px4.md."""
 LAND_DECELERATION_M_S2 = 8.0
 """MPC_ACC_HOR of configs/px4/indoor_mocap.params; enters only the distance of LAND's stop point."""
 

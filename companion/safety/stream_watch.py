@@ -1,4 +1,4 @@
-"""Detect a second motion-capture server at the same address, perhaps a forged one, by its own sequence of frame numbers. Pure."""
+"""Detects a second, perhaps forged, motion-capture server at the same address by its separate sequence of frame numbers. Pure."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _HALF = 0x80000000
 class StreamWatch:
     """Counts frames whose number (uint32, so it wraps) steps back.
 
-    A frame that the network reordered or duplicated is no step back: it is at most REORDERED_MAX behind the newest one, and its number
-    was skipped before, or came with the same content. A second stream with numbers close to those of the first repeats them with
-    another content.
+    A frame that the network reordered or duplicated does not count as a step back: it is at most REORDERED_MAX behind the newest one,
+    and its number was skipped before, or came with the same content. A second stream with numbers close to those of the first repeats
+    them with another content.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class StreamWatch:
         self._back_s: deque[float] = deque(maxlen=STEPS_BACK_MAX + 1)
 
     def update(self, number: int, content: object, t_s: float) -> bool:
-        """Take a frame.
+        """Process a frame.
 
         Args:
             number: frame number.
@@ -36,7 +36,7 @@ class StreamWatch:
             t_s: arrival time.
 
         Returns:
-            True if there were more than STEPS_BACK_MAX steps back within WINDOW_S, so there are two streams.
+            True if more than STEPS_BACK_MAX steps back within WINDOW_S show that there are two streams.
         """
         behind = _HALF if self._newest is None else (self._newest - number) & _MASK
         if behind > REORDERED_MAX:

@@ -1,8 +1,8 @@
 """The safety ladder: one pure update, latched.
 
-NOMINAL -> WARN -> HOLD -> RETRACT -> LAND -> AUTOPILOT_LAND -> TERMINATE. An event carries the action that it asks for; the ladder goes
-to the gravest one. By itself it only goes up: a HOLD that lasts too long becomes a LAND, and so does a RETRACT. Only the operator takes
-it down: `operator_resume` ends a HOLD and nothing else, and only if no active rule asks for a HOLD or more.
+NOMINAL -> WARN -> HOLD -> RETRACT -> LAND -> AUTOPILOT_LAND -> TERMINATE. An event carries the action that it requests; the ladder
+takes the most severe one. By itself it only escalates: a HOLD or RETRACT that exceeds its time limit becomes a LAND. Only the operator
+de-escalates: `operator_resume` ends a HOLD and no other state, and only if no active rule requires a HOLD or more.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class LadderTimes:
 
     @classmethod
     def of(cls, safety: Safety) -> LadderTimes:
-        """Return those of the vehicle file."""
+        """Return the times of the vehicle file."""
         return cls(safety.hold_max_s, safety.retract_max_s)
 
 
@@ -45,11 +45,11 @@ def update(
     """Return the ladder after the events of a tick; the same object if nothing changes.
 
     Args:
-        state: before the tick.
-        events: of this tick.
+        state: state before the tick.
+        events: events of this tick.
         t_s: flight clock.
         times: how long a HOLD and a RETRACT may last.
-        standing: what the vehicle must hold for now; None if nothing does, and the operator may end a HOLD.
+        standing: message of the active rule that requires a HOLD; None if there is none, so that the operator may end a HOLD.
     """
     held = state.action is SafetyAction.HOLD  # a RESUME does not end a HOLD that begins in the same tick
     for event in events:

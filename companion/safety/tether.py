@@ -1,7 +1,7 @@
 """The safety tether: slack now and at the predicted stop, sag against rotors and arm, winding, pull, separation. Pure.
 
 The tether is a line between its anchor and an attachment point on the vehicle that can be no longer than `tether.length_m`.
-What cannot be measured is bounded: how the line hangs (`companion.safety.tether_shape`), how hard it pulls
+Unmeasured quantities are bounded: the shape of the line (`companion.safety.tether_shape`) and its pull
 (`companion.safety.tether_pull`). Plain floats: the watch runs in the control tick.
 """
 
@@ -18,13 +18,13 @@ from companion.safety.tether_shape import Clearance, steepest_slope
 
 _TWO_PI = 2.0 * math.pi
 _ABOVE_M = 0.05
-"""Nearer than this to a vertical the direction to it is not defined, and the winding is held."""
+"""Distance to a vertical below which the direction to it is undefined and the winding is held."""
 _DT_MAX_S = 0.05
-"""A longer gap between two updates counts as this in filters."""
+"""Longest time step of the filters; a longer gap between two updates counts as this."""
 
 
 def attachment_world_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> Vec3:
-    """Return where the tether is tied to the vehicle, world frame, m."""
+    """Return the tether's attachment point on the vehicle, world frame, m."""
     x, y, z = quat_rotate(attitude_wxyz, tether.attachment_body_m)
     return (position_world_m[0] + x, position_world_m[1] + y, position_world_m[2] + z)
 
@@ -70,14 +70,14 @@ class Winding:
 
 
 class TetherWatch:
-    """Follows the tether through a flight. State: winding, and the low-passed force.
+    """Tracks the tether during a flight: winding, clearance and low-passed force.
 
-    `TetherState.turns` is the winding about the anchor's vertical (flying round it) or of the line about the vehicle (turning on the
-    spot), whichever is more: counter-clockwise from above positive, from where the watch began, whole turns come and go.
+    `TetherState.turns` is the larger of the windings of the vehicle about the anchor's vertical (flying round it) and of the line
+    about the vehicle (yawing on the spot), counter-clockwise positive from above and counted from the first update.
     `clearance_m` counts the arm only if the line is not tied in the arm's own plane (`Clearance.judges_arm`).
 
     Args:
-        vehicle: its tether, airframe, arm and tool.
+        vehicle: tether, airframe, arm and tool.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -116,7 +116,7 @@ class TetherWatch:
             position_world_m: position of the body's origin.
             velocity_world_m_s: velocity of the body's origin.
             attitude_wxyz: rotation from body to world.
-            arm_rad: joint angles as in the paper; None if unknown, and then the arm may be anywhere within its reach.
+            arm_rad: joint angles as in the paper; None if unknown: the arm is assumed anywhere within its reach.
             disturbance_world_n: force on the vehicle other than rotor thrust and gravity, N; None if unknown or on the ground.
             tool_force_world_n: the part of this force that acts on the net, tared, N; None if unknown.
         """
@@ -150,7 +150,7 @@ class TetherWatch:
         if outward > 0.0:
             stop_slack -= self._stop.distance_m(outward)
 
-        # The line in the body's frame, straight and hanging as deep as its length lets it.
+        # The line in the body's frame, straight and with the deepest sag that its length permits.
         straight = (xx * ux + yx * uy + zx * uz, xy * ux + yy * uy + zy * uz, xz * ux + yz * uy + zz * uz)
         hanging = None
         if self._clearance.needs_hanging and slack > 0.0:

@@ -1,10 +1,10 @@
 """Pull of the tether, estimated from the residual force on the vehicle.
 
-The residual is the disturbance of the whole machine less the force at the net: a caught payload is in both and drops out. What is
-left are wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the
-vertical part of the residual is worth less than the horizontal: the pull is the weighted least-squares fit of a force along the line.
-For the same reason a payload is not taken for the tether when the force sensor is lost: it pulls down only, and a pull along the line
-has a horizontal part too.
+The residual is the disturbance of the whole machine less the force at the net: a caught payload is in both and cancels. The rest is
+wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the vertical part
+of the residual has less weight than the horizontal: the pull is the weighted least-squares fit of a force along the line. For the same
+reason a payload is not mistaken for the tether when the force sensor is lost: it pulls down only, and a pull along the line has a
+horizontal part too.
 """
 
 from __future__ import annotations
@@ -64,17 +64,17 @@ class PullEstimate:
         self.forget()
 
     def forget(self) -> None:
-        """Start again."""
+        """Discard the estimate."""
         self._f: Vec3 | None = None
         self._pull_s = self._side_s = 0.0
         self._range_mean = self._pull_mean = self._cov = self._var = 0.0
         self.pull_n = 0.0
         self.pulling = False
-        """Something pulls towards the anchor."""
+        """Whether there is a pull towards the anchor."""
         self.sideways = False
-        """Something pulls horizontally, wherever to."""
+        """Whether there is a horizontal pull in any direction."""
         self.growing = False
-        """While pulling: it grew with the range."""
+        """Whether the present pull has grown with the range."""
 
     def update(
         self,
@@ -96,7 +96,7 @@ class PullEstimate:
             rz -= tool_force_world_n[2]
         before = self._f
         if before is None:
-            # Not the sample: a single one is mostly noise.
+            # Not the newest sample, which is mostly noise.
             before = (0.0, 0.0, 0.0)
             self._range_mean = range_m
         gain = dt_s / (self._filter_s + dt_s)

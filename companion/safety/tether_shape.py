@@ -2,8 +2,8 @@
 
 A line that hangs still lies in the vertical plane through its two ends, below their chord, and above its own tangent at the vehicle:
 a hanging line is convex. So it is bounded by two rays from the attachment, the chord and the steepest tangent that its slack allows;
-what happens beyond a metre from the vehicle matters to neither rotors nor arm. The tangent is that of the parabola of the same length,
-which for much slack goes straight down, as the line does. Wind and rotor wash on the line are not in it: `clearance_min_m` is for them.
+its shape beyond a metre from the vehicle is irrelevant for rotors and arm. The tangent is that of the parabola of the same length,
+which for much slack goes straight down, as the line does. `clearance_min_m` covers wind and rotor wash on the line.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.types import Vec2, Vec3
 
 _NEVER = 1.0
-"""Length, m, up to which a line is followed that never leaves the disk."""
+"""Length, m, to which a line is followed that does not leave the disk."""
 
 
 def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float) -> Vec2:
@@ -39,7 +39,7 @@ class Clearance:
     """Rotors as a ring in the plane through the body's origin, the arm as a slab about its plane.
 
     Args:
-        vehicle: airframe, arm, tool, and where the tether is tied.
+        vehicle: airframe, arm, tool, and the tether's attachment.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -55,7 +55,7 @@ class Clearance:
         self._reach_m = self._l1 + self._l2 + self._net_m
         self._aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
         self.judges_arm = self._aside_m > 0.0
-        """False if the tether is tied in the arm's own plane: then it hangs into the arm's sweep in every flight."""
+        """False if the tether is attached in the arm's own plane, where it sags into the arm's sweep in every flight."""
         self.needs_hanging = self.judges_arm or not self._below
         """False if `least_m` does not use the hanging direction."""
 
@@ -65,7 +65,7 @@ class Clearance:
         Args:
             straight_body: unit direction from the attachment to the anchor.
             hanging_body: unit direction in which the line leaves when it hangs deepest; None if it is straight.
-            arm_rad: the paper's angles; None if they are unknown: the arm may be anywhere within its reach.
+            arm_rad: the paper's angles; None if unknown: the arm is assumed anywhere within its reach.
         """
         # Tied below the rotors the line comes nearest when it is straight, tied above them when it hangs deepest.
         nearest = straight_body if self._below or hanging_body is None else hanging_body

@@ -18,10 +18,10 @@ STILL_M_S = 0.08
 REFERENCE_BELOW_M = 0.05
 HEIGHT_HOLD_S = 0.35
 THRUST_SHARE = 0.75
-"""Share of hover thrust. With this thrust a vehicle in the air falls 0.2 m within 0.4 s."""
+"""Share of hover thrust at which a vehicle in the air falls 0.2 m within 0.4 s."""
 THRUST_HOLD_S = 0.2
 NEVER_ABOVE_M = 0.5
-"""Margin over standing height. Above it, by motion capture, thrust and PX4 prove nothing: the vehicle may hang on its tether."""
+"""Margin over standing height. Above it, by motion capture, thrust and PX4 are no evidence: the tether may carry the vehicle."""
 ALONE_S = 0.4
 """Time for which one source may be alone before thrust is reduced."""
 RELIEF_S = 1.0
@@ -34,10 +34,10 @@ MOCAP_FRESH_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class HeightEvidence:
-    """PX4's estimate: low and still, for `HEIGHT_HOLD_S`."""
+    """Evidence by PX4's estimate: low and still for `HEIGHT_HOLD_S`."""
 
     low_m: float
-    """Below this height the vehicle may stand: `low_below_m`."""
+    """Height below which the vehicle may stand, from `low_below_m`."""
     since_s: float | None = None
     """Flight time since when it has been low and still."""
 
@@ -91,7 +91,7 @@ class Touchdown:
     """Evidence of touchdown from three sources, of which two must agree, in a landing that the companion flies itself."""
 
     ceiling_m: float
-    """Above this height by motion capture, thrust and PX4 prove nothing."""
+    """Height by motion capture above which thrust and PX4 are no evidence."""
     height: HeightEvidence
     sinking: Sinking = field(default_factory=Sinking)
     thrust_since_s: float | None = None
@@ -122,9 +122,9 @@ class Touchdown:
             t_s: flight clock.
             vehicle: PX4's state.
             pose: motion-capture pose, None if it is not trusted.
-            reference_height_m: where the law wants the body's origin.
-            thrust_share: of hover thrust, in the last command.
-            landed: PX4's land detector says that the vehicle stands.
+            reference_height_m: height of the body's origin in the reference.
+            thrust_share: share of hover thrust in the last command.
+            landed: whether PX4's land detector reports a landing.
         """
         dt_s = 0.0 if self.last_s is None else t_s - self.last_s
         height = self.height.update(t_s, vehicle.position_world_m[2], vehicle.velocity_world_m_s[2], reference_height_m)
@@ -144,7 +144,7 @@ class Touchdown:
         return after._relieved(t_s, dt_s, sink_m_s, (low or carried) and below)
 
     def _relieved(self, t_s: float, dt_s: float, sink_m_s: float | None, seems_to_stand: bool) -> Touchdown:
-        """Reduce thrust while one source alone says that the vehicle stands; restore it at once when the vehicle sinks."""
+        """Reduce thrust while only one source shows that the vehicle stands; restore it at once when the vehicle sinks."""
         if not seems_to_stand or sink_m_s is None or sink_m_s > RELIEF_SINK_MAX_M_S:
             return replace(self, relief=1.0, alone_since_s=None)
         since_s = t_s if self.alone_since_s is None else self.alone_since_s

@@ -1,4 +1,4 @@
-"""Records with a value that is not finite or out of range: they count as not arrived, and the rules `*_not_finite` report them."""
+"""Records with a value that is not finite or out of range: they count as not received, and the rules `*_not_finite` report them."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _mocap_is_valid(m: MocapPose) -> bool:
         _stamp(m.stamp_s)
         and (m.latency_s is None or _stamp(m.latency_s))
         and (m.exposure_server_s is None or _stamp(m.exposure_server_s))
-        # Motive may send anything for a body that it does not see; the pose is not used then.
+        # Motive may send any values for an untracked body; the pose is not used then.
         and (not m.tracking_valid or (_in_range3(m.position_world_m) and _is_rotation(m.attitude_wxyz)))
     )
 

@@ -231,7 +231,7 @@ def synthetic_flight(
             control=control if flying else None,
             outcome=Outcome.COMPLETED if kind is PhaseKind.DONE else None,
             mocap_trusted=True,
-            bent_by=(),
+            limited_by=(),
         )
         late_s = abs(noise.gauss(0, 6e-4))
         start_s = t_s + late_s

@@ -102,7 +102,7 @@ class Rig:
                 out=self.sandbox.cwd,
                 param_names=(),
                 unsettled=lambda _: None,
-                tell=lambda _, __: None,
+                progress=lambda _, __: None,
             )
         return {row.id: row for row in preflight.rows(seen, vehicle)}
 

@@ -113,16 +113,16 @@ def test_hold_resume_hold_resume_land() -> None:
     flown = commanded(*first, (11.0, LAND), (11.5, LAND), (11.7, HOLD), (11.9, RESUME), (12.1, START))
     assert flown.effects == [
         (True, "holding"),
-        (True, "holding already"),
-        (True, "going on"),
+        (True, "already holding"),
+        (True, "continuing"),
         (False, "nothing to resume: not holding"),
         (True, "holding"),
-        (True, "going on"),
+        (True, "continuing"),
         (True, "landing"),
         (True, "already landing"),
-        (False, "not held: it is landing"),
-        (False, "nothing to resume: it is landing"),
-        (False, "start refused: in the air already"),
+        (False, "hold rejected: the vehicle is landing"),
+        (False, "nothing to resume: the vehicle is landing"),
+        (False, "start refused: already in the air"),
     ]
     asked = [id_ for id_ in flown.ids if id_.startswith("operator_")]
     assert asked == [
@@ -147,7 +147,7 @@ def test_a_hold_that_nobody_may_end_yet() -> None:
         assert not accepted
         assert text.startswith("resume refused: 0.")
         assert text.endswith("m off the reference (limit 0.60 m)")
-    assert flown.effects[2] == (True, "going on")
+    assert flown.effects[2] == (True, "continuing")
     assert [id_ for id_ in flown.ids if id_ in ("tracking_hold", "resume_refused")] == [
         *("tracking_hold", "resume_refused", "resume_refused"),
     ]
@@ -176,7 +176,7 @@ def test_commands_while_it_goes_back_along_the_tether() -> None:
     flown = commanded((7.0, HOLD), (7.1, RESUME), (7.3, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"))
     assert flown.effects[:2] == [
         (False, "HOLD rejected: the vehicle is in RETRACT and will land"),
-        (False, "nothing to resume: it goes back along the tether and lands"),
+        (False, "nothing to resume: the vehicle returns along the tether and lands"),
     ]
     assert flown.effects[2] == (True, "landing")
 
@@ -186,7 +186,7 @@ def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
     assert flown.effects == [(True, "too low to hold: landing")]
     begin_s = times_of(ordinary())["land"]
     flown = commanded((begin_s + 0.5, HOLD), (begin_s + 1.0, RESUME))
-    assert flown.effects == [(False, "not held: it is landing"), (True, "the landing continues")]
+    assert flown.effects == [(False, "hold rejected: the vehicle is landing"), (True, "the landing continues")]
     assert flown.outcome is Outcome.COMPLETED
 
 
@@ -249,7 +249,7 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
         *((t_s + late_s, command) for t_s in begin_s for late_s, command in ((0.004, START), (0.104, RESUME)))
     )
     assert flown.effects[0::2] == [
-        (False, "start refused: this flight takes off by itself as soon as it can"),
+        (False, "start refused: this flight takes off by itself as soon as it is ready"),
         *[(True, "taking off already")] * 3,
     ]
     assert flown.effects[1::2] == [(False, "nothing to resume: on the ground")] * 4
@@ -361,7 +361,7 @@ def test_after_the_flight_nothing_is_to_be_done() -> None:
     over = ordinary().outputs[-1]
     assert [effect_of(command, over, over) for command in (LAND, HOLD, RESUME, START)] == [
         (True, "down already"),
-        (False, "not held: the flight is over"),
+        (False, "hold rejected: the flight is over"),
         (False, "nothing to resume: the flight is over"),
         (False, "start refused: the flight is over"),
     ]

@@ -61,7 +61,7 @@ def test_a_stop_drops_every_resume_and_start_that_was_given_before_it(
         operator.ask(commands) if one_batch else [back for command in commands for back in operator.ask([command])]
     )
     assert sorted(back.asked.nonce for back in dropped) == [command.nonce for command in commands[:3]]
-    assert {back.why for back in dropped} == {f"a {stop.value} was commanded after it"}
+    assert {back.why for back in dropped} == {f"a {stop.value} was commanded later"}
     assert given(operator, 5) == [stop, NONE, NONE, NONE, NONE]
 
 
@@ -77,7 +77,7 @@ def in_tick(action: SafetyAction) -> Outputs:
         action=action,
         events=(),
         mocap_trusted=True,
-        bent_by=(),
+        limited_by=(),
     )
 
 

@@ -123,8 +123,8 @@ async def commanded(station: Station) -> None:
     await station.until(lambda: stream().action == SafetyAction.HOLD.value, "the hold")
     held = stream().progress
     ack = await station.command(CommandName.RESUME)
-    assert (ack.accepted, ack.text) == (True, "going on")
-    await station.until(lambda: stream().action == "nominal" and stream().progress > held + 0.01, "going on")
+    assert (ack.accepted, ack.text) == (True, "continuing")
+    await station.until(lambda: stream().action == "nominal" and stream().progress > held + 0.01, "continuing")
     ack = await station.command(CommandName.LAND)
     assert (ack.accepted, ack.text) == (True, "landing")
     await station.until(lambda: station.state is not None and station.state.presence is Presence.ENDED, "the end")

@@ -48,7 +48,7 @@ def test_torque_is_clipped_below_the_joint_limit_never_above() -> None:
 
 @pytest.mark.parametrize("torque_nm", [math.nan, math.inf])
 def test_torque_that_is_not_finite_is_an_error(torque_nm: float) -> None:
-    with pytest.raises(ValueError, match="not a number"):
+    with pytest.raises(ValueError, match="not finite"):
         joint_scale(JOINTS[0], KT, 1193).current_counts(torque_nm)
 
 

@@ -91,7 +91,7 @@ def outputs(tick: int = 0, phase: str = "approach", events: tuple[Event, ...] = 
         events=events,
         mocap_trusted=True,
         tether=tether,
-        bent_by=(),
+        limited_by=(),
     )
 
 
@@ -143,7 +143,7 @@ def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() ->
                     action=SafetyAction.RETRACT,
                     text="slack 0.1 m: going back",
                 )
-                station.tell(inputs(), outputs(events=(event,)))
+                station.report_tick(inputs(), outputs(events=(event,)))
                 said = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase approach")
                 assert said.severity == mavlink.MAV_SEVERITY_INFO
                 text = "RETRACT: slack 0.1 m: going back"
@@ -272,7 +272,7 @@ def test_px4_never_hears_the_companions_words_and_no_station_in_its_name() -> No
             px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED  # in the air
             async with link(port, ground.address) as (autopilot, station):
                 for tick in range(200):
-                    station.tell(inputs(tick), outputs(tick, phase=f"phase{tick}"))
+                    station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
                 await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191)
                 await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
                 assert autopilot.send_attitude(LEVEL)
@@ -325,7 +325,7 @@ def test_a_ground_station_that_is_not_there_yet_is_told_the_phase_when_it_comes(
         port, ground = free_udp_port(), GroundPeer(beating=False)
         with ground, Px4Peer(port):
             async with link(port, ground.address) as (_, station):
-                station.tell(inputs(), outputs(phase="catch"))
+                station.report_tick(inputs(), outputs(phase="catch"))
                 await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase catch")
                 assert len(ground.of("STATUSTEXT", 191)) == 1
                 ground.beating = True
@@ -339,7 +339,7 @@ def test_without_any_ground_station_the_link_to_px4_is_as_ever() -> None:
         port, nobody = free_udp_port(), free_udp_port()
         with Px4Peer(port) as px4:
             async with link(port, f"udpout://localhost:{nobody}") as (autopilot, station):
-                await send_setpoints(autopilot, px4, 200, lambda tick: station.tell(inputs(tick), outputs(tick)))
+                await send_setpoints(autopilot, px4, 200, lambda tick: station.report_tick(inputs(tick), outputs(tick)))
                 assert await autopilot.read_param("COM_RC_IN_MODE") == 4
                 assert station.take_messages() == []
 
@@ -357,7 +357,7 @@ def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> 
                 said: list[str] = []
 
                 def each(tick: int) -> None:
-                    station.tell(inputs(tick), outputs(tick, phase=f"phase{tick}"))
+                    station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
                     said.extend(station.take_messages())
 
                 await send_setpoints(autopilot, px4, 400, each)
@@ -370,7 +370,7 @@ def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> 
                 # A killed process ends when the kernel comes to it.
                 await until(told, "the relay's end")
                 assert [line for line in said if "relay has ended" in line] == [
-                    f"ground station {ground.address}: the relay has ended, nothing is forwarded any more"
+                    f"ground station {ground.address}: the relay has ended; nothing is forwarded"
                 ]
 
     asyncio.run(fly())
@@ -388,11 +388,11 @@ def test_a_stopped_relay_holds_nobody_up() -> None:
                     # More than its sockets hold.
                     await send_setpoints(
                         *(autopilot, px4, 2000),
-                        lambda tick: station.tell(inputs(tick), outputs(tick, phase=f"phase{tick}")),
+                        lambda tick: station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}")),
                     )
                 finally:
                     os.kill(station.relay_pid, signal.SIGCONT)
-                station.tell(inputs(2000), outputs(2000, phase="landing"))
+                station.report_tick(inputs(2000), outputs(2000, phase="landing"))
                 await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
 
     asyncio.run(fly())

@@ -44,7 +44,7 @@ class Row:
     fence_m: float = math.inf
     """Least distance of rotors, arm and net from the walls and the ceiling."""
     events: list[str] = field(default_factory=list)
-    bent: int = 0
+    constrained: int = 0
     """Ticks in which the governor changed the reference."""
 
     @property
@@ -160,7 +160,7 @@ def fly(number: int, phases_max: int = 4) -> Row:
     ended = result.outputs[-1]
     row.outcome = "crashed" if result.crashed else ended.outcome.value if ended.outcome else "lost"
     row.events = [event.id for outputs in result.outputs for event in outputs.events]
-    row.bent = sum(bool(outputs.bent_by) for outputs in result.outputs)
+    row.constrained = sum(bool(outputs.limited_by) for outputs in result.outputs)
     row.tether_m, row.fence_m = margins_m(config, result)
     return row
 

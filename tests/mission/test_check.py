@@ -107,7 +107,7 @@ REFUSED = [
     (["mission.phases[4].arm_deg=[50, 140]"], "phase 'return' drives joint 1 through its wall at t = 17.0 s, (-1.00, 0.00, 1.00) m: 50.0 deg, 60 to 175 deg allowed; change arm_deg (also in 'above the start', 'land')"),
     (["mission.phases[2].arm_deg=[100, -20]"], "phase 'catch' drives joint 2 through its wall"),
     (["mission.phases[2].duration_s=4"], "phase 'catch' flies too fast at t = 5.5 s, (0.00, 0.00, 1.00) m: 1.09 m/s, limits.speed_max_m_s is 0.8; take longer or go less far"),
-    (["mission.limits.speed_max_m_s=1.61"], "mission 'catch': limits.speed_max_m_s is 1.61 m/s, but the flight is stopped at 2 m/s (safety.speed_max_m_s) and needs a margin of a fifth to that; lower it to 1.60 m/s or less"),
+    (["mission.limits.speed_max_m_s=1.61"], "mission 'catch': limits.speed_max_m_s is 1.61 m/s, but the flight is stopped at 2 m/s (safety.speed_max_m_s) and needs a margin of one fifth; lower it to 1.60 m/s or less"),
     (["mission.limits.speed_max_m_s=3"], "limits.speed_max_m_s is 3 m/s, but the flight is stopped at 2 m/s"),
     (["vehicle.safety.speed_max_m_s=0.9"], "limits.speed_max_m_s is 0.8 m/s, but the flight is stopped at 0.9 m/s"),
     (["mission.phases[2].duration_s=3"], "phase 'catch' accelerates too hard at t = 5.7 s, (0.81, 0.00, 1.00) m: 1.67 m/s^2, limits.acceleration_max_m_s2 is 1; take longer or go less far"),

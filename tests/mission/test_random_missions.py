@@ -27,7 +27,7 @@ def test_what_is_accepted_stays_off_tether_and_walls_and_ends_well(rows: list[Ro
 
 @pytest.mark.hypothesis
 def test_the_governor_leaves_alone_what_was_accepted(rows: list[Row]) -> None:
-    assert [row.number for row in rows if row.bent] == []
+    assert [row.number for row in rows if row.constrained] == []
 
 
 @pytest.mark.hypothesis

@@ -220,7 +220,7 @@ def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
         ("companion check --hand", hand_test_evaluation.ended("nobody lifted it")),
         ("companion mocap align", hand_test_evaluation.ended("nobody lifted it", "companion mocap align")),
     ):
-        assert (row.refuses, row.read, row.fix) == (True, "nobody lifted it", f"do it again: {again}")
+        assert (row.refuses, row.read, row.fix) == (True, "nobody lifted it", f"repeat the test: {again}")
 
 
 def test_a_machine_that_nobody_lifts_is_told_after_the_time_limit() -> None:

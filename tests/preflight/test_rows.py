@@ -139,7 +139,7 @@ CASES = {
     "not always tracked": Case(
         "mocap.tracked", "99.9%", "markers", {"mocap": (replace(r.mocap()[0], tracking_valid=False), *r.mocap()[1:])}, WARN
     ),
-    "another body": Case("mocap.body", "others: 2, 7", "switch the others off", {"mocap_stream": r.stream(other_bodies=(2, 7))}, WARN),
+    "another body": Case("mocap.body", "others: 2, 7", "disable the others", {"mocap_stream": r.stream(other_bodies=(2, 7))}, WARN),
     "bent markers": Case("mocap.error", "4.0 mm", "calibrate", {"mocap": r.mocap(marker_error_m=0.004)}, WARN),
     "stalling server": Case("mocap.clock", "jitter", "stalls", {"mocap": unsteady_clock()}, WARN),
     "another frame rate": Case(

@@ -73,7 +73,7 @@ def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
             action=SafetyAction.NOMINAL,
             events=events,
             mocap_trusted=True,
-            bent_by=(),
+            limited_by=(),
         ),
         Sent(
             tick=k,

@@ -313,7 +313,7 @@ def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
     result = FastFlight(config(*overrides)).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert event_ids(result) == ["takeoff", "catch", "touchdown"]
-    assert all(o.action is SafetyAction.NOMINAL and not o.bent_by and o.mocap_trusted for o in result.outputs)
+    assert all(o.action is SafetyAction.NOMINAL and not o.limited_by and o.mocap_trusted for o in result.outputs)
     states = [o.tether for o in result.outputs if o.tether is not None and o.phase_kind is PhaseKind.FLIGHT]
     assert len(states) > 1000
     assert not any(state.taut or state.snagged or state.separated for state in states)

@@ -30,7 +30,7 @@ _NAMES = ("sources.", "mission.vehicle")
 """Names of files; their content has keys of its own."""
 
 _SECTIONS = ("mission", "controller", "vehicle", "world", "sources")
-_KEYS_TOLD = 4
+_KEYS_SHOWN = 4
 """Number of keys that a sentence names; the table has all of them."""
 
 
@@ -148,8 +148,8 @@ def _caution(flights: Sequence[Flight], kind: str, settings: Sequence[Setting]) 
         values = zip(flights, settings[0].values, settings[0].present, strict=True)
         told = ", ".join(f"{f.letter} {text_of(value) + unit if there else '–'}" for f, value, there in values)
         return f"Different {kind}: {told}."
-    told = ", ".join(setting.key for setting in settings[:_KEYS_TOLD])
-    return f"Different {kind} ({_count(settings)}): {told}{', ...' if len(settings) > _KEYS_TOLD else '.'}"
+    told = ", ".join(setting.key for setting in settings[:_KEYS_SHOWN])
+    return f"Different {kind} ({_count(settings)}): {told}{', ...' if len(settings) > _KEYS_SHOWN else '.'}"
 
 
 def _circumstances(flights: Sequence[Flight], payload_told: bool) -> list[str]:

@@ -262,7 +262,7 @@ class Stream(Record, frozen=True, kw_only=True):
     control: ControlView | None = None
     timing: Timing
     lights: tuple[DeviceHealth, ...]
-    bent_by: tuple[str, ...]
+    limited_by: tuple[str, ...]
     waits_for_start: bool
     """The vehicle is ready on the ground and waits for `start`."""
     proofs: tuple[str, ...]

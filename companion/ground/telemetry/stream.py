@@ -189,7 +189,7 @@ class StreamBuilder:
             control=_control(o.control),
             timing=timing,
             lights=self._health.evaluate(snapshot),
-            bent_by=o.bent_by,
+            limited_by=o.limited_by,
             proofs=(),
             waits_for_start=o.phase == WAITS_FOR_START,
         )

@@ -29,7 +29,7 @@ _CLOSE_TIMEOUT_S = 2.0
 _KEEPALIVES_PER_WATCHDOG = 3.0
 _FIRST_READ_S = 0.002
 _SMOOTHING, _DEVIATIONS = 0.05, 2.0
-"""Estimate of the duration of a read, as TCP estimates round trips (RFC 6298), somewhat slower."""
+"""Smoothing of the estimated read duration, as in TCP's round-trip estimate (RFC 6298) but slower."""
 
 _T = TypeVar("_T")
 
@@ -68,7 +68,7 @@ class DynamixelArm:
         self._arm = arm
         self._clock = clock
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
-        """Queue of `_Read`, or one of the marks above."""
+        """Queue of `_Read` or of one of the marks above."""
         self._goals: deque[Pair] = deque(maxlen=1)
         self._goal_handed_s = 0.0
         self._state: ArmState | None = None
@@ -125,7 +125,7 @@ class DynamixelArm:
 
     @property
     def problem(self) -> str:
-        """Return the port's error when it last failed; empty if it has not."""
+        """Return the newest error of the port; empty if it has not failed."""
         return self._problem
 
     @property
@@ -219,11 +219,11 @@ class DynamixelArm:
                     break
         except DeviceError as error:
             return error
-        except Exception as error:  # an unplugged port raises whatever its driver likes; preflight wants one line of it
+        except Exception as error:  # an unplugged port raises any exception of its driver; preflight needs one line
             return DeviceError(f"arm bus {self._device.port}: failed while being set up: {_describe(error)}")
         if self._state is None:
             return DeviceError(
-                f"arm bus {self._device.port}: the servos fell silent right after set-up; check the cables"
+                f"arm bus {self._device.port}: the servos stopped answering right after set-up; check the cables"
             )
         return None
 
@@ -252,7 +252,7 @@ class DynamixelArm:
                 continue  # it has begun meanwhile
             reading = later
             if job is None and later is not None and later.at_s > self._clock():
-                reading = None  # far off: meanwhile the watchdogs are kept quiet, and an old torque is taken back
+                reading = None  # far in the future: meanwhile feed the watchdogs and withdraw an expired torque
             if reading is not None:
                 later = None
                 reading.begun = True
@@ -265,7 +265,7 @@ class DynamixelArm:
                 sent = (0, 0)
                 self._try(bus.restart_watchdogs)
             elif self._goal_handed_s > 0.0 and time.monotonic() - self._goal_handed_s > watchdog_s:
-                # Again and again: nobody answers a sync write, and our reads keep the servos' watchdogs content.
+                # Repeated, because a sync write has no reply and our reads keep the servos' watchdogs from tripping.
                 sent = (0, 0)
                 self._try(lambda: bus.write_currents((0, 0)))
 
@@ -279,7 +279,7 @@ class DynamixelArm:
         return goal
 
     def _read_once(self, bus: ArmBus) -> bool:
-        """Read and publish the state; returns whether a bus watchdog had tripped."""
+        """Read and publish the state. Return whether a bus watchdog had tripped."""
         asked_s = self._clock()
         try:
             pair = bus.read()
@@ -314,7 +314,7 @@ class DynamixelArm:
         )
 
     def _try(self, transaction: Callable[[], None]) -> None:
-        # A port that dies raises whatever its driver likes; the thread must outlive it to let go of the arm in the end.
+        # A lost port raises any exception of its driver; the thread must survive it to release the arm in the end.
         try:
             transaction()
         except Exception as error:
@@ -322,7 +322,7 @@ class DynamixelArm:
 
     def _post(self, callback: Callable[[], None]) -> None:
         assert self._loop is not None
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+        with contextlib.suppress(RuntimeError):  # the loop is closed: no caller waits
             self._loop.call_soon_threadsafe(callback)
 
 

@@ -66,7 +66,7 @@ class ArmBus:
         blocks = next((pair for pair in (self.read() for _ in range(SETUP_ATTEMPTS)) if pair is not None), None)
         if blocks is None:
             raise self._error(
-                "servos", self._ids, "answered one by one, but not to a sync read; look for a loose cable"
+                "servos", self._ids, "answered individually but not to a sync read; look for a loose cable"
             )
         scales = tuple(
             self._within_walls(joint, scale, block)
@@ -81,7 +81,7 @@ class ArmBus:
         return scales[0], scales[1]
 
     def read(self) -> tuple[Block, Block] | None:
-        """Perform one sync read. Returns None unless both servos answered in time and still have the settings of `open`.
+        """Perform one sync read. Return None unless both servos answered in time and still have the settings of `open`.
 
         Raises:
             OSError: the port is gone.
@@ -97,7 +97,9 @@ class ArmBus:
                 return None
             block = Block.from_bytes(bytes(data))
             if block.bus_watchdog not in (self._watchdog, dxl.WATCHDOG_TRIPPED):
-                return None  # restarted by itself (a loose supply): its indirect addresses are gone, the block means nothing
+                return (
+                    None  # restarted by itself (a loose supply): its indirect addresses are lost, the block is invalid
+                )
             blocks.append(block)
         return blocks[0], blocks[1]
 
@@ -128,7 +130,7 @@ class ArmBus:
             self._try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
 
     def close(self) -> None:
-        """Set goal current 0, switch torque and watchdog off and close the port, as far as the bus still works. Never raises."""
+        """Set goal current 0, switch off torque and watchdog as far as the bus still works, and close the port. Never raises."""
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
         try:
             if self._touched and self._port.is_open:
@@ -136,7 +138,7 @@ class ArmBus:
                 for register in (dxl.TORQUE_ENABLE, dxl.BUS_WATCHDOG):
                     for servo_id in self._ids:
                         self._try_write(servo_id, register, 0)
-        except Exception:  # a dead port raises whatever its driver likes; what counts is that it gets closed
+        except Exception:  # a lost port raises any exception of its driver; it must be closed all the same
             pass
         finally:
             with contextlib.suppress(OSError):
@@ -148,7 +150,7 @@ class ArmBus:
         self._port.baudrate = self._device.baud
         if not self._port.openPort():
             raise self._error("port", None, f"dynamixel-sdk does not know baud rate {self._device.baud}")
-        # There is no such thing on a pty or a native UART; what counts is what the kernel says next.
+        # A pty or a native UART has no latency timer; only the kernel's value matters.
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             self._port.ser.set_low_latency_mode(True)
         latency_ms = dxl.usb_latency_ms(self._device.port)
@@ -183,7 +185,7 @@ class ArmBus:
                 joint.servo_id,
                 f"has model number {model}, expected {dxl.MODEL_NUMBER_XM430_W210} (XM430-W210)",
             )
-        # A servo told to answer nothing but pings would look dead; what this write itself answers does not matter.
+        # A servo set to answer pings only would look dead; the answer to this write does not matter.
         self._try_write(joint.servo_id, dxl.STATUS_RETURN_LEVEL, 2)
         errors = self._read(joint, dxl.HARDWARE_ERROR)
         if errors:
@@ -219,7 +221,7 @@ class ArmBus:
             raise self._error(
                 "servo",
                 joint.servo_id,
-                f"stands at {angle_deg:.1f} deg ({dxl.PRESENT_POSITION} = {block.position_count}), outside its walls "
+                f"is at {angle_deg:.1f} deg ({dxl.PRESENT_POSITION} = {block.position_count}), outside its limits "
                 f"{low_deg:g} to {high_deg:g} deg; move the arm by hand or correct zero_count and sign",
             )
         return scale

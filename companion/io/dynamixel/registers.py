@@ -64,7 +64,7 @@ PRESENT_TEMPERATURE = Register(146, 1, "present temperature")
 INDIRECT_ADDRESS_1 = 168
 INDIRECT_DATA_1 = 224
 
-# The one block that is read in every cycle. A small byte stands behind every signed value, so that FF FF FD never occurs in an
+# The one block that is read in every cycle. A small byte follows every signed value, so that FF FF FD never occurs in an
 # answer: once it has removed a stuffed byte, dynamixel-sdk 4.1.0 also removes one from a later FF FD FD, which is data.
 BLOCK = (PRESENT_POSITION, HARDWARE_ERROR, PRESENT_VELOCITY, PRESENT_TEMPERATURE, PRESENT_CURRENT, BUS_WATCHDOG)
 BLOCK_SIZE = sum(register.size for register in BLOCK)
@@ -135,7 +135,7 @@ class JointScale:
             ValueError: the torque is not finite.
         """
         if not math.isfinite(torque_nm):
-            raise ValueError(f"joint torque {torque_nm} is not a number that a servo could follow")
+            raise ValueError(f"joint torque {torque_nm} is not finite")
         limit = self.current_max_counts
         return max(-limit, min(limit, round(self.sign * torque_nm / self.torque_nm_per_count)))
 
@@ -157,7 +157,7 @@ def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: 
 
 
 def turn_offset_counts(joint: Joint, position_count: int) -> int:
-    """Return the whole turns to add to `zero_count` so that the joint angle lies within its limits, or 0 if no turn fits.
+    """Return the whole turns, in counts, to add to `zero_count` so that the joint angle lies within its limits, or 0 if none fits.
 
     The encoder measures the angle within one turn; the servo loses the number of turns when it is switched off. A joint with less than
     a turn between its limits is unambiguous all the same.
@@ -194,7 +194,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         if self.is_open:
             self.closePort()
         try:
-            # A write that cannot proceed means that nobody is there; it must not block the bus thread for ever. Not shorter:
+            # A write that cannot proceed means that no device is present; it must not block the bus thread for ever. Not shorter:
             # pyserial looks at the time after a write that succeeded, too, and the process may have been held up meanwhile.
             self.ser = serial.Serial(
                 self.port_name,
@@ -250,7 +250,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         """Return whether the reply has timed out."""
         elapsed_ms = self.getTimeSinceStart()
         if elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > _NOISE_BYTES:
-            return True  # a line that never falls silent
+            return True  # a line with endless noise
         return elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
 
 
@@ -259,7 +259,7 @@ def _open_failure(port: str, error: Exception) -> str:
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not Path(port).exists():
         found = sorted(p.device for p in list_ports.comports())
-        there = f"serial ports here: {', '.join(found)}" if found else "this machine has no serial port at all"
+        there = f"serial ports here: {', '.join(found)}" if found else "this machine has no serial port"
         return f"no such port; {there}; correct devices.arm.port or plug the U2D2 in"
     if number in (errno.EACCES, errno.EPERM):
         return "no permission to open it; add this user to the group that owns the port (usually dialout)"

@@ -74,7 +74,7 @@ class RobotousForceTorque:
         """Return the samples of the next `duration_s` (counted at the configured rate), for the caller to average.
 
         Raises:
-            DeviceError: they did not arrive within twice the time plus one second.
+            DeviceError: the samples did not arrive within twice the time plus one second.
         """
         count = max(1, math.ceil(duration_s * self._device.rate_hz))
         deadline_s = 2.0 * duration_s + 1.0
@@ -95,7 +95,7 @@ class RobotousForceTorque:
         self._serial = self._open()
         try:
             asyncio.get_running_loop().add_reader(self._serial.fileno(), self._on_readable)
-            self._send(Command.STOP)  # it may still stream from an earlier run, and then obeys nothing else
+            self._send(Command.STOP)  # it may still stream from an earlier run and then accepts no other command
             self.product_name = rft.decode_text(await self._ask(Command.PRODUCT_NAME, repeat_s=_REPEAT_S))
             if _MODEL not in self.product_name:
                 raise DeviceError(
@@ -128,7 +128,7 @@ class RobotousForceTorque:
             opened = serial.Serial(self._device.port, self._device.baud, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise DeviceError(f"{self._where}: {self._why_not_open(error)}") from None
-        # USB adapters hold bytes back for up to 16 ms otherwise; ports that cannot do it (a pty) have no such delay.
+        # USB adapters otherwise delay bytes by up to 16 ms; ports without this setting (a pty) have no such delay.
         with suppress(OSError, ValueError, NotImplementedError):
             opened.set_low_latency_mode(True)
         return opened
@@ -212,7 +212,7 @@ class RobotousForceTorque:
         try:
             os.write(self._serial.fileno(), rft.encode_command(command, parameter))
         except BlockingIOError:
-            _LOG.warning("%s: command %s was not taken by the port", self._where, command.name)
+            _LOG.warning("%s: command %s was not accepted by the port", self._where, command.name)
         except OSError as error:
             self._lose(str(error))
 

@@ -1,6 +1,6 @@
-"""A NatNet client without I/O: datagrams and their arrival times in, frames, poses and requests out.
+"""NatNet client without I/O: takes datagrams with arrival times, returns frames, poses and requests.
 
-The flight (`companion.io.mocap.driver`), the guardian (`companion.guardian.mocap`) and the commissioning tools put sockets around it.
+The flight (`companion.io.mocap.driver`), the guardian (`companion.guardian.mocap`) and the commissioning tools add the sockets.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class NatNetClient:
         """Process a datagram of the server.
 
         Returns:
-            The frame that it holds, or None if it holds none, or one that is malformed, repeated or late. While two streams are mixed
+            The datagram's frame, or None if it has none or its frame is malformed, repeated or late. While two streams are mixed
             every frame is returned, in any order.
         """
         message = natnet.message_id(datagram)
@@ -97,7 +97,7 @@ class NatNetClient:
         return None
 
     def other_body(self, datagram: bytes, body_id: int) -> RigidBody | None:
-        """Return another rigid body of a frame that `receive` has returned, or None if its pose is malformed."""
+        """Return a body other than the vehicle's from a frame that `receive` has returned, or None if its pose is malformed."""
         assert self.version is not None and self.info is not None
         frame = natnet.parse_frame(datagram, self.version, body_id, self.info.clock_frequency_hz)
         return frame.body if isinstance(frame, Frame) else None

@@ -39,8 +39,7 @@ class NatNetMocap:
         on_pose: called with every pose; an exception is logged once and never stops the reception.
         connect_timeout_s: timeout of the server's answer.
         body_timeout_s: timeout of the first frame in which the body is tracked.
-        on_frame: called with every frame, also with those that are not delivered. With it, opening waits for any frame and not for
-            the body.
+        on_frame: called with every frame, delivered or not. If given, opening waits for any frame, not for the body.
     """
 
     def __init__(

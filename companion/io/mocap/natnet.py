@@ -72,7 +72,7 @@ _QUAT_NORM_TOLERANCE = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Malformed:
-    """A datagram that is not what its header says."""
+    """A datagram that does not match its header."""
 
     reason: str
 
@@ -115,7 +115,7 @@ class RigidBody:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What the companion wants from one frame of data."""
+    """The data of one frame that the companion uses."""
 
     number: int
     timestamp_s: float
@@ -123,9 +123,9 @@ class Frame:
     latency_s: float | None
     """Mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency."""
     exposure_s: float | None
-    """Mid-exposure on the server's own clock; None as above."""
+    """Mid-exposure on the server's own clock; None in the same cases."""
     body: RigidBody | None
-    """None: the wanted id is not in this frame."""
+    """The requested rigid body; None if it is not in this frame."""
     body_ids: tuple[int, ...]
 
 
@@ -162,12 +162,12 @@ def encode_connect(application: str = "companion") -> bytes:
 
 
 def is_newer(number: int, last_number: int | None, silence_s: float) -> bool:
-    """Whether a frame number follows the last accepted one; modulo 2^32, and after a restart of the server.
+    """Return whether a frame number follows the last accepted one, modulo 2^32 or after a restart of the server.
 
     Args:
-        number: of the frame that just came.
-        last_number: of the frame accepted last, None before the first.
-        silence_s: since that frame, s.
+        number: number of the frame that just arrived.
+        last_number: number of the frame accepted last, None before the first.
+        silence_s: time since that frame, s.
     """
     if last_number is None:
         return True
@@ -187,7 +187,7 @@ def z_up_from_y_up(position_m: Vec3, quat_wxyz: Quat) -> tuple[Vec3, Quat]:
 
 
 def parse_server_info(datagram: Buffer) -> ServerInfo | Malformed:
-    """NAT_SERVERINFO; clock and connection fields are None for a server before 3.0 or a short reply."""
+    """Parse NAT_SERVERINFO; clock and connection fields are None for a server before 3.0 or a short reply."""
     payload = _payload(datagram, Message.SERVER_INFO)
     if isinstance(payload, Malformed):
         return payload
@@ -216,12 +216,12 @@ def parse_server_info(datagram: Buffer) -> ServerInfo | Malformed:
 def parse_frame(
     datagram: Buffer, version: NatNetVersion, body_id: int, clock_frequency_hz: int | None
 ) -> Frame | Malformed:
-    """Parse a NAT_FRAMEOFDATA datagram: the wanted rigid body and the suffix; all other sections are skipped.
+    """Parse the requested rigid body and the suffix of a NAT_FRAMEOFDATA datagram; all other sections are skipped.
 
     Args:
         datagram: the datagram including its header.
         version: the server's NatNet version.
-        body_id: streaming id of the wanted rigid body.
+        body_id: streaming id of the requested rigid body.
         clock_frequency_hz: from `ServerInfo`, for the latency.
     """
     payload = _payload(datagram, Message.FRAME)
@@ -231,18 +231,18 @@ def parse_frame(
         return _frame(payload, version == "4.1", body_id, clock_frequency_hz)
     except (struct.error, ValueError) as error:
         # Every read past the end and every missing terminator lands here, so the walk needs no check of its own per field.
-        return Malformed(f"frame of {len(payload)} bytes ends early or lies about its sections ({error})")
+        return Malformed(f"frame of {len(payload)} bytes ends early or has wrong section sizes ({error})")
 
 
 def parse_model_definitions(datagram: Buffer, version: NatNetVersion) -> tuple[BodyDefinition, ...] | Malformed:
-    """NAT_MODELDEF: ids and names of the rigid bodies (of skeletons and assets not)."""
+    """Parse NAT_MODELDEF: ids and names of the rigid bodies, not those of skeletons and assets."""
     payload = _payload(datagram, Message.MODELDEF)
     if isinstance(payload, Malformed):
         return payload
     try:
         return _model_definitions(payload, version == "4.1")
     except (struct.error, ValueError) as error:
-        return Malformed(f"model definitions of {len(payload)} bytes end early or lie about their size ({error})")
+        return Malformed(f"model definitions of {len(payload)} bytes end early or have wrong sizes ({error})")
 
 
 def _payload(datagram: Buffer, expected: Message) -> bytes | Malformed:
@@ -312,12 +312,12 @@ def _rigid_body(data: bytes, offset: int) -> RigidBody | Malformed:
         return Malformed(
             f"rigid body {number}: tracked, but its pose is not finite or its quaternion's norm is {norm:g}"
         )
-    # Motive fills an untracked body with whatever it likes, zeros included.
+    # Motive fills an untracked body with arbitrary values, zeros included.
     return RigidBody(id=number, position_m=(0.0, 0.0, 0.0), quat_wxyz=IDENTITY_QUAT, error_m=0.0, tracking_valid=False)
 
 
 def _section(data: bytes, offset: int, sized: bool) -> tuple[int, int]:
-    """Count of a section and where its first element starts."""
+    """Return the count of a section and the offset of its first element."""
     count: int = _U32.unpack_from(data, offset)[0]
     return count, offset + (8 if sized else 4)
 
@@ -348,7 +348,7 @@ def _skip_skeletons(data: bytes, offset: int) -> int:
 
 
 def _skip_channels(data: bytes, offset: int) -> int:
-    """Force plates and devices: id, channels, each with its own number of floats."""
+    """Skip force plates or devices: an id and channels, each with its own number of floats."""
     count, offset = _section(data, offset, sized=False)
     for _ in range(count):
         _, channels = _COUNT_BYTES.unpack_from(data, offset)
@@ -407,7 +407,7 @@ def _text(name: bytes) -> str:
 
 
 def _skip_body(data: bytes, offset: int) -> int:
-    """Name, id, parent, offset, then per marker (3.0): position and active label."""
+    """Skip name, id, parent and offset, then position and active label of each marker (3.0)."""
     offset = _skip_string(data, offset) + 8 + _VEC3_BYTES
     markers: int = _U32.unpack_from(data, offset)[0]
     return offset + 4 + (_VEC3_BYTES + 4) * markers

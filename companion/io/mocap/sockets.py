@@ -12,7 +12,7 @@ from companion.io.arrival import STAMP_ROOM_BYTES, stamp_arrivals
 _IP_ADD_SOURCE_MEMBERSHIP: Final = 39
 """linux/in.h; `socket` defines the name since Python 3.12."""
 _MAX_DATAGRAMS: Final = 256
-"""Per call of `waiting`: a flood must not block the caller."""
+"""Limit per call of `waiting`, so that a flood does not block the caller."""
 _MAX_BYTES: Final = 65535
 
 
@@ -29,7 +29,7 @@ def open_udp(address: str, port: int = 0, *, shared: bool = False) -> socket.soc
     """Open a non-blocking UDP socket whose datagrams the kernel stamps on arrival.
 
     Args:
-        address: IPv4 address to bind to: of an interface, or of a multicast group, which keeps out everything else.
+        address: IPv4 address to bind to: that of an interface, or of a multicast group, which excludes other traffic.
         port: 0 for any free port.
         shared: other processes may bind to the same address and port.
 
@@ -66,7 +66,7 @@ def join_source(opened: socket.socket, group: str, interface: str, source: str) 
 
 
 def waiting(opened: socket.socket) -> Iterator[Datagram]:
-    """Read the waiting datagrams, at most 256."""
+    """Return the pending datagrams, at most 256."""
     for _ in range(_MAX_DATAGRAMS):
         try:
             data, ancillary, _, address = opened.recvmsg(_MAX_BYTES, STAMP_ROOM_BYTES)

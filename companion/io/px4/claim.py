@@ -1,6 +1,4 @@
-"""Exclusive use of the link to PX4: only this process holds the near end, and the far end is the one address that has proved
-to be PX4.
-"""
+"""Exclusive use of the link to PX4: only this process holds the local end, and only the address verified as PX4's is the remote end."""
 
 from __future__ import annotations
 
@@ -39,7 +37,7 @@ class LinkClaim:
 
     A serial port is locked with flock on the device itself, so that every name of the device counts and pyserial's `exclusive`
     conflicts with the same lock. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets that option
-    and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is proved; from then on the kernel
+    and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from then on the kernel
     delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and another port of the same
     IPv4 address sends a HEARTBEAT of its system, MAVSDK's socket is connected to that port, because a restarted router sends from
     another one.
@@ -64,7 +62,7 @@ class LinkClaim:
         self._armed = False
         self._before: frozenset[int] = frozenset()
         self.peer: Peer | None = None
-        """PX4's UDP address; None before it is proved, and on TCP and serial links, which have one far end."""
+        """PX4's UDP address; None before it is verified, and on TCP and serial links, which have one peer."""
         if self._parts.serial:
             self._lock = _lock(address, self._parts.host)
         elif self._parts.kind == "udpin":
@@ -206,7 +204,7 @@ class LinkClaim:
         self._mavsdk.connect(sender)
         self._moved = (
             f"PX4 (system {self._system}) was silent at {_text(self.peer)} for {REPIN_SILENCE_S:g} s and is heard at {_text(sender)}; "
-            "it is heard there alone now"
+            "it is now received from there only"
         )
         self.peer = sender
         self._rivals.discard(sender)

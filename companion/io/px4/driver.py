@@ -187,7 +187,7 @@ class MavsdkAutopilot:
         return self._inbox.vehicle()
 
     def status(self) -> AutopilotStatus | None:
-        """Return the latest slow state, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
+        """Return the latest status, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
         HEARTBEAT.
         """
         return self._inbox.status()
@@ -197,11 +197,11 @@ class MavsdkAutopilot:
         return self._inbox.estimator()
 
     def counts(self) -> StateCounts:
-        """Return the numbers of messages of the fast state since the link was opened."""
+        """Return the number of state messages since the link was opened."""
         return self._inbox.counts()
 
     def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
-        """Send SET_ATTITUDE_TARGET at once; with None no more setpoints are sent. Returns False if nothing was sent.
+        """Send SET_ATTITUDE_TARGET at once; None stops the setpoints. Return False if nothing was sent.
 
         Raises:
             ValueError: an invalid value (not finite, not a unit quaternion, thrust outside 0 to 1).
@@ -264,8 +264,8 @@ class MavsdkAutopilot:
             self._requests.answer_sent_once(messages.refusal(message.fields_json), self._clock())
 
     def take_messages(self) -> list[str]:
-        """Return, oldest first, all refusals and STATUSTEXTs since the last call, reports of a second sender that claims to be PX4, and
-        of a new port of PX4.
+        """Return, oldest first, all refusals and STATUSTEXTs since the last call, and reports of a new port of PX4 or of a second
+        sender that claims to be PX4.
         """
         texts = self._requests.take_messages(self._clock())
         rival = self._claim.take_rival(self._inbox.silent_s()) if self._claim is not None else None
@@ -295,7 +295,7 @@ class MavsdkAutopilot:
         """Write one PX4 parameter, read it back and return the value that PX4 now holds, a float in single precision.
 
         Raises:
-            DeviceError: no such name, a value that PX4's type cannot hold, PX4 refused it, or holds another one afterwards.
+            DeviceError: no such name, a value that PX4's type cannot hold, a refusal by PX4, or another value in PX4 afterwards.
         """
         return await self._transfer().write(name, value)
 
@@ -349,14 +349,14 @@ class MavsdkAutopilot:
     def _on_heartbeat(self) -> None:
         """Handle HEARTBEAT, in a thread of MAVSDK."""
         assert self._loop is not None
-        with contextlib.suppress(RuntimeError):  # the loop is closed: MAVSDK hung and was left behind
+        with contextlib.suppress(RuntimeError):  # the loop is closed: MAVSDK hung and was not closed
             self._loop.call_soon_threadsafe(self._show_ground_station)
 
     def _show_ground_station(self) -> None:
         """Answer the heartbeat of a disarmed PX4 with a ground station's: PX4 reports the reasons of a refusal only if it sees one.
 
-        While PX4 is armed nothing is sent, because PX4 must notice the loss of the real ground station, whatever NAV_DLL_ACT makes of
-        it.
+        While PX4 is armed nothing is sent, because PX4 must notice the loss of the real ground station, whatever NAV_DLL_ACT
+        is set to.
         """
         status = self._inbox.status()
         if self._open and status is not None and not status.armed:
@@ -392,7 +392,8 @@ class MavsdkAutopilot:
             # MAVSDK must not be destroyed under a call that is still inside it, nor before the last command's callback has run.
             if not self._calls.finish(_CLOSE_DEADLINE_S):
                 _log.error(
-                    "autopilot %s: a call into MAVSDK hangs, left to the end of the process", self._device.address
+                    "autopilot %s: a call into MAVSDK hangs; it is not closed before the process ends",
+                    self._device.address,
                 )
                 return
             while self._requests.pending() and time.monotonic() < deadline_s:

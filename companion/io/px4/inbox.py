@@ -64,7 +64,7 @@ class Inbox:
 
     def subscribe(self, telemetry: Telemetry, direct: MavlinkDirect) -> None:
         """Store everything that arrives from now on."""
-        self._telemetry = telemetry  # MAVSDK's plugin ends its subscriptions when nobody holds it any more
+        self._telemetry = telemetry  # MAVSDK's plugin ends its subscriptions when it is garbage-collected
         telemetry.subscribe_position_velocity_ned(self._on_position)
         telemetry.subscribe_attitude_quaternion(self._on_attitude)
         telemetry.subscribe_attitude_angular_velocity_body(self._on_rates)
@@ -94,12 +94,12 @@ class Inbox:
                 boot_s = attitude[2] * 1e-6 if attitude[2] else None
                 total = flu_from_frd(imu[3])
                 state = replace(state, boot_s=boot_s, imu_boot_s=imu[2], delta_velocity_body_m_s=total)
-            # Values that are not finite are as good as not arrived: the last good state stays, and its stamps grow old.
+            # Values that are not finite count as not received: the last valid state stays and becomes stale.
             self._vehicle = state or self._vehicle
         return self._vehicle
 
     def status(self) -> AutopilotStatus | None:
-        """Return the latest slow state, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
+        """Return the latest status, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
         HEARTBEAT.
         """
         heartbeat = self._heartbeat
@@ -134,7 +134,7 @@ class Inbox:
         return self._clock() - max((message[0] for message in newest if message is not None), default=-math.inf)
 
     def counts(self) -> StateCounts:
-        """Return the numbers of messages of the fast state since the link was opened."""
+        """Return the number of state messages since the link was opened."""
         return StateCounts(self._positions, self._attitudes, self._imus)
 
     # Callbacks: C++ threads, one message type in one thread. Nothing but an assignment, and one more in a count or a sum.

@@ -1,4 +1,4 @@
-"""Opening of MAVSDK's connection to PX4. Every kind of failure is one clear line."""
+"""Opens MAVSDK's connection to PX4; every failure is reported in one line."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
 
     handle = mavsdk.first_autopilot_async(timeout_s, lambda system: loop.call_soon_threadsafe(resolve, system))
     try:
-        # MAVSDK keeps the deadline; this one only guards against MAVSDK.
+        # MAVSDK enforces the deadline; this one applies only if MAVSDK hangs.
         async with asyncio.timeout(timeout_s + 2.0):
             system = await found
     except TimeoutError:
@@ -176,7 +176,7 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
         raise no_heartbeat(address, timeout_s)
     kind = system.autopilot_type()
     if kind != AutopilotKind.PX4:
-        raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion speaks no other's modes")
+        raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion supports no other autopilot")
     return system
 
 

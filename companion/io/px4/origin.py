@@ -52,7 +52,7 @@ async def ensure_origin(
     if await _has_origin(address, calls, direct, system_id):
         return True
     if await armed():
-        return False  # to move the origin under a flying estimate is worse than to have none
+        return False  # moving the origin in flight is worse than having none
     direct.send_message(MavlinkMessage("SET_GPS_GLOBAL_ORIGIN", fields_json=set_origin_json(system_id)))
     return await _has_origin(address, calls, direct, system_id)
 

@@ -62,11 +62,11 @@ class ParamQueries:
         return len(self.answered) + len(self.absent) == len(self._names)
 
     def due(self, now_s: float) -> list[str]:
-        """Return the names to request at `now_s`, with ALWAYS_THERE last if a sign of life is needed. Empty if there is nothing to
-        request yet.
+        """Return the names to request at `now_s`, with ALWAYS_THERE last if PX4 must show that it still answers. Empty if none is
+        due.
         """
         for name in [name for name, sent_s in self._sent_s.items() if now_s >= sent_s + ANSWER_S]:
-            # Silence says something only if PX4 spoke since.
+            # A missing answer counts only if PX4 has answered since.
             self._unheard[name] += self._heard_s > self._sent_s.pop(name)
             if self._unheard[name] >= ASKS:
                 self.absent.add(name)
@@ -151,7 +151,7 @@ class ParamTransfer:
                     for name in queries.due(self._clock()):
                         self._ask(name)
                     changed.clear()
-                    with contextlib.suppress(TimeoutError):  # then it is time to look what is overdue
+                    with contextlib.suppress(TimeoutError):  # then check which requests are overdue
                         async with asyncio.timeout(ANSWER_S / 4):
                             await changed.wait()
         except TimeoutError:
@@ -171,7 +171,7 @@ class ParamTransfer:
         """Write one value, read it back and return the value that PX4 now holds.
 
         Raises:
-            DeviceError: no such name, a value that the type cannot hold, PX4 refused it, or holds another one afterwards.
+            DeviceError: no such name, a value that the type cannot hold, a refusal by PX4, or another value in PX4 afterwards.
         """
         before = (await self.read([name])).get(name)
         if before is None:
@@ -180,11 +180,13 @@ class ParamTransfer:
         wanted = self._storable(name, value, integer=isinstance(before, int))
         try:
             setter = self._param.set_param_int if isinstance(wanted, int) else self._param.set_param_float
-            await self._calls.run(f"PX4 to take {name} = {wanted:g}", 2 * NATIVE_CALL_DEADLINE_S, setter, name, wanted)
+            await self._calls.run(
+                f"PX4 to accept {name} = {wanted:g}", 2 * NATIVE_CALL_DEADLINE_S, setter, name, wanted
+            )
         except ParamError as error:
             found = error.result.name.lower().replace("_", " ")
             fix = "check the value's range and the link"
-            raise device_error(self._address, f"PX4 to take {name} = {wanted:g}", found, fix) from None
+            raise device_error(self._address, f"PX4 to accept {name} = {wanted:g}", found, fix) from None
         after = (await self.read([name])).get(name)
         if after != wanted:
             fix = "PX4 clipped or refused the value; choose one within the parameter's range"
@@ -209,7 +211,7 @@ class ParamTransfer:
             "param_id": name,
             "param_index": -1,
         }
-        # A message that the link refuses is one that is not answered: it is asked again.
+        # A message that the link refuses counts as unanswered and is repeated.
         self._direct.send_message(MavlinkMessage("PARAM_REQUEST_READ", fields_json=json.dumps(fields)))
 
     async def _read_int(self, name: str) -> Value:

@@ -20,7 +20,7 @@ SENT_ONCE = frozenset({AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM})
 makes must not stop rotors. The core repeats the request in every tick for as long as its rule holds.
 """
 RETRY_S = 0.5
-"""Least time between two commands of one kind."""
+"""Min time between two commands of one kind."""
 SETTLE_S = 1.5
 """Pause after an accepted command: the heartbeat that shows it done comes once a second."""
 ANSWER_DEADLINE_S = 3.0

@@ -1,6 +1,6 @@
 """PX4's STATUSTEXT messages: assembled from chunks, cleaned, each line reported once. Pure: time is an argument, nothing is sent.
 
-PX4 sends a long text in chunks of 50 characters (`id`, `chunk_seq`), ends most texts with a tab, which tells a ground station that the
+PX4 sends a long text in chunks of 50 characters (`id`, `chunk_seq`), ends most texts with a tab, which shows a ground station that the
 same text was sent as an event too, and repeats a complaint for as long as it holds. Its first text after boot has the id 0, which by
 the message's definition has no chunks; it may have some all the same (measured on 1.16.1 and 1.18).
 """

@@ -42,7 +42,7 @@ class Difference:
 
     @property
     def type_problem(self) -> str | None:
-        """Return why it cannot be written (the file has another type than PX4), or None if it can."""
+        """Return why it cannot be written (the types of file and PX4 differ), or None if it can."""
         if isinstance(self.px4, int) is isinstance(self.file, int):
             return None
         names = ("a REAL32", "an INT32")

@@ -109,7 +109,7 @@ class Relay:
                 self._say(message)
 
     def _hear(self) -> bool:
-        """Process messages of the flight process; returns False when the channel has ended."""
+        """Process messages of the flight process. Return False when the channel has ended."""
         for _ in range(_ROUND_DATAGRAMS):
             try:
                 data = self._channel.recv(CHANNEL_MAX_BYTES)
@@ -142,7 +142,7 @@ class Relay:
             if not passed or not self._open:
                 continue
             if self._heard_s is None:
-                self._tell(f"ground station {self._name} is there")
+                self._tell(f"ground station {self._name} is connected")
             if self._situation is not None and (self._heard_s is None or now_s - self._heard_s > _AWAY_S):
                 self._texts.say(int(mavlink.MAV_SEVERITY_INFO), self._situation)
             self._heard_s = now_s
@@ -165,7 +165,7 @@ class Relay:
         self._encoder.seq = (self._encoder.seq + 1) % 256
 
     def _to_ground(self, data: bytes) -> None:
-        with contextlib.suppress(OSError):  # nobody listens there, or no network: both may come back
+        with contextlib.suppress(OSError):  # no listener or no network; both may return
             self._ground.send(data)
 
     def _tell(self, text: str) -> None:
@@ -182,7 +182,7 @@ def _received(source: socket.socket) -> list[bytes]:
         except BlockingIOError:
             break
         except OSError:
-            continue  # an ICMP of before: nobody listened
+            continue  # an ICMP error of an earlier send: no listener
     return datagrams
 
 
@@ -194,7 +194,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--system", type=int, required=True, help="MAVLink system id of the vehicle")
     parser.add_argument("--own", type=int, nargs=2, required=True, help="system and component id of MAVSDK")
-    parser.add_argument("--name", required=True, help="the ground station's address for people")
+    parser.add_argument("--name", required=True, help="the ground station's address for display")
     parser.add_argument("--while-armed", action="store_true", help="pass everything while PX4 is armed too")
     parser.add_argument("--console", action="store_true", help="pass SERIAL_CONTROL while PX4 is not armed")
     a = parser.parse_args(argv)

@@ -95,8 +95,8 @@ class GroundStation:
     def line(self) -> str:
         """Return one line about the open link for the operator."""
         return (
-            f"MAVLink goes to and from {self.address}: whoever speaks from there can change PX4's mode and, while it is disarmed, its"
-            f" parameters{', and all of it in flight' if self._while_armed else ''}, but never what the companion knows"
+            f"MAVLink goes to and from {self.address}: whoever sends from there can change PX4's mode and, while it is disarmed, its"
+            f" parameters{', and all of it in flight' if self._while_armed else ''}, but nothing in the companion"
         )
 
     async def __aenter__(self) -> Self:
@@ -122,8 +122,8 @@ class GroundStation:
         self._send({"bye": True})
         await self._close()
 
-    def tell(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Send a tick's news: events and phase changes at once, values at 4 Hz. Never waits; what does not fit is dropped."""
+    def report_tick(self, inputs: Inputs, outputs: Outputs) -> None:
+        """Send a tick's events and phase changes at once, its values at 4 Hz. Never waits; what does not fit is dropped."""
         if self._channel is None:
             return
         texts = [words.event_text(event) for event in outputs.events]
@@ -180,7 +180,7 @@ class GroundStation:
             raise ground_error(self.address, f"an address of {host}", str(found_text).lower(), fix) from None
         ip = str(found[0][4][0])
         if ipaddress.ip_address(ip.partition("%")[0]).is_multicast or ip == "255.255.255.255":
-            raise ground_error(self.address, "one computer", f"the group {ip}", "give that of the ground station")
+            raise ground_error(self.address, "one computer", f"the group {ip}", "give the ground station's address")
         return ip, port
 
     async def _start(self, ip: str, port: int) -> int:
@@ -218,7 +218,7 @@ class GroundStation:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
-                process_group=0,  # Ctrl-C on the terminal is for the flight alone
+                process_group=0,  # Ctrl-C on the terminal is for the flight process only
             )
         except BaseException:
             ours.close()
@@ -233,7 +233,7 @@ class GroundStation:
         try:
             self._channel.send(pack(said))
         except BlockingIOError:
-            pass  # the relay is held up: these words are lost, the flight is not
+            pass  # the relay is delayed: the text is lost, the flight continues
         except OSError:
             self._gone()
 
@@ -241,7 +241,7 @@ class GroundStation:
         if self._channel is not None:
             self._channel.close()
             self._channel = None
-            self._messages.append(f"ground station {self.address}: the relay has ended, nothing is forwarded any more")
+            self._messages.append(f"ground station {self.address}: the relay has ended; nothing is forwarded")
 
     async def _close(self) -> None:
         if self._channel is not None:

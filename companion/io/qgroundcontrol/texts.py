@@ -42,7 +42,7 @@ def event_text(event: Event) -> Text:
 
 
 def phase_text(phase: str) -> Text:
-    """Return the text for the begin of a phase."""
+    """Return the text for the start of a phase."""
     return _INFO, f"phase {phase}"
 
 

@@ -60,7 +60,7 @@ _SET_MODE_BYTES = 6
 
 
 class ArmedState:
-    """Whether PX4 is armed, as the relay sees it.
+    """Tracks whether PX4 is armed.
 
     Args:
         vehicle_system: MAVLink system id of PX4.
@@ -82,7 +82,7 @@ class ArmedState:
         self._arming_s = now_s
 
     def armed(self, now_s: float) -> bool:
-        """Return whether PX4 is armed, may be, or is not heard."""
+        """Return whether PX4 is armed, may be armed, or sends no heartbeat."""
         if self._disarmed_s is None or now_s - self._disarmed_s > HEARTBEAT_MAX_AGE_S:
             return True
         return now_s - self._arming_s <= HEARTBEAT_MAX_AGE_S
@@ -124,7 +124,7 @@ class UplinkFilter:
         if frame.system in (0, self._vehicle_system):
             return f"in the vehicle's name (system id {frame.system})"
         if frame.message_id not in GROUND_MESSAGES:
-            return f"{frame.name}, which is not a ground station's to say"
+            return f"{frame.name}, which a ground station may not send"
         if frame.message_id in COMMANDS and command_of(frame.payload) in REFUSED_COMMANDS:
             return f"command {command_of(frame.payload)}, which the flight does not allow"
         reason = self._now(frame, self.state.armed(now_s))

@@ -22,7 +22,7 @@ from companion.model.types import AutopilotStatus, MocapPose, VehicleState
 from companion.preflight.checks import Check
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
-from companion.preflight.hand_test.run import TOLD, HandResult, HandSample, HandTest, HandView, Step
+from companion.preflight.hand_test.run import INSTRUCTIONS, HandResult, HandSample, HandTest, HandView, Step
 from companion.runtime.terminal import Bars, pressed, raw_keys
 
 LOOK_PERIOD_S: Final = 0.004
@@ -71,7 +71,9 @@ async def run_hand_test(
 async def perform(
     devices: Devices | AvailableDevices, config: FlightConfig, console: Console, json: bool = False
 ) -> HandResult | str:
-    """Guide the operator through the test and return the measurements, or why there are none. Arguments as of `run_hand_test`."""
+    """Guide the operator through the test and return the measurements, or the reason why there are none. Arguments are those of
+    `run_hand_test`.
+    """
     mocap, autopilot, arm = devices.mocap, devices.autopilot, devices.arm
     if mocap is None or autopilot is None:
         missing = "motion capture" if mocap is None else "PX4"
@@ -102,7 +104,7 @@ def _keep(path: Path, setup: hand_record.Setup, rows: list[Row]) -> Row:
     try:
         tests = hand_record.load(path)
     except hand_record.RecordError:
-        tests = []  # what cannot be understood is replaced: the test that was just passed is what counts
+        tests = []  # an unreadable record is replaced: the test that was just passed must be kept
     try:
         hand_record.save(path, hand_record.with_passed(tests, setup, datetime.now(UTC), rows))
     except hand_record.RecordError as error:
@@ -152,7 +154,9 @@ def _interrupted(stop: asyncio.Event) -> Iterator[None]:
 
 
 def _show(bars: Bars, view: HandView) -> None:
-    """Show the step, how far it is, and why the last attempt did not count."""
+    """Show the step, its progress, and why the last attempt did not count."""
     number = f"{_STEPS.index(view.step) + 1}/{len(_STEPS)}" if view.step in _STEPS else "   "
-    bars.say(f"   {view.notice}" if view.notice else f"{number}  {TOLD[view.step]}", "yellow" if view.notice else "")
+    bars.say(
+        f"   {view.notice}" if view.notice else f"{number}  {INSTRUCTIONS[view.step]}", "yellow" if view.notice else ""
+    )
     bars.show([view.progress], [f"{view.step.value}  {view.seen}"])

@@ -19,18 +19,18 @@ from companion.preflight.hand_test.run import HandResult
 
 _ASTRAY = "the controller would push in wrong directions"
 DONE = Check("hand.done", "hand test", "every step is recognised", "the axes are not known")
-TOLD = Check(
+AS_REQUESTED = Check(
     "hand.told",
     "hand test: as instructed",
     "the IMU measured up, forward and a turn to the left",
-    "either it was moved otherwise, or PX4's own axes are wrong",
+    "the vehicle was moved otherwise, or PX4's own axes are wrong",
 )
 LEVEL = Check("hand.level", "hand test: level", "gravity is vertical in the stream within 5 deg", _ASTRAY)
 LIFT = Check("hand.lift", "hand test: up", "IMU and motion capture agree on the direction within 20 deg", _ASTRAY)
 FORWARD = Check(
     "hand.forward",
     "hand test: forward",
-    "the same, and within 12 deg about the vertical",
+    "the same directions, and within 12 deg about the vertical",
     "PX4 fuses this yaw and cannot detect that it is wrong: the vehicle would circle or fly away",
 )
 TURN = Check(
@@ -45,7 +45,7 @@ SCALE = Check(
     "0.7 to 1.4 m by motion capture for each metre by the IMU",
     "every distance would be wrong by that",
 )
-CHECKS = (DONE, TOLD, LEVEL, LIFT, FORWARD, TURN, SCALE)
+CHECKS = (DONE, AS_REQUESTED, LEVEL, LIFT, FORWARD, TURN, SCALE)
 
 LEVEL_MAX_DEG: Final = 5.0
 """Largest angle between gravity by the accelerometer, rotated by the streamed attitude, and the world's vertical."""
@@ -54,7 +54,7 @@ YAW_MAX_DEG: Final = 12.0
 """Largest angle between the rigid body's forward axis and the machine's."""
 TURN_MAX_DEG: Final = 8.0
 """Largest difference between gyro and motion capture over a turn of about 45 deg."""
-TOLD_MAX_DEG: Final = 40.0
+REQUESTED_MAX_DEG: Final = 40.0
 """Largest angle between the requested direction and the motion measured by the IMU."""
 SCALE_SPAN: Final = (0.7, 1.4)
 
@@ -73,8 +73,8 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
     """
     lift, forward, turn = result.lift, result.forward, result.turn
     up_body = result.stood.force_m_s2
-    told = _told(lift, forward, turn, up_body)
-    fix = _BOARD if not told.ok and _seen_as_told(result) else _explain(result, up_axis)
+    requested = _as_requested(lift, forward, turn, up_body)
+    fix = _BOARD if not requested.ok and _seen_as_requested(result) else _explain(result, up_axis)
     level_deg = math.degrees(angle_rad(quat_rotate(result.stood.attitude, up_body), _UP))
     lift_deg = math.degrees(angle_rad(lift.response, lift.felt_m))
     yaw_deg = yaw_offset_deg(forward)
@@ -89,7 +89,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
     far = "calibrate the motion-capture volume anew (wand length), or the accelerometer if it reads wrong at rest"
     return [
         DONE.good("lift, forward and turn were recognised"),
-        told,
+        requested,
         row(
             LEVEL,
             level_deg <= LEVEL_MAX_DEG,
@@ -99,7 +99,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
         row(
             LIFT,
             lift_deg <= AXIS_MAX_DEG,
-            f"felt {_way(lift.felt_m)}, seen {_way(lift.seen_m)}, {lift_deg:.0f} deg apart",
+            f"IMU {_way(lift.felt_m)}, motion capture {_way(lift.seen_m)}, {lift_deg:.0f} deg apart",
             f"within {AXIS_MAX_DEG:g} deg",
         ),
         row(
@@ -126,7 +126,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
 
 def ended(cause: str, again: str = "companion check --hand") -> Row:
     """Return the row of a test without a result; `again` is the command to repeat."""
-    return DONE.bad(cause, "lift, forward and a turn to the left, each recognised", f"do it again: {again}")
+    return DONE.bad(cause, "lift, forward and a turn to the left, each recognised", f"repeat the test: {again}")
 
 
 def yaw_offset_deg(forward: Motion) -> float:
@@ -135,27 +135,27 @@ def yaw_offset_deg(forward: Motion) -> float:
     return math.degrees(math.atan2(sx * fy - sy * fx, fx * sx + fy * sy))
 
 
-def _told(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) -> Row:
+def _as_requested(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) -> Row:
     """Return the row on whether the IMU measured the requested motion. If so, the IMU's own axes are right as well."""
     up_deg = math.degrees(angle_rad(lift.felt_m, up_body))
     standing_deg = math.degrees(angle_rad(up_body, _UP))
     ahead_deg = math.degrees(angle_rad(forward.felt_m, _AHEAD))
     left_deg = math.degrees(turn.felt_turn_rad[2])
     read = f"the IMU measured {_way(lift.felt_m)}, then {_way(forward.felt_m)}, then a turn by {left_deg:+.0f} deg"
-    if max(up_deg, standing_deg, ahead_deg) <= TOLD_MAX_DEG and left_deg > 0.0:
-        return TOLD.good(read, "up, forward, left")
-    return TOLD.bad(read, "up, forward, left", f"repeat the test; if it was moved as instructed, {_BOARD}")
+    if max(up_deg, standing_deg, ahead_deg) <= REQUESTED_MAX_DEG and left_deg > 0.0:
+        return AS_REQUESTED.good(read, "up, forward, left")
+    return AS_REQUESTED.bad(read, "up, forward, left", f"repeat the test; if it was moved as instructed, {_BOARD}")
 
 
-def _seen_as_told(result: HandResult) -> bool:
-    """Return whether motion capture alone saw the requested motion: up, forward, left."""
-    most = math.radians(TOLD_MAX_DEG)
+def _seen_as_requested(result: HandResult) -> bool:
+    """Return whether motion capture alone measured the requested motion: up, forward, left."""
+    most = math.radians(REQUESTED_MAX_DEG)
     straight = angle_rad(result.lift.seen_m, _UP) <= most and angle_rad(result.forward.seen_m, _AHEAD) <= most
     return straight and result.turn.seen_turn_rad[2] > 0.0
 
 
 def best_axes(result: HandResult) -> AxisMap:
-    """Return which of the 48 axis maps of the rigid body is nearest to all measurements."""
+    """Return the one of the 48 axis maps of the rigid body that is nearest to all measurements."""
     polar = [(m.felt_m, m.response) for m in (result.lift, result.forward)]
     axial = (result.turn.felt_turn_rad, result.turn.seen_turn_rad)
 
@@ -169,7 +169,7 @@ def best_axes(result: HandResult) -> AxisMap:
 
 
 def _explain(result: HandResult, up_axis: str) -> str:
-    """Return one line on what to do."""
+    """Return the remedy as one line."""
     axes = best_axes(result)
     yaw_deg = yaw_offset_deg(result.forward)
     if axes.determinant < 0:

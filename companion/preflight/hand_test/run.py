@@ -1,7 +1,7 @@
 """The guided hand test: the operator carries the machine, rotors off, and every axis of motion capture is compared with the IMU. Pure.
 
-The steps are: stand still, lift, forward, turn left. Each step is recognised by how far motion capture saw the machine move, whatever
-the direction, because the directions are what is tested. They are evaluated at the end (`companion.preflight.hand_test.evaluation`).
+The steps are: stand still, lift, forward, turn left. Each step is recognised by the distance that motion capture measures, in any
+direction, because the directions are under test. They are evaluated at the end (`companion.preflight.hand_test.evaluation`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ STILL_S: Final = 0.6
 STILL_M, STILL_DEG = 0.02, 5.0
 """Largest deviation from the mean within `STILL_S` of a machine of 3 kg held by hand."""
 STAND_M, STAND_DEG = 0.004, 1.0
-"""The same for a machine on the floor."""
+"""Largest deviation from the mean of a machine on the floor."""
 MOVE_MAX_S: Final = 8.0
 """Longest motion that is evaluated, because the IMU's integration drifts."""
 SILENCE_MAX_S: Final = 3.0
@@ -58,7 +58,7 @@ class Step(Enum):
 
 
 _NEXT: Final = {Step.STAND: Step.LIFT, Step.LIFT: Step.FORWARD, Step.FORWARD: Step.TURN, Step.TURN: Step.DONE}
-TOLD: Final = {
+INSTRUCTIONS: Final = {
     Step.STAND: "place the vehicle on the floor and let go of it",
     Step.LIFT: "take it by its legs, lift it straight up by 30 cm in about two seconds, hold it still",
     Step.FORWARD: "move it 30 cm forward, where its nose points, without turning it; hold it still",
@@ -194,7 +194,7 @@ class HandTest:
         elif self._rest is not None:
             self._move(t_s, self._rest, still)
         if self._step is not Step.DONE and t_s - self._step_s > STEP_TIMEOUT_S:
-            self._ended = f"not within {STEP_TIMEOUT_S:g} s: {TOLD[self._step]} ({self._why(t_s)})"
+            self._ended = f"not within {STEP_TIMEOUT_S:g} s: {INSTRUCTIONS[self._step]} ({self._why(t_s)})"
 
     def _why(self, t_s: float) -> str:
         for samples, what in (
@@ -212,7 +212,7 @@ class HandTest:
         recent = self._poses[bisect_left(self._poses, t_s - window_s, key=lambda pose: pose.t_s) :]
         if len(recent) < _POSES_MIN or recent[0].t_s > t_s - window_s + _SPARSE_S or recent[-1].t_s < t_s - _SPARSE_S:
             return None
-        # Enough of them to tell rest from motion; two hundred a second are not needed for that.
+        # A few samples distinguish rest from motion; 200 per second are not needed.
         some = recent[:: max(1, len(recent) // 24)]
         position = mean_vector([pose.position_m for pose in some])
         if max(math.dist(pose.position_m, position) for pose in some) > within_m:
@@ -227,7 +227,7 @@ class HandTest:
         rest = self._still(t_s, STAND_S, STAND_M, STAND_DEG)
         stood_s = 0.0 if self._still_since_s is None else t_s - max(self._still_since_s, self._step_s)
         self._progress = min(1.0, stood_s / STAND_S)
-        self._seen = "it stands" if self._still_since_s is not None else "it moves, or is not tracked"
+        self._seen = "it stands" if self._still_since_s is not None else "the machine moves, or is not tracked"
         felt = self._imu[bisect_left(self._imu, t_s - STAND_S, key=lambda sample: sample.t_s) :]
         if rest is None or len(felt) < _POSES_MIN:
             return

@@ -271,7 +271,7 @@ def test_what_comes_from_outside_is_text(stub: MonitorStub, page: Page) -> None:
     light = replace(in_flight().lights[0], text=HOSTILE, name=HOSTILE)
     page.tell(
         relayed(state(mission=HOSTILE, text=HOSTILE)),
-        relayed(in_flight(phase=HOSTILE, lights=(light,), bent_by=(HOSTILE,), mode=HOSTILE)),
+        relayed(in_flight(phase=HOSTILE, lights=(light,), limited_by=(HOSTILE,), mode=HOSTILE)),
         events_of(event(1, HOSTILE, id_=HOSTILE, action=HOSTILE)),
         relayed(ack("hold", "f" * 32, HOSTILE, operator=HOSTILE)),
         {**BROKER, "rejected": 3, "rejected_text": HOSTILE},

@@ -125,7 +125,7 @@ const vector = (value, digits, unit) => (Array.isArray(value) ? `${value.map((pa
 const DETAILS = [
   ["PX4 mode", ({ stream: s }) => [readable(s.mode ?? "unknown"), s.armed ? "armed" : "disarmed", readable(s.landed)].filter(Boolean).join(", ")],
   ["safety action", ({ stream: s }) => readable(s.action)],
-  ["reference constrained by", ({ stream: s }) => (s.bent_by.length > 0 ? s.bent_by.map(readable).join(", ") : "nothing")],
+  ["reference constrained by", ({ stream: s }) => (s.limited_by.length > 0 ? s.limited_by.map(readable).join(", ") : "nothing")],
   ["position", ({ stream: s }) => vector(s.position_world_m, 2, "m")],
   ["reference", ({ stream: s }) => vector(s.reference_world_m, 2, "m")],
   ["pose from", ({ stream: s }) => s.pose_from ?? NOTHING],
