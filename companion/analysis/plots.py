@@ -120,8 +120,9 @@ def _actuation(log: FlightLog) -> Figure | None:
     commanded = log.column(lambda i, o, s: o.arm_torque_nm, 2)
     sent = log.column(lambda i, o, s: s.arm_torque_sent_nm, 2)
     for j in range(2):
+        # Below what was sent, which is noisy and mostly the same: only a difference is to show.
+        axes[2].plot(t, commanded[:, j], color=_SERIES_DARK[j], lw=1.2, label=f"joint {j + 1} commanded")
         _line(axes[2], t, sent[:, j], f"joint {j + 1} sent", _SERIES[j])
-        _line(axes[2], t, commanded[:, j], f"joint {j + 1} commanded", _SERIES_DARK[j], reference=True)
     axes[2].set_ylabel("joint torque [N m]")
     _legend(axes[2], columns=4)
     return figure
@@ -225,7 +226,7 @@ def _timing(log: FlightLog) -> Figure | None:
     panes["time"].margins(x=0.0)
     panes["time"].set_ylim(bottom=0.0)
     panes["time"].set_xlabel("flight clock [s]")
-    panes["time"].set_ylabel("[ms]")
+    panes["time"].set_ylabel("time [ms]")
     _legend(panes["time"], columns=3)
     for name, title, values_s in (
         ("late", "tick lateness", log.columns.lateness_s),
@@ -235,7 +236,7 @@ def _timing(log: FlightLog) -> Figure | None:
         ax = panes[name]
         dress(ax)
         ax.set_title(title, fontsize=10, color=INK)
-        ax.set_xlabel("ms")
+        ax.set_xlabel("[ms]")
         spread = metrics.percentiles(values_s)
         if spread is None:
             ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=_REFERENCE, transform=ax.transAxes)
