@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 DPI = 150
@@ -29,6 +31,12 @@ def new_figure(height_in: float) -> Figure:
 def write_png(figure: Figure, path: Path) -> None:
     """Write the figure as PNG."""
     FigureCanvasAgg(figure).print_png(path)
+
+
+def write_svg(figure: Figure, path: Path) -> None:
+    """Write the figure as SVG, byte for byte the same for the same data."""
+    with matplotlib.rc_context({"svg.hashsalt": "companion"}):
+        FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None, "Creator": None})
 
 
 def dress(ax: Any) -> None:

@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from companion.campaigns.compare.campaign import Compare
-from companion.campaigns.compare.grid import flights_of, variants_of
+from companion.campaigns.compare.grid import ADAPTATION, flights_of, variants_of
 from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, count, fly, names
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
@@ -40,6 +40,10 @@ def add_parser(commands: Any) -> None:
         "(default: that of the world)",
     )  # fmt: skip
     parser.add_argument(
+        "--adaptation", type=_adaptation, default=ADAPTATION[:1], metavar="on,off",
+        help="fly the presets of the adaptive law with their adaptation, without it (off), or both ways (default: on)",
+    )  # fmt: skip
+    parser.add_argument(
         "--ablation", action="store_true", help="also fly adaptive/recommended with one thing at a time removed"
     )
     parser.add_argument("--mission", default=DEFAULT_MISSION, metavar="FILE")
@@ -53,6 +57,12 @@ def _payloads(text: str) -> tuple[float, ...]:
 
 def _model_errors(text: str) -> tuple[float, ...]:
     return _numbers(text, 0.3, "shares from 0 to 0.3")
+
+
+def _adaptation(text: str) -> tuple[str, ...]:
+    if not set(names(text)) <= set(ADAPTATION):
+        raise argparse.ArgumentTypeError(f"expected on, off or on,off, got '{text}'")
+    return names(text)
 
 
 def _numbers(text: str, most: float, what: str) -> tuple[float, ...]:
@@ -81,7 +91,9 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
             if override.partition("=")[0].strip() == key:
                 raise ConfigError([f"companion compare: --set {key}: the grid sets it; use {option}"])
     try:
-        variants = variants_of(PRESETS, arguments.controllers, arguments.presets, arguments.ablation)
+        variants = variants_of(
+            PRESETS, arguments.controllers, arguments.presets, arguments.ablation, arguments.adaptation
+        )
     except ValueError as error:
         raise ConfigError([f"companion compare: {error}"]) from None
     configs: list[SitlConfig] = []

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-from companion.campaigns.compare.aggregate import aggregate
+from companion.campaigns.compare.aggregate import Spread, adaptation_pairs, aggregate
 from companion.campaigns.compare.campaign import print_tables
 from companion.campaigns.compare.grid import ABLATED, ABLATIONS, flights_of, variants_of
 from companion.campaigns.compare.paper_results import TABLE, printed
@@ -31,8 +30,13 @@ def row(seed: int, e_p_m: float | None, **changes: Any) -> Row:
 # -- the grid ----------------------------------------------------------------------------------------------------------
 
 
-def labels(controllers: tuple[str, ...] = (), presets: tuple[str, ...] = (), ablation: bool = False) -> list[str]:
-    return [variant.label for variant in variants_of(AVAILABLE, controllers, presets, ablation)]
+def labels(
+    controllers: tuple[str, ...] = (),
+    presets: tuple[str, ...] = (),
+    ablation: bool = False,
+    adaptation: tuple[str, ...] = ("on",),
+) -> list[str]:
+    return [variant.label for variant in variants_of(AVAILABLE, controllers, presets, ablation, adaptation)]
 
 
 def test_all_laws_fly_all_their_presets_unless_asked_otherwise() -> None:
@@ -50,6 +54,14 @@ def test_what_is_taken_away_stands_below_what_it_is_taken_from() -> None:
     at = found.index("/".join(ABLATED))
     assert found[at + 1 : at + 1 + len(ABLATIONS)] == [f"{'/'.join(ABLATED)} - {what}" for what in ABLATIONS]
     assert "adaptive/recommended" in labels(presets=("paper",), ablation=True), "nothing to see it beside"
+
+
+def test_the_adaptation_can_be_switched_off_in_every_preset_of_the_adaptive_law() -> None:
+    both = ["adaptive/paper", "adaptive/paper - adaptation off", "csc/tuned", "psc/tuned"]
+    assert labels(presets=("paper",), adaptation=("on", "off")) == both
+    assert labels(presets=("paper",), adaptation=("off",)) == both[1:]
+    ablated = labels(controllers=("adaptive",), presets=("recommended",), ablation=True, adaptation=("off",))
+    assert ablated == labels(controllers=("adaptive",), presets=("recommended",), ablation=True)
 
 
 @pytest.mark.parametrize(
@@ -101,40 +113,48 @@ def test_the_model_error_is_an_axis_of_the_grid_and_of_the_table() -> None:
 # -- what it adds up to ------------------------------------------------------------------------------------------------
 
 
-def test_mean_and_deviation_over_seeds() -> None:
-    values = [0.1, 0.2, 0.4]
-    (group,) = aggregate([row(seed, value) for seed, value in enumerate(values, 1)])
-    spread = group.spread("rms.post.e_p_m")
-    assert spread is not None and spread.std is not None
-    assert spread.mean == pytest.approx(sum(values) / 3, rel=1e-15)
-    assert spread.std == pytest.approx(math.sqrt(sum((v - spread.mean) ** 2 for v in values) / 2), rel=1e-12)
+def test_percentiles_over_seeds_are_values_of_flights() -> None:
+    (group,) = aggregate([row(seed, seed / 1000) for seed in range(100, 0, -1)])
+    assert group.spread("rms.post.e_p_m") == Spread(0.050, 0.095, 100)
     height = group.spread("final_abs_e_z_m")
     assert height is not None
-    assert height.mean == pytest.approx((0.02 + 0.01 + 0.02) / 3), "errors of either sign must not cancel"
+    assert (height.p50, height.p95) == (0.01, 0.02), "errors of either sign must not cancel"
     assert group.failures == {} and group.failure_text == ""
+    (one,) = aggregate([row(1, 0.1)])
+    assert one.spread("rms.post.e_p_m") == Spread(0.1, 0.1, 1)
 
 
-def test_a_crash_is_counted_and_its_errors_are_not_averaged() -> None:
+def test_a_crash_counts_as_worse_than_every_other_flight() -> None:
     (group,) = aggregate([row(1, 0.1), row(2, None), row(3, 0.3), row(4, None), row(5, 0.2)])
     assert group.failure_text == "crashed 2 of 5"
-    post, pre = group.spread("rms.post.e_p_m"), group.spread("rms.pre.e_p_m")
-    assert post is not None and post.mean == pytest.approx(0.2)
-    assert pre is not None and pre.mean == pytest.approx(0.01)
+    assert group.spread("rms.post.e_p_m") == Spread(0.3, None, 5)
+    assert group.spread("rms.pre.e_p_m") == Spread(0.01, 0.01, 5), "it crashed after the catch"
     assert group.jsonable()["completed"] == 3
+    assert group.jsonable()["p95"]["rms"]["post"]["e_p_m"] is None
+    (all_crashed,) = aggregate([row(1, None), row(2, None)])
+    assert all_crashed.spread("rms.post.e_p_m") is None
 
 
 def test_a_payload_that_was_not_caught_is_told() -> None:
     missed = row(1, 0.1, catch_t_s=None)
-    (group,) = aggregate([missed])
-    assert group.failure_text == "missed 1 of 1"
+    missed["rms"] = {**missed["rms"], "post": {"e_p_m": None, "e_q_deg": None, "e_alpha_deg": None}}
+    (group,) = aggregate([missed, row(2, 0.2)])
+    assert group.failure_text == "missed 1 of 2"
+    assert group.spread("rms.post.e_p_m") == Spread(0.2, 0.2, 1), "not the law's failure"
     (nothing_thrown,) = aggregate([{**missed, "payload_kg": 0.0}])
     assert nothing_thrown.failures == {}
 
 
-def test_one_seed_has_no_deviation() -> None:
-    (group,) = aggregate([row(1, 0.1)])
-    spread = group.spread("rms.post.e_p_m")
-    assert spread is not None and spread.std is None
+def test_adaptation_is_compared_flight_by_flight() -> None:
+    off = {"preset": "paper - adaptation off"}
+    on_m = {1: 0.1, 2: 0.1, 3: 0.3, 4: 0.1, 5: None, 6: None, 7: 0.1}
+    off_m = {1: 0.2, 2: 0.3, 3: 0.2, 4: None, 5: 0.2, 6: None, 8: 0.1}
+    rows = [*(row(seed, m) for seed, m in on_m.items()), *(row(seed, m, **off) for seed, m in off_m.items())]
+    (pairs,) = adaptation_pairs(aggregate(rows))
+    assert (pairs.preset, len(pairs.off_on), pairs.better) == ("paper", 5, 3)
+    assert pairs.p_value == pytest.approx(2 * (1 + 5 + 10) / 32), "3 of 5, by the binomial distribution"
+    assert (pairs.p50(0), pairs.p50(1)) == (0.2, 0.1)
+    assert adaptation_pairs(aggregate([row(1, 0.1)])) == []
 
 
 def test_printed_values_are_the_papers() -> None:

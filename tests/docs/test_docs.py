@@ -111,7 +111,7 @@ def test_links_and_file_names_exist(page: Path) -> None:
 def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs/pictures").glob("*"))
     assert pictures
-    limits = {".png": 200_000, ".gif": 1_500_000}
+    limits = {".png": 200_000, ".svg": 400_000, ".gif": 1_500_000}
     assert [picture.name for picture in pictures if picture.stat().st_size > limits[picture.suffix]] == []
 
 

@@ -27,13 +27,17 @@ RUNS = {
     "robustness": [str(CATCH), "--draws", "2"],
     "faults": [str(CATCH), "--kinds", "force_loss", "--phases", "line"],
 }
+FLIGHT: dict[str, Any] = {"controller": "adaptive", "preset": "paper", "payload_kg": 0.2, "seed": 1}
 ROWS: dict[str, Callable[[dict[str, Any]], Row]] = {
     "compare": compare_row,
     "robustness": lambda flight: draw_row(flight["number"], 0.02),
     "faults": fault_row,
 }
 PAGES = {
-    "compare": (("laws", "ablation"), compare_doc.main),
+    "compare": (
+        ("published", "extras", "differences", "model error", "adaptation", "ablation", "told"),
+        compare_doc.main,
+    ),
     "robustness": (("result",), robustness_doc.main),
     "faults": (("kinds", "campaign"), faults_doc.main),
 }
@@ -62,13 +66,15 @@ def test_a_campaign_notes_its_command_and_the_page_prints_it(
     assert "the old one" not in text
     shown = re.sub(r" --out \S+", "", command)
     assert text.count(f"Flown by `{shown}` at commit {results['versions']['git'][:10]}") == (
-        2 if name == "compare" else 1
+        4 if name == "compare" else 1
     )
 
 
 def test_a_file_that_names_no_command_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "compare.json"
-    file.write_text(json.dumps({"aggregate": [], "settings": {}, "versions": {}}), encoding="utf-8")
+    file.write_text(
+        json.dumps({"rows": [compare_row(FLIGHT)], "settings": {"world": "lab"}, "versions": {}}), encoding="utf-8"
+    )
     assert compare_doc.main(["page.md", str(file)]) == 2
     assert capsys.readouterr().err == f"{file}: key 'command' is missing\n"
 

@@ -1,75 +1,276 @@
-"""Writes the tables of docs/compare.md: `python -m tools.docs.compare docs/compare.md compare.json`."""
+"""Writes tables and plots of docs/compare.md: `python -m tools.docs.compare docs/compare.md compare.json [compare.json ...]`."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.campaigns.compare.grid import LESS, is_ablation
-from tools.docs.tables import flown_by, markdown, write_results
+from companion.analysis.plot_style import write_svg
+from companion.campaigns.compare.aggregate import Group, adaptation_pairs, aggregate
+from companion.campaigns.compare.campaign import by_payload, spread_text
+from companion.campaigns.compare.grid import ABLATED, ADAPTATION_OFF, LESS, is_ablation
+from companion.campaigns.compare.paper_results import Printed
+from companion.campaigns.compare.plots import distributions
+from companion.campaigns.runner import Row
+from companion.config.controller import PRESETS, AdaptiveConfig, ControllerConfig, CscConfig, PscConfig
+from companion.config.loader import load_flight
+from tools.docs.tables import flown_by, markdown, write_page
 
+MISSION = Path(__file__).parents[2] / "configs/missions/catch.yaml"
+"""Any mission: only the controller of its configuration is used."""
+Results = dict[str, Any]
+"""A compare.json."""
+AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned")
+"""Presets with nothing beyond what the law's paper describes; all others have the extras."""
+IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"}
+"""The variants whose figures the paper prints, with the paper's name of the law."""
 ABLATION_KG = 0.2
 """Payload of the table of ablations."""
-_LAWS = ("payload", "law/preset", "e_p before, m", "e_p after, m", "e_q after, deg", "e_alpha after, deg", "arm dI, N m",
-         "final e_z, m")  # fmt: skip
-_ABLATIONS = (
-    "taken away",
-    "e_p before, m",
-    "e_p after, m",
-    "e_alpha after, deg",
-    "arm dI, N m",
-    "torque activity, N m",
+_E_P = "rms.{}.e_p_m"
+_FIGURES = (
+    ("e_p before, m", _E_P.format("pre"), 3),
+    ("e_p after, m", _E_P.format("post"), 3),
+    ("peak e_p, m", "peak_e_p_m", 3),
+    ("e_q before, deg", "rms.pre.e_q_deg", 1),
+    ("e_q after, deg", "rms.post.e_q_deg", 1),
+    ("arm impedance, N m", "impedance_error.arm_nm", 2),
 )
+_ABLATION_FIGURES = (*_FIGURES[:3], ("e_alpha after, deg", "rms.post.e_alpha_deg", 1), _FIGURES[-1])
 
 
-def laws_markdown(aggregate: Sequence[dict[str, Any]]) -> str:
-    """Return one line per payload and preset, without the ablations: means over the seeds."""
+def merged(files: Sequence[Results]) -> list[Row]:
+    """Return the rows of all files, each with the line `flown_by` that names its command and commit. A flight that several files hold
+    is taken from the last of them.
+
+    Raises:
+        ValueError: the files were flown in different worlds, or no flight was flown.
+    """
+    worlds = sorted({results["settings"]["world"] for results in files})
+    if len(worlds) > 1:
+        raise ValueError(f"flown in different worlds: {', '.join(worlds)}; expected one")
+    keys = ("controller", "preset", "payload_kg", "model_error", "seed")
+    rows = {
+        tuple(row[key] for key in keys): {**row, "flown_by": flown_by(results)}
+        for results in files
+        for row in results["rows"]
+    }
+    if not rows:
+        raise ValueError("no rows; expected those of at least one flight")
+    return list(rows.values())
+
+
+def laws_markdown(groups: Iterable[Group]) -> str:
+    """Return one line per payload and preset."""
+    head = ("payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES), "paper: e_p before / after")
+    rows = [
+        (f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _paper(group))
+        for group in groups
+    ]
+    return markdown(head, rows)
+
+
+def model_error_markdown(groups: Sequence[Group]) -> str:
+    """Return one line per payload and preset, one column per model error."""
+    errors = sorted({group.model_error for group in groups})
+    lines: dict[tuple[float, str], dict[float, Group]] = {}
+    for group in groups:
+        lines.setdefault((group.payload_kg, group.label), {})[group.model_error] = group
+    head = ("payload", "law/preset", *(f"{100 * error:g} %" for error in errors))
+    rows = [
+        (f"{payload_kg:g} kg", label, *(_error_cell(found.get(error)) for error in errors))
+        for (payload_kg, label), found in lines.items()
+    ]
+    return markdown(head, rows)
+
+
+def adaptation_markdown(groups: Sequence[Group]) -> str:
+    """Return one line per preset, payload and model error that was flown with the adaptation on and off."""
+    head = ("law/preset", "payload", "model error", "off, m", "on, m", "change", "better with it", "p (sign test)")
     rows = []
-    for cell in aggregate:
-        if not is_ablation(cell["preset"]):
-            mean, before, after = _mean(cell)
-            rows.append((
-                f"{cell['payload_kg']:g} kg", f"{cell['controller']}/{cell['preset']}", f"{before['e_p_m']:.4f}",
-                f"{after['e_p_m']:.4f}", f"{after['e_q_deg']:.2f}", f"{after['e_alpha_deg']:.1f}",
-                f"{mean['impedance_error']['arm_nm']:.3f}", f"{mean['final_abs_e_z_m']:.3f}",
-            ))  # fmt: skip
-    return markdown(_LAWS, rows)
+    for pairs in adaptation_pairs(groups):
+        off, on = pairs.p50(0), pairs.p50(1)
+        change = "–" if off is None or on is None else f"{100 * (on / off - 1):+.0f} %"
+        shown = ("–" if value is None else f"{value:.3f}" for value in (off, on))
+        rows.append((
+            f"{pairs.controller}/{pairs.preset}", f"{pairs.payload_kg:g} kg", f"{100 * pairs.model_error:g} %", *shown, change,
+            f"{pairs.better} of {len(pairs.off_on)}", f"{pairs.p_value:.1g}",
+        ))  # fmt: skip
+    return markdown(head, rows)
 
 
-def ablation_markdown(aggregate: Sequence[dict[str, Any]]) -> str:
-    """Return one line per ablation with `ABLATION_KG`: means over the seeds."""
-    rows = []
-    for cell in aggregate:
-        if is_ablation(cell["preset"]) and cell["payload_kg"] == ABLATION_KG:
-            mean, before, after = _mean(cell)
-            rows.append((
-                cell["preset"].partition(LESS)[2], f"{before['e_p_m']:.4f}", f"{after['e_p_m']:.4f}", f"{after['e_alpha_deg']:.1f}",
-                f"{mean['impedance_error']['arm_nm']:.3f}", f"{mean['torque_activity_nm']:.3f}",
-            ))  # fmt: skip
-    return markdown(_ABLATIONS, rows)
+def ablation_markdown(groups: Iterable[Group]) -> str:
+    """Return one line per ablation with `ABLATION_KG`."""
+    head = ("taken away", "completed", *(title for title, _, _ in _ABLATION_FIGURES))
+    rows = [
+        (group.preset.partition(LESS)[2], _completed(group), *_spreads(group, _ABLATION_FIGURES)) for group in groups
+    ]
+    return markdown(head, rows)
 
 
-def _mean(cell: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    mean = cell["mean"]
-    return mean, mean["rms"]["pre"], mean["rms"]["post"]
+def differences_markdown(groups: Sequence[Group]) -> str:
+    """Return how the figures of the laws that the paper prints differ from the printed ones, as a list."""
+    lines = []
+    for part, word in (("pre", "before"), ("post", "after")):
+        for label, name in IN_PAPER.items():
+            these = [group for group in groups if group.label == label and group.printed is not None]
+            if these:
+                text = ", ".join(_against_print(group, part) for group in these)
+                lines.append(f"* {name} {word} the catch ({label}): {text}.")
+    for payload_kg in dict.fromkeys(group.payload_kg for group in groups):
+        these = [group for group in groups if group.payload_kg == payload_kg and group.label in IN_PAPER]
+        ours = [IN_PAPER[g.label] for g in sorted(these, key=lambda g: _rank(g.spread(_E_P.format("post"))))]
+        if len(ours) == len(IN_PAPER):
+            lines.append(
+                f"* Order after the catch at {payload_kg:g} kg: {', '.join(ours)}; printed: proposed, PSC, CSC."
+            )
+    return "\n".join(lines)
+
+
+def told_markdown() -> str:
+    """Return what each built-in preset uses of the vehicle, and what it estimates in flight."""
+    named = [(law, preset) for law, presets in PRESETS.items() for preset in presets]
+    configs = [load_flight(MISSION, controller_law=law, preset=preset).controller for law, preset in named]
+    head = ("law/preset", *(title for title, _ in _TOLD), "adapted or estimated in flight")
+    rows = [(f"{c.law}/{c.preset}", *("yes" if uses(c) else "–" for _, uses in _TOLD), _estimated(c)) for c in configs]
+    return markdown(head, rows)
+
+
+def _observer(c: ControllerConfig) -> bool:
+    return any(c.disturbance_time_xyz_s)
+
+
+_TOLD: tuple[tuple[str, Callable[[ControllerConfig], bool]], ...] = (
+    ("mass, hover thrust", lambda c: True),
+    ("arm lengths", lambda c: True),
+    ("gravity of the arm", lambda c: not isinstance(c, AdaptiveConfig) or c.arm_gravity_nominal),
+    ("inertia of the arm", lambda c: not isinstance(c, AdaptiveConfig) or c.arm_inertia_nominal),
+    ("inertia of the base, coupling", lambda c: isinstance(c, CscConfig)),
+    ("joint friction", lambda c: c.arm_friction_share > 0),
+    ("lag of thrust or attitude", lambda c: _observer(c) or c.feedforward_lead_s > 0 or isinstance(c, PscConfig)),
+    ("force fed forward", lambda c: any(c.force_feedforward_xyz)),
+)  # fmt: skip
+
+
+def _estimated(c: ControllerConfig) -> str:
+    found = ["disturbance force"] if _observer(c) else []
+    if isinstance(c, AdaptiveConfig):
+        found += ["H, zeta"]
+        loads = (("load", any(c.load_rate_xyz)), ("moments", c.moment_rate > 0), ("friction", c.friction_rate > 0))
+        found += [name for name, used in loads if used]
+    if isinstance(c, PscConfig):
+        found += ["payload mass"] if c.payload_max_kg > 0 else []
+        found += ["integral of the position error"] if any(c.position_ki_xyz) else []
+    return ", ".join(found) or "–"
+
+
+def _with_source(table: str, groups: Sequence[Group]) -> str:
+    """Return the table and below it the seeds, commands and commits of its flights."""
+    if not groups:
+        return "Not flown."
+    rows = [row for group in groups for row in group.rows]
+    seeds = sorted({row["seed"] for row in rows})
+    errors = ", ".join(f"{100 * error:g} %" for error in sorted({group.model_error for group in groups}))
+    what = f"{len(seeds)} laboratories (seeds {seeds[0]} to {seeds[-1]}), {len(rows)} flights, model error {errors}."
+    return "\n".join([table, "", what, *dict.fromkeys(row["flown_by"].lstrip() for row in rows)])
+
+
+def _spreads(group: Group, figures: Sequence[tuple[str, str, int]]) -> list[str]:
+    return [spread_text(group.spread(name), digits) or "–" for _, name, digits in figures]
+
+
+def _completed(group: Group) -> str:
+    done = f"{len(group.rows) - sum(group.failures.values())} of {len(group.rows)}"
+    return (
+        f"{done} ({', '.join(f'{count} {what}' for what, count in group.failures.items())})" if group.failures else done
+    )
+
+
+def _error_cell(group: Group | None) -> str:
+    if group is None:
+        return ""
+    text = spread_text(group.spread(_E_P.format("post")), 3) or "–"
+    return f"{text}; {_completed(group)}" if group.failures else text
+
+
+def _paper(group: Group) -> str:
+    if group.label not in IN_PAPER or group.printed is None:
+        return ""
+    return f"{group.printed.pre.e_p_m:.3f} / {_printed(group.printed.post)}"
+
+
+def _printed(figures: Printed | None) -> str:
+    return "crashed" if figures is None else f"{figures.e_p_m:.3f}"
+
+
+def _rank(spread: Any) -> float:
+    return float("inf") if spread is None or spread.p50 is None else float(spread.p50)
+
+
+def _against_print(group: Group, part: str) -> str:
+    assert group.printed is not None
+    printed = group.printed.pre if part == "pre" else group.printed.post
+    spread = group.spread(_E_P.format(part))
+    ours = None if spread is None else spread.p50
+    text = "failed" if ours is None else f"{ours:.3f} m"
+    times = f", {ours / printed.e_p_m:.1f} times it" if ours is not None and printed is not None else ""
+    return f"{text} at {group.payload_kg:g} kg (printed: {_printed(printed)}{times})"
+
+
+def tables(files: Sequence[Results]) -> dict[str, str]:
+    """Return every table, each with the commands and the commits of its figures."""
+    groups = by_payload(aggregate(merged(files)))
+    whole = [group for group in groups if not is_ablation(group.preset)]
+    first = [group for group in whole if group.model_error == min(one.model_error for one in groups)]
+    published = [group for group in first if group.preset in AS_PUBLISHED]
+    extras = [group for group in first if group.preset not in AS_PUBLISHED]
+    errors_of = Counter((group.label, group.payload_kg) for group in whole)
+    by_error = [group for group in whole if errors_of[group.label, group.payload_kg] > 1]
+    off = {
+        (group.label, group.payload_kg, group.model_error) for group in groups if group.preset.endswith(ADAPTATION_OFF)
+    }
+    off |= {(label.removesuffix(ADAPTATION_OFF), payload_kg, error) for label, payload_kg, error in off}
+    paired = [group for group in groups if (group.label, group.payload_kg, group.model_error) in off]
+    ablated = [
+        group
+        for group in groups
+        if group.label.startswith("/".join(ABLATED) + LESS)
+        and (group.payload_kg, group.model_error) == (ABLATION_KG, first[0].model_error)
+    ]
+    return {
+        "published": _with_source(laws_markdown(published), published),
+        "extras": _with_source(laws_markdown(extras), extras),
+        "differences": differences_markdown(first),
+        "model error": _with_source(model_error_markdown(by_error), by_error),
+        "adaptation": _with_source(adaptation_markdown(paired), paired),
+        "ablation": _with_source(ablation_markdown(ablated), ablated),
+        "told": told_markdown(),
+    }
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page."""
+    """Write the tables into a page and the plots beside it, into `pictures/`."""
     parser = argparse.ArgumentParser(prog="tools.docs.compare")
     parser.add_argument("page", type=Path)
-    parser.add_argument("results", type=Path, help="compare.json of companion compare --ablation")
+    parser.add_argument("results", type=Path, nargs="+", help="compare.json of companion compare")
     arguments = parser.parse_args(argv)
-    return write_results(arguments.page, arguments.results, tables)
-
-
-def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Return both tables, each with the command and the commit of its figures."""
-    aggregate, below = results["aggregate"], flown_by(results)
-    return {"laws": laws_markdown(aggregate) + "\n" + below, "ablation": ablation_markdown(aggregate) + "\n" + below}
+    try:
+        files = [json.loads(file.read_text(encoding="utf-8")) for file in arguments.results]
+        found, rows = tables(files), merged(files)
+    except (OSError, ValueError, KeyError) as error:
+        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
+        print(f"{', '.join(map(str, arguments.results))}: {reason}", file=sys.stderr)
+        return 2
+    code = write_page(arguments.page, found)
+    pictures = arguments.page.parent / "pictures"
+    pictures.mkdir(exist_ok=True)
+    for name, _, _, figure in distributions(aggregate(rows)):
+        write_svg(figure, pictures / f"compare_{name}.svg")
+    return code
 
 
 if __name__ == "__main__":

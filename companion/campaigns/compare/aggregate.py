@@ -1,4 +1,4 @@
-"""Means and deviations of a comparison over the seeds.
+"""Distributions of a comparison's figures over the seeds, and the paired comparison of two variants.
 
 A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome, error,
 catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,
@@ -8,13 +8,13 @@ the controller.
 
 from __future__ import annotations
 
-import statistics
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.campaigns.compare.grid import is_ablation
+from companion.campaigns.compare.grid import ADAPTATION_OFF, is_ablation
 from companion.campaigns.compare.paper_results import PrintedFlight, printed
 from companion.campaigns.runner import Row, flat
 
@@ -29,18 +29,20 @@ FIGURES = (
     "final_abs_e_z_m",
     "peak_e_p_m",
     "torque_activity_nm",
-    "catch_t_s",
 )
-"""Averaged figures: dotted keys of a row, and the absolute final height error, because signed ones would cancel."""
+"""Summarised figures: dotted keys of a row, and the absolute final height error, whose sign does not matter."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Mean and sample standard deviation over seeds."""
+    """Percentiles of a figure over seeds, by nearest rank. A flight that failed counts as worse than every other."""
 
-    mean: float
-    std: float | None
-    """None for a single value."""
+    p50: float | None
+    """None if half of the flights or more failed."""
+    p95: float | None
+    """None if more than one flight in twenty failed."""
+    flights: int
+    """Number of flights, failed ones included."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +60,19 @@ class Group:
         """`law/preset`."""
         return f"{self.controller}/{self.preset}"
 
+    def values(self, name: str) -> list[float]:
+        """Return one of `FIGURES` of each flight: infinite if the flight failed before it had the figure. A flight that was completed
+        without it is left out, such as one whose payload missed the net.
+        """
+        found = ((row, figure(row, name)) for row in self.rows)
+        return [math.inf if value is None else value for row, value in found if value is not None or _ended_early(row)]
+
     def spread(self, name: str) -> Spread | None:
-        """Return one of `FIGURES` over the flights that have it; None if none has."""
-        values = [value for row in self.rows if (value := figure(row, name)) is not None]
-        if not values:
+        """Return the percentiles of one of `FIGURES`; None if no flight has it."""
+        values = sorted(self.values(name))
+        if not values or math.isinf(values[0]):
             return None
-        return Spread(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
+        return Spread(_percentile(values, 0.5), _percentile(values, 0.95), len(values))
 
     @property
     def failures(self) -> dict[str, int]:
@@ -92,8 +101,8 @@ class Group:
             "flights": len(self.rows),
             "completed": sum(row["outcome"] == COMPLETED for row in self.rows),
             "failures": self.failures,
-            "mean": _nested({name: None if spread is None else spread.mean for name, spread in spreads.items()}),
-            "std": _nested({name: None if spread is None else spread.std for name, spread in spreads.items()}),
+            "p50": _nested({name: None if spread is None else spread.p50 for name, spread in spreads.items()}),
+            "p95": _nested({name: None if spread is None else spread.p95 for name, spread in spreads.items()}),
             "printed": of
             and {"controller": of.title, "pre": of.pre.jsonable(), "post": of.post and of.post.jsonable()},
         }
@@ -108,10 +117,70 @@ def aggregate(rows: Iterable[Row]) -> list[Group]:
     return [Group(*key, group) for key, group in groups.items()]
 
 
+def _ended_early(row: Row) -> bool:
+    return bool(row["outcome"] != COMPLETED)
+
+
+def _percentile(values: Sequence[float], share: float) -> float | None:
+    """Return the smallest of the sorted values that has at least this share of them at or below it; None if it is infinite."""
+    value = values[math.ceil(share * len(values)) - 1]
+    return value if math.isfinite(value) else None
+
+
 def _failure(row: Row) -> str | None:
-    if row["outcome"] != COMPLETED:
+    if _ended_early(row):
         return str(row["outcome"])
     return MISSED if row["payload_kg"] > 0 and row["catch_t_s"] is None else None
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """The same flights with the adaptation off and on: one law and preset, payload and model error, a pair for each seed."""
+
+    controller: str
+    preset: str
+    """With the adaptation on."""
+    payload_kg: float
+    model_error: float
+    off_on: Sequence[tuple[float, float]]
+    """RMS of ||e_p|| after the catch in m; infinite if the flight failed. Pairs with two failures or a missed payload are left out."""
+
+    @property
+    def better(self) -> int:
+        """Number of pairs in which the error is smaller with the adaptation on."""
+        return sum(on < off for off, on in self.off_on)
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided p-value of the sign test: how likely a count as uneven as `better` is if on and off are equally good."""
+        n = sum(on != off for off, on in self.off_on)
+        least = min(self.better, n - self.better)
+        return min(1.0, sum(math.comb(n, k) for k in range(least + 1)) / math.exp2(n - 1))
+
+    def p50(self, part: int) -> float | None:
+        """Return the median error with the adaptation off (0) or on (1); None if it is that of a failed flight."""
+        return _percentile(sorted(pair[part] for pair in self.off_on), 0.5)
+
+
+def adaptation_pairs(groups: Sequence[Group]) -> list[Pairs]:
+    """Return the pairs of every variant that was flown with the adaptation on and off."""
+    found = []
+    by_key = {(g.controller, g.preset, g.payload_kg, g.model_error): g for g in groups}
+    for (controller, preset, payload_kg, model_error), on in by_key.items():
+        off = by_key.get((controller, f"{preset}{ADAPTATION_OFF}", payload_kg, model_error))
+        if off is None:
+            continue
+        off_m, on_m = (_post_by_seed(group) for group in (off, on))
+        pairs = [(off_m[seed], on_m[seed]) for seed in off_m if seed in on_m]
+        known = [pair for pair in pairs if any(map(math.isfinite, pair))]
+        if known:
+            found.append(Pairs(controller, preset, payload_kg, model_error, known))
+    return found
+
+
+def _post_by_seed(group: Group) -> dict[int, float]:
+    known = {row["seed"]: row["rms"]["post"]["e_p_m"] for row in group.rows if _failure(row) != MISSED}
+    return {seed: math.inf if value is None else value for seed, value in known.items()}
 
 
 def figure(row: Row, name: str) -> float | None:

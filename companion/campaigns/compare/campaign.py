@@ -12,17 +12,17 @@ from rich.measure import Measurement
 
 from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, table
-from companion.campaigns.compare.aggregate import MISSED, Group, aggregate
+from companion.campaigns.compare.aggregate import MISSED, Group, Spread, aggregate
 from companion.campaigns.compare.grid import Variant, is_ablation, short_label
 from companion.campaigns.compare.paper_results import SOURCE
 from companion.campaigns.process import Message
 from companion.campaigns.runner import Campaign, Row
 
+STATISTIC = "RMS, p50 (p95) over seeds; a flight that failed counts as worse than every other, and – is such a flight"
 EXPLAINED = (
-    "RMS, mean ± standard deviation over seeds. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
+    f"{STATISTIC}. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
     "control law. Impedance: RMS after the catch of M_d e'' + K_d e' + K_p e - e_tau, the deviation from one target for every law, the "
-    "paper's table. Torque activity: RMS change of the commanded joint torques from one tick to the next. A flight that was not "
-    "completed is counted, but its errors are not averaged."
+    "paper's table. Torque activity: RMS change of the commanded joint torques from one tick to the next."
 )
 _PARTS = {"pre": "before", "post": "after"}
 _E_P, _E_Q, _E_ALPHA = ("e_p_m", "‖e_p‖", "m", 4), ("e_q_deg", "‖e_q‖", "deg", 2), ("e_alpha_deg", "‖e_α‖", "deg", 2)
@@ -75,32 +75,31 @@ class Compare(Campaign):
         return f"{row['controller']}/{row['preset']} {row['payload_kg']:g} kg{error} seed {row['seed']}"
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return the means and deviations over seeds."""
+        """Return the percentiles over seeds."""
         return {"aggregate": [group.jsonable() for group in aggregate(rows)]}
 
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return both tables and the pictures."""
         groups = by_payload(aggregate(rows))
-        lead = f"RMS, mean ± standard deviation over seeds. Grey: as printed in the paper ({SOURCE})."
+        lead = f"{STATISTIC}. Grey: as printed in the paper ({SOURCE})."
         sections = [
             Section("Tracking before and after the catch", lead, [tracking_table(groups)]),
             Section("After the catch", tables=[compliance_table(groups)], text=EXPLAINED),
             *([Section("Pictures", pictures=pictures)] if pictures else []),
         ]
-        seeds = ", ".join(map(str, self.seeds))
+        seeds = f"seed {self.seeds[0]}" if len(self.seeds) == 1 else f"seeds {self.seeds[0]} to {self.seeds[-1]}"
         mission = self.configs[0].sources.mission
         return Page(
             "Comparison of controllers",
-            f"{mission} · {len(rows)} flights in the fast loop · world {self.world} · seeds {seeds}",
+            f"{mission} · {len(rows)} flights in the fast loop · world {self.world} · {seeds}",
             sections,
         )
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Plot the time series and the overview of the flights with the first model error."""
+        """Plot the distributions, and the time series of the flights that recorded one."""
         from companion.campaigns.compare.plots import write_pictures
 
-        shown = [message for message in messages if message["row"]["model_error"] == self.model_errors[0]]
-        return write_pictures(shown, aggregate(message["row"] for message in shown), out)
+        return write_pictures(messages, aggregate(message["row"] for message in messages), out)
 
     def show(self, rows: Sequence[Row], console: Console) -> None:
         """Print both tables."""
@@ -117,33 +116,33 @@ def by_payload(groups: Sequence[Group]) -> list[Group]:
 
 
 def print_tables(groups: Sequence[Group], console: Console) -> None:
-    """Print both tables, without the deviations where the terminal is too narrow. No figure is ever cut off."""
+    """Print both tables, without the 95th percentiles where the terminal is too narrow. No figure is ever cut off."""
     groups, width = by_payload(groups), console.width
     unlimited = console.options.update(max_width=10_000)
     for make in (tracking_table, compliance_table):
         shown = for_terminal(make(groups))
         if Measurement.get(console, unlimited, shown).maximum > width:
-            shown = for_terminal(make(groups, deviation=False))
+            shown = for_terminal(make(groups, p95=False))
         console.width = max(width, Measurement.get(console, unlimited, shown).maximum)
         console.print(shown, highlight=False)
         console.width = width
 
 
-def tracking_table(groups: Sequence[Group], *, deviation: bool = True) -> Table:
+def tracking_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
     """Return the paper's table, each figure with the printed one beside it."""
     columns = []
     for part, word in _PARTS.items():
         for key, title, unit, digits in (_E_P, _E_Q):
             name = f"rms.{part}.{key}"
             # A failure takes the place of the figures that it cost.
-            ours = _ours(name, f"{word}\n{title}", unit, digits, deviation, failures=(part, key) == ("post", "e_p_m"))
+            ours = _ours(name, f"{word}\n{title}", unit, digits, p95, failures=(part, key) == ("post", "e_p_m"))
             columns += [ours, _paper(part, key, digits)]
     return _table("Tracking before and after the catch", columns, groups)
 
 
-def compliance_table(groups: Sequence[Group], *, deviation: bool = True) -> Table:
+def compliance_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
     """Return the table of compliance after the catch, which the tracking errors do not show."""
-    columns = [_ours(*of, deviation, failures=position == 0) for position, of in enumerate(_COMPLIANCE)]
+    columns = [_ours(*of, p95, failures=position == 0) for position, of in enumerate(_COMPLIANCE)]
     return _table("After the catch", columns, groups)
 
 
@@ -163,19 +162,21 @@ def _table(title: str, columns: Sequence[Column], groups: Sequence[Group]) -> Ta
     return table([*head, *columns], groups, title=title, group=lambda group: (group.payload_kg, group.model_error))
 
 
-def _ours(name: str, title: str, unit: str, digits: int, deviation: bool, *, failures: bool) -> Column:
+def _ours(name: str, title: str, unit: str, digits: int, p95: bool, *, failures: bool) -> Column:
     def show(group: Group) -> Cell:
-        spread = group.spread(name)
-        if spread is None:
-            text = "" if group.failures else "–"
-        elif spread.std is None or not deviation:
-            text = f"{spread.mean:.{digits}f}"
-        else:
-            text = f"{spread.mean:.{digits}f}±{f'{spread.std:.{digits}f}'.removeprefix('0') or '0'}"
+        text = spread_text(group.spread(name), digits, p95=p95) or ("" if group.failures else "–")
         note_kind = "warning" if set(group.failures) == {MISSED} else "bad"
         return Cell(text, note=group.failure_text if failures else "", note_kind=note_kind)
 
     return Column(f"{title}\n[{unit}]", show)
+
+
+def spread_text(spread: Spread | None, digits: int, *, p95: bool = True) -> str:
+    """Return `p50 (p95)`, with – for the error of a flight that failed; only p50 of a single flight; empty for None."""
+    if spread is None:
+        return ""
+    shown = ["–" if value is None else f"{value:.{digits}f}" for value in (spread.p50, spread.p95)]
+    return f"{shown[0]} ({shown[1]})" if p95 and spread.flights > 1 else shown[0]
 
 
 def _paper(part: str, key: str, digits: int) -> Column:

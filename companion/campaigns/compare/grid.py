@@ -9,9 +9,17 @@ from companion.campaigns.process import Message
 
 ABLATED = ("adaptive", "recommended")
 LESS = " - "
+ADAPTATION = ("on", "off")
+ADAPTATION_OFF = f"{LESS}adaptation off"
+"""Follows the name of a preset that is flown without its adaptation."""
 ABLATIONS: dict[str, tuple[str, ...]] = {
-    # rho = min(H . b + zeta, rho_max): removes all that H and zeta learn.
-    "adaptation off": ("controller.rho_max=1.0e-9",),
+    # rho = min(H . b + zeta, rho_max): the first removes all that H and zeta learn, the others the adaptive loads.
+    "adaptation off": (
+        "controller.rho_max=1.0e-9",
+        "controller.load_rate_xyz=[0, 0, 0]",
+        "controller.moment_rate=0",
+        "controller.friction_rate=0",
+    ),
     "H3 uncapped": ("controller.acceleration_cap=1.0e9",),
     "S = I": ("controller.row_weights_s=[1, 1, 1, 0, 0, 0, 1, 1]",),
     "base feed-forward off": ("controller.force_feedforward_xyz=[0, 0, 0]",),
@@ -54,7 +62,11 @@ class Variant:
 
 
 def variants_of(
-    available: Mapping[str, Sequence[str]], controllers: Sequence[str], presets: Sequence[str], ablation: bool
+    available: Mapping[str, Sequence[str]],
+    controllers: Sequence[str],
+    presets: Sequence[str],
+    ablation: bool,
+    adaptation: Sequence[str] = ADAPTATION[:1],
 ) -> list[Variant]:
     """Return the lines of the table.
 
@@ -65,6 +77,7 @@ def variants_of(
         controllers: requested laws; empty for all.
         presets: requested presets; empty for all.
         ablation: add `ABLATED` with one thing at a time removed.
+        adaptation: of `ADAPTATION`: fly the presets of the adaptive law as they are, without their adaptation, or both.
 
     Raises:
         ValueError: there is no such law or preset, or nothing to ablate; one line.
@@ -85,9 +98,13 @@ def variants_of(
         if ablation and law == ABLATED[0] and ABLATED[1] not in chosen:
             chosen.append(ABLATED[1])  # an ablation means something only beside the whole preset
         for preset in chosen:
-            found.append(Variant(law, preset, preset))
-            if ablation and (law, preset) == ABLATED:
-                found += [Variant(law, f"{preset}{LESS}{what}", preset, less) for what, less in ABLATIONS.items()]
+            adaptive = law == ABLATED[0]
+            less = list(ABLATIONS) if ablation and (law, preset) == ABLATED else []
+            if "on" in adaptation or less or not adaptive:
+                found.append(Variant(law, preset, preset))
+            if "off" in adaptation and adaptive:
+                less = list(dict.fromkeys([ADAPTATION_OFF.removeprefix(LESS), *less]))
+            found += [Variant(law, f"{preset}{LESS}{what}", preset, ABLATIONS[what]) for what in less]
     return found
 
 
