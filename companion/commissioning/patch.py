@@ -1,4 +1,4 @@
-"""A proposed change of the vehicle file: printed for people and scripts, written only with `--write`."""
+"""A proposed change of the vehicle file: printed for users and scripts, written only with `--write`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Changes that a vehicle file needs; false if it has all these values already."""
+    """Changes of a vehicle file; false if the file has all these values already."""
 
     path: Path
     shown: str
@@ -65,7 +65,7 @@ class Patch:
 
     @property
     def text(self) -> str:
-        """Return the lines for the file in its own shape, each with the line that it replaces."""
+        """Return the changed lines in the file's own format, each with the line that it replaces."""
         if not self.changes:
             return f"# {self.shown}: nothing to change"
         lines: list[tuple[str, str]] = [(f"# {self.shown}", "")]
@@ -84,7 +84,7 @@ class Patch:
         """Write the file and keep the old one beside it; return the path of that backup.
 
         Raises:
-            ConfigError: the file has changed meanwhile, or cannot be written; it is unchanged then.
+            ConfigError: the file has changed meanwhile or cannot be written; it is left unchanged.
         """
         path = self.path.resolve()
         try:
@@ -108,7 +108,7 @@ def propose(vehicle_path: str | Path, changes: Mapping[Location, Data]) -> Patch
             already are left out, missing keys are added. Values are written as given: round them before.
 
     Raises:
-        ConfigError: the file cannot be read, or would not be valid any more; one line per problem.
+        ConfigError: the file cannot be read, or would become invalid; one line per problem.
     """
     path, shown = Path(vehicle_path), str(vehicle_path)
     document = read_document(path)
@@ -146,15 +146,13 @@ def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
     document = Document(shown, data)
     for change in changes:
         if not _same(document.get(change.location), change.new):
-            raise ConfigError(
-                [f"{shown}: {change.key} cannot be changed by a tool here; write it by hand: {change.new}"]
-            )
+            raise ConfigError([f"{shown}: {change.key} cannot be changed by this tool; write it by hand: {change.new}"])
     if validate(Vehicle, document) is None:
         raise ConfigError([f"{line} (after the proposed change)" for line in problem_lines(document.problems)])
 
 
 def _lines(open_steps: Location, change: Change, shown: str) -> list[tuple[str, str]]:
-    """Return the change's own line and those of the blocks that it opens."""
+    """Return the line of the change and of the blocks that it opens."""
     *way, last = change.location
     common = 0
     while common < min(len(open_steps), len(way)) and open_steps[common] == way[common]:

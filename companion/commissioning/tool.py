@@ -1,4 +1,4 @@
-"""The one commissioning tool: collect with devices open, fit, propose a change of the vehicle file, show.
+"""Common sequence of the commissioning tools: collect with open devices, fit, propose a change of the vehicle file, show.
 
 Its instances are the `TOOLS` of `companion.commissioning.arm`, `.force_torque`, `.latency` and `.mocap`.
 """
@@ -36,12 +36,12 @@ _T = TypeVar("_T")
 
 
 class GivenUp(Exception):
-    """The user ended the tool or answered no; the message says what was not done."""
+    """The user ended the tool or answered no; the message states what was not done."""
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """How the tools of a command treat the user and the vehicle file."""
+    """Behaviour of a command's tools towards the user and the vehicle file."""
 
     guides_on_stderr: bool
     """Whether instructions go to standard error even without `--json`."""
@@ -65,7 +65,7 @@ class Report:
     text: Sequence[str] = ()
     """Lines printed above the rows."""
     changes: Mapping[Location, Data] = field(default_factory=dict)
-    """Values that the vehicle file should have."""
+    """Values to change in the vehicle file."""
     advice: Sequence[str] = ()
     """Lines printed below the rows."""
     ok: bool | None = None
@@ -93,14 +93,14 @@ class Session:
         self.arguments = arguments
         self.vehicle = load_vehicle(arguments.vehicle, arguments.overrides)
         self.console = console_on(sys.stderr if family.guides_on_stderr or arguments.json else sys.stdout)
-        """For instructions and progress."""
+        """Console for instructions and progress."""
 
     def say(self, text: str, style: str = "") -> None:
         """Print one line of instructions."""
         self.console.print(Text(text, style=style), soft_wrap=True)
 
     def ask(self, question: str) -> bool | None:
-        """Ask a yes-or-no question, which `--yes` answers with yes. Return None if there is no terminal to ask at."""
+        """Ask a yes-or-no question, which `--yes` answers with yes. Return None without a terminal."""
         if getattr(self.arguments, "yes", False):
             return True
         if sys.stdin is None or not sys.stdin.isatty():
@@ -109,10 +109,10 @@ class Session:
         return sys.stdin.readline().strip().lower() in ("y", "yes")
 
     def confirm(self, question: str) -> bool:
-        """Return whether the user agrees; without a terminal print that nothing is done."""
+        """Return whether the user agrees; without a terminal print that nothing was done."""
         answer = self.ask(question)
         if answer is None:
-            self.say(f"{question} not done: there is no terminal to ask at, say --yes")
+            self.say(f"{question} not done: there is no terminal to ask; add --yes")
         return bool(answer)
 
 
@@ -124,11 +124,11 @@ class Tool(Generic[_T]):
     """Words after `companion`."""
     family: Family
     collect: Callable[[Session], _T | Coroutine[Any, Any, _T]]
-    """Check the options, open the devices, guide the user, return what was measured. Ctrl-C cancels it if it is a coroutine."""
+    """Check the options, open the devices, guide the user, return the measurements. Ctrl-C cancels it if it is a coroutine."""
     fit: Callable[[_T, Vehicle], Report]
-    """Judge what was measured. Pure."""
+    """Evaluates the measurements. Pure."""
     device: Check | None = None
-    """The row for a device that does not open or goes silent; None if it is reported as one line on standard error."""
+    """The row for a device that does not open or stops answering; None if it is reported as one line on standard error."""
     no_data: Mapping[str, Any] = field(default_factory=dict)
     """`Report.data` when a device fails."""
 
@@ -137,7 +137,7 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
     """Run a tool to its end; return the exit code.
 
     Raises:
-        ConfigError: an option or the vehicle file is wrong, or the vehicle file cannot take the change.
+        ConfigError: an option or the vehicle file is wrong, or the change cannot be written into the vehicle file.
         KeyboardInterrupt: Ctrl-C.
     """
     session = Session(arguments, tool.family)
@@ -191,10 +191,10 @@ def _may_write(session: Session, family: Family, patch: Patch) -> bool:
 
 
 def row_lines(rows: Sequence[Row], brief: Mapping[str, str]) -> list[str]:
-    """Return the rows as lines: result, title, what was read; then what to do about those that are not ok.
+    """Return the rows as lines: result, title, measured value, and the remedy if a row is not ok.
 
     Args:
-        rows: in the order in which they are printed.
+        rows: rows in the order of display.
         brief: see `Report.brief`.
     """
     lines, hidden, wrong = [], Counter[str](), set()
@@ -219,11 +219,16 @@ def row_lines(rows: Sequence[Row], brief: Mapping[str, str]) -> list[str]:
 def _patch_lines(patch: Patch | None, written: str | None) -> list[str]:
     if not patch:
         return []
-    return ["", patch.text, "", f"written; the old file: {written}" if written else "not written; --write does it"]
+    return [
+        "",
+        patch.text,
+        "",
+        f"written; the old file: {written}" if written else "not written; add --write to write it",
+    ]
 
 
 def run_until_interrupted(work: Coroutine[Any, Any, _T]) -> _T:
-    """Run a coroutine in its own event loop. Ctrl-C cancels it and is raised again when it has ended, however that was.
+    """Run a coroutine in its own event loop. Ctrl-C cancels it and is raised again after its end.
 
     Raises:
         KeyboardInterrupt: Ctrl-C.
@@ -245,7 +250,7 @@ def run_until_interrupted(work: Coroutine[Any, Any, _T]) -> _T:
             loop.remove_signal_handler(signal.SIGINT)
         if interrupted.is_set():
             if not task.cancelled():
-                task.exception()  # retrieved: it is not what ended the work
+                task.exception()  # retrieved, because this exception did not end the work
             return None
         return (task.result(),)
 
@@ -262,10 +267,10 @@ def add_tool(
 
     Args:
         parts: sub-parsers of the command.
-        name: the tool's word, its key in `TOOLS`.
-        module: where `TOOLS` is; imported when the tool runs.
-        help: one line.
-        description: with the exit codes.
+        name: name of the tool, its key in `TOOLS`.
+        module: module of `TOOLS`; imported when the tool runs.
+        help: help text, one line.
+        description: description with the exit codes.
         write: help of `--write`; empty if the tool has no such option.
         yes: whether the tool has `--yes`.
     """

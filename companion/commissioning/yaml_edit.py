@@ -1,4 +1,4 @@
-"""Replace or add single values of a YAML text; comments, order and everything else stay as they are. Pure."""
+"""Replaces or adds single values of a YAML text; comments, order and everything else remain unchanged. Pure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from companion.config.yaml_text import flow_text
 
 
 class EditError(Exception):
-    """The text cannot be edited there; the message is one line without the file's name."""
+    """The text cannot be edited at this location; the message is one line without the file's name."""
 
 
 class Edit(NamedTuple):
@@ -27,10 +27,10 @@ class Edit(NamedTuple):
 
 
 def edited(text: str, changes: Mapping[Location, Data]) -> str:
-    """Return the text with every change made.
+    """Return the text with all changes.
 
     Args:
-        text: YAML whose top level is a mapping, as `read_document` takes it.
+        text: YAML whose top level is a mapping, as `read_document` accepts it.
         changes: new values by location; missing keys, and mappings on the way to them, are added.
 
     Raises:
@@ -38,7 +38,7 @@ def edited(text: str, changes: Mapping[Location, Data]) -> str:
             change its length.
     """
     for location, value in changes.items():
-        # One after the other: each change moves what follows it.
+        # One after the other, because each change moves the text after it.
         text = _edited(text, location, value)
     return text
 
@@ -58,7 +58,7 @@ def _edited(text: str, location: Location, value: Data) -> str:
             found = below
             continue
         if not isinstance(found, yaml.MappingNode) or not isinstance(step, str):
-            raise EditError(f"{key_path(location[: depth + 1])}: there is no such place; change it by hand")
+            raise EditError(f"{key_path(location[: depth + 1])}: there is no such key; change it by hand")
         return _added(text, found, location[depth:], value)
     edits = _replaced(text, found, value, location)
     for begin, end, new in sorted(edits, reverse=True):
@@ -91,7 +91,7 @@ def _replaced(text: str, node: yaml.Node, value: Data, location: Location) -> li
 
 
 def _aligned(text: str, end: int, longer: int) -> str:
-    """Return what follows a value, with its comment moved back to its column as far as there is room."""
+    """Return the text after a value, with its comment moved back to its column if there is room."""
     rest = text[end:]
     comment = re.match(r"( {2,})#", rest)
     if comment is None or longer == 0:
@@ -121,7 +121,7 @@ def _added(text: str, parent: yaml.MappingNode, steps: Location, value: Data) ->
 
 
 def _last_line_of_plain_values(parent: yaml.MappingNode) -> int:
-    """Return the index of a character on the line after which a new key is added: that of the last value that is no block."""
+    """Return the index of a character on the line after which a new key is added: that of the last value that is not a block."""
     plain = [value for _, value in parent.value if _is_flow(value)]
     last: yaml.Node = (plain or [parent.value[-1][1]])[-1]
     while not _is_flow(last):

@@ -94,11 +94,11 @@ class RecorderClient:
         """Send the result of a command.
 
         Args:
-            nonce, operator, command: of the command, as `take_commands` returned it.
-            accepted: the command took effect, or its effect was already there.
-            text: what was done, or why nothing was.
+            nonce, operator, command: fields of the command that `take_commands` returned.
+            accepted: the command took effect, or the requested state was reached before.
+            text: what was done, or why the command was refused.
             t_s: flight clock of the tick that handled it.
-            phase, action: of that tick's `Outputs`.
+            phase, action: phase and action of that tick's `Outputs`.
         """
         return self._send(
             CommandAnswer(
@@ -141,7 +141,7 @@ class RecorderClient:
                 return True
             except BlockingIOError:
                 pass  # full
-            except (ValueError, TypeError, OverflowError) as error:  # a value that no record holds
+            except (ValueError, TypeError, OverflowError) as error:  # a value that no record may hold
                 self.error = f"recorder: a record could not be packed: {error}"
             except OSError as error:
                 if isinstance(error, (BrokenPipeError, ConnectionError)):
@@ -151,7 +151,7 @@ class RecorderClient:
         return False
 
     def _read_messages(self, data: bytes) -> None:
-        """Handle a message and those right behind it; empty bytes mean the end of the channel."""
+        """Handle a message and those that follow at once; empty bytes mean the end of the channel."""
         left = _MESSAGES_PER_TICK
         with contextlib.suppress(OSError):
             while data:
@@ -239,7 +239,7 @@ class RecorderProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 pass_fds=(theirs.fileno(), config_fd),
-                # Ctrl-C on the terminal is for the flight alone; the recorder ends when the flight does.
+                # Ctrl-C on the terminal is for the flight process only; the recorder ends when the flight ends.
                 process_group=0,
             )
         except BaseException:

@@ -29,7 +29,7 @@ class LogWriter:
     """Converts packets to messages of one MCAP file.
 
     Attributes:
-        viewer_error: why the viewer messages of a tick were left out, for the first such tick; None if that never happened.
+        viewer_error: why the viewer messages of a tick were left out, for the first such tick; None if none were left out.
     """
 
     def __init__(self, log_file: LogFile, epoch_offset_ns: int, *, chunk_bytes: int) -> None:
@@ -76,7 +76,7 @@ class LogWriter:
         self._line(self._stamp_ns(t_s), severity, source, text)
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """Write one metadata record. The viewer scene is built from `config` and `plan`, as far as they are valid."""
+        """Write one metadata record. The viewer scene is built from `config` and `plan` if they are valid."""
         self._mcap.write_metadata(name, values)
         if name in ("config", "plan"):
             try:

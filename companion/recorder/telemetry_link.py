@@ -1,4 +1,4 @@
-"""The event loop of the telemetry: packets in, MQTT messages out, whatever the broker does. Runs in the telemetry thread only."""
+"""The event loop of the telemetry: turns packets into MQTT messages, whatever the broker does. Runs in the telemetry thread only."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ACKS_MAX = 200
 
 
 class FlightSide(Protocol):
-    """What the telemetry may do to the rest of the recorder; neither call waits."""
+    """Calls that the telemetry may make to the rest of the recorder; none waits."""
 
     def send(self, message: dict[str, Any]) -> bool:
         """Send a message to the flight process. Return False if it does not read."""
@@ -279,7 +279,7 @@ class Uplink:
             self._slow_down(now_s)
 
     def _slow_down(self, now_s: float) -> None:
-        """Limit the processor time that a flood of invalid commands takes from the flight: unread messages wait at the broker."""
+        """Limit the processor time that a flood of invalid commands costs the flight: unread messages wait at the broker."""
         if now_s - self._flood_began_s >= 1.0:
             self._flood_began_s, self._flood_before = now_s, self._session.refused
         many = self._session.refused - self._flood_before

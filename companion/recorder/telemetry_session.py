@@ -310,7 +310,7 @@ class TelemetrySession:
         if self._over:
             return
         if self._tick_s is None:
-            self._tick_s = now_s  # first call: from now on a tick is expected
+            self._tick_s = now_s  # first call: a tick is expected from now on
         silent = now_s - self._tick_s > SILENT_S
         text = _SILENT if silent else self._no_commands
         self._set_state(presence=Presence.SILENT if silent else Presence.FLYING, text=text)

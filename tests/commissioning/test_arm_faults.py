@@ -87,7 +87,7 @@ def test_a_wrong_baud_rate_is_found_and_set_last(tmp_path: Path, searched: Calla
             (4, 57600, 1),
             (2, 1000000, 2),
         }
-        assert row_of(found, "arm.scan.baud")["fix"] == "companion arm setup brings every servo to 3000000"
+        assert row_of(found, "arm.scan.baud")["fix"] == "companion arm setup sets every servo to 3000000"
         alone = one.json("scan", "--baud", "57600")[1]
         assert (alone["bauds"], [servo["id"] for servo in alone["servos"]]) == ([57600], [4])
         fix = "servo 1 and 2 does not answer at 57600 baud: companion arm scan without --baud tries all rates"

@@ -100,13 +100,13 @@ def test_a_sweep_that_gravity_does_not_change_along_cannot_tell_the_constant(veh
     found = fit(swept(vehicle, reach=0.1, noise_a=0.03), vehicle)
     assert found.torque_per_amp_nm_a is None
     assert ("arm", "torque_per_amp_nm_a") not in found.changes(vehicle)
-    assert any("cannot tell" in note for note in found.notes)
+    assert any("do not determine the torque constant" in note for note in found.notes)
 
 
 def test_noise_that_hides_the_friction_is_told(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle, noise_a=0.3), vehicle)
     assert found.joint_friction_nm is None and found.changes(vehicle) == {}
-    assert sum("cannot tell the dry friction" in note for note in found.notes) == 2
+    assert sum("do not determine the dry friction" in note for note in found.notes) == 2
 
 
 def test_too_few_samples_tell_nothing(vehicle: Vehicle) -> None:
@@ -124,7 +124,7 @@ def test_constants_that_differ_point_at_the_masses(vehicle: Vehicle) -> None:
 def test_a_constant_of_no_such_servo_is_not_proposed(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle, k=(3.0, 3.0)), vehicle)
     assert found.torque_per_amp_nm_a is None
-    assert any("none of an XM430-W210" in note for note in found.notes)
+    assert any("implausible for an XM430-W210" in note for note in found.notes)
 
 
 def test_a_machine_that_is_not_level_is_told(vehicle: Vehicle) -> None:

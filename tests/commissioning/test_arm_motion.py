@@ -128,7 +128,7 @@ def test_something_in_the_way_stops_it_gently(vehicle: Vehicle) -> None:
     bench.disturbance = lambda angle: (0.0, -200.0 * max(0.0, angle[1] - obstacle_rad))
     bench.motion.go(1, math.radians(80.0), math.radians(20.0))
     moved = bench.until(lambda m: m.reached)
-    assert moved.stop.startswith("joint 2: +0.") and "in its way" in moved.stop and moved.torque_nm == (0.0, 0.0)
+    assert moved.stop.startswith("joint 2: +0.") and "obstacle" in moved.stop and moved.torque_nm == (0.0, 0.0)
     assert bench.degrees[1] < 41.0
 
 

@@ -121,7 +121,7 @@ def test_each_taps_error_is_what_it_scatters_by() -> None:
 
 def test_weak_taps_are_not_believed() -> None:
     imu, poses = tapped(0.005, strength_m_s2=3.0, accel_noise=0.2, mocap_noise_m=0.004)
-    assert all(tap.problem.startswith("too weak") or "nothing like it" in tap.problem for tap in measured(imu, poses))
+    assert all(tap.problem.startswith("too weak") or "no similar motion" in tap.problem for tap in measured(imu, poses))
     assert isinstance(combine(measured(imu, poses)), str)
 
 
@@ -143,7 +143,7 @@ def made_up(*delays_ms: float, problem: str = "") -> list[TapDelay]:
 def test_too_few_taps_are_refused() -> None:
     told = combine([*made_up(5.0, 5.1, 4.9, 5.2), *made_up(7.0, problem="too weak: x")])
     assert isinstance(told, str)
-    assert "4 of 5 taps could be measured, 5 are needed" in told
+    assert "4 of 5 taps are usable, 5 are needed" in told
 
 
 def test_one_tap_that_is_far_off_does_not_count() -> None:

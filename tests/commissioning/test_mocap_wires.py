@@ -167,7 +167,7 @@ def test_ctrl_c_ends_the_hand_test(sandbox: Sandbox, vehicle: Path) -> None:
             running.signal(signal.SIGINT)
             ended = running.end()
     assert (ended.code, ended.out) == (EXIT_ABORTED, "")
-    assert "given up; nothing was changed" in ended.err
+    assert "cancelled; nothing was changed" in ended.err
 
 
 def test_a_y_up_stream_is_found_and_written(sandbox: Sandbox, vehicle: Path) -> None:

@@ -73,7 +73,7 @@ def test_a_list_keeps_its_comment(mine: Path) -> None:
         (("arm", "joints", 0, "sign"), 0, "arm.joints[0].sign"),
         (("arm", "joints", 1, "servo_id"), 1, "both servos have the id 1"),
         (("arm", "jonits"), 1, "unknown key"),
-        (("arm", "joints", 2, "sign"), 1, "there is no such place"),
+        (("arm", "joints", 2, "sign"), 1, "there is no such key"),
         (("arm", "joints"), [], "another structure"),
     ],
 )

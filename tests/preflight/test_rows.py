@@ -75,12 +75,12 @@ def failure(device: str) -> Mapping[str, Any]:
 WARN = Level.WARN
 CASES = {
     "no PX4": Case("px4.device", "expected it, found nothing; plug", "", failure("autopilot")),
-    "no heartbeat": Case("px4.heartbeat", "none came", "baud rate", {"status": ()}),
+    "no heartbeat": Case("px4.heartbeat", "no heartbeat", "baud rate", {"status": ()}),
     "old heartbeat": Case("px4.heartbeat", "none for 3.0 s", "cable", {"status": r.status(heartbeat_stamp_s=4.0)}),
     "armed": Case("px4.disarmed", "armed", "disarm it", {"status": r.status(armed=True)}),
     "slow state": Case("px4.rates", "position 60,", "MAV_x_RATE", {"state_counts": StateCounts(300, 1000, 1000)}, WARN),
     "very slow state": Case("px4.rates", "IMU 20 Hz", "MAV_x_RATE", {"state_counts": StateCounts(600, 1000, 100)}),
-    "no position": Case("px4.rates", "position 0,", "fuses no", {"state_counts": StateCounts(0, 1000, 1000)}),
+    "no position": Case("px4.rates", "position 0,", "does not fuse", {"state_counts": StateCounts(0, 1000, 1000)}),
     "late link": Case("px4.lag", "90 ms", "other traffic", {"vehicle": late(0.05, 0.09)}, WARN),
     "no local position": Case("px4.vision", "no LOCAL_POSITION_NED", "EKF2_EV_CTRL", {"vehicle": ()}),
     "no estimator status": Case("px4.vision", "no ESTIMATOR_STATUS", "EKF2_HGT_REF", {"estimator": ()}),
@@ -109,7 +109,7 @@ CASES = {
     "turned": Case("px4.agrees", "20.", "body's axes", {"vehicle": moved(yaw_rad=math.radians(20))}, also=("frames.px4_yaw",)),
     "wandering": Case("px4.steady", "0.06", "at rest", {"vehicle": moved(x_m=0.06, until=200)}),
     "wandering yaw": Case("px4.steady", "4.", "gyros", {"vehicle": moved(yaw_rad=math.radians(4), until=200)}),
-    "never in time together": Case("px4.agrees", "no pair", "rates", {"mocap": r.mocap(stamp_s=90.0)}),
+    "never in time together": Case("px4.agrees", "no state and pose", "rates", {"mocap": r.mocap(stamp_s=90.0)}),
     "flat battery": Case("px4.battery", "25%", "charge", {"status": r.status(battery_remaining=0.25)}),
     "battery of other cells": Case("px4.battery", "11.4 V", "cells", {"status": r.status(battery_voltage_v=11.4)}),
     "battery unknown": Case("px4.battery", "97%", "BAT1_N_CELLS", {"status": r.status(battery_voltage_v=None)}, WARN),
@@ -145,7 +145,7 @@ CASES = {
     "another frame rate": Case(
         "mocap.clock", "5.000 ms", "rate_hz", {}, WARN, vehicle={"devices.mocap.rate_hz": 190.0}
     ),
-    "paused": Case("mocap.clock", "stands still", "paused", {"mocap": r.mocap(frame_number=5)}, WARN),
+    "paused": Case("mocap.clock", "does not advance", "paused", {"mocap": r.mocap(frame_number=5)}, WARN),
     "no arm": Case("arm.device", "expected it", "", failure("arm")),
     "another servo": Case("arm.model", "id 2: model 1020", "servo_id", {"servos": r.servos(model=1020)}),
     "old firmware": Case("arm.firmware", "48 and 37", "Wizard", {"servos": r.servos(firmware=37)}),

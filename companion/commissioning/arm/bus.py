@@ -1,4 +1,4 @@
-"""Read and write registers of any servo on a bus, at any baud rate. Blocking; nothing here gives torque.
+"""Read and write registers of any servo on a bus, at any baud rate. Blocking; nothing here switches torque on.
 
 Uses dynamixel-sdk on the flight's own port (`companion.io.dynamixel.registers.ServoPort`).
 """
@@ -18,7 +18,9 @@ from companion.io.dynamixel.registers import Register
 from companion.io.protocols import DeviceError
 
 BAUDS: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-"""Baud rate by value of register 8; 4.5 Mbps, the eighth, has no name in termios and dynamixel-sdk does not know it."""
+"""Baud rates that the tools try (a flight's: `devices.arm.baud`, `companion.config.vehicle`), by value of register 8; 4.5 Mbps, the
+eighth, has no name in termios and dynamixel-sdk does not know it.
+"""
 FACTORY_BAUD: Final = 57600
 
 ID = Register(7, 1, "id")
@@ -40,7 +42,7 @@ _REPLY_TIMEOUT_MS: Final = 100.0
 _ERROR_NUMBER: Final = 0x7F
 _CRC_ERROR: Final = 3
 _ATTEMPTS: Final = 10
-"""Number of times that a read or write is sent: interference damages single packets, and a busy computer delays an answer."""
+"""Attempts of a read or write, because interference damages single packets and a busy computer delays an answer."""
 
 
 class _CountingPort(dxl.ServoPort):
@@ -59,13 +61,13 @@ class PingAnswers:
     """The answers to a broadcast ping at one baud rate."""
 
     servos: tuple[tuple[int, int, int], ...]
-    """Id, model and firmware of each, by id."""
+    """Model and firmware of each servo, by id."""
     garbled: bool
-    """Unreadable bytes came: two servos with one id, or noise."""
+    """Whether unreadable bytes arrived: two servos with one id, or noise."""
 
 
 class ServoTalk:
-    """One port. Not thread-safe. A KeyboardInterrupt in any method leaves no servo under torque.
+    """Communication on one port. Not thread-safe. A KeyboardInterrupt in any method leaves no servo under torque.
 
     Args:
         port: serial device.
@@ -89,14 +91,14 @@ class ServoTalk:
         """Open the port, or change its baud rate.
 
         Raises:
-            DeviceError: no such port, busy, not permitted.
+            DeviceError: the port does not exist, is busy, or is not permitted.
         """
         self._port.reply_timeout_ms = _REPLY_TIMEOUT_MS
         self._port.baudrate = baud
         if not self._port.openPort():
             raise DeviceError(f"arm bus {self._name}: this computer's serial ports do not know baud rate {baud}")
-        self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's is one control tick
-        # Bytes at the old rate are no answer.
+        self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's timeout is one control tick
+        # Discard bytes received at the old rate.
         with contextlib.suppress(OSError):
             self._port.ser.reset_input_buffer()
 
@@ -145,10 +147,10 @@ class ServoTalk:
         """Write a register and read it back. A lost or damaged packet is repeated.
 
         Args:
-            servo_id: whose.
-            register: which.
-            value: the new value.
-            read_back: False for id and baud rate, after which the servo answers elsewhere: no answer is expected.
+            servo_id: id of the servo.
+            register: register to write.
+            value: new value.
+            read_back: False for id and baud rate, because the servo then answers at another id or rate.
 
         Raises:
             DeviceError: no answer, a refusal, or another value is read afterwards.
@@ -180,7 +182,7 @@ class ServoTalk:
 
     @contextlib.contextmanager
     def _named(self, doing: str) -> Iterator[None]:
-        """Convert whatever a failing port raises to a DeviceError."""
+        """Convert any exception of a failing port to a DeviceError."""
         self._port.is_using = False  # an exception in an earlier transaction leaves it set
         try:
             yield

@@ -1,4 +1,4 @@
-"""Move the real arm after a leader, over the flight's own driver, and make it limp at the end however that comes."""
+"""Move the real arm as a leader decides, with the flight's own driver, and make it limp at the end in every case."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ _READ_TIMEOUT_S: Final = 0.03
 
 
 class Leader(Protocol):
-    """Decides where the arm goes next."""
+    """Decides the motion of the arm."""
 
     def begin(self, state: ArmState) -> Sequence[Vec2]:
-        """Return every pose (rad) that the arm will go to, as far as that is known."""
+        """Return every known pose (rad) that the arm will move to."""
         ...
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """Decide what to do after a control step; `moved` is None before the first. Return True when all is done."""
+        """Decide after a control step; `moved` is None before the first. Return True at the end of the motion."""
         ...
 
     def status(self) -> str:
-        """Return what it does now, for people."""
+        """Return the present activity for display."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """The end of a motion."""
+    """Result of a motion."""
 
     stop: str
     """Why it ended early, one line; empty if the leader ended it."""
@@ -49,7 +49,7 @@ class Driven:
 
 
 async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
-    """Open the arm, follow the leader, make it limp. Cancelled at any time, the arm is limp within a few ms.
+    """Open the arm, follow the leader, make the arm limp. After a cancellation the arm is limp within a few ms.
 
     Raises:
         DeviceError: the arm does not open, or a pose is too heavy.
@@ -58,7 +58,7 @@ async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
     limits = [joint.angle_deg for joint in vehicle.arm.joints]
     async with DynamixelArm(vehicle.devices.arm, gentle(vehicle.arm), clock) as arm:
         state = arm.latest()
-        assert state is not None, "the driver has read once before it is open"
+        assert state is not None, "the driver reads once while it opens"
         motion = Motion(vehicle, state)
         refusal = motion.refusal(leader.begin(state))
         if refusal:
@@ -71,7 +71,9 @@ async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
                 state = newest
             age_s = clock() - state.stamp_s
             if age_s > vehicle.safety.arm_timeout_s:
-                text = f"lost the arm: no answer for {age_s:.2f} s, {state.read_failures} reads; look for a loose cable"
+                text = (
+                    f"the arm is lost: no answer for {age_s:.2f} s, {state.read_failures} reads; look for a loose cable"
+                )
                 return _driven(text, motion, state)
             if state.stamp_s > stepped_s:
                 moved = motion.step(state, state.stamp_s - stepped_s)

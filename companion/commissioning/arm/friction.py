@@ -23,7 +23,7 @@ from companion.control.manipulator import Manipulator
 from companion.model.types import IDENTITY_QUAT, Vec2
 
 BIN_S: Final = 0.25
-"""Samples are averaged over this time: those of neighbouring control ticks are not independent."""
+"""Samples are averaged over this time, because those of neighbouring control ticks are not independent."""
 BINS_MIN: Final = 12
 LEVEL_DEG: Final = 2.0
 CONSTANT_ERROR_MAX: Final = 0.05
@@ -31,7 +31,7 @@ CONSTANT_ERROR_MAX: Final = 0.05
 FRICTION_ERROR_MAX_NM: Final = 0.015
 CONSTANT_SAME: Final = 0.02
 FRICTION_SAME_NM: Final = 0.008
-"""A value nearer to the vehicle file's than this is the same."""
+"""A smaller difference from the vehicle file's value counts as none."""
 JOINTS_SAME: Final = 0.06
 """Relative difference of the torque constants of two servos of one model."""
 PLAUSIBLE_NM_A: Final = (0.7, 2.2)
@@ -50,7 +50,7 @@ class Estimate:
     standard_error: float
 
     def text(self, digits: int) -> str:
-        """Return it as `1.30 ± 0.02`."""
+        """Return value and error, such as `1.30 ± 0.02`."""
         return f"{self.value:.{digits}f} ± {self.standard_error:.{digits}f}"
 
 
@@ -76,13 +76,13 @@ class FrictionFit:
     joints: tuple[JointFit | None, JointFit | None]
     """Fit of each joint; None with too few samples."""
     torque_per_amp_nm_a: Estimate | None
-    """Mean of both joints; None if the data cannot tell."""
+    """Mean of both joints; None if the data do not determine it."""
     joint_friction_nm: Estimate | None
     notes: tuple[str, ...]
     """Remarks, one line each."""
 
     def changes(self, vehicle: Vehicle) -> dict[Location, Data]:
-        """Return what the vehicle file should have; empty if it is right as far as the data can tell."""
+        """Return the values to change in the vehicle file; empty if the data do not contradict it."""
         wanted: dict[Location, Data] = {}
         for name, found, same in (
             ("torque_per_amp_nm_a", self.torque_per_amp_nm_a, CONSTANT_SAME * vehicle.arm.torque_per_amp_nm_a),
@@ -98,35 +98,35 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
     """Fit both joints.
 
     Args:
-        samples: of both joints' sweeps, both ways, at two speeds or more.
+        samples: sweeps of both joints in both directions, at two speeds or more.
         vehicle: masses, lengths, and the torque constant and friction to compare with.
     """
     fits = tuple(fit_joint([one for one in samples if one.joint == joint], vehicle, joint) for joint in (0, 1))
     constants, frictions, notes = [], [], []
     for number, one in enumerate(fits, 1):
         if one is None:
-            notes.append(f"joint {number}: too few samples at constant speed, the data cannot tell anything")
+            notes.append(f"joint {number}: too few samples at constant speed, nothing can be determined")
             continue
         k, c, off = one.torque_per_amp_nm_a, one.dry_nm, one.off_deg
         if k.standard_error <= CONSTANT_ERROR_MAX * abs(k.value):
             constants.append(k)
         else:
             notes.append(
-                f"joint {number}: the data cannot tell the torque constant ({k.text(2)} N m/A): gravity changes by "
+                f"joint {number}: the data do not determine the torque constant ({k.text(2)} N m/A): gravity changes by "
                 f"only {one.gravity_span_nm:.2f} N m along the sweep"
             )
         if c.standard_error <= FRICTION_ERROR_MAX_NM:
             frictions.append(c)
         else:
-            notes.append(f"joint {number}: the data cannot tell the dry friction ({c.text(3)} N m)")
+            notes.append(f"joint {number}: the data do not determine the dry friction ({c.text(3)} N m)")
         if abs(off.value) > LEVEL_DEG + _SURE * off.standard_error:
             turned = f"gravity pulls as if the arm were turned by {off.value:+.1f} deg"
-            notes.append(f"joint {number}: {turned}: is the machine level, is zero right?")
+            notes.append(f"joint {number}: {turned}: check that the machine is level and the zero is correct")
     constant = _together(constants)
     low, high = PLAUSIBLE_NM_A
     if constant is not None and not low <= constant.value <= high:
         notes.append(
-            f"{constant.value:.2f} N m/A is none of an XM430-W210 ({low} to {high}): check the masses and centres of mass of "
+            f"{constant.value:.2f} N m/A is implausible for an XM430-W210 ({low} to {high}): check the masses and centres of mass of "
             "the vehicle file first; nothing is proposed"
         )
         constant = None
@@ -135,7 +135,7 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
         apart = abs(a.value - b.value)
         if apart > JOINTS_SAME * a.value and apart > _SURE * math.hypot(a.standard_error, b.standard_error):
             notes.append(
-                f"the joints' torque constants differ, {a.value:.3f} and {b.value:.3f} N m/A: servos of one model do not; check the "
+                f"the joints' torque constants differ, {a.value:.3f} and {b.value:.3f} N m/A: servos of one model agree; check the "
                 "masses, lengths and centres of mass of the vehicle file"
             )
     return FrictionFit((fits[0], fits[1]), constant, _together(frictions), tuple(notes))
@@ -217,7 +217,7 @@ def _as_joint_fit(theta: _Array, covariance: _Array, rows: _Array, scatter: floa
 
 
 def _together(estimates: Sequence[Estimate]) -> Estimate | None:
-    """Return the mean weighted by the standard errors, with a larger error if the values scatter more than these; None without any."""
+    """Return the mean weighted by the standard errors, with a larger error if the values scatter more; None without values."""
     if not estimates:
         return None
     weights = [1.0 / max(one.standard_error, 1e-6) ** 2 for one in estimates]

@@ -1,4 +1,4 @@
-"""`companion arm jog` without `--to`: what keys mean for the motion of a joint. Pure."""
+"""`companion arm jog` without `--to`: motion of a joint by keys. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, Motion, Moved
 from companion.model.types import ArmState, Vec2
 
 STEP_DEG: Final = 2.0
-"""Motion per key; a key that is held repeats before it is over."""
+"""Motion per key press; a held key repeats before the motion ends."""
 KEY_TIMEOUT_S: Final = 0.5
 """Without a key for this time the joint stops."""
 IDLE_S: Final = 60.0
@@ -23,7 +23,7 @@ JOINT_KEYS: Final = {"1": 0, "2": 1}
 
 
 def keys_in(data: str) -> list[str]:
-    """Split what a terminal sends into keys; an arrow is three characters."""
+    """Split a terminal's input into keys; an arrow is three characters."""
     return re.findall(r"\x1b\[.|.", data, re.DOTALL)
 
 
@@ -31,7 +31,7 @@ class ByKeys:
     """A leader that moves a joint while its keys are pressed.
 
     Args:
-        pressed: returns what the terminal has sent since the last call.
+        pressed: returns the terminal's input since the last call.
     """
 
     def __init__(self, pressed: Callable[[], str]) -> None:
@@ -43,12 +43,12 @@ class ByKeys:
         self._moving = False
 
     def begin(self, state: ArmState) -> list[Vec2]:
-        """Return the pose that the arm is in."""
+        """Return the present pose of the arm."""
         self._ends_s = state.stamp_s + IDLE_S
         return [state.angle_rad]
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """Follow the keys; return True at an end key, or when no key came for a long time."""
+        """Follow the keys. Return True at an end key or after `IDLE_S` without a key."""
         for key in keys_in(self._pressed()):
             self._ends_s = state.stamp_s + IDLE_S
             if key in END_KEYS:
@@ -65,7 +65,7 @@ class ByKeys:
         return state.stamp_s > self._ends_s
 
     def status(self) -> str:
-        """Return which joint the keys move, or why it may not go on."""
+        """Return which joint the keys move, or why it must not move further."""
         return self._refusal or f"keys move joint {self._joint + 1}"
 
     def _go(self, motion: Motion, way: float, state: ArmState) -> None:

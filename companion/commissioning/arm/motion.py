@@ -20,7 +20,7 @@ from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
 SPEED_MAX_DEG_S: Final = 20.0
 ACCELERATION_DEG_S2: Final = 60.0
 TORQUE_SHARE: Final = 0.6
-"""Share of `torque_max_nm` that limits each servo here."""
+"""Torque limit of each servo as a share of `torque_max_nm`."""
 LOAD_NM: Final = 0.5
 """Torque beside gravity that means an obstacle if it lasts for `LOAD_S`."""
 LOAD_S: Final = 0.15
@@ -33,11 +33,11 @@ REACHED_DEG: Final = 0.7
 _INTEGRAL_NM_RAD_S: Final = 12.0
 _INTEGRAL_MAX_NM: Final = 0.25
 _LEAD_RAD: Final = math.radians(5.0)
-"""The reference waits for a joint that is further behind."""
+"""Lag of a joint beyond which the reference waits."""
 
 
 def gentle(arm: Arm, share: float = TORQUE_SHARE) -> Arm:
-    """Return the arm with this share of the torque allowed; the driver clips every command to it."""
+    """Return the arm's configuration with this share of the torque; the driver clips every command to it."""
     first, second = (joint.model_copy(update={"torque_max_nm": share * joint.torque_max_nm}) for joint in arm.joints)
     return arm.model_copy(update={"joints": (first, second)})
 
@@ -58,9 +58,9 @@ class Moved:
     load_nm: Vec2
     """Torque beside gravity."""
     reached: bool
-    """Reference and joint are at the goal."""
+    """Whether reference and joint are at the goal."""
     stop: str = ""
-    """Why the motion has to end at once, with a torque of 0; empty if it need not."""
+    """Why the motion has to end at once, with a torque of 0; empty if it may continue."""
 
 
 class Motion:
@@ -68,7 +68,7 @@ class Motion:
 
     Args:
         vehicle: arm, tool and limits.
-        state: the arm's state now.
+        state: present state of the arm.
     """
 
     def __init__(self, vehicle: Vehicle, state: ArmState) -> None:
@@ -95,7 +95,7 @@ class Motion:
 
         Args:
             joint: 0 or 1.
-            goal_rad: clipped to the joint limits less the margin; a joint beyond them may only come back.
+            goal_rad: clipped to the joint limits less the margin; a joint beyond them may only return.
             speed_rad_s: at most `SPEED_MAX_DEG_S`.
         """
         low, high = (math.radians(limit) for limit in limits_deg(self._arm, joint))
@@ -110,7 +110,7 @@ class Motion:
         self._rate = [0.0, 0.0]
 
     def refusal(self, poses_rad: Sequence[Vec2]) -> str:
-        """Return why the arm may not go to these poses (rad); empty if it may."""
+        """Return why the arm must not move to these poses (rad); empty if it may."""
         for pose in poses_rad:
             gravity = self._manipulator.gravity_torque_nm(pose, IDENTITY_QUAT)
             for joint in (0, 1):
@@ -126,8 +126,8 @@ class Motion:
         """Compute one control step.
 
         Args:
-            state: the newest.
-            dt_s: since the last step; a late step moves the reference by at most 20 ms.
+            state: newest state of the arm.
+            dt_s: time since the last step; a late step moves the reference by at most 20 ms.
         """
         dt_s = min(dt_s, 0.02)
         for joint in (0, 1):
@@ -197,15 +197,15 @@ class Motion:
                 return f"{name} runs away; unless it was pulled, its sign is wrong: companion arm zero"
             astray_deg = math.degrees(abs(state.angle_rad[joint] - self._reference[joint]))
             if astray_deg > ASTRAY_DEG:
-                return f"{name} is {astray_deg:.0f} deg from its reference; look for what is in its way, or pulls it"
+                return f"{name} is {astray_deg:.0f} deg from its reference; look for an obstacle or for something that pulls it"
             low, high = self._arm.joints[joint].angle_deg
             angle_deg = math.degrees(state.angle_rad[joint])
             if not low <= angle_deg <= high:
-                return f"{name} is at {angle_deg:.0f} deg, beyond its limits, {low:g} to {high:g} deg; bring it back by hand"
+                return f"{name} is at {angle_deg:.0f} deg, beyond its limits, {low:g} to {high:g} deg; move it back by hand"
         if self._loaded_s > LOAD_S:
             joint = 0 if abs(load[0]) > abs(load[1]) else 1
             return (
-                f"joint {joint + 1}: {load[joint]:+.2f} N m beside gravity; look for what is in its way, and for masses or a torque "
-                "constant that are not the vehicle file's"
+                f"joint {joint + 1}: {load[joint]:+.2f} N m beside gravity; look for an obstacle, and check the masses "
+                "and the torque constant in the vehicle file"
             )
         return ""

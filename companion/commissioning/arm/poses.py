@@ -1,7 +1,7 @@
 """The poses in which the user holds the arm, so that its zeros, directions and plugs can be found. Pure.
 
 Angles are the paper's: joint 1 from body +x, positive turning down; joint 2 turns the lower link the other way, so that it points along
-`alpha_1 - alpha_2`. Exact are only directions that a hand can hold: level or plumb.
+`alpha_1 - alpha_2`. Only level and plumb directions can be held exactly by hand.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Step:
     by_deg: float
     """Angle by which it moves."""
     exact: bool
-    """It ends in a direction that can be held exactly; otherwise only the sense of the motion counts."""
+    """Whether it ends in a direction that can be held exactly; otherwise only the direction of the motion counts."""
     pose_deg: Vec2
     """Both joints at the end; approximate if not exact."""
 
@@ -57,7 +57,7 @@ def steps_of(arm: Arm) -> tuple[Step, Step, Step]:
         raise ConfigError(
             [
                 "arm.joints[].angle_deg: the limits allow neither straight forward (0, 0) nor straight down (90, 0), and one of "
-                "the two is needed to find the zeros; widen the limits as far as the arm can really go"
+                "the two is needed to find the zeros; widen the limits to the arm's real range"
             ]
         )
     elbow_deg, elbow_exact = _turn(second, straight[1], 1)
@@ -105,7 +105,7 @@ def _turn(joint: Joint, from_deg: float, index: int) -> tuple[float, bool]:
     by_deg = min(SWING_DEG, high - from_deg) if high - from_deg >= from_deg - low else -min(SWING_DEG, from_deg - low)
     if abs(by_deg) < SWING_MIN_DEG:
         raise ConfigError(
-            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the limits leave {abs(by_deg):.0f} deg to turn, at least "
+            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the limits permit a turn of {abs(by_deg):.0f} deg, at least "
              f"{SWING_MIN_DEG:g} are needed to find which way the servo counts"]
         )  # fmt: skip
     return by_deg, False
@@ -131,7 +131,7 @@ def _shoulder_text(alpha1_deg: float, by_deg: float, exact: bool) -> str:
 
 
 def _way(from_deg: float, by_deg: float) -> str:
-    """Return where a link that points forward or down goes when its angle (positive down from forward) changes."""
+    """Return the direction in which a link that points forward or down moves when its angle (positive down from forward) changes."""
     middle_deg = from_deg + math.copysign(SWING_DEG, by_deg)
     forward, down = math.cos(math.radians(middle_deg)), math.sin(math.radians(middle_deg))
     if from_deg == 0.0:

@@ -49,11 +49,11 @@ class Judgement:
     rows: tuple[Row, ...]
     assignment: Assignment
     changes: Mapping[Location, Data]
-    """Values that the vehicle file could take over from the servos."""
+    """Values of the servos that the vehicle file could adopt."""
 
 
 def scan_for(session: Session, only: int | None = None) -> Scan:
-    """Scan the vehicle file's port and show the progress; arguments as of `scan`."""
+    """Scan the vehicle file's port and show the progress; arguments are those of `scan`."""
     device = session.vehicle.devices.arm
     where = "every baud rate" if only is None else f"{only} baud only"
     session.say(f"{device.port}: every servo at {where}; nothing is written, no torque")
@@ -82,7 +82,7 @@ def scan(
     with ServoTalk(device.port) as talk:
         for baud in bauds:
             if only is None and baud < bus.FACTORY_BAUD and len(servos) > 1:
-                break  # 5 s for a rate that nobody sets on purpose
+                break  # 5 s for a rate that is rarely used
             progress(f"{baud} baud")
             talk.open(baud)
             answers = talk.ping_all()
@@ -96,7 +96,7 @@ def scan(
 
 
 def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundServo:
-    """Read the registers of a servo that answered a ping; none if it is another model or does not answer any more."""
+    """Read the registers of a servo that answered a ping; none if it is another model or no longer answers."""
     registers: dict[str, int] = {}
     if model == dxl.MODEL_NUMBER_XM430_W210:
         try:
@@ -138,7 +138,7 @@ def _collision(found: Scan) -> Row:
     if not found.garbled_at:
         return COLLISION.good("every answer is readable", "readable answers")
     where = " and ".join(map(str, found.garbled_at))
-    fix = f"two servos may have one id: {_one_at_a_time()}; else look for a bad cable or ground"
+    fix = f"two servos may share one id: {_one_at_a_time()}; otherwise look for a bad cable or ground"
     return COLLISION.bad(f"unreadable answers at {where} baud", "readable answers", fix)
 
 
@@ -150,7 +150,7 @@ def _ids(found: Scan, who: Assignment, arm: Arm) -> Row:
     missing = [index for index, servo in enumerate(who.joints) if servo is None]
     if who.renamed is not None and (servo := who.joints[who.renamed]):
         now, new = servo.servo_id, arm.joints[who.renamed].servo_id
-        fix = f"{_SETUP} gives servo {now} the id {new}; or keep it and let the vehicle file say {now}"
+        fix = f"{_SETUP} gives servo {now} the id {new}; or keep it and change the vehicle file to {now}"
         return IDS.bad(read, wanted, fix)
     if not missing:
         return IDS.good(read, wanted)
@@ -170,7 +170,7 @@ def _models(found: Scan) -> Iterator[Row]:
         read, fix = f"id {servo.servo_id}: model {servo.model}", "install an XM430-W210, or take it off this bus"
         if servo.model == dxl.MODEL_NUMBER_XM430_W210:
             read = f"id {servo.servo_id}: answers a ping, but not all reads"
-            fix = "another program may be on the bus: close that; else cycle the servo's power"
+            fix = "another program may be on the bus: close it; otherwise cycle the servo's power"
         yield MODEL.bad(read, "XM430-W210", fix)
     if found.servos and not strange:
         yield MODEL.good("XM430-W210", "XM430-W210")
@@ -184,9 +184,9 @@ def _bauds(found: Scan, device: ArmDevice) -> Iterator[Row]:
         yield BAUD.good(str(device.baud), str(device.baud))
         return
     read = ", ".join(f"servo {servo.servo_id} at {servo.baud}" for servo in found.servos)
-    fix = f"{_SETUP} brings every servo to {device.baud}"
+    fix = f"{_SETUP} sets every servo to {device.baud}"
     if len(bauds) == 1 and min(bauds) >= bus.FACTORY_BAUD:
-        fix += f"; or let the vehicle file say {min(bauds)}"
+        fix += f"; or change the vehicle file to {min(bauds)}"
     yield BAUD.bad(read, str(device.baud), fix)
 
 
@@ -207,7 +207,7 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
             not tripped,
             _each(servos, ["tripped" if servo in tripped else "not tripped" for servo in servos]),
             "not tripped",
-            f"{_SETUP} clears it; its cause is a companion that died, or a cable that was pulled under torque",
+            f"{_SETUP} clears it; a companion that died or a cable pulled under torque caused it",
         ),
         preflight.supply(VOLTAGE, [servo.value(dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V for servo in servos]),
         TEMPERATURE.row(
@@ -237,13 +237,13 @@ def _each(servos: Sequence[FoundServo], texts: Sequence[str]) -> str:
 
 
 def _found(found: Scan, judged: Judgement) -> list[dict[str, Any]]:
-    """Return what is known of each servo, with the number of its joint."""
+    """Return the data of each servo, with the number of its joint."""
     joints = {id(servo): index + 1 for index, servo in enumerate(judged.assignment.joints) if servo is not None}
     return [{**servo.as_json(), "joint": joints.get(id(servo))} for servo in found.servos]
 
 
 def table(found: Scan, judged: Judgement) -> list[str]:
-    """Return the servos as lines, for people."""
+    """Return the servos as lines for display."""
     layout = "{:>4}  {:>8}  {:<10}  {:>8}  {:>5}  {:>8}  {:>11}  {:>6}"
     lines = [layout.format("id", "baud", "model", "firmware", "joint", "position", "temperature", "supply")]
     for servo, about in zip(found.servos, _found(found, judged), strict=True):
@@ -255,7 +255,7 @@ def table(found: Scan, judged: Judgement) -> list[str]:
 
 
 def as_json(found: Scan, judged: Judgement) -> dict[str, Any]:
-    """Return the JSON document's part."""
+    """Return the scan's part of the JSON document."""
     return {
         "bauds": list(found.bauds),
         "garbled_at": list(found.garbled_at),

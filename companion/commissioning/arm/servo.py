@@ -1,4 +1,4 @@
-"""Settings of a servo, as found and as the companion needs them, and which servo belongs to which joint. Pure."""
+"""Settings of a servo, found and required, and the assignment of servos to joints. Pure."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class FoundServo:
         return self.model == dxl.MODEL_NUMBER_XM430_W210 and bool(self.registers)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the JSON document's part, with names and units instead of register values."""
+        """Return the servo's part of the JSON document, with names and units instead of register values."""
         about: dict[str, Any] = {"id": self.servo_id, "baud": self.baud, "model": self.model, "firmware": self.firmware}
         if not self.registers:
             return about
@@ -90,18 +90,18 @@ class Scan:
 
 
 class Setting(NamedTuple):
-    """One register, as found and as the companion needs it."""
+    """Found and required value of one register."""
 
     register: Register
     found: int
     wanted: int
     shown: Callable[[int], str]
-    """Formats a value for people."""
+    """Formats a value for display."""
     why: str
 
     @property
     def right(self) -> bool:
-        """Whether there is nothing to write."""
+        """Return whether the found value is correct."""
         return self.found == self.wanted
 
 
@@ -109,23 +109,23 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
     """Return every setting that the companion needs, in the order of writing: id and baud rate, which change the address, last.
 
     Args:
-        servo: as it was found, registers read.
-        joint: the joint that it is for.
-        arm: torque constant.
-        device: the bus's baud rate.
+        servo: found servo with its registers.
+        joint: joint of this servo.
+        arm: provides the torque constant.
+        device: provides the bus's baud rate.
     """
     needed = math.floor(joint.torque_max_nm / (arm.torque_per_amp_nm_a * dxl.AMP_PER_COUNT) + 1e-9)
     limit = servo.value(dxl.CURRENT_LIMIT)
     wanted_limit = limit if limit >= needed else min(CURRENT_LIMIT_MAX, math.ceil(CURRENT_RESERVE * needed))
     delay = dxl.RETURN_DELAY_UNIT_US
     rows: list[tuple[Register, int, Callable[[int], str], str]] = [
-        (dxl.RETURN_DELAY, 0, lambda v: f"{v * delay} us", "the factory's 500 us a servo are a fifth of a control tick"),
+        (dxl.RETURN_DELAY, 0, lambda v: f"{v * delay} us", "the factory setting of 500 us per servo takes a fifth of a control tick"),
         (dxl.OPERATING_MODE, dxl.MODE_CURRENT, _mode_text, "the companion commands currents"),
-        (bus.DRIVE_MODE, 0, _drive_text, "the vehicle file's sign says which way a servo counts"),
-        (bus.HOMING_OFFSET, 0, str, "the vehicle file's zero_count says where zero is"),
+        (bus.DRIVE_MODE, 0, _drive_text, "the vehicle file's sign gives the servo's direction"),
+        (bus.HOMING_OFFSET, 0, str, "the vehicle file's zero_count gives the zero"),
         (bus.SHADOW_ID, NO_SHADOW, lambda v: "none" if v > 252 else str(v), "it would follow another servo's commands"),
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
-        (bus.PWM_LIMIT, 885, str, "less than full voltage is less torque at speed"),
+        (bus.PWM_LIMIT, 885, str, "a lower voltage gives less torque at speed"),
         (bus.MIN_POSITION_LIMIT, 0, str, "the companion keeps the joint limits itself"),
         (bus.MAX_POSITION_LIMIT, dxl.COUNTS_PER_TURN - 1, str, "the companion keeps the joint limits itself"),
         (bus.STARTUP, 0, str, "no torque when the power comes on"),
@@ -141,18 +141,18 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Which servo belongs to which joint."""
+    """Assignment of servos to joints."""
 
     joints: tuple[FoundServo | None, FoundServo | None]
-    """Servo of each joint, by id; one servo that is left over belongs to the missing joint."""
+    """Servo of each joint, by id; a single remaining servo belongs to the missing joint."""
     renamed: int | None
-    """The joint whose servo has another id than the vehicle file says."""
+    """Joint whose servo has another id than in the vehicle file."""
     others: tuple[FoundServo, ...]
-    """Servos that are not the arm's, or of an unknown joint."""
+    """Servos that belong to no joint or an unknown one."""
 
 
 def assign(servos: Sequence[FoundServo], arm: Arm) -> Assignment:
-    """Assign servos by id; if one joint's servo is missing and one XM430 is left over, that must be it."""
+    """Assign servos by id. If one joint's servo is missing and one XM430 remains, assign it to this joint."""
     by_joint: list[FoundServo | None] = []
     for joint in arm.joints:
         having = [servo for servo in servos if servo.servo_id == joint.servo_id and servo.is_xm430]

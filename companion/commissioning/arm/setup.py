@@ -1,6 +1,6 @@
-"""`companion arm setup`: bring each servo to what the companion needs. Written with torque off, read back, the baud rate last.
+"""`companion arm setup`: write the required settings to each servo, with torque off and read back, the baud rate last.
 
-Every step leaves servos that `companion arm scan` finds, so a setup that was interrupted can be run again.
+After every step `companion arm scan` finds the servos, so an interrupted setup can be run again.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ class ServoPlan:
 
     @property
     def wake(self) -> bool:
-        """Whether torque is on or the bus watchdog is: both are switched off first."""
+        """Whether torque or bus watchdog is on; both are switched off first."""
         return bool(self.servo.value(dxl.TORQUE_ENABLE)) or self.servo.value(dxl.BUS_WATCHDOG) != 0
 
     @property
     def needed(self) -> bool:
-        """Whether there is something to do."""
+        """Whether anything has to be written."""
         return bool(self.writes) or self.wake
 
     def as_json(self) -> dict[str, Any]:
-        """Return the JSON document's part."""
+        """Return the plan's part of the JSON document."""
         changes = [
             {
                 "register": setting.register.address,
@@ -64,13 +64,13 @@ class ServoPlan:
 
 @dataclass(frozen=True, slots=True)
 class SetupPlan:
-    """What a setup would do with the servos that were found."""
+    """Plan of a setup for the servos that were found."""
 
     servos: tuple[ServoPlan, ...] = ()
     refusal: str = ""
-    """Why nothing may be done, with what to do instead; empty if it may."""
+    """Why nothing may be written, with the remedy; empty if the plan may be carried out."""
     one_at_a_time: bool = False
-    """Whether one servo alone has to be connected."""
+    """Whether the servos have to be connected one at a time."""
     absent: tuple[int, ...] = ()
     """Joints whose servo was not found."""
 
@@ -82,14 +82,14 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
         found: a scan of all baud rates.
         arm: joints of the vehicle file.
         device: baud rate of the vehicle file.
-        joint: 0 or 1 if the one servo that is connected is this joint's whatever its id; None to go by the ids.
+        joint: 0 or 1 if the one connected servo belongs to this joint regardless of its id; None to assign by id.
     """
     alone = "connect only the servo of joint 1: companion arm setup --joint 1; then only that of joint 2: companion arm setup --joint 2"
     if joint is not None:
         alone = f"connect only the servo of joint {joint + 1} and run companion arm setup --joint {joint + 1} again"
     if found.garbled_at:
         where = " and ".join(map(str, found.garbled_at))
-        text = f"unreadable answers at {where} baud, as from two servos with one id; {alone}"
+        text = f"unreadable answers at {where} baud, probably from two servos with one id; {alone}"
         return SetupPlan(refusal=text, one_at_a_time=True)
     strange = [servo for servo in found.servos if not servo.is_xm430]
     if strange:
@@ -117,12 +117,12 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
 
 
 def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None] = lambda _: None) -> None:
-    """Write what the plans contain, servo after servo.
+    """Write the settings of the plans, one servo after the other.
 
     Args:
         port: serial device.
         plans: plans from one scan.
-        report: called with what is being written.
+        report: called with a line for each value that is written.
 
     Raises:
         DeviceError: no answer, a refusal, or a value that was not stored; values written before remain.
@@ -136,7 +136,7 @@ def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], Non
 def _carry_out(talk: ServoTalk, one: ServoPlan, report: Callable[[str], None]) -> None:
     talk.open(one.servo.baud)
     servo_id = one.servo.servo_id
-    # EEPROM is locked while torque is on; a watchdog that tripped refuses goals until it is cleared.
+    # EEPROM is locked while torque is on; a tripped watchdog rejects goals until it is cleared.
     talk.write(servo_id, dxl.TORQUE_ENABLE, 0)
     talk.write(servo_id, dxl.BUS_WATCHDOG, 0)
     for setting in one.writes:
@@ -157,32 +157,32 @@ def _carry_out(talk: ServoTalk, one: ServoPlan, report: Callable[[str], None]) -
 def _expect(talk: ServoTalk, servo_id: int, now: str, before: str) -> None:
     if not talk.answers(servo_id):
         raise DeviceError(
-            f"servo {servo_id}: does not answer with its new {now} (it had {before}); run companion arm scan: it is found at "
-            "either, and setup continues from there"
+            f"servo {servo_id}: does not answer with its new {now} (it had {before}); run companion arm scan, which "
+            "finds it at either value, then companion arm setup again"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The end of a setup."""
+    """Result of a setup."""
 
     plan: SetupPlan
     outcome: str
     text: tuple[str, ...]
     """Remarks, one line each."""
     right: bool
-    """Whether every servo is as the companion needs it."""
+    """Whether every servo has the required settings."""
 
 
 def set_up(session: Session) -> Done:
-    """Scan, show what would be written, ask, write, scan again; one servo at a time if they cannot be distinguished.
+    """Scan, show the changes, ask, write, scan again; one servo at a time if they cannot be distinguished.
 
     Raises:
-        DeviceError: a servo does not answer any more; scan again.
-        GivenUp: the user does not want it to be written.
+        DeviceError: a servo no longer answers; scan again.
+        GivenUp: the user declined to write.
     """
     joint, arguments = session.arguments.joint, session.arguments
-    session.say("setup: torque stays off; what is to be written is shown first", "bold")
+    session.say("setup: torque stays off; the changes are shown before they are written", "bold")
     wanted = _plan(session, joint)
     at_terminal = sys.stdin is not None and sys.stdin.isatty() and not arguments.yes and not arguments.json
     if not (wanted.one_at_a_time and joint is None and at_terminal):
@@ -216,7 +216,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
         servo_id = vehicle.arm.joints[index].servo_id
         session.say(f"servo {servo_id} (joint {index + 1}) does not answer: check its power and cable", "bold red")
     if not needed:
-        text = "nothing to write: every servo that answers is as the companion needs it"
+        text = "nothing to write: every servo that answers has the required settings"
         return Done(wanted, "nothing to do", (text,), right=not wanted.absent)
     answer = session.ask(f"write this to {len(needed)} servo{'s' if len(needed) > 1 else ''}?")
     if answer is None:
@@ -228,21 +228,19 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
     lines = _left(vehicle, wanted)
     right = not lines and not wanted.absent
     if any(setting.register in (bus.DRIVE_MODE, bus.HOMING_OFFSET) for one in needed for setting in one.writes):
-        lines.append("a servo counts differently now: run companion arm zero")
+        lines.append("a servo's direction or zero has changed: run companion arm zero")
     return Done(wanted, "written", (*lines, *(["set up and read back"] if right else [])), right)
 
 
 def _left(vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
-    """Scan again and return what is not as it was to be, one line each."""
+    """Scan again and return the settings that differ, one line each."""
     arm, device = vehicle.arm, vehicle.devices.arm
     servos = {servo.servo_id: servo for servo in scan(device, only=device.baud).servos if servo.is_xm430}
     lines: list[str] = []
     for one in wanted.servos:
         servo_id = arm.joints[one.joint].servo_id
         if servo_id not in servos:
-            lines.append(
-                f"servo {servo_id}: does not answer at {device.baud} baud any more; companion arm scan finds it"
-            )
+            lines.append(f"servo {servo_id}: no longer answers at {device.baud} baud; find it with companion arm scan")
             continue
         for setting in settings(servos[servo_id], arm.joints[one.joint], arm, device):
             if not setting.right:
@@ -268,7 +266,7 @@ def _show(session: Session, plans: Sequence[ServoPlan]) -> None:
 
 
 def judge(done: Done, vehicle: Vehicle) -> Report:
-    """Report the end of a setup."""
+    """Return the report of a setup."""
     data = {
         "outcome": done.outcome,
         "refusal": done.plan.refusal,

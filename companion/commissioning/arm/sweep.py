@@ -15,7 +15,7 @@ from companion.model.types import ArmState, Vec2
 HANGING_DEG: Final = (90.0, 0.0)
 SPEEDS_DEG_S: Final = (9.0, 18.0)
 REACH_DEG: Final = ((-30.0, 30.0), (-5.0, 70.0))
-"""Each joint's sweep about hanging, within its limits."""
+"""Sweep of each joint about the hanging pose, within its limits."""
 REACH_MIN_DEG: Final = 20.0
 SETTLED_S: Final = 0.4
 """Time at constant speed before a sample counts."""
@@ -47,7 +47,7 @@ class Sample:
 
 
 def legs_of(arm: Arm) -> tuple[Leg, ...]:
-    """Return the sweeps: to hanging, each joint there and back at each speed, and to hanging again, where the arm may go limp.
+    """Return the sweeps: to the hanging pose, each joint back and forth at each speed, then to the hanging pose, to go limp.
 
     Raises:
         ConfigError: the joint limits leave too little room.
@@ -60,7 +60,7 @@ def legs_of(arm: Arm) -> tuple[Leg, ...]:
         (low, high), (down, up) = limits[joint], REACH_DEG[joint]
         begin, end = max(low, home[joint] + down), min(high, home[joint] + up)
         if end - begin < REACH_MIN_DEG:
-            room = f"about hanging and within its limits joint {joint + 1} has {max(0.0, end - begin):.0f} deg"
+            room = f"about the hanging pose and within its limits joint {joint + 1} can turn {max(0.0, end - begin):.0f} deg"
             why = f"at least {REACH_MIN_DEG:g} are needed to separate gravity from friction"
             raise ConfigError([f"arm.joints[{joint}].angle_deg: {room}, {why}"])
         legs.append(Leg(joint, begin, fast))
@@ -71,7 +71,7 @@ def legs_of(arm: Arm) -> tuple[Leg, ...]:
 
 
 def duration_s(legs: Sequence[Leg], start_deg: Vec2) -> float:
-    """Return about how long the legs take."""
+    """Return the approximate duration of the legs, s."""
     at = list(start_deg)
     total = 0.0
     for leg in legs:
@@ -81,10 +81,10 @@ def duration_s(legs: Sequence[Leg], start_deg: Vec2) -> float:
 
 
 class Sweeper:
-    """A leader that follows its legs and keeps the samples that count.
+    """A leader that follows its legs and keeps the samples for the fit.
 
     Args:
-        legs: in order.
+        legs: legs in order.
         torque_per_amp_nm_a: the constant by which the arm's driver converts currents to torques.
     """
 
@@ -104,7 +104,7 @@ class Sweeper:
         return poses
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """Note the sample, and begin the next leg when one has ended; return True after the last."""
+        """Store the sample and begin the next leg at the end of one. Return True after the last."""
         if moved is not None and 0 <= self._leg < len(self.legs):
             self._note(moved, state)
         if self._leg < 0 or (moved is not None and moved.reached):
@@ -116,7 +116,7 @@ class Sweeper:
         return self._leg >= len(self.legs)
 
     def status(self) -> str:
-        """Return what moves now."""
+        """Return the present motion for display."""
         if not 0 <= self._leg < len(self.legs):
             return ""
         leg = self.legs[self._leg]

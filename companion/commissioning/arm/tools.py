@@ -1,4 +1,4 @@
-"""`companion arm scan|setup|zero|jog|friction`: from servos out of their boxes to an arm whose numbers are measured."""
+"""`companion arm scan|setup|zero|jog|friction`: commissioning of the arm, from new servos to measured parameters."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NAMES = ("joint 1", "joint 2")
 
 
 def _stand_text(vehicle: Vehicle) -> str:
-    """Return what the machine must stand on so that the arm can hang."""
+    """Return how the machine must be set up so that the arm can hang freely."""
     arm = vehicle.arm
     below_m = sum(arm.link_lengths_m) + vehicle.tool.net_radius_m - arm.shoulder_body_m[2]
     text = f"the arm reaches {below_m:.2f} m below the body"
@@ -54,7 +54,7 @@ def _judge_scan(found: Scan, vehicle: Vehicle) -> Report:
         arm_scan.as_json(found, judged),
         arm_scan.table(found, judged),
         judged.changes,
-        advice=[] if wrong else ["the servos are as the vehicle file says"],
+        advice=[] if wrong else ["the servos match the vehicle file"],
         ok=wrong <= settled,
         brief={f"arm.scan.joint{n}": f"joint {n}: settings" for n in (1, 2)},
     )
@@ -65,7 +65,7 @@ def _zero(session: Session) -> ZeroResult:
     session.say("zero: the arm is limp, nothing moves by itself; propellers off", "bold")
     session.say(f"  {_stand_text(session.vehicle)}")
     session.say(
-        "  the servos' lights are on while a step is to be done, and off once it counts: held still for 2 s, or Enter"
+        "  the servos' lights are on during a step and go off when it is accepted: held still for 2 s, or Enter"
     )
     for number, step in enumerate(guide.steps, 1):
         session.say(f"  {number}. {step.instruction}")
@@ -75,7 +75,7 @@ def _zero(session: Session) -> ZeroResult:
 def _judge_zero(result: ZeroResult, vehicle: Vehicle) -> Report:
     text, joints = [], []
     if result.swapped:
-        text.append("the servos are swapped: each moved when the other joint was to be moved")
+        text.append("the servos are swapped: each moved when the other joint was requested")
     for number, (found, joint) in enumerate(zip(result.joints, vehicle.arm.joints, strict=True), 1):
         error_deg = result.error_deg(vehicle.arm, number - 1)
         turned = "" if found.sign == joint.sign else ", which is the opposite direction"
@@ -87,7 +87,7 @@ def _judge_zero(result: ZeroResult, vehicle: Vehicle) -> Report:
         joints.append({"joint": number, **asdict(found), "file_error_deg": error_deg})
     changes = result.changes(vehicle.arm)
     if not changes:
-        text.append("the vehicle file is right, as far as a hand can hold the arm")
+        text.append("the vehicle file is correct within the accuracy of a hand-held pose")
     return Report((), {"swapped": result.swapped, "joints": joints}, text, changes)
 
 
@@ -97,8 +97,8 @@ async def _drive(session: Session, leader: Leader, what: str) -> Driven:
     session.say(f"{part}: {what}", "bold")
     session.say(f"  propellers off; {_stand_text(session.vehicle)}")
     bounds = f"at most {SPEED_MAX_DEG_S:g} deg/s and {100 * TORQUE_SHARE:.0f} % of the torque"
-    session.say(f"  {bounds}; it stops at {LOAD_NM:g} N m that gravity does not explain, and at Ctrl-C at once")
-    session.say("  at the end, however it comes, the arm goes limp: keep hands off its way down, and nothing below it")
+    session.say(f"  {bounds}; the arm stops at {LOAD_NM:g} N m beyond gravity, and immediately at Ctrl-C")
+    session.say("  at the end the arm always goes limp: keep hands and objects out of the space below it")
     answer = session.ask("may the arm move now?")
     if answer is None:
         raise ConfigError([f"companion arm {part}: there is no terminal to ask whether the arm may move; add --yes"])
@@ -126,7 +126,7 @@ async def _jog(session: Session) -> Driven:
         raise ConfigError(
             ["companion arm jog: no terminal to read keys from; --joint N --to DEG --yes moves without keys"]
         )
-    keys = "1, 2: which joint; arrows or + and -: move it while held; any other key: stop; q: end"
+    keys = "1, 2: select the joint; arrows or + and -: move it while held; any other key: stop; q: end"
     with raw_keys() as descriptor:
         return await _drive(session, ByKeys(lambda: pressed(descriptor)), f"keys move the arm; {keys}")
 
@@ -145,7 +145,9 @@ async def _sweep(session: Session) -> tuple[Driven, Sequence[Sample]]:
     legs = legs_of(vehicle.arm)
     leader = Sweeper(legs, vehicle.arm.torque_per_amp_nm_a)
     seconds = duration_s(legs, vehicle.safety.fold_arm_deg)
-    driven = await _drive(session, leader, f"both joints sweep slowly for about {seconds:.0f} s, about hanging")
+    driven = await _drive(
+        session, leader, f"both joints sweep slowly for about {seconds:.0f} s, about the hanging pose"
+    )
     return driven, leader.samples
 
 
@@ -167,8 +169,8 @@ def _judge_sweep(swept: tuple[Driven, Sequence[Sample]], vehicle: Vehicle) -> Re
             ]
     for name, unit in (("torque_per_amp_nm_a", "N m/A"), ("joint_friction_nm", "N m")):
         estimate = getattr(found, name)
-        value = "the data cannot tell" if estimate is None else f"{estimate.text(3)} {unit}"
-        text.append(f"{name}: {value}; the vehicle file says {getattr(vehicle.arm, name):g}")
+        value = "not determined" if estimate is None else f"{estimate.text(3)} {unit}"
+        text.append(f"{name}: {value}; the vehicle file has {getattr(vehicle.arm, name):g}")
     known = found.torque_per_amp_nm_a is not None and found.joint_friction_nm is not None
     data = {"stopped": "", **asdict(found)}
     return Report((), data, [*text, *found.notes], found.changes(vehicle), ok=known)

@@ -1,4 +1,4 @@
-"""Zeros, directions and plugs of the arm's servos, from three poses in which the user holds it. Pure: counts in, result out."""
+"""Zeros, directions and plugs of the arm's servos, from three hand-held poses. Pure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ALONE_SHARE: Final = 0.35
 HAND_DEG: Final = 2.0
 """Accuracy of a link held level or plumb; a zero of the vehicle file within this is kept."""
 DISAGREE_DEG: Final = 8.0
-"""Poses whose zeros differ by more were not held as asked, or the arm slips."""
+"""Difference of the zeros of two poses beyond which a pose was not held as requested, or the arm slips."""
 _DEG_PER_COUNT: Final = 360.0 / COUNTS_PER_TURN
 
 Counts = tuple[int, int]
@@ -51,10 +51,10 @@ class ZeroResult:
 
     joints: tuple[ZeroJoint, ZeroJoint]
     swapped: bool
-    """The servos of the vehicle file are in each other's joint."""
+    """Whether the vehicle file assigns each servo to the other's joint."""
 
     def changes(self, arm: Arm) -> dict[Location, Data]:
-        """Return what the vehicle file should have; empty if it is right within `HAND_DEG`."""
+        """Return the values to change in the vehicle file; empty if it is correct within `HAND_DEG`."""
         wanted: dict[Location, Data] = {}
         for index, (found, joint) in enumerate(zip(self.joints, arm.joints, strict=True)):
             at: Location = ("arm", "joints", index)
@@ -84,17 +84,17 @@ class ZeroView:
     held: float
     """Share of `HELD_S` for which the arm has been held, 0 to 1."""
     notice: str
-    """What is not as asked; empty if all is."""
+    """Deviation from the requested pose; empty if there is none."""
     result: ZeroResult | None = None
     failed: str = ""
     """Why the poses contradict each other, which ends the guide."""
 
 
 class ZeroGuide:
-    """Watch the arm, decide when a pose is held, and find the result in the end.
+    """Watches the arm, decides when a pose is held, and computes the result at the end.
 
     Args:
-        arm: the vehicle file's; its joint limits decide which poses are requested.
+        arm: arm of the vehicle file; its joint limits determine the poses.
 
     Raises:
         ConfigError: the joint limits leave no such poses.
@@ -109,12 +109,12 @@ class ZeroGuide:
         self._begun = False
 
     def update(self, t_s: float, counts: Counts, accept: bool = False) -> ZeroView:
-        """Take one reading.
+        """Process one reading.
 
         Args:
-            t_s: any clock.
+            t_s: time on any clock.
             counts: present positions (register 132), in the order of the vehicle file's servos.
-            accept: the user says that the arm is held now; it need not have been moved.
+            accept: the user confirms that the arm is held, whether or not it has moved.
         """
         index = len(self._held)
         step = self.steps[index]
@@ -170,19 +170,19 @@ class ZeroGuide:
         view = ZeroView(step=None, number=len(self.steps), moved_deg=moved, held=1.0, notice="")
         if elbow == shoulder:
             servo_id = self._arm.joints[elbow].servo_id
-            text = f"the servo with id {servo_id} turned in both steps, the other one never: was it the elbow first, then the shoulder?"
+            text = f"the servo with id {servo_id} turned in both steps, the other one did not: turn the elbow first, then the shoulder"
             return _failed(view, text)
         counts = (tuple(held[shoulder] for held in self._held), tuple(held[elbow] for held in self._held))
         joints = tuple(self._joint(joint, (shoulder, elbow)[joint], counts[joint]) for joint in (0, 1))
         for joint, found in enumerate(joints):
             if found.spread_deg is not None and found.spread_deg > DISAGREE_DEG:
                 text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
-                return _failed(view, f"{text}; hold them more exactly, and look for a horn that slips")
+                return _failed(view, f"{text}; hold them more exactly, and look for a slipping horn")
         result = ZeroResult((joints[0], joints[1]), elbow == 0)
         return ZeroView(step=None, number=view.number, moved_deg=moved, held=1.0, notice="", result=result)
 
     def _joint(self, joint: int, servo: int, counts: Sequence[int]) -> ZeroJoint:
-        # The elbow turns in the second step, the shoulder in the third, where the elbow stays only roughly.
+        # The elbow turns in the second step, the shoulder in the third, in which the elbow is only roughly held.
         at = 1 if joint == 1 else 2
         turns = self.steps[at]
         sign = 1 if (counts[at] - counts[at - 1]) * turns.by_deg > 0.0 else -1

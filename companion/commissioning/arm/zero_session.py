@@ -1,4 +1,4 @@
-"""`companion arm zero`: the arm is limp and the user holds it; the servos' lights show what counts. I/O only."""
+"""`companion arm zero`: the user holds the limp arm; the servos' lights show which step is accepted. I/O only."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FULL_DEG: Final = 90.0
 
 
 def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
-    """Lead the user through the guide's steps, without torque; the lights are out at the end however it comes.
+    """Guide the user through the steps without torque; the lights always go off at the end.
 
     Raises:
         DeviceError: a servo does not answer or is not set up, a pose was not held in time, or the poses contradict each other.
@@ -45,13 +45,13 @@ def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
 def _ready(talk: ServoTalk, servo_id: int) -> None:
     name = f"arm bus: servo {servo_id}"
     if not talk.answers(servo_id):
-        fix = "companion arm scan finds it, companion arm setup puts it right"
+        fix = "find it with companion arm scan, correct it with companion arm setup"
         raise DeviceError(f"{name} does not answer at {talk.baud} baud; {fix}")
     talk.write(servo_id, dxl.TORQUE_ENABLE, 0)
     drive, offset = talk.read(servo_id, bus.DRIVE_MODE), talk.read(servo_id, bus.HOMING_OFFSET)
     if drive or offset:
         found = f"{bus.DRIVE_MODE} is {drive} and {bus.HOMING_OFFSET} {offset}, expected 0 and 0"
-        raise DeviceError(f"{name}: {found}; run companion arm setup first: it would change a zero found now")
+        raise DeviceError(f"{name}: {found}; run companion arm setup first, because it would change the zero")
 
 
 def _steps(talk: ServoTalk, ids: Sequence[int], guide: ZeroGuide, bars: Bars, keys: int | None) -> ZeroResult:

@@ -1,4 +1,4 @@
-"""How the force sensor is mounted and scaled, from a known weight on the net; drift of a sensor at rest. Pure.
+"""Mounting and scale of the force sensor, from a known weight on the net; drift of a sensor at rest. Pure.
 
 Frames: link 2 (x outwards along the link, y along the joint axis) and the sensor, rotated against it by `tool.sensor_rpy_deg`. A
 reading is the force of the surroundings on the tool side of the sensor.
@@ -24,21 +24,21 @@ from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import angle_rad, norm
 
 STUCK = Check("ft.stuck", "force sensor alive", why="a stuck sensor reports plausible values and measures nothing")
-WEIGHT = Check("ft.weight", "known weight", why="scale and direction stay unknown")
-SCALE = Check("ft.scale", "force sensor scale", why="the law would see more or less force than there is")
+WEIGHT = Check("ft.weight", "known weight", why="scale and direction remain unknown")
+SCALE = Check("ft.scale", "force sensor scale", why="the law would respond to a wrong force")
 DIRECTION = Check(
     "ft.direction", "force sensor direction", why="the law would respond to every force in a wrong direction"
 )
 POSE = Check(
-    "ft.pose", "pose of the arm", why="a sensor that is turned about the weight's own direction looks right", warns=True
+    "ft.pose", "pose of the arm", why="a rotation of the sensor about the weight's direction is invisible", warns=True
 )
 
 SCALE_TOLERANCE: Final = 0.05
 DIRECTION_MAX_DEG: Final = 8.0
 EXPLAINED_MAX_DEG: Final = 20.0
-"""A right-angle turn explains a direction if no more than this is left."""
+"""Largest remaining angle at which a right-angle turn explains a direction."""
 APART_MIN_DEG: Final = 12.0
-"""The best explanation has to be better than the next one by this."""
+"""Smallest difference in angle between the best and the next explanation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class WeightFit:
     turn: AxisMap
     """Right-angle turn of the sensor, on top of the vehicle file's mounting, that explains the weight best."""
     rest_deg: float
-    """Angle that is left after that turn."""
+    """Remaining angle after that turn."""
     others: tuple[AxisMap, ...]
     """Turns that explain it nearly as well."""
     rpy_deg: Vec3
@@ -68,7 +68,7 @@ def down_in_link2(arm_rad: Vec2) -> Vec3:
 
 
 def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Vec2, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
-    """Find which of the 24 right-angle turns explains the weight best; the configured mounting if it is as good.
+    """Return the one of the 24 right-angle turns that explains the weight best, preferring the configured mounting.
 
     Args:
         empty_n: mean reading with the net empty, sensor frame.
@@ -98,28 +98,28 @@ def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Vec2, weight_kg: float, s
 
 
 def rows(fit: WeightFit) -> Iterator[Row]:
-    """Judge scale and direction, and whether this pose of the arm shows them."""
-    read = f"{fit.measured_n:.2f} N of {fit.expected_n:.2f} N, {fit.scale:.3f} of it"
+    """Return the rows on scale, direction, and whether the arm's pose reveals the direction."""
+    read = f"{fit.measured_n:.2f} N of {fit.expected_n:.2f} N, ratio {fit.scale:.3f}"
     fix = (
-        f"it reads {fit.scale:.2f} times the truth: weigh the weight, and let nothing but the net carry it; if that is right, the "
-        "sensor is another model (this one has 50 counts per N) or has to be calibrated by its maker"
+        f"the sensor reads {fit.scale:.2f} times the true force: check the weight, and hang it on the net only; if "
+        "that is correct, the sensor is another model (this one has 50 counts per N) or has to be calibrated by its maker"
     )
     yield SCALE.row(abs(fit.scale - 1.0) <= SCALE_TOLERANCE, read, f"within {100 * SCALE_TOLERANCE:g} %", fix)
     read = f"{fit.off_deg:.0f} deg from the direction by tool.sensor_rpy_deg"
     fix = (
-        "let the weight hang from the net's centre, and nothing touch it; check the arm's angles (companion arm zero); level the "
+        "hang the weight freely from the net's centre; check the arm's angles (companion arm zero); level the "
         "machine; raise link 2 to some 30 deg below level, and repeat"
     )
     if changes(fit):
         rpy = ", ".join(f"{angle:g}" for angle in fit.rpy_deg)
-        fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}], which leaves {fit.rest_deg:.0f} deg"
+        fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}], with {fit.rest_deg:.0f} deg remaining"
     yield DIRECTION.row(fit.off_deg <= DIRECTION_MAX_DEG, read, f"within {DIRECTION_MAX_DEG:g} deg", fix)
     read = f"{len(fit.others) or 'no'} other right-angle turns explain it as well"
     yield POSE.row(not fit.others, read, "none", "repeat with link 2 some 20 to 35 deg below level, not straight down")
 
 
 def changes(fit: WeightFit) -> dict[Location, Data]:
-    """Return the mounting that the vehicle file should have; empty if it is right or not certain."""
+    """Return the mounting to change in the vehicle file; empty if it is correct or uncertain."""
     right = fit.off_deg <= DIRECTION_MAX_DEG
     if right or fit.turn == IDENTITY or fit.others or fit.rest_deg > EXPLAINED_MAX_DEG:
         return {}
@@ -127,13 +127,13 @@ def changes(fit: WeightFit) -> dict[Location, Data]:
 
 
 def as_json(fit: WeightFit) -> dict[str, Any]:
-    """Return the JSON document's part; N and degrees."""
+    """Return the fit's part of the JSON document; N and degrees."""
     numbers = {key: getattr(fit, key) for key in ("expected_n", "measured_n", "scale", "off_deg", "rest_deg")}
     return {**numbers, "sensor_rpy_deg": list(fit.rpy_deg), "certain": not fit.others}
 
 
 def stuck_row(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
-    """Judge the longest time with exactly the same reading."""
+    """Return the row on the longest time with an unchanged reading."""
     longest_s, since_s = 0.0, samples[0].stamp_s
     for before, now in itertools.pairwise(samples):
         same = (before.force_sensor_n, before.torque_sensor_nm) == (now.force_sensor_n, now.torque_sensor_nm)

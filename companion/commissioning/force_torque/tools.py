@@ -31,7 +31,7 @@ TARE_S: Final = 1.0
 """Duration of a flight's tare."""
 DRIFT_WARN_N_MIN: Final = 0.3
 ZERO_MAX_N: Final = 0.3
-_EMPTY: Final = "the machine stands level on its legs, the net is empty, hands off"
+_EMPTY: Final = "the machine stands level on its legs, the net is empty, nothing touches it"
 
 DRIFT = Check(
     "ft.drift",
@@ -44,14 +44,14 @@ BIAS_SET = Check("ft.bias_set", "sensor's own bias", why="the sensor ignored the
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """The sensor at rest, then perhaps under a known weight."""
+    """Measurement of the sensor at rest and, if announced, under a known weight."""
 
     empty: Sequence[ForceSample]
     arm_rad: Vec2
     stream: ForceStream
     usb_latency_ms: int | None
     weight_kg: float | None
-    """Announced weight; None if there is none."""
+    """Announced weight; None if none was announced."""
     loaded: Sequence[ForceSample] = ()
     """Samples under the weight; empty if no weight was recognised."""
     loaded_arm_rad: Vec2 = (0.0, 0.0)
@@ -60,7 +60,7 @@ class Watched:
 
 
 async def watch(session: Session) -> Watched:
-    """Watch the sensor at rest, then under the weight."""
+    """Measure the sensor at rest, then under the weight."""
     vehicle, weight_kg = session.vehicle, session.arguments.weight
     clock, device = flight_clock(), vehicle.devices.force
     given_rad = pose_rad(session.arguments.arm_pose, vehicle)
@@ -82,11 +82,11 @@ async def watch(session: Session) -> Watched:
         try:
             weight_n = GRAVITY_M_S2 * weight_kg
             session.say(
-                f"hang {weight_kg:g} kg ({weight_n:.2f} N) on the net's centre and let it come to rest; it is recognised"
+                f"hang {weight_kg:g} kg ({weight_n:.2f} N) on the net's centre and let it come to rest; it is detected automatically"
             )
             if not await until_loaded(sensor, mean_force_n(empty), weight_n):
                 return seen
-            session.say(f"recognised; do not touch it for {LOADED_S:g} s")
+            session.say(f"weight detected; do not touch it for {LOADED_S:g} s")
             loaded = await sensor.tare_samples(LOADED_S)
             seen = replace(seen, loaded=loaded, loaded_arm_rad=await angles_rad())
             session.say("take the weight off")
@@ -96,7 +96,7 @@ async def watch(session: Session) -> Watched:
 
 
 def judge(seen: Watched, vehicle: Vehicle) -> Report:
-    """Judge the sensor at rest, and scale and direction if a weight was announced."""
+    """Return the report on the sensor at rest, and on scale and direction if a weight was announced."""
     rows = _rest_rows(seen, vehicle)
     duration_s = seen.empty[-1].stamp_s - seen.empty[0].stamp_s
     rest = {
@@ -111,7 +111,9 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
     if seen.weight_kg is None:
         return Report(rows, data, advice=["a known weight shows scale and direction: companion ft check --weight KG"])
     if not seen.loaded:
-        fix = "hang it on the net itself; a sensor that measures nothing of it has a broken cable or is bypassed by its mount"
+        fix = (
+            "hang it on the net itself; if the sensor does not measure it, its cable is broken or its mount bypasses it"
+        )
         wanted = f"{GRAVITY_M_S2 * seen.weight_kg:.2f} N"
         return Report([*rows, ft_fit.WEIGHT.bad("no steady force appeared", wanted, fix)], data)
     fit = ft_fit.fit_weight(
@@ -128,12 +130,12 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
 
 
 def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
-    """Return the preflight's rows of what was watched, and whether the readings change."""
+    """Return the preflight's rows, and the row on whether the readings change."""
     samples = seen.empty
     duration_s = samples[-1].stamp_s - samples[0].stamp_s
     bias_fix = (
-        "free the net; without a load correct tool.net_mass_kg, or loosen the sensor's mount; what then stays becomes the sensor's own "
-        "zero by companion ft tare --sensor"
+        "free the net; without a load correct tool.net_mass_kg, or loosen the sensor's mount; make the remaining "
+        "force the sensor's own zero with companion ft tare --sensor"
     )
     return [
         *(
@@ -147,7 +149,7 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
 
 @dataclass(frozen=True, slots=True)
 class Tared:
-    """The empty net for some time, and the sensor's reading after its own zero was set."""
+    """Measurement of the empty net, and of the sensor after its own zero was set."""
 
     samples: Sequence[ForceSample]
     first: Sequence[ForceSample]
@@ -158,7 +160,7 @@ class Tared:
 
 
 async def watch_drift(session: Session) -> Tared:
-    """Watch the empty net; set or clear the sensor's own zero if asked to."""
+    """Measure the empty net; set or clear the sensor's own zero on request."""
     arguments, vehicle = session.arguments, session.vehicle
     given_rad = pose_rad(arguments.arm_pose, vehicle)
     for wanted, question in (
@@ -184,7 +186,7 @@ async def watch_drift(session: Session) -> Tared:
 
 
 def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
-    """Judge the drift of each axis, and whether the sensor's own zero was set."""
+    """Return the report on the drift of each axis, and on whether the sensor's own zero was set."""
     rows = []
     if seen.zeroed:
         left_n = math.hypot(*mean_force_n(seen.zeroed))
@@ -192,9 +194,9 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
         rows.append(BIAS_SET.row(left_n <= ZERO_MAX_N, read, f"{ZERO_MAX_N:g} N", "power-cycle the sensor and repeat"))
     axes = dict(zip("xyz", ft_fit.drift(seen.samples), strict=True))
     worst_n = max(abs(axis.per_minute_n) for axis in axes.values())
-    fix = "leave it powered for twenty minutes and repeat; keep sun and the motors' heat away from it"
-    read = f"{worst_n:.2f} N a minute on the worst axis"
-    rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g} N a minute", fix))
+    fix = "leave it powered for 20 minutes and repeat; keep it away from sunlight and the motors' heat"
+    read = f"{worst_n:.2f}N per minute on the worst axis"
+    rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g}N per minute", fix))
     rows.append(ft_fit.stuck_row(seen.samples, vehicle))
     x, y, z = bias_n = tare_bias_n(seen.first, vehicle, IDENTITY_QUAT, seen.arm_rad)
     net_kg = vehicle.tool.net_mass_kg
@@ -206,7 +208,7 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
     text = [
         *(
             f"  F{name}  mean {one.mean_n:+7.2f} N   noise {one.noise_n:.3f} N   drift {one.per_minute_n:+.3f} "
-            f"+- {one.standard_error_n:.3f} N a minute"
+            f"+- {one.standard_error_n:.3f}N per minute"
             for name, one in axes.items()
         ),
         f"  a flight's tare removes ({x:+.2f}, {y:+.2f}, {z:+.2f}) N beside the net's {net_kg:g} kg",

@@ -1,4 +1,4 @@
-"""The force sensor in use by `companion ft`: its own bias, a weight that is put on the net, the arm's angles. I/O only."""
+"""Devices of `companion ft`: the sensor's own bias, detection of a weight on the net, the arm's angles. I/O only."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _STILL_N: Final = 0.3
 """Largest difference between means over `_LOOK_S` once the weight has stopped swinging."""
 _CHANGE_MIN_N: Final = 0.5
 _CHANGE_SHARE: Final = 0.15
-"""Share of the weight that counts as a weight: a sensor that reads too little has to be recognised, too."""
+"""Share of the weight from which on it is detected, so that a sensor that reads too little is found as well."""
 
 
 class FtSensor(RobotousForceTorque):
-    """The force sensor's driver, with the one command that no flight uses."""
+    """The force sensor's driver with SET_BIAS, which no flight uses."""
 
     async def set_bias(self, on: bool) -> None:
-        """Make the present reading zero (SET_BIAS 1), or undo that (0), and drop the samples that were on their way.
+        """Make the present reading zero (SET_BIAS 1), or undo that (0), and drop the samples in transit.
 
-        The sensor does not acknowledge it: check what it reads.
+        The sensor does not acknowledge the command; check its reading.
 
         Raises:
-            DeviceError: the sensor went silent.
+            DeviceError: the sensor stopped sending.
         """
         self._send(Command.SET_BIAS, int(on))
         await self.tare_samples(_ON_THEIR_WAY_S)
@@ -67,10 +67,10 @@ def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:
 async def arm_angles(
     vehicle: Vehicle, clock: Clock, given_rad: Vec2 | None
 ) -> AsyncIterator[Callable[[], Awaitable[Vec2]]]:
-    """Yield a function that reads the joint angles from the servos, which hold with no current, or returns the given ones.
+    """Yield a function that returns the given joint angles, or reads them from the servos, which get no current.
 
     Raises:
-        DeviceError: the arm does not open, or goes silent.
+        DeviceError: the arm does not open, or stops answering.
     """
 
     async def given() -> Vec2:
@@ -80,7 +80,7 @@ async def arm_angles(
     async def read() -> Vec2:
         state = await arm.read(0.5)
         if state is None or state.read_failures:
-            raise DeviceError(f"arm: the servos do not answer any more; {arm.problem or 'check their cable'}")
+            raise DeviceError(f"arm: the servos no longer answer; {arm.problem or 'check their cable'}")
         return state.angle_rad
 
     if given_rad is not None:
@@ -98,10 +98,10 @@ async def arm_angles(
 
 
 async def until_loaded(sensor: FtSensor, empty_n: Vec3, weight_n: float, timeout_s: float = WEIGHT_TIMEOUT_S) -> bool:
-    """Wait until a good part of the weight pulls steadily on the net; return False at the timeout.
+    """Wait until a weight hangs steadily on the net. Return False at the timeout.
 
     Raises:
-        DeviceError: the sensor went silent.
+        DeviceError: the sensor stopped sending.
     """
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + timeout_s

@@ -1,10 +1,11 @@
 """Delay of motion capture from taps on the airframe, by comparing it with the IMU. Pure.
 
-A tap is a kink in the position: too small for a second difference of motion capture, whose noise of 0.2 mm makes 20 m/s^2 at 200 Hz.
-So the IMU is integrated instead. Around each tap the specific force is rotated into the world and integrated twice, the gyro once.
-Position and rotation by motion capture are regressed on that, shifted by a delay, and on a polynomial for everything slow: initial
-values, gravity, bias, the sway of the hand. The residual is least at the delay; a parabola through the minimum gives it finer than the
-samples, and its curvature the error. IMU samples are on the companion's clock, poses are stamped on arrival at the companion.
+A tap changes the position too little for a second difference of motion capture, whose noise of 0.2 mm gives 20 m/s^2 at 200 Hz.
+Therefore the IMU is integrated. Around each tap the specific force is rotated into the world and integrated twice, the gyro once.
+Position and rotation by motion capture are regressed on the result, shifted by a delay, and on a polynomial for slow changes: initial
+values, gravity, bias, the sway of the hand. The residual is smallest at the delay; a parabola through the minimum resolves it below the
+sample period, and its curvature gives the error. IMU samples are on the companion's clock, poses are stamped on arrival at the
+companion.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ ERROR_MAX_S: Final = 0.0015
 BEFORE_S, AFTER_S = 0.08, 0.16
 """Time around a tap in which motion capture is compared."""
 SETTLE_S: Final = 0.35
-"""Time after a tap until all of it has arrived, delay included."""
+"""Time after a tap until all its data have arrived, delay included."""
 APART_S: Final = 0.45
 _SLOW_S: Final = 0.10
 """Half the width of the moving mean that separates the slow part."""
@@ -68,7 +69,7 @@ class TapDelay:
     correlation: float
     """Correlation without the slow part: 1 if the shifted IMU explains all of the motion."""
     problem: str
-    """Reason why the tap is not used; empty if it is."""
+    """Why the tap is not used; empty if it is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +109,9 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
 
     Args:
         tap: found in `imu`.
-        imu: in order of time.
-        poses: in order of arrival.
-        noise: of motion capture, m and rad, one sigma of one axis (`mocap_noise`).
+        imu: samples in order of time.
+        poses: poses in order of arrival.
+        noise: noise of motion capture, m and rad, one sigma of one axis (`mocap_noise`).
     """
     low, high = DELAY_SPAN_S
     felt = [s for s in imu if tap.t_s - BEFORE_S - high - 0.05 <= s.t_s <= tap.t_s + AFTER_S - low + 0.05]
@@ -118,7 +119,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     rest = [p for p in seen if p.t_s <= tap.t_s - 0.01]
     if len(felt) < 40 or len(rest) < 3 or len(seen) < 15:
         return TapDelay(
-            tap=tap, delay_s=0.0, error_s=math.inf, correlation=0.0, problem="samples are missing around it"
+            tap=tap, delay_s=0.0, error_s=math.inf, correlation=0.0, problem="IMU samples are missing around the tap"
         )
     course = _Course(felt, mean_attitude([pose.attitude for pose in rest[-12:]]))
     delay_s = 0.0
@@ -132,7 +133,11 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
         window = [pose for pose in seen if centre_s - BEFORE_S <= pose.t_s <= until_s]
         if len(window) < 12:
             return TapDelay(
-                tap=tap, delay_s=0.0, error_s=math.inf, correlation=0.0, problem="motion capture was lost around it"
+                tap=tap,
+                delay_s=0.0,
+                error_s=math.inf,
+                correlation=0.0,
+                problem="motion capture was lost around the tap",
             )
         costs, nothing, free = course.costs(window, grid, noise)
         best = int(np.argmin(costs))
@@ -142,7 +147,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
                 delay_s=float(grid[best]),
                 error_s=math.inf,
                 correlation=0.0,
-                problem="motion capture shows nothing like it",
+                problem="motion capture shows no similar motion",
             )
         delay_s, curvature = _vertex(grid, costs, best)
     least = float(costs[best])
@@ -151,14 +156,16 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     error_s = math.sqrt(2.0 * scatter / curvature) if curvature > 0.0 else math.inf
     problem = ""
     if correlation < CORRELATION_MIN:
-        problem = f"too weak: the IMU explains too little of what motion capture saw (correlation {correlation:.2f})"
+        problem = (
+            f"too weak: the IMU explains too little of the motion by motion capture (correlation {correlation:.2f})"
+        )
     elif error_s > TAP_ERROR_MAX_S:
-        problem = f"too weak: its time is only known to {1e3 * error_s:.1f} ms"
+        problem = f"too weak: its time is known only to {1e3 * error_s:.1f} ms"
     return TapDelay(tap=tap, delay_s=delay_s, error_s=error_s, correlation=correlation, problem=problem)
 
 
 def agreeing(taps: Sequence[TapDelay]) -> list[TapDelay]:
-    """Return the taps that count and whose delays agree with the others'."""
+    """Return the usable taps whose delays agree."""
     good = [tap for tap in taps if not tap.problem]
     if not good:
         return []
@@ -168,25 +175,27 @@ def agreeing(taps: Sequence[TapDelay]) -> list[TapDelay]:
 
 
 def combine(taps: Sequence[TapDelay]) -> Delay | str:
-    """Return the mean of all taps that count and agree, or why there is none."""
+    """Return the mean delay of all usable taps that agree, or the reason why there is none."""
     good = agreeing(taps)
     if len(good) < TAPS_MIN:
         weak = [tap.problem for tap in taps if tap.problem]
-        why = f"; {len(weak)} do not count, the last: {weak[-1]}" if weak else ""
-        return f"{len(good)} of {len(taps)} taps could be measured, {TAPS_MIN} are needed{why}"
+        why = f"; {len(weak)} are unusable, the last: {weak[-1]}" if weak else ""
+        return f"{len(good)} of {len(taps)} taps are usable, {TAPS_MIN} are needed{why}"
     values = np.array([tap.delay_s for tap in good])
     spread_s = float(values.std(ddof=1))
     error_s = spread_s / math.sqrt(len(good))
     if error_s > ERROR_MAX_S:
         return (
-            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), the mean is only known to {1e3 * error_s:.1f} ms, "
+            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), the mean is known only to {1e3 * error_s:.1f} ms, "
             f"{1e3 * ERROR_MAX_S:g} ms are needed"
         )
     return Delay(float(values.mean()), error_s, spread_s, tuple(good))
 
 
 def mocap_noise(poses: Sequence[PoseAt]) -> tuple[float, float]:
-    """Return the noise of one axis (one sigma, m and rad) from third differences of at least 20 poses, which motion hardly changes."""
+    """Return the noise of one axis (one sigma, m and rad) from third differences of at least 20 poses, on which motion has little
+    effect.
+    """
     p = np.array([pose.position_m for pose in poses])
     turns = np.array(
         [rotation_vector(quat_multiply(quat_conjugate(a.attitude), b.attitude)) for a, b in pairwise(poses)]
@@ -208,7 +217,7 @@ class _Course:
         places, speeds, pulls = [p], [v], []
         turns, rates = [r], []
         for before, now in pairwise(imu):
-            # A sample is the mean since the one before it, as PX4 integrates.
+            # A sample is the mean since the previous one, because PX4 integrates.
             dt = now.t_s - before.t_s
             half = turned(q, now.rate_rad_s, 0.5 * dt)
             a = np.array(quat_rotate(half, now.force_m_s2)) - _GRAVITY
@@ -244,7 +253,7 @@ class _Course:
                 fast = (felt - slow @ (slow.T @ felt)) / sigma
                 power = float((fast**2).sum())
                 share = float((fast * seen).sum()) / power if power > 0.0 else 0.0
-                # The scales of both may differ a little, their signs may not.
+                # The scales may differ slightly, the signs must agree.
                 share = min(1.5, max(0.0, share))
                 cost += float(((seen - share * fast) ** 2).sum())
             costs.append(cost)

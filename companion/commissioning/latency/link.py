@@ -1,4 +1,5 @@
-"""Read IMU samples with PX4's timestamps (HIGHRES_IMU) and measure the offset between PX4's clock and ours (TIMESYNC). I/O only.
+"""Read IMU samples with PX4's timestamps (HIGHRES_IMU) and measure the offset between PX4's and the companion's clock (TIMESYNC). I/O
+only.
 
 HIGHRES_IMU carries the time of its sample (`time_usec`), so the latency of the message does not matter. PX4 answers a TIMESYNC request
 (`tc1` = 0) immediately with its time; half of the round-trip time is taken as the delay of the reply.
@@ -27,7 +28,7 @@ SYNC_PERIOD_S: Final = 0.1
 _SYNC_MIN: Final = 5
 _SYNC_DEADLINE_S: Final = 5.0
 _NEAR: Final = 30
-"""Number of answers around a moment from which its clock offset is computed."""
+"""Number of answers around an instant from which its clock offset is computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +36,9 @@ class Sync:
     """One answer with PX4's clock."""
 
     t_s: float
-    """Middle of request and answer, our clock."""
+    """Midpoint between request and answer, companion's clock."""
     offset_s: float
-    """PX4's clock minus ours."""
+    """PX4's clock minus the companion's."""
     round_trip_s: float
 
 
@@ -57,7 +58,7 @@ class LatencyLink(MavsdkAutopilot):
         """Open the link as for a flight, then wait for PX4's clock.
 
         Raises:
-            DeviceError: also if PX4 does not answer TIMESYNC.
+            DeviceError: the link does not open, or PX4 does not answer TIMESYNC.
         """
         await super().__aenter__()
         try:
@@ -80,7 +81,7 @@ class LatencyLink(MavsdkAutopilot):
         await super().__aexit__(kind, error, trace)
 
     def imu(self, last_s: float = math.inf) -> list[ImuAt]:
-        """Return all samples so far on our clock, or those of the last `last_s`."""
+        """Return all samples so far on the companion's clock, or those of the last `last_s`."""
         self._read()
         offsets = _Offsets(self.syncs)
         found: list[ImuAt] = []
@@ -93,7 +94,7 @@ class LatencyLink(MavsdkAutopilot):
         return found
 
     def imu_age_s(self) -> float | None:
-        """Return the median time from a sample to the arrival of its message; None if none came."""
+        """Return the median time from a sample to the arrival of its message; None if none arrived."""
         self._read()
         offsets = _Offsets(self.syncs)
         ages = [arrived_s - (px4_s - offsets.at(px4_s)) for arrived_s, px4_s, _ in self._raw]
@@ -150,7 +151,7 @@ class LatencyLink(MavsdkAutopilot):
 
 
 class _Offsets:
-    """PX4's clock minus ours at any time: the median of the faster half of the answers around it."""
+    """PX4's clock minus the companion's at any time: the median of the faster half of the answers around that time."""
 
     def __init__(self, syncs: list[Sync]) -> None:
         self._px4_s = [sync.t_s + sync.offset_s for sync in syncs]

@@ -1,4 +1,4 @@
-"""`companion latency`: how late motion capture reaches PX4, measured by taps on the airframe; what EKF2_EV_DELAY should be."""
+"""`companion latency`: delay of motion capture to PX4, measured by taps on the airframe, and the value of EKF2_EV_DELAY."""
 
 from __future__ import annotations
 
@@ -43,42 +43,44 @@ _HISTORY_POSES_MIN: Final = 50
 _DIGITS: Final = 1
 """Decimals of a delay in ms."""
 
-DEVICES = Check("latency.devices", "PX4 and motion capture", why="there is nothing to compare")
-TAPS = Check("latency.taps", "taps", why="the delay stays unknown")
+DEVICES = Check("latency.devices", "PX4 and motion capture", why="both are needed for the comparison")
+TAPS = Check("latency.taps", "taps", why="the delay remains unknown")
 DELAY = Check(
-    "latency.delay", "EKF2_EV_DELAY", why="PX4 fuses each pose in the wrong place: the estimate swings with the machine"
+    "latency.delay",
+    "EKF2_EV_DELAY",
+    why="PX4 fuses each pose at the wrong time: the estimate oscillates with the machine",
 )
 LONG = Check(
     "latency.long",
     "delay of motion capture",
-    why="the filter runs this far in the past, and every loop that depends on it becomes slower",
+    why="the filter lags by this time, and every loop that depends on it becomes slower",
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All taps of a session, and what is known of the links."""
+    """All taps of a session, and the delays of the links."""
 
     taps: tuple[TapDelay, ...]
     delay: Delay | str
-    """Delay from exposure to the companion, or why there is none."""
+    """Delay from exposure to the companion, or the reason why there is none."""
     round_trip_s: float
     imu_age_s: float | None
     mocap_latency_s: float | None
     """Median time from mid-exposure to transmission, by the server's stamps."""
     px4_ms: float | None
-    """EKF2_EV_DELAY as it is; None if PX4 has no such parameter."""
+    """Present EKF2_EV_DELAY; None if PX4 has no such parameter."""
     written_ms: float | None = None
-    """EKF2_EV_DELAY as it was written; None if it was not."""
+    """Written EKF2_EV_DELAY; None if it was not written."""
 
     @property
     def total_ms(self) -> float | None:
-        """Time from exposure to arrival in PX4, which is what EKF2_EV_DELAY means; None without a delay."""
+        """Time from exposure to arrival in PX4, the meaning of EKF2_EV_DELAY; None without a delay."""
         return None if isinstance(self.delay, str) else 1e3 * (self.delay.delay_s + 0.5 * self.round_trip_s)
 
 
 async def measure(session: Session) -> Measured:
-    """Open motion capture and PX4, wait for the taps, write the parameter if asked to."""
+    """Open motion capture and PX4, wait for the taps, write the parameter on request."""
     from companion.commissioning.latency.link import LatencyLink  # imports MAVSDK
     from companion.io.mocap.driver import NatNetMocap
 
@@ -90,7 +92,7 @@ async def measure(session: Session) -> Measured:
         LatencyLink(devices.autopilot, clock) as link,
     ):
         _refuse_armed(link, devices.autopilot.address)
-        # As in flight: a busy computer would stamp motion capture late.
+        # As in flight, because a busy computer stamps motion capture late.
         claim_realtime(FLIGHT_PRIORITY, cpus=vehicle.computer.cpus, lock_memory=False)
         session.say(
             f"hold the machine up by its legs, propellers off, and have a second person tap its frame {arguments.taps} times with the "
@@ -124,9 +126,9 @@ def _refuse_armed(link: LatencyLink, address: str) -> None:
 
 
 async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list[MocapPose]) -> tuple[TapDelay, ...]:
-    """Return every tap so far, once enough of them count or the time is over.
+    """Return every tap so far, once enough are usable or the time is over.
 
-    While taps come they are only counted: work on the event loop would stamp motion capture late.
+    During the session taps are only counted, because work on the event loop would stamp motion capture late.
     """
     end_s, from_s, wanted = clock() + session.arguments.seconds, clock(), session.arguments.taps
     done: list[TapDelay] = []
@@ -148,14 +150,14 @@ async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list
         from_s = clock() + _LOOK_S
         if missing > 0:
             problem = next((tap.problem for tap in reversed(done) if tap.problem), "their delays differ")
-            session.say(f"{missing} of {wanted} are missing, the last problem: {problem}; go on tapping")
+            session.say(f"{missing} of {wanted} are missing, the last problem: {problem}; continue tapping")
     return tuple(done)
 
 
 async def _count(
     session: Session, link: LatencyLink, clock: Clock, from_s: float, end_s: float, wanted: int
 ) -> list[Tap]:
-    """Return the taps since `from_s` once there are `wanted` and the last one is complete; fewer when the time is over."""
+    """Return the taps since `from_s` once there are `wanted` and the last one is complete; fewer if the time is over."""
     felt: list[Tap] = []
     while clock() < end_s and (len(felt) < wanted or clock() < felt[-1].t_s + SETTLE_S):
         await asyncio.sleep(_LOOK_S)
@@ -174,7 +176,7 @@ def _max_ms(vehicle: Vehicle) -> float:
 
 
 def judge(m: Measured, vehicle: Vehicle) -> Report:
-    """Compare the measured delay with PX4's parameter and with what the preflight accepts."""
+    """Compare the measured delay with PX4's parameter and with the preflight's limit."""
     advice = []
     if m.written_ms is not None:
         advice.append(f"{PARAMETER} = {m.written_ms:g} ms is written to PX4 (was {m.px4_ms} ms); restart PX4")
@@ -195,7 +197,7 @@ def rows(m: Measured, max_ms: float) -> list[Row]:
     set_it = (
         f"set {PARAMETER} to {round(m.total_ms, _DIGITS):g} (companion latency --write, or QGroundControl), restart PX4"
     )
-    relieve = "take load off Motive (no video, fewer bodies), a cable to a network of its own; then measure again"
+    relieve = "reduce Motive's load (no video, fewer bodies), use a cable to a network of its own; then measure again"
     return [
         TAPS.good(f"{len(m.delay.used)} of {len(m.taps)}, {1e3 * m.delay.spread_s:.1f} ms from tap to tap"),
         DELAY.row(
@@ -209,8 +211,8 @@ def rows(m: Measured, max_ms: float) -> list[Row]:
 
 
 def text(m: Measured) -> list[str]:
-    """Return the table of taps and the sum of the delays, for people."""
-    lines = [f"  tap  {'felt':>10}  {'delay':>9}  {'error':>8}  correlation"]
+    """Return the table of taps and the sum of the delays, for display."""
+    lines = [f"  tap  {'strength':>10}  {'delay':>9}  {'error':>8}  correlation"]
     for number, tap in enumerate(m.taps, start=1):
         error = f"{1e3 * tap.error_s:5.2f} ms" if math.isfinite(tap.error_s) else "       -"
         lines.append(
@@ -232,7 +234,7 @@ def text(m: Measured) -> list[str]:
 
 
 def as_json(m: Measured) -> dict[str, Any]:
-    """Return the JSON document's part; ms."""
+    """Return the measurement's part of the JSON document; ms."""
 
     def ms(value_s: float | None) -> float | None:
         return None if value_s is None or not math.isfinite(value_s) else 1e3 * value_s

@@ -1,4 +1,4 @@
-"""The one setting that explains a hand test: up axis, yaw of the rigid body, yaw of the world, a mirrored stream. Pure."""
+"""Finds the one setting that explains a hand test: up axis, yaw of the rigid body, yaw of the world, or a mirrored stream. Pure."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from companion.preflight.hand_test.evaluation import LEVEL_MAX_DEG, YAW_MAX_DEG,
 from companion.preflight.hand_test.motion import angle_rad
 from companion.preflight.hand_test.run import HandResult
 
-WORLD_YAW = Check("align.world_yaw", "world's yaw", why="room, tether and course are given in these axes")
+WORLD_YAW = Check("align.world_yaw", "world's yaw", why="room, tether and mission are given in these axes")
 _UP: Final[Vec3] = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Axes of the set-up by the three moves."""
+    """Axes of the set-up by the three motions."""
 
     axes: AxisMap
     """The true directions of the rigid body's streamed axes."""
     mirrored: bool
     level: bool
-    """Gravity is vertical in the stream: then either all of the stream has other axes, or nothing has."""
+    """Whether gravity is vertical in the stream. Then either the whole stream has other axes, or nothing has."""
     up_axis: str
     """Proposed `devices.mocap.up_axis`."""
     body_yaw_deg: float
@@ -42,9 +42,9 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
     """Find the axes from a finished test.
 
     Args:
-        result: of the test.
+        result: result of the test.
         up_axis: `devices.mocap.up_axis` during the test.
-        start_yaw_rad: true yaw of the nose while it was moved forward: the mission's start.
+        start_yaw_rad: true yaw of the nose during the motion forward, the mission's start yaw.
     """
     axes = best_axes(result)
     level = angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP) <= math.radians(LEVEL_MAX_DEG)
@@ -69,26 +69,26 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
 
 
 def changes(found: Alignment, up_axis: str) -> dict[Location, Data]:
-    """Return what the vehicle file should have; everything else is set in Motive."""
+    """Return the values to change in the vehicle file; everything else is set in Motive."""
     return {("devices", "mocap", "up_axis"): found.up_axis} if found.up_axis != up_axis else {}
 
 
 def world_row(found: Alignment, tolerance_deg: float) -> Row | None:
-    """Judge the world's yaw; return None if the axes have to be put right first."""
+    """Return the row on the world's yaw, or None if the axes must be corrected first."""
     yaw_deg = found.world_yaw_deg
     if yaw_deg is None:
         return None
-    limit_deg = max(tolerance_deg, YAW_MAX_DEG)  # a hand is not exact to the degree
+    limit_deg = max(tolerance_deg, YAW_MAX_DEG)  # a hand-held direction is not exact to the degree
     read = f"forward is {yaw_deg:+.0f} deg off the mission's start yaw"
     fix = (
-        f"if the machine stood as the mission's start.yaw_deg says, Motive's ground plane is turned by {yaw_deg:+.0f} deg: set it anew "
+        f"if the machine stood at the mission's start.yaw_deg, Motive's ground plane is turned by {yaw_deg:+.0f} deg: set it anew "
         "with the calibration square's x along the room's x; if not, turn the machine that way and repeat"
     )
     return WORLD_YAW.row(abs(yaw_deg) <= limit_deg, read, f"within {limit_deg:g} deg", fix)
 
 
 def as_json(found: Alignment) -> dict[str, Any]:
-    """Return the JSON document's part; degrees."""
+    """Return the alignment's part of the JSON document; degrees."""
     return {
         "axes": list(found.axes.names),
         "mirrored": found.mirrored,

@@ -1,4 +1,4 @@
-"""Rates, jitter, latency and bodies of a watched stream of motion capture, and what to change. Pure.
+"""Rates, jitter, latency and bodies of a watched stream of motion capture, and the remedies. Pure.
 
 The preflight's rows are used as they are (`companion.preflight.mocap`); the others are for a new set-up.
 """
@@ -28,9 +28,11 @@ STEADY = Check("mocap.steady", "mocap jitter", why="EKF2 subtracts the same fixe
 DELAY = Check(
     "mocap.delay",
     "mocap latency against EKF2_EV_DELAY",
-    why="PX4 fuses each pose in the wrong place: the estimate oscillates with the vehicle's motion",
+    why="PX4 fuses each pose at the wrong time: the estimate oscillates with the vehicle's motion",
 )
-NETWORK = Check("mocap.network", "way to the server", why="Wi-Fi delays frames and delivers them in bursts", warns=True)
+NETWORK = Check(
+    "mocap.network", "route to the server", why="Wi-Fi delays frames and delivers them in bursts", warns=True
+)
 CHECKS = (SERVER, OWN, STEADY, DELAY, NETWORK)
 
 MOVED_MIN_M: Final = 0.05
@@ -76,23 +78,23 @@ class BodyMotion:
     frames: int
     tracked: int
     moved_m: float
-    """Diagonal of the box around its positions, tracked frames only."""
+    """Diagonal of the bounding box of its tracked positions."""
     error_m: float
     """Mean marker error."""
 
     @property
     def label(self) -> str:
-        """Id, and name if it has one."""
+        """Return the id, and the name if there is one."""
         return f'id {self.id} "{self.name}"' if self.name else f"id {self.id}"
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How evenly frames arrive."""
+    """Regularity of the frames' arrival."""
 
     rate_hz: float
     server_rate_hz: float | None
-    """Rate by frame numbers and the server's own time stamps; None if it sends none."""
+    """Rate by frame numbers and the server's own time stamps; None if the server sends no time stamps."""
     period_s: float
     lost: int
     gap_s: float
@@ -158,7 +160,7 @@ def bodies(frames: Sequence[FrameSeen], names: Mapping[int, str]) -> list[BodyMo
 
 
 def histogram(t: Timing) -> list[str]:
-    """Draw the arrivals against an even stream as bars; the last bar holds all that came later."""
+    """Return a histogram of the delays against an even stream; the last bar contains all longer delays."""
     width_s = max(0.0005, _percentile(t.off_s, 0.99) / (_BINS - 1))
     counts = [0] * _BINS
     for off_s in t.off_s:
@@ -174,7 +176,7 @@ def histogram(t: Timing) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """A stream that was watched."""
+    """Recording of a stream."""
 
     frames: Sequence[FrameSeen]
     """Frames in order of arrival."""
@@ -188,7 +190,7 @@ class Watched:
 
 
 def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location, Data]]:
-    """Return all rows of a watched stream, and the changes of the vehicle file that would put right what is wrong."""
+    """Return all rows of a watched stream, and the corrections of the vehicle file."""
     frames, info, device = watched.frames, watched.info, vehicle.devices.mocap
     changes = dict[Location, Data]()
     version = ".".join(map(str, info.application_version))
@@ -212,7 +214,7 @@ def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location,
     )
     observed = Observations(start_s=0.0, duration_s=watched.duration_s, mocap=tuple(poses), mocap_stream=stream)
     rate = _rate(t, device.rate_hz, changes)
-    # The preflight's device row is the server's here, and the rate is reported with its cause.
+    # The preflight's device row is replaced by the server's row, and its rate by a row with the cause.
     rows += [
         rate if row.id == preflight.RATE.id else row
         for row in preflight.rows(observed, vehicle)
@@ -259,7 +261,7 @@ def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Lo
     if moving and not moved:
         return OWN.bad(read, f"id {own_id} moves", "nothing moved: repeat, and carry the vehicle some 30 cm")
     if len(moved) > 1 and own_id in [body.id for body in moved]:
-        return OWN.bad(read, f"id {own_id} alone moves", "move nothing but the vehicle, and repeat")
+        return OWN.bad(read, f"id {own_id} is the only one that moves", "move only the vehicle, and repeat")
     if own_id in streamed:
         result = "moved as the vehicle did" if moving else "is streamed; --move shows whether it is the vehicle's"
         return OWN.good(f"{streamed[own_id].label} {result}")
@@ -267,7 +269,7 @@ def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Lo
         (changes[key],) = streamed
         fix = f"set devices.mocap.rigid_body_id: {changes[key]}, if that is the vehicle"
     elif streamed:
-        fix = "find out which one the vehicle is: companion mocap check --move"
+        fix = "find the vehicle's id: companion mocap check --move"
     else:
         fix = "in Motive create a rigid body of the vehicle's markers and stream rigid bodies"
     return OWN.bad(read, f"id {own_id}", fix)
@@ -279,7 +281,7 @@ def _rate(t: Timing, expected_hz: float, changes: dict[Location, Data]) -> Row:
     read = f"{t.rate_hz:.1f} Hz, the cameras run at {camera_hz:.1f} Hz"
     if abs(t.rate_hz / expected_hz - 1.0) <= RATE_TOLERANCE:
         return preflight.RATE.good(read, wanted)
-    fix = "frames are lost on the way: a cable, a network of its own, a computer less busy"
+    fix = "frames are lost on the network: use a cable, a network of its own, a less busy computer"
     if abs(camera_hz / expected_hz - 1.0) > RATE_TOLERANCE:
         changes["devices", "mocap", "rate_hz"] = float(round(camera_hz))
         fix = f"set the camera rate to {expected_hz:g} Hz in Motive; or fly with this one, devices.mocap.rate_hz: {round(camera_hz)}"
@@ -290,7 +292,7 @@ def _steady(t: Timing) -> Row:
     late_s, limit_s = t.percentile_off_s(0.99), 0.5 * t.period_s
     median, worst = t.percentile_off_s(0.5), t.off_s[-1]
     read = f"late by {1e3 * median:.1f} ms (median), {1e3 * late_s:.1f} ms (99 %), {1e3 * worst:.1f} ms (worst)"
-    fix = "a cable, no power saving of the network card, and nothing else on this computer"
+    fix = "use a cable, disable power saving of the network card, and stop other programs on this computer"
     return STEADY.row(late_s <= limit_s, read, f"99 % within {1e3 * limit_s:.1f} ms", fix)
 
 
@@ -298,8 +300,8 @@ def _delay(t: Timing) -> Row:
     latency_s = _percentile(t.latency_s, 0.5)
     read = f"{1e3 * latency_s:.1f} ms from exposure to transmission (median)"
     fix = (
-        "take load off Motive (no video, fewer bodies, labelled markers off); what stays is measured by companion latency, and "
-        f"goes into PX4's EKF2_EV_DELAY: {1e3 * latency_s:.0f} ms or a little more"
+        "reduce Motive's load (no video, fewer bodies, labelled markers off); measure the rest with companion latency, and set "
+        f"PX4's EKF2_EV_DELAY to the result, about {1e3 * latency_s:.0f} ms or a little more"
     )
     near = abs(latency_s - 1e-3 * EV_DELAY_MS) <= DELAY_TOLERANCE_S
     return DELAY.row(near, read, f"{EV_DELAY_MS:g} ms, as in the parameter file", fix)
@@ -308,12 +310,12 @@ def _delay(t: Timing) -> Row:
 def _network(route: Route) -> Row:
     read = f"{route.transport} on {route.interface or 'an unknown interface'} ({route.local_address})"
     if route.wireless:
-        return NETWORK.bad(read + ", Wi-Fi", "a cable", "use a cable, or unicast and a Wi-Fi of its own at 5 GHz")
+        return NETWORK.bad(read + ", Wi-Fi", "a cable", "use a cable, or unicast on a separate 5 GHz Wi-Fi")
     return NETWORK.good(read)
 
 
 def text(watched: Watched) -> list[str]:
-    """Return the bodies and the histogram of arrivals, for people."""
+    """Return the bodies and the histogram of delays for display."""
     lines = [f"bodies of {watched.info.application}, {watched.route.transport}:"]
     for body in bodies(watched.frames, watched.names):
         share = f"{100.0 * body.tracked / body.frames:.0f} % tracked" if body.frames else "not streamed"
@@ -323,12 +325,12 @@ def text(watched: Watched) -> list[str]:
         )
     t = timing(watched.frames)
     if t is not None:
-        lines += ["arrival of the frames against an even stream:", *histogram(t)]
+        lines += ["delay of the frames against an even stream:", *histogram(t)]
     return [*lines, ""]
 
 
 def as_json(watched: Watched) -> dict[str, Any]:
-    """Return the JSON document's part; seconds, metres, Hz."""
+    """Return the stream's part of the JSON document; seconds, metres, Hz."""
     t, info, route = timing(watched.frames), watched.info, asdict(watched.route)
     del route["wireless"]
     version = ".".join(map(str, info.application_version))

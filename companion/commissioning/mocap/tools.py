@@ -1,4 +1,4 @@
-"""`companion mocap check`: is motion capture streamed as the flight needs it? `companion mocap align`: in which axes?"""
+"""`companion mocap check` checks the motion-capture stream for the flight, `companion mocap align` its axes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class NotStreaming:
 
     problem: str
     info: ServerInfo | None
-    """What it said about itself; None if it did not answer."""
+    """Server description; None if it did not answer."""
     others: Mapping[str, ServerInfo]
     """Servers that answered a broadcast, by address."""
 
@@ -76,12 +76,12 @@ async def watch(session: Session) -> Watched | NotStreaming:
     except DeviceError as error:
         if driver.server_info is not None:
             return NotStreaming(str(error), driver.server_info, {})
-        session.say("no answer; asking the whole segment")
+        session.say("no answer; searching the whole segment")
         return NotStreaming(str(error), None, await discover(device.interface, device.command_port))
 
 
 def judge(seen: Watched | NotStreaming, vehicle: Vehicle) -> Report:
-    """Judge the stream, or propose where to find it."""
+    """Return the report on the stream, or a proposal where to find it."""
     if isinstance(seen, Watched):
         rows, changes = mocap_judge.judge(seen, vehicle)
         return Report(rows, mocap_judge.as_json(seen), mocap_judge.text(seen), changes)
@@ -102,7 +102,7 @@ def judge(seen: Watched | NotStreaming, vehicle: Vehicle) -> Report:
 
 
 def _streaming(info: ServerInfo, device: MocapDevice) -> dict[Location, Data]:
-    """Return what the server says about its stream where the vehicle file says something else."""
+    """Return the settings of the server's stream that differ from the vehicle file."""
     if info.multicast is None:
         return {}
     found: dict[str, Data] = {"transport": "multicast" if info.multicast else "unicast"}
@@ -115,10 +115,10 @@ def _streaming(info: ServerInfo, device: MocapDevice) -> dict[Location, Data]:
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """A hand test, and where the mission starts."""
+    """Result of a hand test, and the mission's start."""
 
     outcome: HandResult | str
-    """What was measured, or why there is nothing."""
+    """Measurements, or the reason why there are none."""
     start: Start
 
 
@@ -138,7 +138,7 @@ async def carry(session: Session) -> Carried:
             opened.autopilot.send_vision(pose)
 
     session.say(
-        "axes of motion capture, by hand: lift, forward, turn left; put the machine where the mission starts, nose as there"
+        "axes of motion capture, by hand: lift, forward, turn left; place the machine at the mission's start position and yaw"
     )
     try:
         async with (
@@ -149,12 +149,12 @@ async def carry(session: Session) -> Carried:
     except DeviceError as error:
         outcome = str(error)
     if outcome == ENDED_BY_HAND:
-        raise GivenUp("given up; nothing was changed")
+        raise GivenUp("cancelled; nothing was changed")
     return Carried(outcome, config.mission.start)
 
 
 def judge_axes(carried: Carried, vehicle: Vehicle) -> Report:
-    """Judge the hand test, and find the one setting that explains what is wrong."""
+    """Return the report on the hand test, with the one setting that explains all errors."""
     outcome, start, up_axis = carried.outcome, carried.start, vehicle.devices.mocap.up_axis
     if isinstance(outcome, str):
         return Report([hand_evaluation.ended(outcome, "companion mocap align")], {"alignment": None})

@@ -1,4 +1,4 @@
-"""All of motion capture: every rigid body of every frame, the route to the server, servers found by broadcast. I/O only."""
+"""Devices of `companion mocap`: every rigid body of every frame, the route to the server, servers found by broadcast. I/O only."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _ASK_PERIOD_S: Final = 0.25
 
 
 def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], None]) -> NatNetMocap:
-    """Return the motion-capture driver, not yet open, which reports every rigid body of every frame and waits for none.
+    """Return the motion-capture driver, not yet open, which reports every rigid body of every frame and requires none.
 
     Args:
         device: addresses, transport, version.
         clock: the flight clock.
-        on_frame: called with every frame in order of arrival, also with those that are read together.
+        on_frame: called with every frame in order of arrival.
     """
 
     def show(frame: Frame, datagram: bytes, arrived_s: float) -> None:
@@ -55,7 +55,7 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
     Args:
         interface: address of this computer in that segment; 0.0.0.0: all segments.
         command_port: NatNet's, 1510 unless it was changed in Motive.
-        within_s: how long to wait.
+        within_s: time to wait for answers.
     """
     found: dict[str, ServerInfo] = {}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
@@ -74,7 +74,7 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
                     with contextlib.suppress(TimeoutError):
                         async with asyncio.timeout(_ASK_PERIOD_S):
                             await _collect(opened, found)
-        for address in found:  # a unicast server took the request for a client's
+        for address in found:  # a unicast server took the request for that of a client
             with contextlib.suppress(OSError):
                 opened.sendto(natnet.encode_message(Message.DISCONNECT), (address, command_port))
     return found
