@@ -2,6 +2,7 @@
 
     PX4_SITL=.../build/px4_sitl_default python -m benchmarks.px4 --keep flights/px4           # 36 flights, half an hour
     python -m benchmarks.px4 --keep flights/px4 --table                                       # only what lies there
+    python -m benchmarks.px4 --keep flights/lab --world lab --case catch-0.1kg --case catch-0.2kg --case catch-0.3kg
 
 Flights that lie in the folder already are not flown again. Times after a fault are on the autopilot's own clock: of a real PX4 by its
 ULog (needs pyulog), of the stub by the world's. Exit code 0: every flight ended as it must, 1: not, or one could not be flown.
@@ -87,12 +88,12 @@ class Row:
     worst_tilt_deg: float | None = None
 
 
-def fly(case: Case, autopilot: str, run: int, folder: Path) -> None:
+def fly(case: Case, world: str, autopilot: str, run: int, folder: Path) -> None:
     """Fly once, unless the folder holds the flight already."""
     if (folder / "summary.json").exists():
         return
     command = [sys.executable, "-m", "companion", "fly", str(MISSION), f"--sitl={autopilot}", "--out", str(folder)]
-    command += ["--set", *case.overrides, f"world.seed={run}"]
+    command += ["--world", world, "--seed", str(run), "--set", *case.overrides]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with open(folder.with_name(f"{folder.name}.txt"), "wb") as output:
         subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, timeout=TIMEOUT_S, check=False)
@@ -234,7 +235,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--keep", type=Path, required=True, metavar="DIR", help="folder of the flights")
     parser.add_argument("--case", choices=[case.name for case in CASES], action="append", help="default: all")
     parser.add_argument("--autopilot", choices=AUTOPILOTS, action="append", help="default: both")
-    parser.add_argument("--repeat", type=int, default=3, help="flights of each case")
+    parser.add_argument("--repeat", type=int, default=3, help="flights of each case, seeds 1 to N")
+    parser.add_argument("--world", default="ideal", metavar="lab|ideal|FILE", help="default: %(default)s")
     parser.add_argument("--table", action="store_true", help="fly nothing")
     parser.add_argument("--json", type=Path, help="write the rows here as well")
     arguments = parser.parse_args(argv)
@@ -248,7 +250,7 @@ def main(argv: list[str] | None = None) -> int:
                 folder = arguments.keep / f"{case.name}-{autopilot}-{run}"
                 try:
                     if not arguments.table:
-                        fly(case, autopilot, run, folder)
+                        fly(case, arguments.world, autopilot, run, folder)
                     row = row_of(case, autopilot, run, folder)
                 except (Px4Error, subprocess.TimeoutExpired) as error:
                     print(f"{folder}: {error}", file=sys.stderr)
