@@ -3,9 +3,9 @@
     python -m benchmarks.calibration --laboratories 20
 
 The laboratory is calibrated on these figures alone. Each is the median over laboratories of an RMS from the end of the take-off to the
-catch. The paper does not say what its attitude error is measured against: the third column is against the attitude that the law commands,
-the fourth against level flight along x. The soft laws are CSC and PSC with the position stiffness Lambda Phi and damping Lambda + M_d Phi
-that the paper's printed gains give its own law.
+catch. The paper does not say what its attitude error refers to: the second figure is against the attitude that the law commands, the
+third against level flight along x. The soft laws are CSC and PSC with the position stiffness Lambda Phi and the damping
+Lambda + M_d Phi that the paper's printed gains give its own law.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LAWS = {
 
 
 def errors(name: str, world: str, seed: int) -> tuple[float, float, float]:
-    """Fly one laboratory; return RMS ||e_p|| in mm, ||e_q|| and the attitude from level in deg before the catch, NaN if not measured."""
+    """Fly one laboratory; return before the catch RMS ||e_p|| in mm, ||e_q|| and the attitude from level in deg. NaN is unknown."""
     law, preset, overrides, _, _ = LAWS[name]
     config = load_sitl(MISSION, None, law, preset, overrides, world=world)
     flown = fly_to_end(with_world(config, {"seed": seed}))
