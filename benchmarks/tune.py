@@ -1,18 +1,25 @@
 """Tunes the gains of one law in the fast closed loop by CMA-ES; every law has the same cost, flights and budget.
 
     python -m benchmarks.tune psc --world lab --budget 300 --out mine.yaml
+    python -m benchmarks.tune psc --world lab --budget 300 --out mine.yaml --state psc.state --minutes 5   # repeat until it is finished
 
 Cost of a flight: ||e_p|| after the catch + 0.3 of that before it + 0.1 m/(N m) of the arm's impedance error against one common target
-(`companion.analysis.metrics.impedance_error`) + 0.5 m/(N m) of the torque activity, all RMS. A flight that is not completed with the
-payload on board costs `FAILURE_COST`. Cost of a point: mean over laboratories 1 to --laboratories, with 0.1, 0.2 and 0.3 kg in turn. A
-found point is judged on laboratories that the search has not seen, beside the point it started from. Parameters are searched on a
-logarithmic scale; one that ends near a bound is named, so that the bound can be widened.
+(`companion.analysis.metrics.impedance_error`) + 0.5 m/(N m) of the torque activity, all RMS. A flight in which the payload is missed
+or the safety supervisor does more than warn costs `FAILURE_COST`. Cost of a point: mean over laboratories 1 to --laboratories, with
+0.1, 0.2 and 0.3 kg in turn; every point flies the same ones.
+
+Flights of the search end `SEARCH_FLIGHT_S` after power-on, some 5 s after the catch. Of each generation all points fly the first
+half of the laboratories and the better half of the points the rest, because CMA-ES needs only the order of the points. A found point
+is judged on whole missions in laboratories that the search has not seen, beside the point it started from. Parameters are searched on
+a logarithmic scale; one that ends near a bound is named, so that the bound can be widened.
 """
 
 from __future__ import annotations
 
 import argparse
+import pickle
 import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -22,22 +29,27 @@ from typing import Any
 
 import cma
 import numpy as np
+import numpy.typing as npt
 from pydantic import ValidationError
 
+from companion.analysis import metrics
 from companion.config.controller import LAWS
 from companion.config.document import ConfigError
-from companion.model.types import Outcome
+from companion.model.types import Outcome, SafetyAction
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.campaigns.flights import fly_to_end, row_of, with_world
+from sitl.campaigns.flights import Flown, fly_to_end, log_of, torque_activity_nm, with_world
 
 Gains = dict[str, Any]
+Costs = npt.NDArray[np.float64]
 
 MISSION = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
 PAYLOADS_KG = (0.1, 0.2, 0.3)
 BEFORE_SHARE, ARM_WEIGHT_M_NM, ACTIVITY_WEIGHT_M_NM, FAILURE_COST = 0.3, 0.1, 0.5, 1.0
 HELD_OUT_FROM = 1001
 """First laboratory of the judgement."""
-FIRST_STEP, NEAR_BOUND = 0.15, 0.03
+SEARCH_FLIGHT_S, MISSION_LIMIT_S = 15.0, 90.0
+"""Longest flights of the search and of the judgement, from power-on; the catch is at about 10 s."""
+FIRST_STEP, NEAR_BOUND = 0.1, 0.03
 """Initial standard deviation, and what counts as near, as shares of the logarithmic range."""
 
 
@@ -98,8 +110,8 @@ _PSC = (
     Parameter("arm_inertia_md", 0.005, 0.3, (0, 1)),
     Parameter("arm_damping_kd", 0.1, 3.0, (0, 1)),
     Parameter("arm_stiffness_kp", 0.4, 20.0, (0, 1)),
-    Parameter("payload_time_s", 0.03, 2.0),
 )
+_PAYLOAD = Parameter("payload_time_s", 0.03, 2.0)
 _ADAPTIVE = (
     Parameter("lambda_gain", 1.0, 30.0, XY),
     Parameter("lambda_gain", 2.0, 80.0, Z),
@@ -119,11 +131,11 @@ _LOADS = (
 SEARCHES: dict[str, tuple[str, str, tuple[Parameter, ...]]] = {
     "csc": ("csc", "tuned", (*_CSC, _ATTITUDE)),
     "csc_extras": ("csc", "tuned_extras", (*_CSC, *_EXTRAS)),
-    "psc": ("psc", "tuned", (*_PSC, _ATTITUDE)),
+    "psc": ("psc", "tuned", (*_PSC, _PAYLOAD, _ATTITUDE)),
     "psc_extras": ("psc", "tuned_extras", (*_PSC, *_EXTRAS)),
     "paper": ("adaptive", "paper", (*_ADAPTIVE, _ATTITUDE)),
     "model_free": ("adaptive", "model_free", (*_ADAPTIVE, *_LOADS, *_EXTRAS[2:])),
-    "recommended": ("adaptive", "recommended", (*_ADAPTIVE, *_LOADS, *_EXTRAS)),
+    "recommended": ("adaptive", "recommended", (*_ADAPTIVE, *_LOADS, *_EXTRAS[2:])),
 }
 """Search spaces: the law, the preset whose file gives the start and everything that is not searched, and the parameters."""
 
@@ -139,21 +151,32 @@ def gains_of(base: Gains, parameters: Sequence[Parameter], point: Sequence[float
     return gains
 
 
-def cost(config: SitlConfig, gains: Gains, laboratory: int) -> float:
-    """Return the cost of one flight."""
+def cost(config: SitlConfig, limit_s: float, gains: Gains, laboratory: int) -> float:
+    """Return the cost of one flight, which ends at `limit_s` if it has not ended before."""
     try:
         controller = LAWS[gains["law"]].model_validate(gains)
     except ValidationError:  # the law's own conditions refuse the point
         return FAILURE_COST
     world = {"seed": laboratory, "payload_kg": PAYLOADS_KG[laboratory % len(PAYLOADS_KG)]}
-    flown = fly_to_end(with_world(config.model_copy(update={"controller": controller}), world))
-    row, _ = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error)
-    before, after = row["rms"]["pre"]["e_p_m"], row["rms"]["post"]["e_p_m"]
-    arm_nm, activity_nm = row["impedance_error"]["arm_nm"], row["torque_activity_nm"]
-    if row["outcome"] != Outcome.COMPLETED.value or None in (before, after, arm_nm, activity_nm):
+    flown = fly_to_end(with_world(config.model_copy(update={"controller": controller}), world), limit_s)
+    if _failed(flown):
         return FAILURE_COST
-    value = after + BEFORE_SHARE * before + ARM_WEIGHT_M_NM * arm_nm + ACTIVITY_WEIGHT_M_NM * activity_nm
-    return min(FAILURE_COST, float(value))
+    log = log_of(flown.config.flight, flown.result, flown.caught_t_s)
+    before, after = metrics.flight_masks(log)
+    terms = (
+        (1.0, metrics.tracking_rms(log, after).e_p_m),
+        (BEFORE_SHARE, metrics.tracking_rms(log, before).e_p_m),
+        (ARM_WEIGHT_M_NM, metrics.impedance_error(log)[1]),
+        (ACTIVITY_WEIGHT_M_NM, torque_activity_nm(log, before | after)),
+    )
+    return min(FAILURE_COST, sum(FAILURE_COST if value is None else weight * value for weight, value in terms))
+
+
+def _failed(flown: Flown) -> bool:
+    outputs = flown.result.outputs
+    if flown.caught_t_s is None or flown.result.crashed or not outputs:
+        return True
+    return outputs[-1].action.rank > SafetyAction.WARN.rank or outputs[-1].outcome not in (None, Outcome.COMPLETED)
 
 
 class Judge:
@@ -162,46 +185,96 @@ class Judge:
     def __init__(self, config: SitlConfig, pool: ProcessPoolExecutor) -> None:
         self._config, self._pool = config, pool
 
-    def means(self, candidates: Sequence[Gains], laboratories: Sequence[int]) -> list[float]:
-        """Return the mean cost of each candidate over the same laboratories."""
+    def costs(self, limit_s: float, candidates: Sequence[Gains], laboratories: Sequence[int]) -> Costs:
+        """Return the cost of each candidate (rows) in each laboratory (columns)."""
         jobs = [(gains, laboratory) for gains in candidates for laboratory in laboratories]
-        costs = np.array(list(self._pool.map(partial(cost, self._config), *zip(*jobs, strict=True))))
-        return [float(mean) for mean in costs.reshape(len(candidates), len(laboratories)).mean(axis=1)]
+        found = list(self._pool.map(partial(cost, self._config, limit_s), *zip(*jobs, strict=True)))
+        return np.array(found).reshape(len(candidates), len(laboratories))
+
+    def ranked(self, candidates: Sequence[Gains], laboratories: Sequence[int]) -> list[float]:
+        """Return a cost of each candidate of a generation: the mean over the laboratories for the better half of them, judged by the
+        first half of the laboratories; more than any of these, in their order, for the others.
+        """
+        half = (len(laboratories) + 1) // 2
+        first = self.costs(SEARCH_FLIGHT_S, candidates, laboratories[:half])
+        order = np.argsort(first.mean(axis=1))[: (len(candidates) + 1) // 2]
+        rest = self.costs(SEARCH_FLIGHT_S, [candidates[k] for k in order], laboratories[half:])
+        means = np.hstack([first[order], rest]).mean(axis=1)
+        costs = means.max() + first.mean(axis=1)
+        costs[order] = means
+        return [float(mean) for mean in costs]
 
 
-def search(
-    judge: Judge, base: Gains, parameters: Sequence[Parameter], laboratories: Sequence[int], budget: int, seed: int
-) -> Gains:
-    """Return the best controller file of `budget` points, the start included."""
-    low = np.log([parameter.low for parameter in parameters])
-    span = np.log([parameter.high for parameter in parameters]) - low
-    start = (np.log([max(parameter.read(base), parameter.low) for parameter in parameters]) - low) / span
+@dataclass
+class Progress:
+    """A search between two generations, as it is written to its state file."""
 
-    def gains(point: Sequence[float]) -> Gains:
-        return gains_of(base, parameters, np.exp(low + span * np.clip(point, 0.0, 1.0)).tolist())
+    strategy: Any
+    start: Gains
+    """The controller file that the search began with."""
+    best: Gains
+    best_cost: float
 
-    options = {"bounds": [0.0, 1.0], "seed": seed, "verbose": -9, "maxfevals": budget}
-    strategy = cma.CMAEvolutionStrategy(np.clip(start, 0.0, 1.0), FIRST_STEP, options)
-    best, best_cost = gains(start), judge.means([gains(start)], laboratories)[0]
-    print(f"   1/{budget}  cost {best_cost:.5f} (start)", file=sys.stderr, flush=True)
-    while not strategy.stop():
-        points = strategy.ask()
-        costs = judge.means([gains(point) for point in points], laboratories)
-        strategy.tell(points, costs)
-        if min(costs) < best_cost:
-            best_cost = min(costs)
-            best = gains(points[costs.index(best_cost)])
-        print(
-            f"{1 + strategy.countevals:4d}/{budget}  cost {best_cost:.5f}  step {strategy.sigma:.3f}",
-            file=sys.stderr,
-            flush=True,
-        )
-    for parameter, at in zip(
-        parameters, (np.log([parameter.read(best) for parameter in parameters]) - low) / span, strict=True
-    ):
-        if min(at, 1.0 - at) < NEAR_BOUND:
-            print(f"{parameter.name} ended near a bound: {parameter.read(best):g}", file=sys.stderr)
-    return best
+
+class Search:
+    """CMA-ES on a logarithmic scale.
+
+    Args:
+        base: controller file with the start and everything that is not searched.
+        parameters: the search space.
+        budget: points to try, the start included.
+        seed: of the search.
+    """
+
+    def __init__(self, base: Gains, parameters: Sequence[Parameter], budget: int, seed: int) -> None:
+        self._base, self._parameters, self._budget = base, parameters, budget
+        self._low = np.log([parameter.low for parameter in parameters])
+        self._span = np.log([parameter.high for parameter in parameters]) - self._low
+        options = {"bounds": [0.0, 1.0], "seed": seed, "verbose": -9, "maxfevals": budget - 1}
+        strategy = cma.CMAEvolutionStrategy(self._point(base), FIRST_STEP, options)
+        start = self._gains(self._point(base))
+        self.progress = Progress(strategy, start, start, np.inf)
+
+    def _point(self, gains: Gains) -> Any:
+        values = [parameter.read(gains) for parameter in self._parameters]
+        return np.clip((np.log(np.maximum(values, 1e-9)) - self._low) / self._span, 0.0, 1.0)
+
+    def _gains(self, point: Sequence[float]) -> Gains:
+        values = np.exp(self._low + self._span * np.clip(point, 0.0, 1.0))
+        return gains_of(self._base, self._parameters, values.tolist())
+
+    def run(self, judge: Judge, laboratories: Sequence[int], state: Path | None, deadline_s: float) -> bool:
+        """Search until the budget is used, which returns True, or `time.monotonic()` passes `deadline_s` after a generation."""
+        p = self.progress
+        if not np.isfinite(p.best_cost):
+            p.best_cost = float(judge.costs(SEARCH_FLIGHT_S, [p.start], laboratories).mean())
+            self._say("start")
+        while not p.strategy.stop():
+            if time.monotonic() >= deadline_s:
+                return False
+            points = p.strategy.ask()
+            candidates = [self._gains(point) for point in points]
+            costs = judge.ranked(candidates, laboratories)
+            p.strategy.tell(points, costs)
+            if min(costs) < p.best_cost:
+                p.best_cost = min(costs)
+                p.best = candidates[costs.index(p.best_cost)]
+            self._say(f"step {p.strategy.sigma:.3f}")
+            if state is not None:
+                state.write_bytes(pickle.dumps(p))
+        return True
+
+    def _say(self, text: str) -> None:
+        p = self.progress
+        tried = f"{1 + p.strategy.countevals:4d}/{self._budget}"
+        print(f"{tried}  cost {p.best_cost:.5f}  {text}", file=sys.stderr, flush=True)
+
+    def name_bounds(self) -> None:
+        """Name the parameters that are near a bound."""
+        best = self.progress.best
+        for parameter, at in zip(self._parameters, self._point(best), strict=True):
+            if min(at, 1.0 - at) < NEAR_BOUND:
+                print(f"{parameter.name} is near a bound: {parameter.read(best):g}", file=sys.stderr)
 
 
 def controller_yaml(gains: Gains, found: str) -> str:
@@ -233,10 +306,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--world", default="lab", help="lab, ideal or a world file (%(default)s)")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--budget", type=int, default=300, help="points to try (%(default)s)")
-    parser.add_argument("--laboratories", type=int, default=6, help="flights per point (%(default)s)")
+    parser.add_argument("--laboratories", type=int, default=4, help="flights per point, at least 2 (%(default)s)")
     parser.add_argument("--held-out", type=int, default=30, help="laboratories of the judgement (%(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of the search (%(default)s)")
+    parser.add_argument(
+        "--state", type=Path, help="file of the search's progress; if it exists the search goes on from there"
+    )
+    parser.add_argument("--minutes", type=float, default=1e6, help="stop after the generation in which they pass")
     parser.add_argument("--out", type=Path, help="controller file to write; absent: standard output")
     a = parser.parse_args(arguments)
     law, preset, parameters = SEARCHES[a.search]
@@ -245,14 +322,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(f"tune: {error}", file=sys.stderr)
         return 2
-    base = config.controller.model_dump(mode="json")
+    run = Search(config.controller.model_dump(mode="json"), parameters, a.budget, a.seed)
+    if a.state is not None and a.state.exists():
+        run.progress = pickle.loads(a.state.read_bytes())
+    training = range(1, a.laboratories + 1)
+    held_out = range(HELD_OUT_FROM, HELD_OUT_FROM + a.held_out)
     with ProcessPoolExecutor(a.jobs) as pool:
         judge = Judge(config, pool)
-        best = search(judge, base, parameters, range(1, a.laboratories + 1), a.budget, a.seed)
-        before, after = judge.means([base, best], range(HELD_OUT_FROM, HELD_OUT_FROM + a.held_out))
-    command = f"python -m benchmarks.tune {a.search} --world {a.world} --budget {a.budget}"
+        finished = run.run(judge, training, a.state, time.monotonic() + 60.0 * a.minutes)
+        best = run.progress.best
+        judged = f"Cost on laboratories 1 to {a.laboratories}: {run.progress.best_cost:.4f}."
+        if finished:
+            before, after = judge.costs(MISSION_LIMIT_S, [run.progress.start, best], held_out).mean(axis=1)
+            judged += f" On {a.held_out} held-out laboratories, whole missions: {before:.4f} before, {after:.4f} after."
+    run.name_bounds()
+    options = "".join(f" --set {override}" for override in a.overrides)
+    command = f"python -m benchmarks.tune {a.search} --world {a.world}{options} --budget {a.budget}"
     command += f" --laboratories {a.laboratories} --seed {a.seed}"
-    judged = f"Cost on {a.held_out} held-out laboratories: {before:.4f} before, {after:.4f} after."
     text = controller_yaml(best, f"Found by `{command}`.\n{judged}")
     if a.out is None:
         print(text, end="")

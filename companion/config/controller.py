@@ -174,7 +174,7 @@ LAWS: dict[str, type[AdaptiveConfig] | type[CscConfig] | type[PscConfig]] = {
 }
 PRESETS: dict[str, tuple[str, ...]] = {
     "adaptive": ("paper", "paper_slow_leakage", "model_free", "recommended"),
-    "csc": ("tuned",),
-    "psc": ("tuned",),
+    "csc": ("tuned_extras", "tuned"),
+    "psc": ("tuned_extras", "tuned"),
 }
 """Built-in presets of each law, the default last."""

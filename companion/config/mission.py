@@ -144,7 +144,7 @@ class ControllerChoice(Model):
     """A controller file, or a law and one of its presets."""
 
     law: Literal["adaptive", "csc", "psc"] = "adaptive"
-    preset: Literal["paper", "recommended", "tuned"] | None = None
+    preset: Literal["paper", "paper_slow_leakage", "model_free", "recommended", "tuned_extras", "tuned"] | None = None
     """If neither preset nor file is given, the law's default: recommended or tuned."""
     file: str | None = None
     """Path of a controller file, relative to the mission file."""

@@ -57,11 +57,13 @@ def laboratory_of(config: SitlConfig) -> Data:
     return {"world_seed": config.world.seed, "model_error": config.world.model_error}
 
 
-def fly_to_end(config: SitlConfig) -> Flown:
-    """Fly the mission. An exception ends this flight as it would end the flight process, not the campaign."""
+def fly_to_end(config: SitlConfig, limit_s: float = 90.0) -> Flown:
+    """Fly the mission, at most until world time `limit_s`. An exception ends this flight as it would end the flight process, not the
+    campaign.
+    """
     try:
         fast = FastFlight(config)
-        return Flown(fast.config, fast, fast.run(), None)
+        return Flown(fast.config, fast, fast.run(limit_s), None)
     except Exception as error:
         return Flown(config, None, FastResult(), f"{type(error).__name__}: {error}")
 

@@ -124,7 +124,7 @@ BAD_MISSION = [
         "preset: recommended",
         "preset: recomended",
         [
-            f'{CATCH}:9:37: controller.preset: expected one of "paper", "recommended", "tuned", got "recomended" '
+            f'{CATCH}:9:37: controller.preset: expected one of "paper", "paper_slow_leakage", "model_free", "recommended", "tuned_extras", "tuned", got "recomended" '
             "(did you mean recommended?)"
         ],
     ),
@@ -258,7 +258,7 @@ def test_unknown_controller_and_preset(project: Path) -> None:
         "--controller cscc: no such controller; available: adaptive, csc, psc"
     ]
     assert lines_of(lambda: load_sitl(CATCH, controller_law="psc", preset="paper")) == [
-        "--preset paper: no such preset of 'psc'; available: tuned"
+        "--preset paper: no such preset of 'psc'; available: tuned_extras, tuned"
     ]
     assert lines_of(lambda: load_sitl(CATCH, preset="papr")) == [
         "--preset papr: no such preset of 'adaptive'; available: paper, paper_slow_leakage, model_free, recommended"
@@ -272,7 +272,7 @@ BAD_LAW_IN_MISSION = [
     ),
     (
         "{law: psc, preset: paper}",
-        "controller.preset: no such preset of 'psc', got \"paper\"; available: tuned",
+        "controller.preset: no such preset of 'psc', got \"paper\"; available: tuned_extras, tuned",
     ),
     (
         "{preset: tuned}",
@@ -297,7 +297,7 @@ def test_the_preset_option_is_of_the_missions_law(project: Path) -> None:
     assert load_sitl(CATCH, preset="tuned").controller.law == "csc"
     assert load_sitl(CATCH, controller_law="psc").controller.law == "psc"
     assert lines_of(lambda: load_sitl(CATCH, preset="paper")) == [
-        "--preset paper: no such preset of 'csc'; available: tuned"
+        "--preset paper: no such preset of 'csc'; available: tuned_extras, tuned"
     ]
 
 
