@@ -129,8 +129,8 @@ def test_thirds_are_of_payload_and_grade_only_what_was_caught_and_completed() ->
     assert (first.payload_kg[0], third.payload_kg[1]) == pytest.approx((0.1, 0.4))
     assert [part.flights for part in (first, second, third)] == [3, 2, 4]
     assert [part.caught for part in (first, second, third)] == [2, 2, 4]
-    assert first.e_p_m == pytest.approx({"p50": 0.015, "p90": 0.019, "max": 0.02})
-    assert third.e_p_m == pytest.approx({"p50": 0.06, "p90": 0.068, "max": 0.07})
+    assert first.e_p_m == pytest.approx({"p50": 0.015, "p95": 0.0195, "max": 0.02})
+    assert third.e_p_m == pytest.approx({"p50": 0.06, "p95": 0.069, "max": 0.07})
 
 
 def test_flights_are_told_apart_by_what_the_force_sensor_was_like() -> None:

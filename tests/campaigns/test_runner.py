@@ -197,7 +197,7 @@ def test_draws_are_written_as_table_and_cases_and_a_crash_is_exit_code_5(monkeyp
     assert page.pictures == [Path("out/distribution.png").read_bytes()]
     assert "1 flights crashed or were lost." in page.text
     summary = json.loads(Path("out/robustness.json").read_text())["summary"]
-    assert summary["thirds"][0]["flights"] == 4 and set(summary["thirds"][0]["e_p_m"]) == {"p50", "p90", "max"}
+    assert summary["thirds"][0]["flights"] == 4 and set(summary["thirds"][0]["e_p_m"]) == {"p50", "p95", "max"}
 
 
 CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"

@@ -21,11 +21,13 @@ def result_markdown(results: dict[str, Any]) -> str:
     outcomes = ", ".join(
         f"{count} {outcome}" for outcome, count in Counter(row["outcome"] for row in rows).most_common()
     )
-    p50, p90, largest = (f"{value:.1f} mm" for value in np.percentile(errors_mm, [50, 90, 100]))
+    p50, p95, largest = (f"{value:.1f} mm" for value in np.percentile(errors_mm, [50, 95, 100]))
+    model_errors = ", ".join(f"{100 * error:g} %" for error in sorted({row["model_error"] for row in rows}))
     return (
-        f"{len(rows)} draws, seed {settings['seed']}, `{settings['controller']}/{settings['preset']}`: {outcomes}; "
+        f"{len(rows)} draws of the world `{settings['world']}`, seed {settings['seed']}, model error {model_errors}, "
+        f"`{settings['controller']}/{settings['preset']}`: {outcomes}; "
         f"{summary['caught']} payloads were caught, {summary['missed']} missed the net.\n"
-        f"RMS of the position error after the catch: p50 {p50}, p90 {p90}, largest {largest}.\n{flown_by(results)}"
+        f"RMS of the position error after the catch: p50 {p50}, p95 {p95}, largest {largest}.\n{flown_by(results)}"
     )
 
 

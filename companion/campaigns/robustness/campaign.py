@@ -176,7 +176,7 @@ def thirds_table(rows: Sequence[Row]) -> Table:
         Column("payload", lambda third: "{:.2f} to {:.2f} kg".format(*third.payload_kg), left=True),
         Column("flights", lambda third: str(third.flights)),
         Column("caught", lambda third: str(third.caught)),
-        *map(percentile, ("p50", "p90", "max")),
+        *map(percentile, ("p50", "p95", "max")),
     )
     return table(columns, thirds(rows), title="RMS of e_p after the catch, m")
 
@@ -211,6 +211,8 @@ def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
         Column("force sensor", _sensor_text, left=True),
         Column("seed", lambda row: str(row["world_seed"])),
     ]
+    # A world leaves out what it does not draw.
+    columns = [column for column in columns if any(column.show(row) != "–" for row in rows)]
     kept = {case.name: case.kept for case in cases}
     if kept:
 

@@ -93,7 +93,7 @@ class Third:
     flights: int
     caught: int
     e_p_m: dict[str, float | None]
-    """p50, p90 and max of the RMS after the catch, over the flights of `graded`."""
+    """p50, p95 and max of the RMS after the catch, over the flights of `graded`."""
 
 
 def thirds(rows: Sequence[Row]) -> list[Third]:
@@ -109,9 +109,9 @@ def thirds(rows: Sequence[Row]) -> list[Third]:
             r for r in rows if low <= r["world"]["payload_kg"] < high or (last and r["world"]["payload_kg"] == high)
         ]
         errors = [row["e_p_m"] for row in graded(these)]
-        shares = np.percentile(errors, [50, 90, 100]).tolist() if errors else (None, None, None)
+        shares = np.percentile(errors, [50, 95, 100]).tolist() if errors else (None, None, None)
         caught = sum(bool(row["caught"]) for row in these)
-        found.append(Third((low, high), len(these), caught, dict(zip(("p50", "p90", "max"), shares, strict=True))))
+        found.append(Third((low, high), len(these), caught, dict(zip(("p50", "p95", "max"), shares, strict=True))))
     return found
 
 

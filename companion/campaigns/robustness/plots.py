@@ -6,6 +6,7 @@ Needs matplotlib (extra `analysis`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from companion.campaigns.robustness.draws import DRIVERS, drivers, graded, influ
 from companion.campaigns.runner import Row
 
 _COLOURS = dict(zip(("working", "lost after the catch", "missing at the catch"), COLOURS, strict=False))
-_AGAINST = ("payload_kg", "throw_speed_m_s", "setpoint_delay_s", "catch_x_m")
+_AGAINST = ("payload_kg", "throw_speed_m_s", "setpoint_delay_s", "catch_x_m", "hover_thrust_error")
+"""The first four of these that the world drew are shown."""
 BARS = 10
 
 
@@ -36,9 +38,13 @@ def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
     sensors = [sensor_of(row) for row in flown]
     error_mm = np.array([row["e_p_m"] for row in flown]) * 1e3
     _histogram(axes[0, 0], error_mm, sensors)
-    for ax, key in zip((axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1]), _AGAINST, strict=True):
-        values = np.array([drivers(row["world"])[key] for row in flown], dtype=np.float64)
-        _scatter(ax, values, error_mm, sensors)
+    drawn = {key: np.array([drivers(row["world"])[key] for row in flown], dtype=np.float64) for key in _AGAINST}
+    known = [key for key, values in drawn.items() if np.isfinite(values).any()]
+    for ax, key in zip_longest((axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1]), known[:4]):
+        if key is None:
+            ax.set_visible(False)
+            continue
+        _scatter(ax, drawn[key], error_mm, sensors)
         ax.set_xlabel(DRIVERS[key])
         ax.set_ylabel(r"RMS $\|e_p\|$ [mm]")
     _bars(axes[1, 2], list(influence(rows).items()))
@@ -52,7 +58,7 @@ def _histogram(ax: Any, error_mm: Any, sensors: Sequence[str]) -> None:
     groups = [[e for e, s in zip(error_mm.tolist(), sensors, strict=True) if s == name] for name in _COLOURS]
     bins = np.linspace(0.0, 1.02 * float(error_mm.max()), 31)
     ax.hist(groups, bins=bins, stacked=True, color=list(_COLOURS.values()))
-    for share, text, height in ((50, "p50", 0.99), (90, "p90", 0.92)):
+    for share, text, height in ((50, "p50", 0.99), (95, "p95", 0.92)):
         at = float(np.percentile(error_mm, share))
         ax.axvline(at, color=CATCH, lw=1.2, ls=(0, (5, 3)))
         ax.annotate(f"{text} {at:.1f}", (at, height), xycoords=ax.get_xaxis_transform(), xytext=(3, 0),
@@ -71,6 +77,9 @@ def _scatter(ax: Any, values: Any, error_mm: Any, sensors: Sequence[str]) -> Non
 
 
 def _bars(ax: Any, found: Sequence[tuple[str, float]]) -> None:
+    if not found:
+        ax.set_visible(False)
+        return
     shown = list(found[:BARS])[::-1]
     ax.barh(range(len(shown)), [value for _, value in shown], color=SOFT, height=0.7)
     # Labels stand beside zero: left of the axis they would take half of the width.
@@ -91,3 +100,4 @@ def _bars(ax: Any, found: Sequence[tuple[str, float]]) -> None:
     ax.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
     ax.set_xlabel(r"rank correlation with $\|e_p\|$")
     dress(ax)
+    ax.spines["left"].set_visible(False)
