@@ -14,6 +14,7 @@ from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.plots import write_plots
 from companion.analysis.summary import effective_config, world_text
 from companion.analysis.table import Cell, Column, Table, table
+from companion.model.types import Outcome, SafetyAction
 
 
 def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path:
@@ -47,12 +48,27 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
             Section("Events", "" if summary["events"] else "None.", [_events(summary["events"])]),
             Section("Record", tables=[_pairs("", versions)], folded=folded),
         ],
+        verdict=_why_ended(summary),
+        good=False,
         badge=str(summary["outcome"]),
         player_html="" if movie is None else player_html(movie),
         width_rem=62,
     )
     write_page(page, path)
     return path
+
+
+def _why_ended(summary: dict[str, Any]) -> str:
+    """Return the text of the event that ended the mission early; empty if the mission was completed or no event did."""
+    if summary["outcome"] == Outcome.COMPLETED.value:
+        return ""
+    ranked = [(SafetyAction(event["action"]).rank, str(event["text"])) for event in summary["events"]]
+    # The first landing says more than an earlier hold.
+    for least in (SafetyAction.LAND, SafetyAction.HOLD):
+        for rank, text in ranked:
+            if rank >= least.rank:
+                return text
+    return ""
 
 
 def _results(summary: dict[str, Any], stride: int) -> list[Table]:

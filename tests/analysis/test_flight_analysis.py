@@ -364,6 +364,7 @@ def test_the_report_is_one_file_with_plots_results_and_events(flight: FlightLog,
     assert not re.search(r"""(?:src|href)=['"](?!data:)""", page)
     assert f"{summary['rms']['post']['e_p_m']:.4f}" in page
     assert "payload in the net" in page
+    assert 'class="verdict' not in page
     assert "world lab, seed 7, model error 20%" in page
     assert "version_" not in page
     assert "numpy" in page
@@ -461,8 +462,19 @@ def test_the_report_of_a_flight_that_hardly_began_is_written_all_the_same(tmp_pa
     for part in (rows, rows[:1]):
         log = made_of(part)
         summary = summarise(log, outcome="aborted", controller="adaptive", preset="<b>mine</b>")
+        actions = (
+            ("warn", "<i>"),
+            ("hold", "mocap lost"),
+            ("autopilot_land", "mocap lost for long"),
+            ("land", "low battery"),
+        )
+        summary["events"] = [
+            {"mission_t_s": 1.0, "id": "made_up", "severity": "warning", "action": action, "text": text}
+            for action, text in actions
+        ]
         page = write_report(log, summary, tmp_path).read_text(encoding="utf-8")
         assert "aborted" in page
+        assert re.findall(r'class="verdict not"><p>(.*?)</p>', page) == ["mocap lost for long"]
         assert "<b>mine</b>" not in page
 
 
