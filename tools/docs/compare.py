@@ -64,13 +64,15 @@ def merged(files: Sequence[Results]) -> list[Row]:
     return list(rows.values())
 
 
-def laws_markdown(groups: Iterable[Group]) -> str:
-    """Return one line per payload and preset."""
-    head = ("payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES), "paper: e_p before / after")
+def laws_markdown(groups: Sequence[Group]) -> str:
+    """Return one line per payload and preset, with the paper's figures where it prints any."""
+    head = ["payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES)]
     rows = [
-        (f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _paper(group))
-        for group in groups
+        [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES)] for group in groups
     ]
+    if any(map(_paper, groups)):
+        head.append("printed: e_p before / after")
+        rows = [[*row, _paper(group)] for row, group in zip(rows, groups, strict=True)]
     return markdown(head, rows)
 
 
@@ -120,14 +122,25 @@ def differences_markdown(groups: Sequence[Group]) -> str:
             these = [group for group in groups if group.label == label and group.printed is not None]
             if these:
                 text = ", ".join(_against_print(group, part) for group in these)
-                lines.append(f"* {name} {word} the catch ({label}): {text}.")
+                lines.append(f"* {name} ({label}) {word} the catch: {text}.")
+    for part, word in (("pre", "before"), ("post", "after")):
+        found = [g for g in groups if g.label in IN_PAPER and g.printed is not None]
+        ours = [spread.p50 for g in found if (spread := g.spread(f"rms.{part}.e_q_deg")) and spread.p50 is not None]
+        printed = [
+            of.e_q_deg for g in found if g.printed and (of := g.printed.pre if part == "pre" else g.printed.post)
+        ]
+        if ours and printed:
+            lines.append(f"* Attitude {word} the catch: {_range(ours)} deg (printed: {_range(printed)}).")
+    orders: dict[str, list[str]] = {}
     for payload_kg in dict.fromkeys(group.payload_kg for group in groups):
         these = [group for group in groups if group.payload_kg == payload_kg and group.label in IN_PAPER]
-        ours = [IN_PAPER[g.label] for g in sorted(these, key=lambda g: _rank(g.spread(_E_P.format("post"))))]
-        if len(ours) == len(IN_PAPER):
-            lines.append(
-                f"* Order after the catch at {payload_kg:g} kg: {', '.join(ours)}; printed: proposed, PSC, CSC."
-            )
+        order = [IN_PAPER[g.label] for g in sorted(these, key=lambda g: _rank(g.spread(_E_P.format("post"))))]
+        if len(order) == len(IN_PAPER):
+            orders.setdefault(", ".join(order), []).append(f"{payload_kg:g}")
+    for names, payloads in orders.items():
+        lines.append(
+            f"* Order after the catch at {', '.join(payloads)} kg: {names} (printed: {', '.join(IN_PAPER.values())})."
+        )
     return "\n".join(lines)
 
 
@@ -211,13 +224,17 @@ def _rank(spread: Any) -> float:
     return float("inf") if spread is None or spread.p50 is None else float(spread.p50)
 
 
+def _range(values: Sequence[float]) -> str:
+    return f"{min(values):.1f} to {max(values):.1f}"
+
+
 def _against_print(group: Group, part: str) -> str:
     assert group.printed is not None
     printed = group.printed.pre if part == "pre" else group.printed.post
     spread = group.spread(_E_P.format(part))
     ours = None if spread is None else spread.p50
     text = "failed" if ours is None else f"{ours:.3f} m"
-    times = f", {ours / printed.e_p_m:.1f} times it" if ours is not None and printed is not None else ""
+    times = f", ratio {ours / printed.e_p_m:.2g}" if ours is not None and printed is not None else ""
     return f"{text} at {group.payload_kg:g} kg (printed: {_printed(printed)}{times})"
 
 
