@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 from pydantic import TypeAdapter
+from pydantic.json_schema import GenerateJsonSchema
 
 from companion.config.controller import ControllerConfig
 from companion.config.mission import Mission
@@ -21,6 +22,22 @@ KINDS: dict[str, TypeAdapter[Any]] = {
 }
 
 
+class _Brief(GenerateJsonSchema):
+    """Leaves out the titles of fields, which repeat their keys, and writes the schema of a vector's elements once."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        """Return False."""
+        return False
+
+    def tuple_schema(self, schema: Any) -> dict[str, Any]:
+        """Return the schema of a list with as many elements as the tuple has."""
+        found = super().tuple_schema(schema)
+        first, *others = found.get("prefixItems", [None])
+        if first is not None and all(other == first for other in others):
+            found["items"] = found.pop("prefixItems")[0]
+        return found
+
+
 def schema_json(kind: str) -> str:
     """JSON Schema (2020-12) of one kind of file, as text without a final newline.
 
@@ -28,10 +45,11 @@ def schema_json(kind: str) -> str:
         KeyError: if the kind is none of `KINDS`.
     """
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    schema |= KINDS[kind].json_schema()
+    schema |= KINDS[kind].json_schema(schema_generator=_Brief)
     if kind == "world":
         schema = _with_distributions(schema)
-        schema["$defs"] |= {model.__name__: model.model_json_schema() for model in (Uniform, Normal)}
+        distributions = TypeAdapter(Uniform | Normal).json_schema(schema_generator=_Brief)
+        schema["$defs"] |= {**distributions.pop("$defs"), "Distribution": distributions}
     schema["title"] = f"companion {kind}"
     return json.dumps(schema, indent=2, ensure_ascii=False)
 
@@ -45,5 +63,5 @@ def _with_distributions(node: Any) -> Any:
     node = {key: _with_distributions(value) for key, value in node.items()}
     if node.get("type") != "number":
         return node
-    about = {key: node.pop(key) for key in ("title", "description", "default") if key in node}
-    return {**about, "anyOf": [node, *({"$ref": f"#/$defs/{model.__name__}"} for model in (Uniform, Normal))]}
+    about = {key: node.pop(key) for key in ("description", "default") if key in node}
+    return {**about, "anyOf": [node, {"$ref": "#/$defs/Distribution"}]}
