@@ -2,7 +2,6 @@
 
     python -m benchmarks.soak                             # 60 minutes: configs/missions/soak.yaml, 150 catches
     python -m benchmarks.soak --minutes 3 --json FILE --plot FILE.png
-    python -m benchmarks.soak --nice -10 --lift 30        # on a machine that others use and fly on, too (needs the right to)
     python -m benchmarks.soak --read DIR                  # the figures of a flight that was kept, once more
 
 Exit code 0 only if the mission was completed, every throw was caught, nothing was missed, and neither memory nor lateness grew.
@@ -27,7 +26,7 @@ from rich.console import Console
 
 from benchmarks.report import write_json
 from benchmarks.soaking.lateness import Minute, Ticks, read_minutes, run_empty_loop, ticks_of_log
-from benchmarks.soaking.processes import family, lift, pss_mb, usage
+from benchmarks.soaking.processes import family, pss_mb, usage
 from benchmarks.soaking.verdict import (
     MEMORY_GROWTH_MAX,
     Growth,
@@ -64,9 +63,7 @@ def _planned_s(count: int) -> float:
     return Plan.build(config.mission, config.vehicle).duration_s
 
 
-def fly(
-    minutes: float, nice: int | None, lift_by: int, overrides: Sequence[str], folder: Path, console: Console
-) -> int:
+def fly(minutes: float, overrides: Sequence[str], folder: Path, console: Console) -> int:
     """Fly, write samples and logs to the folder, and return the flight's exit code."""
     count, planned_s = repetitions(minutes)
     folder.mkdir(parents=True)
@@ -76,18 +73,17 @@ def fly(
         f"world.battery_life_s={BATTERY_MARGIN * planned_s:.0f}",
         *overrides,
     ]
-    before = [] if nice is None else ["nice", "-n", str(nice)]
     command = [
-        *(*before, sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl"),
+        *(sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl"),
         *("--out", str(folder / "flight"), "--set", *settings),
     ]
     console.print(f"{count} repetitions, {planned_s / 60.0:.1f} minutes; {folder}", highlight=False, soft_wrap=True)
-    empty_command = [*before, sys.executable, "-m", "benchmarks.soak", "--empty-loop", str(folder / "empty_loop.json")]
+    empty_command = [sys.executable, "-m", "benchmarks.soak", "--empty-loop", str(folder / "empty_loop.json")]
     with (folder / "fly.txt").open("wb") as out, (folder / "samples.jsonl").open("w") as samples:
         empty = subprocess.Popen(empty_command)
         flight = subprocess.Popen(command, stdout=out, stderr=out, env={**os.environ, "PYTHONUNBUFFERED": "1"})
         try:
-            _watch(flight, empty, planned_s, lift_by, samples, console)
+            _watch(flight, empty, planned_s, samples, console)
         finally:
             _end(empty)
             if flight.poll() is None:
@@ -100,7 +96,6 @@ def _watch(
     flight: subprocess.Popen[bytes],
     empty: subprocess.Popen[bytes],
     planned_s: float,
-    lift_by: int,
     samples: Any,
     console: Console,
 ) -> None:
@@ -117,8 +112,6 @@ def _watch(
         flew = "flight" in pids
         if len(pids) < 5 or number % 10 == 0:
             pids = family(flight.pid)
-            for pid in (*pids.values(), empty.pid) if lift_by else ():
-                lift(pid, lift_by)
         if flew and "flight" not in pids:
             _end(empty)  # the flight is over; what follows is the grading of its log
         found = {role: used for role, pid in pids.items() if (used := usage(pid)) is not None}
@@ -227,13 +220,6 @@ def show(result: dict[str, Any], folder: Path, plot: Path | None, console: Conso
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.soak", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=60.0, help="in the air, as near as whole repetitions come")
-    parser.add_argument("--nice", type=int, help="niceness of every process of the flight and of the empty loop")
-    parser.add_argument(
-        "--lift",
-        type=int,
-        default=0,
-        help="to the real-time priorities that they claim, where others fly on the same machine",
-    )
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="of the flight; e.g. wider time-outs on a machine that is held up as a whole now and then",
@@ -252,7 +238,7 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.read is None:
         if folder.exists():
             parser.error(f"{folder} exists already; choose another --out")
-        code = fly(arguments.minutes, arguments.nice, arguments.lift, arguments.overrides, folder, console)
+        code = fly(arguments.minutes, arguments.overrides, folder, console)
         if code != 0:
             console.print(
                 f"the flight ended with exit code {code}; see {folder / 'fly.txt'}", highlight=False, soft_wrap=True

@@ -7,15 +7,12 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.runtime.realtime import FLIGHT_PRIORITY, GUARDIAN_PRIORITY, WORLD_PRIORITY
-
 ROLES = {
     "companion.flight.main": "flight",
     "companion.recorder.main": "recorder",
     "companion.guardian": "guardian",
     "sitl": "world",
 }
-REALTIME_CLAIMED = frozenset({WORLD_PRIORITY, FLIGHT_PRIORITY, GUARDIAN_PRIORITY})
 LAUNCHER = "launcher"
 """The process that was started and starts the others."""
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -82,17 +79,3 @@ def pss_mb(pid: int) -> float | None:
     except OSError:
         return None
     return next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("Pss:")), None)
-
-
-def lift(pid: int, by: int) -> None:
-    """Raise the real-time priority of every thread of a process above that of other flights on the computer.
-
-    Raises:
-        PermissionError: not allowed to.
-    """
-    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-        for thread in map(int, os.listdir(f"/proc/{pid}/task")):
-            with contextlib.suppress(ProcessLookupError):
-                priority = os.sched_getparam(thread).sched_priority
-                if os.sched_getscheduler(thread) == os.SCHED_FIFO and priority in REALTIME_CLAIMED:
-                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority + by))
