@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
 import json
 import shutil
-import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -39,6 +37,7 @@ from companion.preflight.px4 import PARAM_ID
 from companion.recorder.client import RecorderProcess
 from companion.runtime.clock import flight_clock
 from companion.runtime.console import console_on, print_error
+from companion.runtime.event_loop import run_until_interrupted
 from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.loader import SitlConfig
 
@@ -132,32 +131,7 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
             mission_s=None if plan else Plan.build(config.mission, config.vehicle).duration_s,
             recorder=_recorder(config, scratch),
         )
-        rows = asyncio.run(_unless_interrupted(_look(task, config, known, line, people)))
-        if rows is None:
-            raise KeyboardInterrupt
-        return rows
-
-
-async def _unless_interrupted(look: Coroutine[Any, Any, list[Row]]) -> list[Row] | None:
-    """Return the result, or None after Ctrl-C, whatever the devices that were being opened made of the cancellation."""
-    interrupted = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    looking = asyncio.ensure_future(look)
-
-    def interrupt() -> None:
-        interrupted.set()
-        looking.cancel()
-
-    loop.add_signal_handler(signal.SIGINT, interrupt)
-    try:
-        await asyncio.wait((looking,))
-    finally:
-        loop.remove_signal_handler(signal.SIGINT)
-    if interrupted.is_set():
-        if not looking.cancelled():
-            looking.exception()  # seen; it is not what ended the check
-        return None
-    return looking.result()
+        return run_until_interrupted(_look(task, config, known, line, people))
 
 
 async def _look(task: Task, config: FlightConfig, known: Observations, line: _Line, people: Console) -> list[Row]:

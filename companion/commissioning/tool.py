@@ -6,10 +6,8 @@ Its instances are the `TOOLS` of `companion.commissioning.arm`, `.force_torque`,
 from __future__ import annotations
 
 import argparse
-import asyncio
 import importlib
 import json
-import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -28,6 +26,7 @@ from companion.model.check_row import Level, Row, refusals
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from companion.preflight.checks import Check
 from companion.runtime.console import console_on, print_error
+from companion.runtime.event_loop import run_until_interrupted
 
 SCHEMA_VERSION: Final = 1
 VEHICLE: Final = "configs/vehicles/tarot650_2r.yaml"
@@ -225,39 +224,6 @@ def _patch_lines(patch: Patch | None, written: str | None) -> list[str]:
         "",
         f"written; the old file: {written}" if written else "not written; add --write to write it",
     ]
-
-
-def run_until_interrupted(work: Coroutine[Any, Any, _T]) -> _T:
-    """Run a coroutine in its own event loop. Ctrl-C cancels it and is raised again after its end.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C.
-    """
-
-    async def guarded() -> tuple[_T] | None:
-        interrupted = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        task = asyncio.ensure_future(work)
-
-        def interrupt() -> None:
-            interrupted.set()
-            task.cancel()
-
-        loop.add_signal_handler(signal.SIGINT, interrupt)
-        try:
-            await asyncio.wait((task,))
-        finally:
-            loop.remove_signal_handler(signal.SIGINT)
-        if interrupted.is_set():
-            if not task.cancelled():
-                task.exception()  # retrieved, because this exception did not end the work
-            return None
-        return (task.result(),)
-
-    done = asyncio.run(guarded())
-    if done is None:
-        raise KeyboardInterrupt
-    return done[0]
 
 
 def add_tool(

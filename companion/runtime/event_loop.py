@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import selectors
+import signal
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
@@ -23,3 +24,36 @@ def run(main: Coroutine[Any, Any, _T]) -> _T:
     """Run a coroutine like `asyncio.run`, on a `fine_loop`."""
     with asyncio.Runner(loop_factory=fine_loop) as runner:
         return runner.run(main)
+
+
+def run_until_interrupted(work: Coroutine[Any, Any, _T]) -> _T:
+    """Run a coroutine in its own event loop. Ctrl-C cancels it and is raised again after its end.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C.
+    """
+
+    async def guarded() -> tuple[_T] | None:
+        interrupted = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        task = asyncio.ensure_future(work)
+
+        def interrupt() -> None:
+            interrupted.set()
+            task.cancel()
+
+        loop.add_signal_handler(signal.SIGINT, interrupt)
+        try:
+            await asyncio.wait((task,))
+        finally:
+            loop.remove_signal_handler(signal.SIGINT)
+        if interrupted.is_set():
+            if not task.cancelled():
+                task.exception()  # retrieved: it is not what ended the work
+            return None
+        return (task.result(),)
+
+    done = asyncio.run(guarded())
+    if done is None:
+        raise KeyboardInterrupt
+    return done[0]

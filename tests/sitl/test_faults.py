@@ -118,7 +118,7 @@ def test_faults_that_are_over_leave_the_world_as_it_was() -> None:
     assert world.rotor_share is None and world.snag is None
     assert world.wind_m_s == pytest.approx((0.0, 0.0, 0.0))
     assert world.tether_length_m == CONFIG.vehicle.tether.length_m
-    assert world.throw_aside_m == 0.0
+    assert world.payload.aside_m == 0.0
     assert not flight.px4.refuses_offboard and not flight.px4.refuses_arming
     assert flight.faults.sag_v == 0.0
     assert [drive.slip_counts for drive in drives] == [0, 0]
