@@ -324,7 +324,7 @@ class Sitl:
     def final(self) -> dict[str, Any]:
         """Return what the world reports at the end of a flight, for `summary.json`."""
         world, armed = self.plant.world, self.plant.armed_t_s
-        caught = world.caught_t_s
+        caught = world.payload.caught_t_s
 
         def since_arming(t_s: float | None) -> float | None:
             return None if t_s is None or armed is None else t_s - armed
@@ -333,12 +333,12 @@ class Sitl:
             "autopilot": self.autopilot.about(),
             "payload_kg": self._config.payload_kg,
             "knobs": self._config.model_dump(mode="json"),
-            "thrown": world.thrown_t_s is not None,
+            "thrown": world.payload.thrown_t_s is not None,
             "caught": caught is not None,
             "caught_after_arming_s": since_arming(caught),
-            "missed": world.missed,
-            "throws": world.throws,
-            "catches": world.catches,
+            "missed": world.payload.missed,
+            "throws": world.payload.throws,
+            "catches": world.payload.catches,
             "crashed": world.crashed,
             "slipped_s": self.slipped_s,
             "flight_fault": self.flight.report(),

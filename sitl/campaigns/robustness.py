@@ -24,7 +24,7 @@ from companion.model.types import Outcome, PhaseKind, SafetyAction
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, row_of, with_world
 from sitl.campaigns.runner import CampaignError, Data
-from sitl.world.world import _THROW_LEAD_S
+from sitl.world.payload import THROW_LEAD_S
 
 PAYLOAD_KG = (0.05, 0.4)
 THROW_SPEED_M_S = (0.5, 4.0)
@@ -69,9 +69,9 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
     line = [t_s for t_s in forwards if begun_s <= t_s < ended_s]
     found: list[Throw] = []
     for t_s in line:
-        now, later = plan.reference(t_s), plan.reference(t_s + _THROW_LEAD_S)
+        now, later = plan.reference(t_s), plan.reference(t_s + THROW_LEAD_S)
         # The simulated world extrapolates the vehicle from its speed at the throw.
-        x_m = now.position_world_m[0] + now.velocity_world_m_s[0] * _THROW_LEAD_S
+        x_m = now.position_world_m[0] + now.velocity_world_m_s[0] * THROW_LEAD_S
         if x_m > plan.reference(line[-1]).position_world_m[0] - END_MARGIN_M:
             break
         slow = now.velocity_world_m_s[0] < ALONG_MIN_M_S
@@ -79,8 +79,8 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
             continue
         net_below_m = -manipulator.net_body_m(later.arm_rad)[2]
         net_z_m = later.position_world_m[2] - net_below_m
-        rise_m = 0.5 * GRAVITY_M_S2 * _THROW_LEAD_S**2
-        slowest = max(0.0, (rise_m + HAND_HEIGHT_M - net_z_m) / _THROW_LEAD_S)
+        rise_m = 0.5 * GRAVITY_M_S2 * THROW_LEAD_S**2
+        slowest = max(0.0, (rise_m + HAND_HEIGHT_M - net_z_m) / THROW_LEAD_S)
         fastest = math.sqrt(2.0 * GRAVITY_M_S2 * max(0.0, net_below_m + ROTORS_ABOVE_BODY_M))
         fastest = max(slowest, min(DESCENT_MAX_M_S, fastest))
         found.append(Throw((x_m, later.position_world_m[1]), (slowest, fastest)))
@@ -154,7 +154,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
             "world": _world_of(flown.config),
             **laboratory_of(flown.config),
             **_graded(flown),
-            "thrown": flown.fast is not None and flown.fast.plant.world.thrown_t_s is not None,
+            "thrown": flown.fast is not None and flown.fast.plant.world.payload.thrown_t_s is not None,
             "caught": caught_t_s is not None,
             "felt": caught_t_s is not None and _felt(flown, caught_t_s),
             "caught_s": _mission_s(flown, caught_t_s),

@@ -190,7 +190,7 @@ class FastFlight:
         with _garbage_collection_paused():
             self._run(result, limit_s)
         result.crashed = world.crashed
-        result.caught = world.caught_t_s is not None
+        result.caught = world.payload.caught_t_s is not None
         return result
 
     def _run(self, result: FastResult, limit_s: float) -> None:

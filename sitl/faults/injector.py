@@ -20,7 +20,8 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.modes import NavState
 from sitl.servo.drive import COUNTS_PER_TURN, ServoDrive
 from sitl.world.model import SECOND, SECOND_CATCH
-from sitl.world.world import Ball, World
+from sitl.world.payload import Ball
+from sitl.world.world import World
 
 FULL_V = 16.6
 OVERHEATED_C = 80.0
@@ -111,7 +112,7 @@ class Faults:
             armed_t_s: world time of arming, or None.
         """
         self._now_s = t_s
-        origins = {"start": 0.0, "arming": armed_t_s, "catch": self._world.caught_t_s}
+        origins = {"start": 0.0, "arming": armed_t_s, "catch": self._world.payload.caught_t_s}
         for index, fault in enumerate(self._faults):
             origin_s = origins[fault.after]
             assert fault.t_s is not None
@@ -121,7 +122,7 @@ class Faults:
             if on is not self._on[index]:
                 self._on[index] = on
                 self._switch(fault, on, t_s)
-        if self._second is not None and self._world.catch(self._second):
+        if self._second is not None and self._world.payload.catch(self._second):
             self._second = None
         if t_s >= self._pilot_lands_s:
             self._pilot_lands_s = math.inf
@@ -160,12 +161,12 @@ class Faults:
                 x, y, z = world.attachment_world_m
                 world.snag = ((x, y, 0.0), z + size) if on else None
             case "payload_missed":
-                world.throw_aside_m = size if on else 0.0
+                world.payload.aside_m = size if on else 0.0
             case "payload_double" if on:
                 self._second = Ball.of(world.model, SECOND, SECOND_CATCH)
-                world.throw(self._second)
+                world.payload.throw(self._second)
             case "payload_dropped" if on:
-                world.drop()
+                world.payload.drop()
             case "servo_overload" if on:
                 self._shut_down_servo(fault.servo - 1, OVERLOAD)
             case "servo_hot":

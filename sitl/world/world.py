@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import mujoco
-import numpy as np
 
 from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
@@ -16,22 +15,18 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
 from sitl.world.effects.battery import BatteryPack
 from sitl.world.effects.downwash import Downwash
-from sitl.world.effects.net import Net
-from sitl.world.effects.rotors import Rotors
+from sitl.world.effects.rotors import LinearRotors, Rotors
 from sitl.world.effects.tether_line import TetherLine
-from sitl.world.effects.thrower import Thrower
 from sitl.world.handling import Wrench
 from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
-from sitl.world.model import PAYLOAD_RADIUS_M, ROTOR_HEIGHT_M, mjcf
+from sitl.world.model import ROTOR_HEIGHT_M, mjcf
+from sitl.world.payload import Payload
 
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
 _EFFECT_STEPS = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
 """Stiffness and damping of a snagged tether."""
-_THROW_LEAD_S = 0.45
-_THROW_BESIDE_M = 0.5
-"""Nothing is thrown if the vehicle passes `catch_at_m` farther to the side than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,23 +97,6 @@ class WorldEvent:
     """thrown, caught, taken (out of the net), missed, bounced_out (of the bag) or crashed."""
 
 
-class Ball(NamedTuple):
-    """Indices of a ball: body, first place in qpos and in qvel, and the constraint that holds it in the net."""
-
-    body: int
-    q: int
-    v: int
-    catch: int
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, name: str, catch: str) -> Ball:
-        """Look up a ball by the names of its body and its constraint."""
-        joint = model.joint(name).id
-        return cls(
-            model.body(name).id, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]), model.equality(catch).id
-        )
-
-
 class Effect(Protocol):
     """An effect that loads bodies of the world."""
 
@@ -148,16 +126,13 @@ class World:
         )
         self._base = m.body("base").id
         self._net = m.body("net").id
-        self._thrower = Thrower.of(config.thrower, config.seed)
-        self._has_payload = config.payload_kg > 0
-        if self._has_payload:
-            self._payload = Ball.of(m, "payload", "catch")
         self._park = [m.equality(name).id for name in ("park1", "park2")]
         self.parked = True
         """Whether a stand holds the arm."""
-        self._gain = 1.0 - math.exp(-PHYSICS_DT_S / config.rotor_lag_s)
         self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
-        self._rotors = Rotors.of(config.rotors, vehicle.airframe.rotor_arm_m, PHYSICS_DT_S)
+        self._rotors: Rotors | LinearRotors = Rotors.of(
+            config.rotors, vehicle.airframe.rotor_arm_m, PHYSICS_DT_S
+        ) or LinearRotors(config.rotor_lag_s, PHYSICS_DT_S)
         self.battery = BatteryPack.of(config.battery, config.battery_start, config.battery_life_s, self.weight_n)
         """The battery, or None if its effect is off."""
         self._crash_m = 0.6 * vehicle.airframe.ground_clearance_m
@@ -166,31 +141,16 @@ class World:
         """Share of each rotor's thrust that a fault leaves; None without a fault."""
         self.snag: tuple[Vec3, float] | None = None
         """Point where the tether is snagged, and its free length from there; None if it is free."""
-        self.throw_aside_m = 0.0
-        """Distance by which the throw misses the net."""
         self._tether = m.tendon("tether").id
         self._attachment = m.site("tether").id
         self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
-        self.thrown_t_s: float | None = None
-        self.caught_t_s: float | None = None
-        self.missed = False
-        """Whether the first throw missed the net."""
-        self.throws = self.catches = 0
-        """Number of throws and of catches so far."""
-        self._flies_since_s: float | None = None
-        """Time of the throw that is in flight; a throw that missed the net may still be caught."""
-        self._kept_since_s: float | None = None
-        """Time of the catch of the payload that is in the net."""
-        self._missed = False
-        """Whether the throw in flight has missed the net."""
         self.crashed = False
         self._events: list[WorldEvent] = []
-        self._last_x = start_position_m[0]
         d = self.data
         # Views: looking up MuJoCo's arrays in every step costs more than reading them.
         self._ctrl, self._qpos, self._qvel, self._sensordata = d.ctrl, d.qpos, d.qvel, d.sensordata
         self.loads = Loads(d)
-        self._bag = Net.of(config.net, m, d, self.loads, vehicle.tool.net_radius_m, PAYLOAD_RADIUS_M)
+        self.payload = Payload(self, vehicle, config)
         self.effects = self._effects_on()
         """Effects that load bodies and are on."""
         self._step = 0
@@ -223,6 +183,7 @@ class World:
             self.model.eq_data[park, 0] = angle
         mujoco.mj_forward(self.model, self.data)
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()
+        self.payload.await_pass()
 
     def sensors(self) -> list[float]:
         """Return sensordata after the last step; see `layout`."""
@@ -263,10 +224,7 @@ class World:
     @property
     def hover_command(self) -> float:
         """True normalised hover thrust without payload, at the battery's start and far from the ground."""
-        linear = self.weight_n / self._vehicle.airframe.thrust_max_n
         ratio = 1.0 if self.battery is None else self.battery.thrust_ratio(self.battery.hover_v)
-        if self._rotors is None:
-            return linear / ratio
         return self._rotors.hover_command(self.weight_n / 4.0, self._rotor_max_n * ratio, self._config.thr_mdl_fac)
 
     def step(self, rotor_commands: Vec4, joint_torque_nm: Vec2, airborne: bool = True, *, drag: bool = True) -> None:
@@ -278,57 +236,48 @@ class World:
             airborne: whether a payload may be thrown.
             drag: whether aerodynamic drag and wind act.
         """
-        k, most, rotors, battery = self._gain, self._rotor_max_n, self._rotors, self.battery
+        most, rotors, battery = self._rotor_max_n, self._rotors, self.battery
         if battery is not None:
             most *= battery.thrust_ratio(battery.voltage_v)
-        if rotors is None:
-            a, b, c, d = self._thrust
-            to_a, to_b, to_c, to_d = rotor_commands
-            self._thrust = thrust = (
-                a + k * (to_a * most - a),
-                b + k * (to_b * most - b),
-                c + k * (to_c * most - c),
-                d + k * (to_d * most - d),
-            )
-        else:
-            self._thrust = thrust = rotors.step(rotor_commands, most)
+        self._thrust = thrust = rotors.step(rotor_commands, most)
         if battery is not None:
             battery.step(PHYSICS_DT_S, thrust)
-        if rotors is not None:
-            (a, b, c, d), near = thrust, rotors.ground_effect(self.q[2] + ROTOR_HEIGHT_M)
-            thrust = (near * a, near * b, near * c, near * d)
+        (a, b, c, d), near = thrust, rotors.ground_effect(self.q[2] + ROTOR_HEIGHT_M)
+        thrust = (near * a, near * b, near * c, near * d)
         if self.rotor_share is not None:
             a, b, c, d = (force * share for force, share in zip(thrust, self.rotor_share, strict=True))
             thrust = (a, b, c, d)
         self._ctrl[:] = thrust + joint_torque_nm
-        force_n = ZERO
-        if drag:
-            (wx, wy, wz), v = self.wind_m_s, self.v
-            wx, wy, wz = wx - v[0], wy - v[1], wz - v[2]
-            force_n = (DRAG_N_PER_M_S * wx, DRAG_N_PER_M_S * wy, DRAG_N_PER_M_S * wz)
-            if rotors is not None:
-                (x, y, z), (hx, hy, hz) = force_n, rotors.drag_n(sum(thrust), (wx, wy, wz), self.q)
-                force_n = (x + hx, y + hy, z + hz)
-        if self.snag is not None:
-            (x, y, z), (px, py, pz) = force_n, self._snag_pull_n(*self.snag)
-            force_n = (x + px, y + py, z + pz)
-        self.loads.set(self._base, "drag and snag", force_n)
+        self.loads.set(self._base, "drag and snag", self._drag_and_snag_n(thrust, drag))
         if self.effects:
             if self._step % _EFFECT_STEPS == 0:
                 for effect in self.effects:
                     effect.apply(self)
             self._step += 1
-        if self._bag is None:
+        bag = self.payload.bag
+        if bag is None:
             self.loads.write()
             mujoco.mj_step(self.model, self.data)
-        elif self._bag.step(self.q, self.v, self.t_s):
-            self._events.append(WorldEvent(self.t_s, "bounced_out"))
+        elif bag.step(self.q, self.v, self.t_s):
+            self.report("bounced_out")
         self.t_s = self.data.time
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()
         self._sensors = None
-        if self._has_payload and not (self._kept_since_s is not None and self.throws == self._config.throws):
-            self._throw_and_catch(airborne)
+        self.payload.step(airborne)
         self._watch_crash()
+
+    def _drag_and_snag_n(self, thrust_n: Vec4, drag: bool) -> Vec3:
+        """Return the force of air and a snagged tether on the base, N, world frame."""
+        force_n = ZERO
+        if drag:
+            (wx, wy, wz), v = self.wind_m_s, self.v
+            wx, wy, wz = wx - v[0], wy - v[1], wz - v[2]
+            hx, hy, hz = self._rotors.drag_n(sum(thrust_n), (wx, wy, wz), self.q)
+            force_n = (DRAG_N_PER_M_S * wx + hx, DRAG_N_PER_M_S * wy + hy, DRAG_N_PER_M_S * wz + hz)
+        if self.snag is not None:
+            (x, y, z), (px, py, pz) = force_n, self._snag_pull_n(*self.snag)
+            force_n = (x + px, y + py, z + pz)
+        return force_n
 
     def release_arm(self) -> None:
         """Release the arm from its stand."""
@@ -341,109 +290,6 @@ class World:
         self.data.eq_active[self._park] = 1
         for park, angle in zip(self._park, angle_rad, strict=True):
             self.model.eq_data[park, 0] = angle
-
-    def _throw_and_catch(self, airborne: bool) -> None:
-        if self._kept_since_s is not None:
-            if self.t_s - self._kept_since_s >= self._config.keep_s:
-                self._take_out()
-            return
-        if self._flies_since_s is None:
-            vx = self.v[0]
-            ahead = self.q[0] + vx * _THROW_LEAD_S
-            at_x, at_y = self._config.catch_at_m
-            if airborne and vx > 0.05 and self._last_x < at_x <= ahead and abs(self.q[1] - at_y) <= _THROW_BESIDE_M:
-                self._throw()
-            self._last_x = ahead
-            return
-        caught_s = self._caught_s(self._payload)
-        if caught_s is not None:
-            self.catches += 1
-            if self.throws == 1:
-                self.caught_t_s = caught_s
-            self._flies_since_s, self._kept_since_s = None, caught_s
-            self._events.append(WorldEvent(self.t_s, "caught"))
-        elif (
-            not self._missed
-            and self.t_s - self._flies_since_s > 2 * _THROW_LEAD_S
-            and not (self._bag is not None and self._bag.in_bag(self._payload.body))
-        ):
-            self._missed = True
-            self.missed = self.missed or self.throws == 1
-            self._events.append(WorldEvent(self.t_s, "missed"))
-            if self.throws < self._config.throws:
-                self._flies_since_s = None
-                self._await_pass()
-
-    def _throw(self) -> None:
-        """Launch the payload so that it meets the net with the configured velocity."""
-        if self.throws == 0:
-            self.thrown_t_s = self.t_s
-        self.throws += 1
-        self._flies_since_s, self._missed = self.t_s, False
-        self.throw(self._payload, self.throw_aside_m)
-        self._events.append(WorldEvent(self.t_s, "thrown"))
-
-    def _take_out(self) -> None:
-        """Take the payload out of the net, so that it can be thrown again."""
-        ball, d = self._payload, self.data
-        self.drop()
-        self._kept_since_s = None
-        d.qpos[ball.q : ball.q + 7] = self.model.qpos0[ball.q : ball.q + 7]
-        d.qvel[ball.v : ball.v + 6] = 0.0
-        self._await_pass()
-        self._events.append(WorldEvent(self.t_s, "taken"))
-
-    def _await_pass(self) -> None:
-        """Wait with the next throw until the vehicle passes `catch_at_m` again."""
-        self._last_x = self.q[0] + self.v[0] * _THROW_LEAD_S
-
-    def throw(self, ball: Ball, aside_m: float = 0.0) -> None:
-        """Launch a ball so that it meets a point `aside_m` to the left (world y) of the net; a person misses that point."""
-        d, thrower = self.data, self._thrower
-        lead_s = _THROW_LEAD_S if thrower is None else _THROW_LEAD_S + thrower.prediction_error_s()
-        target = d.xpos[self._net] + d.qvel[0:3] * lead_s + np.array([0.0, aside_m, 0.0])
-        arrival = np.array(self._config.throw_velocity_m_s)
-        gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
-        velocity = arrival - gravity * _THROW_LEAD_S
-        point = target - velocity * _THROW_LEAD_S - 0.5 * gravity * _THROW_LEAD_S**2
-        q, v = ball.q, ball.v
-        if thrower is None:
-            d.qpos[q : q + 3], d.qvel[v : v + 3] = point, velocity
-        else:
-            d.qpos[q : q + 3], d.qvel[v : v + 3] = thrower.release(point.tolist(), velocity.tolist(), _THROW_LEAD_S)
-        d.qpos[q + 3 : q + 7] = (1, 0, 0, 0)
-        d.qvel[v + 3 : v + 6] = 0.0
-        if self._bag is not None:
-            self._bag.watch(ball.body, ball.q, ball.v)
-
-    def _caught_s(self, ball: Ball) -> float | None:
-        """Return the time of the catch if the ball is caught; otherwise None."""
-        if self._bag is not None:
-            return self._bag.caught_s(ball.body, self.t_s)
-        return self.t_s if self._attach(ball) else None
-
-    def catch(self, ball: Ball) -> bool:
-        """Return whether the ball is caught: it touches the net, which then holds it, or it has settled in the bag."""
-        return self._caught_s(ball) is not None
-
-    def _attach(self, ball: Ball) -> bool:
-        """Attach the ball to the net if it touches it; return whether it does."""
-        d = self.data
-        gap = d.xpos[ball.body] - d.xpos[self._net]
-        if float(gap @ gap) > self._vehicle.tool.net_radius_m**2:
-            return False
-        rotation = d.xmat[self._net].reshape(3, 3)
-        self.model.eq_data[ball.catch, 0:3] = rotation.T @ gap
-        self.model.eq_data[ball.catch, 3:6] = 0.0
-        d.eq_active[ball.catch] = 1
-        return True
-
-    def drop(self) -> None:
-        """Let the payload fall out of the net, if it is in there."""
-        if self._kept_since_s is not None:
-            self.data.eq_active[self._payload.catch] = 0
-            if self._bag is not None:
-                self._bag.let_go(self._payload.body)
 
     @property
     def attachment_world_m(self) -> Vec3:
@@ -481,7 +327,11 @@ class World:
         up = 1.0 - 2.0 * (x * x + y * y)
         if z < self._crash_m or up < 0.3 or not math.isfinite(z):
             self.crashed = True
-            self._events.append(WorldEvent(self.t_s, "crashed"))
+            self.report("crashed")
+
+    def report(self, kind: str) -> None:
+        """Note an event of this moment."""
+        self._events.append(WorldEvent(self.t_s, kind))
 
     def take_events(self) -> list[WorldEvent]:
         """Return the events since the last call."""

@@ -137,9 +137,9 @@ def test_a_row_is_what_the_flight_was(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (knobs.payload_kg, knobs.setpoint_delay_s, knobs.seed) == (0.25, 0.04, 5)
     assert (row["outcome"], row["why"], row["error"]) == ("completed", None, None)
     assert row["events"] == [event.id for outputs in flown.outputs for event in outputs.events]
-    assert (row["thrown"], row["caught"]) == (True, True) == (world.thrown_t_s is not None, flown.caught)
+    assert (row["thrown"], row["caught"]) == (True, True) == (world.payload.thrown_t_s is not None, flown.caught)
     begun_s = next(o.t_s - o.mission_t_s for o in flown.outputs if o.mission_t_s > 0)
-    assert row["caught_s"] + begun_s == pytest.approx(world.caught_t_s)
+    assert row["caught_s"] + begun_s == pytest.approx(world.payload.caught_t_s)
     errors = [
         position_error_m(i, o)
         for i, o in zip(flown.inputs, flown.outputs, strict=True)

@@ -44,7 +44,7 @@ def at(result: FastResult, mission_t_s: float) -> Outputs:
 def test_three_repetitions_catch_three_throws() -> None:
     result, world = flown("mission.repeat=3", "world.throws=3")
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert (world.throws, world.catches, world.missed) == (3, 3, False)
+    assert (world.payload.throws, world.payload.catches, world.payload.missed) == (3, 3, False)
     said = events(result)
     assert [name for name, _ in said] == [
         "takeoff", "catch", "payload_left", "catch", "payload_left", "catch", "touchdown"
@@ -54,7 +54,7 @@ def test_three_repetitions_catch_three_throws() -> None:
     left = [t_s for name, t_s in said if name == "payload_left"]
     for before_s, left_s in zip(caught, left, strict=False):
         assert before_s + 6.0 + 0.5 <= left_s < before_s + 6.0 + 1.0, "keep_s after the catch it is taken out"
-    assert world.caught_t_s is not None
+    assert world.payload.caught_t_s is not None
     assert result.outputs[-1].mission_t_s > CATCH_S + 2 * PERIOD_S
 
 
@@ -83,7 +83,7 @@ def test_the_phase_says_which_repetition_it_is() -> None:
 
 def test_one_throw_is_one_throw_however_often_it_passes() -> None:
     result, world = flown("mission.repeat=2")
-    assert (world.throws, world.catches) == (1, 1)
+    assert (world.payload.throws, world.payload.catches) == (1, 1)
     assert [name for name, _ in events(result)] == ["takeoff", "catch", "touchdown"], "it stays in the net"
 
 
@@ -93,7 +93,12 @@ def test_after_a_miss_the_next_pass_is_thrown_at() -> None:
         "mission.repeat=2", "world.throws=2", "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 12, size: 0.5}]"
     )
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert (world.throws, world.catches, world.missed, world.caught_t_s) == (2, 1, True, None)
+    assert (world.payload.throws, world.payload.catches, world.payload.missed, world.payload.caught_t_s) == (
+        2,
+        1,
+        True,
+        None,
+    )
     assert [name for name, _ in events(result)].count("catch") == 1
 
 
@@ -101,13 +106,13 @@ def test_a_dropped_payload_is_thrown_again() -> None:
     _, world = flown(
         "mission.repeat=2", "world.throws=2", "world.faults=[{kind: payload_dropped, t_s: 1, after: catch}]"
     )
-    assert (world.throws, world.catches) == (2, 2)
+    assert (world.payload.throws, world.payload.catches) == (2, 2)
 
 
 def test_the_committed_soak_mission_catches_in_the_fast_loop() -> None:
     result, world = flown("mission.repeat=1", mission="soak")
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert (world.throws, world.catches) == (1, 1)
+    assert (world.payload.throws, world.payload.catches) == (1, 1)
 
 
 def test_the_battery_lives_as_long_as_it_is_told() -> None:
@@ -131,7 +136,7 @@ def test_the_final_word_counts_throws_and_catches() -> None:
         Ports(),
         lambda message: None,
     )
-    sitl.plant.world.throws, sitl.plant.world.catches = 3, 2
+    sitl.plant.world.payload.throws, sitl.plant.world.payload.catches = 3, 2
     final = sitl.final()
     assert (final["throws"], final["catches"]) == (3, 2)
     assert (final["thrown"], final["caught"], final["missed"]) == (False, False, False)
@@ -146,7 +151,7 @@ def test_what_is_taken_out_of_the_net_lies_where_it_lay_before() -> None:
     at_net = world.data.xpos[world.model.body("net").id]
     q = int(world.model.jnt_qposadr[world.model.joint("payload").id])
     world.data.qpos[q : q + 3] = at_net
-    world.throws, world._flies_since_s = 1, world.t_s
+    world.payload.throws, world.payload._flies_since_s = 1, world.t_s
     seen = []
     for _ in range(200):
         world.step((0, 0, 0, 0), (0, 0), False)

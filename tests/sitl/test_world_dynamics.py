@@ -145,7 +145,7 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
     velocity = m.jnt_dofadr[m.joint("payload").id]
     d.qvel[velocity : velocity + 3] = speed
     mujoco.mj_forward(m, d)
-    world.throws, world._flies_since_s = 1, world.t_s
+    world.payload.throws, world.payload._flies_since_s = 1, world.t_s
 
     def momentum() -> Array:
         mujoco.mj_subtreeVel(m, d)
@@ -155,7 +155,7 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
     np.testing.assert_allclose(before, payload_kg * speed, rtol=1e-9)
     for _ in range(int(0.4 / PHYSICS_DT_S)):
         world.step((0, 0, 0, 0), (0, 0), False, drag=False)
-    assert world.caught_t_s is not None
+    assert world.payload.caught_t_s is not None
     away = d.xpos[payload] - d.xpos[m.body("net").id]
     assert np.linalg.norm(away) < 1.1 * vehicle.tool.net_radius_m, "the net did not keep the payload"
     assert np.linalg.norm(momentum() - before) <= 0.005 * np.linalg.norm(before)

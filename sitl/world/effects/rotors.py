@@ -23,6 +23,42 @@ def curve(signal: float, factor: float) -> float:
     return signal * (factor * signal + 1.0 - factor)
 
 
+class LinearRotors:
+    """Rotors whose thrust is linear in the signal, with one lag: those of a world in which the effect is off.
+
+    Args:
+        lag_s: time constant of the thrust.
+        dt_s: physics step.
+    """
+
+    def __init__(self, lag_s: float, dt_s: float) -> None:
+        self._gain = 1.0 - math.exp(-dt_s / lag_s)
+        self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
+
+    def step(self, signals: Vec4, full_n: float) -> Vec4:
+        """Advance by one physics step, as `Rotors.step`."""
+        k, (a, b, c, d), (to_a, to_b, to_c, to_d) = self._gain, self._thrust, signals
+        self._thrust = thrust = (
+            a + k * (to_a * full_n - a),
+            b + k * (to_b * full_n - b),
+            c + k * (to_c * full_n - c),
+            d + k * (to_d * full_n - d),
+        )
+        return thrust
+
+    def hover_command(self, each_n: float, full_n: float, thr_mdl_fac: float) -> float:
+        """Return the thrust setpoint as `Rotors.hover_command`."""
+        return each_n / full_n
+
+    def ground_effect(self, height_m: float) -> float:
+        """Return 1: there is none."""
+        return 1.0
+
+    def drag_n(self, thrust_n: float, airspeed_m_s: Vec3, q: Sequence[float]) -> Vec3:
+        """Return no force."""
+        return (0.0, 0.0, 0.0)
+
+
 class Rotors:
     """The four rotors, in PX4's quad-x order; `step` once per physics step.
 

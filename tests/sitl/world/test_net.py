@@ -21,7 +21,8 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.fast.loop import FastFlight
 from sitl.world.effects.net import SETTLED_S, Bag
 from sitl.world.model import PAYLOAD_RADIUS_M, SECOND, SECOND_CATCH
-from sitl.world.world import PHYSICS_DT_S, Ball, World
+from sitl.world.payload import Ball
+from sitl.world.world import PHYSICS_DT_S, World
 
 Array = NDArray[np.float64]
 HOOP_M = 0.09
@@ -31,6 +32,12 @@ CATCH_POSE = (math.radians(100), math.radians(60))
 @pytest.fixture(scope="module")
 def vehicle() -> Vehicle:
     return load_vehicle("configs/vehicles/tarot650_2r.yaml")
+
+
+def ball_of(world: World) -> Ball:
+    ball = world.payload.ball
+    assert ball is not None
+    return ball
 
 
 @dataclass
@@ -210,9 +217,9 @@ def thrown_at(world: World, ball: Ball, ball_from_net_m: Vec3, velocity_m_s: Vec
     d.qvel[ball.v : ball.v + 3] = axes @ np.array(velocity_m_s)
     mujoco.mj_forward(m, d)
     world.q, world.v = d.qpos.tolist(), d.qvel.tolist()
-    assert world._bag is not None
-    world._bag.watch(*ball[0:3])
-    world.throws, world._flies_since_s = 1, world.t_s
+    assert world.payload.bag is not None
+    world.payload.bag.watch(*ball[0:3])
+    world.payload.throws, world.payload._flies_since_s = 1, world.t_s
 
 
 @pytest.mark.parametrize("payload_kg", [0.1, 0.3])
@@ -224,7 +231,7 @@ def test_an_off_centre_catch_conserves_both_momenta(vehicle: Vehicle, payload_kg
     m, d = world.model, world.data
     m.opt.gravity[:] = 0
     d.qpos[2] = 1.5
-    thrown_at(world, world._payload, (0.05, -0.03, 0.1), (0.3, 0.1, -2.7))
+    thrown_at(world, ball_of(world), (0.05, -0.03, 0.1), (0.3, 0.1, -2.7))
 
     def momenta() -> tuple[Array, Array]:
         mujoco.mj_forward(m, d)
@@ -232,11 +239,11 @@ def test_an_off_centre_catch_conserves_both_momenta(vehicle: Vehicle, payload_kg
         return np.array(m.body_subtreemass[0] * d.subtree_linvel[0]), np.array(d.subtree_angmom[0])
 
     linear, angular = momenta()
-    payload_before = payload_kg * d.qvel[world._payload.v : world._payload.v + 3]
+    payload_before = payload_kg * d.qvel[ball_of(world).v : ball_of(world).v + 3]
     for _ in range(round(0.2 / PHYSICS_DT_S)):
         world.step((0, 0, 0, 0), (0, 0), False, drag=False)
     linear_after, angular_after = momenta()
-    payload_after = payload_kg * d.qvel[world._payload.v : world._payload.v + 3]
+    payload_after = payload_kg * d.qvel[ball_of(world).v : ball_of(world).v + 3]
     assert np.linalg.norm(payload_after - payload_before) > 0.5 * np.linalg.norm(payload_before), "an impact"
     assert np.linalg.norm(linear_after - linear) <= 0.01 * np.linalg.norm(linear)
     assert np.linalg.norm(angular_after - angular) <= 0.01 * np.linalg.norm(angular)
@@ -246,7 +253,7 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehic
     """On the floor, the arm held out level: the sensor reads the weight, and the weight times its lever."""
     config = WorldConfig(payload_kg=0.2, net=Net(on=True, pocket=1.0))
     world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
-    thrown_at(world, world._payload, (-0.02, 0.06, 0.05), (0.0, 0.0, -1.0))
+    thrown_at(world, ball_of(world), (-0.02, 0.06, 0.05), (0.0, 0.0, -1.0))
     for _ in range(round(4.0 / PHYSICS_DT_S)):
         world.step((0, 0, 0, 0), (0, 0), False)
     assert [event.kind for event in world.take_events()] == ["caught"]
@@ -254,7 +261,7 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehic
     net_weight_n = vehicle.tool.net_mass_kg * GRAVITY_M_S2
     weight_n = 0.2 * GRAVITY_M_S2
     assert truth.force_sensor_n[2] == pytest.approx(-weight_n - net_weight_n, rel=0.01)
-    lever_x_m, lever_y_m = world.data.xpos[world._payload.body][0:2] - world.data.xpos[world._net][0:2]
+    lever_x_m, lever_y_m = world.data.xpos[ball_of(world).body][0:2] - world.data.xpos[world._net][0:2]
     assert lever_y_m == pytest.approx(0.06, abs=0.01)
     assert truth.torque_sensor_nm[0] == pytest.approx(-weight_n * lever_y_m, rel=0.02)
     assert truth.torque_sensor_nm[1] == pytest.approx(weight_n * lever_x_m, rel=0.05)
@@ -263,29 +270,29 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehic
 def test_what_bounces_out_is_an_event_and_no_catch(vehicle: Vehicle) -> None:
     config = WorldConfig(payload_kg=0.1, net=Net(on=True))
     world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
-    thrown_at(world, world._payload, (0.0, 0.0, 0.1), (0.0, 0.0, -9.0))
+    thrown_at(world, ball_of(world), (0.0, 0.0, 0.1), (0.0, 0.0, -9.0))
     for _ in range(round(0.6 / PHYSICS_DT_S)):
         world.step((0, 0, 0, 0), (0, 0), False)
     assert [event.kind for event in world.take_events()] == ["bounced_out"]
-    assert world.caught_t_s is None
+    assert world.payload.caught_t_s is None
 
 
 def test_a_payload_falls_out_of_the_bag_when_it_is_dropped_and_can_be_thrown_again(vehicle: Vehicle) -> None:
     config = WorldConfig(throws=2, keep_s=1.0, net=Net(on=True))
     world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
-    lay = world.data.xpos[world._payload.body].copy()
-    thrown_at(world, world._payload, (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
+    lay = world.data.xpos[ball_of(world).body].copy()
+    thrown_at(world, ball_of(world), (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
     seen = []
     for step in range(round(1.3 / PHYSICS_DT_S)):
         world.step((0, 0, 0, 0), (0, 0), False)
         seen += [event.kind for event in world.take_events()]
         if step == round(0.7 / PHYSICS_DT_S):
             assert seen == ["caught"]
-            world.drop()
+            world.payload.drop()
         if step == round(0.95 / PHYSICS_DT_S):
-            assert world.data.xpos[world._payload.body][2] < 0.06, "on the floor"
+            assert world.data.xpos[ball_of(world).body][2] < 0.06, "on the floor"
     assert seen == ["caught", "taken"]
-    assert world.data.xpos[world._payload.body] == pytest.approx(lay, abs=0.01)
+    assert world.data.xpos[ball_of(world).body] == pytest.approx(lay, abs=0.01)
 
 
 def test_two_payloads_lie_in_the_bag(vehicle: Vehicle) -> None:
@@ -293,12 +300,12 @@ def test_two_payloads_lie_in_the_bag(vehicle: Vehicle) -> None:
     world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
     second = Ball.of(world.model, SECOND, SECOND_CATCH)
     thrown_at(world, second, (0.02, 0.0, 0.04), (0.0, 0.0, -1.0))
-    thrown_at(world, world._payload, (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
-    assert not world.catch(second)
+    thrown_at(world, ball_of(world), (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
+    assert not world.payload.catch(second)
     for _ in range(round(3.0 / PHYSICS_DT_S)):
         world.step((0, 0, 0, 0), (0, 0), False)
-    assert world.catch(second)
-    assert world.catches == 1
+    assert world.payload.catch(second)
+    assert world.payload.catches == 1
     both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + vehicle.tool.net_mass_kg)
     assert world.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)
 
@@ -309,6 +316,11 @@ def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> No
     flight = FastFlight(load_sitl("configs/missions/catch.yaml", overrides=overrides))
     result, world = flight.run(), flight.plant.world
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert (world.throws, world.catches, world.missed, world.caught_t_s) == (2, 1, True, None)
+    assert (world.payload.throws, world.payload.catches, world.payload.missed, world.payload.caught_t_s) == (
+        2,
+        1,
+        True,
+        None,
+    )
     ids = [event.id for output in result.outputs for event in output.events]
     assert ids == ["takeoff", "catch", "touchdown"]

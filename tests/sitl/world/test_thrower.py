@@ -55,8 +55,9 @@ def test_the_world_throws_with_the_errors_of_the_person() -> None:
 
     def thrown(thrower: ThrowerConfig) -> list[float]:
         world = World(vehicle, WorldConfig(thrower=thrower), (0.0, 0.0), 0.0, (2.0, 1.5))
-        ball = world._payload
-        world.throw(ball)
+        ball = world.payload.ball
+        assert ball is not None
+        world.payload.throw(ball)
         state = [*world.data.qpos[ball.q : ball.q + 3], *world.data.qvel[ball.v : ball.v + 3]]
         return [float(value) for value in state]
 
