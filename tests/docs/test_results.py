@@ -82,3 +82,52 @@ def test_a_file_that_names_no_command_is_refused(tmp_path: Path, capsys: pytest.
 def test_changes_beyond_the_commit_are_named() -> None:
     results: dict[str, Any] = {"settings": {"command": "companion compare"}, "versions": {"git": 40 * "a" + "-dirty"}}
     assert flown_by(results).strip() == "Flown by `companion compare` at commit aaaaaaaaaa with changes."
+
+
+def compared(world: str = "lab", first_seed: int = 1) -> dict[str, Any]:
+    """A compare.json of three laws with the adaptation on and off, in three laboratories."""
+    after_m = {
+        ("adaptive", "paper"): 0.2,
+        ("adaptive", "paper - adaptation off"): 0.4,
+        ("psc", "tuned"): 0.1,
+        ("csc", "tuned"): None,
+    }
+    rows = [
+        compare_row({**FLIGHT, "controller": law, "preset": preset, "seed": seed}, e_p_m)
+        for (law, preset), e_p_m in after_m.items()
+        for seed in range(first_seed, first_seed + 3)
+    ]
+    command = f"companion compare --first-seed {first_seed}"
+    return {"rows": rows, "settings": {"world": world, "command": command}, "versions": {"git": 40 * "a"}}
+
+
+def test_the_page_says_how_the_laboratory_differs_from_the_paper() -> None:
+    made = compare_doc.tables([compared(first_seed=1), compared(first_seed=4)])
+    assert "0.200 m at 0.2 kg (printed: 0.165, ratio 1.2)" in made["differences"]
+    assert "* CSC (csc/tuned) after the catch: failed at 0.2 kg (printed: 0.293)." in made["differences"]
+    assert "at 0.2 kg: PSC, proposed, CSC (printed: proposed, PSC, CSC)" in made["differences"]
+    assert "| csc/tuned | 0 of 6 (6 crashed) | 0.010 (0.010) | – |" in made["published"]
+    assert "6 laboratories (seeds 1 to 6), 18 flights" in made["published"]
+    assert made["published"].count("Flown by") == 2
+    assert "| adaptive/paper | 0.2 kg | 0 % | 0.400 | 0.200 | -50 % | 6 of 6 | 0.03 |" in made["adaptation"]
+    assert made["model error"] == made["extras"] == "Not flown."
+
+
+def test_results_of_different_worlds_do_not_share_a_page() -> None:
+    with pytest.raises(ValueError, match="different worlds: ideal, lab"):
+        compare_doc.tables([compared(), compared("ideal")])
+
+
+def test_plots_of_the_same_rows_are_the_same_bytes(tmp_path: Path) -> None:
+    (tmp_path / "compare.json").write_text(json.dumps(compared()), encoding="utf-8")
+    tables = [f"<!-- table: {table} -->\n<!-- end: {table} -->\n" for table in PAGES["compare"][0]]
+    shown = "![](pictures/compare_errors.svg) ![](pictures/compare_adaptation.svg)"
+    drawn = []
+    for name in ("a", "b"):
+        page = tmp_path / name / "page.md"
+        (page.parent / "pictures").mkdir(parents=True)
+        page.write_text("".join(tables) + shown, encoding="utf-8")
+        assert compare_doc.main([str(page), str(tmp_path / "compare.json")]) == 0
+        drawn.append({path.name: path.read_bytes() for path in (page.parent / "pictures").iterdir()})
+    assert set(drawn[0]) == {"compare_errors.svg", "compare_adaptation.svg"}
+    assert drawn[0] == drawn[1]

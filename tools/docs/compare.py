@@ -270,7 +270,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page and the plots beside it, into `pictures/`."""
+    """Write the tables into a page, and the plots that it shows into `pictures/` beside it."""
     parser = argparse.ArgumentParser(prog="tools.docs.compare")
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, nargs="+", help="compare.json of companion compare")
@@ -283,10 +283,10 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{', '.join(map(str, arguments.results))}: {reason}", file=sys.stderr)
         return 2
     code = write_page(arguments.page, found)
-    pictures = arguments.page.parent / "pictures"
-    pictures.mkdir(exist_ok=True)
-    for name, _, _, figure in distributions(aggregate(rows)):
-        write_svg(figure, pictures / f"compare_{name}.svg")
+    for name, _, _, figure in distributions(aggregate(rows)) if code == 0 else []:
+        picture = f"pictures/compare_{name}.svg"
+        if picture in arguments.page.read_text(encoding="utf-8"):
+            write_svg(figure, arguments.page.parent / picture)
     return code
 
 

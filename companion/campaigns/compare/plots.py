@@ -129,7 +129,7 @@ def distributions(groups: Sequence[Group]) -> list[tuple[str, str, str, Figure]]
     first = [group for group in groups if group.model_error == errors[0]]
     ablated = [group for group in first if is_ablation(group.preset) or (group.controller, group.preset) == ABLATED]
     for name, title, shown in (
-        ("errors", "Position errors", [group for group in first if group in whole]),
+        ("errors", "Position errors", [group for group in first if not is_ablation(group.preset)]),
         (
             "ablations",
             "Position errors of the ablations",
