@@ -22,12 +22,28 @@ from companion.safety.rotor_stop import (
     fresh_pose,
     hears_px4,
 )
-from companion.safety.touchdown import HEIGHT_MARGIN_M, NEVER_ABOVE_M, STILL_M_S, HeightEvidence, Sinking, low_below_m
+from companion.safety.touchdown import (
+    HEIGHT_HOLD_S,
+    HEIGHT_MARGIN_M,
+    NEVER_ABOVE_M,
+    STILL_M_S,
+    HeightEvidence,
+    Sinking,
+    low_below_m,
+)
 
 ZERO_THRUST_STREAM_S = 0.6
 """Zero-thrust setpoints are streamed for this time before OFFBOARD is requested, so that no older setpoint takes effect."""
 BEGUN_S = 1.0
 """Time from LAND to the start of PX4's descent. Before that a vehicle that does not sink is not evidence of touchdown."""
+DESCENT_M_S = 0.25
+"""PX4 descends when its estimate sinks faster; a third of MPC_LAND_SPEED."""
+DESCENT_HOLD_S = 0.3
+ARRESTED_SHARE = 0.5
+"""Share of the fastest descent. PX4 controls its estimated speed, so in the air the estimate does not slow down to less: the floor
+stops it."""
+DRIFT_M_S2 = 0.5
+"""Without motion capture the estimated height may be off by half of this times the square of the time."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
 FLIPPED = "flipped: FORCE_DISARM is requested at once"
@@ -50,6 +66,34 @@ class LandingStep:
 
 
 @dataclass(frozen=True, slots=True)
+class Arrest:
+    """Evidence of touchdown for an estimate that drifts: PX4's descent, by its own estimate, was stopped and not resumed.
+
+    Dead reckoning on an accelerometer with an error of 0.2 m/s^2 is 0.4 m/s and 0.4 m off after 2 s, so speed and height do not show
+    rest. The change of speed at the floor does.
+    """
+
+    descends_since_s: float | None = None
+    fastest_m_s: float = 0.0
+    """Fastest descent that lasted for `DESCENT_HOLD_S`; 0 before there was one."""
+    arrested_since_s: float | None = None
+
+    def update(self, t_s: float, up_m_s: float) -> Arrest:
+        """Return the evidence after one more tick of PX4's descent; `up_m_s` is its estimated vertical speed."""
+        descends = up_m_s < -max(DESCENT_M_S, ARRESTED_SHARE * self.fastest_m_s)
+        since_s = (t_s if self.descends_since_s is None else self.descends_since_s) if descends else None
+        lasting = since_s is not None and t_s - since_s >= DESCENT_HOLD_S
+        fastest_m_s = max(self.fastest_m_s, -up_m_s) if lasting else self.fastest_m_s
+        arrested = fastest_m_s > 0.0 and up_m_s > -ARRESTED_SHARE * fastest_m_s
+        arrested_since_s = (t_s if self.arrested_since_s is None else self.arrested_since_s) if arrested else None
+        return Arrest(since_s, fastest_m_s, arrested_since_s)
+
+    def stands(self, t_s: float) -> bool:
+        """Return whether the descent has been arrested for long enough."""
+        return self.arrested_since_s is not None and t_s - self.arrested_since_s >= HEIGHT_HOLD_S
+
+
+@dataclass(frozen=True, slots=True)
 class AutopilotLanding:
     """One landing in LAND mode."""
 
@@ -64,6 +108,7 @@ class AutopilotLanding:
     stop: RotorStop
     height: HeightEvidence
     sinking: Sinking = field(default_factory=Sinking)
+    arrest: Arrest = field(default_factory=Arrest)
     was_landing: bool = False
     standing_since_s: float | None = None
     touched_s: float | None = None
@@ -178,12 +223,18 @@ class AutopilotLanding:
         begun = since_s is not None and t_s - since_s > BEGUN_S
         fresh = vehicle is not None and t_s - vehicle.position_stamp_s < STATE_FRESH_S
         now = replace(self, pose_s=pose_s, sinking=sinking, landing_since_s=since_s)
-        if vehicle is None or not fresh or not begun or t_s - pose_s > ESTIMATE_TRUSTED_S:
-            return replace(now, height=replace(self.height, since_s=None)), False
+        if vehicle is None or not fresh or since_s is None or t_s - pose_s > ESTIMATE_TRUSTED_S:
+            return replace(now, height=replace(self.height, since_s=None), arrest=Arrest()), False
         height_m, up_m_s = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
+        arrest = self.arrest.update(t_s, up_m_s) if pose is None else Arrest()
+        now = replace(now, arrest=arrest)
+        if not begun:
+            return replace(now, height=replace(self.height, since_s=None)), False
         height = self.height.update(t_s, height_m, up_m_s, height_m - 1.0)
+        drift_m = 0.5 * DRIFT_M_S2 * (t_s - pose_s) ** 2
+        arrested = arrest.stands(t_s) and height_m < self.height.low_m + drift_m
         flies = pose is not None and self._flies_by_mocap(i, sinking.speed_m_s)
-        return replace(now, height=height), height.stands(t_s) and not flies
+        return replace(now, height=height), (height.stands(t_s) or arrested) and not flies
 
     def _flies_by_mocap(self, i: Inputs, sink_m_s: float | None) -> bool:
         high = i.mocap is not None and i.mocap.position_world_m[2] > self.clearance_m + NEVER_ABOVE_M

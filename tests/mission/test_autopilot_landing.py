@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+
+import pytest
 
 from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.model.types import (
@@ -15,6 +18,7 @@ from companion.model.types import (
     OperatorCommand,
     VehicleState,
 )
+from companion.safety.touchdown import HEIGHT_HOLD_S, HEIGHT_MARGIN_M
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ZERO = (0.0, 0.0, 0.0)
@@ -120,6 +124,43 @@ def test_a_height_that_does_not_arrive_any_more_is_no_touchdown() -> None:
     steps = [landing.step(seen(1.5 + k * 0.005, 0.31, mocap=False, position_s=1.2)) for k in range(400)]
     assert {step.request for step in steps} == {AutopilotRequest.LAND}
     assert not any(step.zero_thrust for step in steps)
+
+
+def blind_landing(up_m_s: Callable[[float], float], height_m: float) -> float | None:
+    """Time of zero thrust in a landing without motion capture with this estimated speed; None if there is none within 4 s."""
+    landing = Landing(pilot=False)
+    for k in range(1, 800):
+        t_s = k * 0.005
+        if landing.step(seen(t_s, height_m, sink_m_s=-up_m_s(t_s), mocap=False)).zero_thrust:
+            return t_s
+    return None
+
+
+@pytest.mark.parametrize("after_m_s", [-0.2, 0.0, 0.4])
+def test_a_descent_that_the_floor_stops_is_a_touchdown_although_the_estimate_drifts(after_m_s: float) -> None:
+    """The floor is touched after 2 s; dead reckoning is 0.5 m off by then, and not at rest."""
+    found_s = blind_landing(lambda t_s: -0.7 if 0.8 < t_s < 2.0 else after_m_s if t_s >= 2.0 else 0.0, 0.8)
+    assert found_s == pytest.approx(2.0 + HEIGHT_HOLD_S, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "up_m_s",
+    [
+        lambda t_s: 0.0,  # it brakes, and has not begun to descend
+        lambda t_s: -0.7,
+        lambda t_s: -0.7 if t_s < 1.5 else -0.4,  # PX4 descends more slowly near the floor
+        lambda t_s: -0.7 if t_s < 1.5 or t_s > 1.7 else 0.0,  # a gust
+    ],
+)
+def test_a_descent_that_goes_on_is_no_touchdown(up_m_s: Callable[[float], float]) -> None:
+    assert blind_landing(up_m_s, 0.8) is None
+
+
+def test_a_descent_that_ends_higher_than_the_estimate_can_have_drifted_is_no_touchdown() -> None:
+    assert (
+        blind_landing(lambda t_s: -0.7 if 0.5 < t_s < 1.0 else 0.0, 2.0 + CLEARANCE_M + HEIGHT_MARGIN_M + 0.25 * 16)
+        is None
+    )
 
 
 def test_sinking_is_no_touchdown() -> None:
