@@ -28,7 +28,7 @@ JITTER = Check(
 LATENCY = Check(
     "mocap.latency",
     "mocap latency",
-    "`safety.mocap_latency_warn_s`, and reported by the server; `safety.mocap_timeout_s` refuses",
+    "`safety.mocap_latency_warn_s`, and reported by the server; `safety.mocap_latency_max_s` refuses",
     "EKF2_EV_DELAY is 5 ms: older poses are fused as if they were current",
 )
 LOST = Check(
@@ -116,7 +116,7 @@ def _jitter(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
 
 
 def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
-    limit_s, worst_s = vehicle.safety.mocap_latency_warn_s, vehicle.safety.mocap_timeout_s
+    limit_s, worst_s = vehicle.safety.mocap_latency_warn_s, vehicle.safety.mocap_latency_max_s
     wanted = f"{limit_s * 1e3:.0f} ms"
     latency_s = sorted(pose.latency_s for pose in poses if pose.latency_s is not None)
     if not latency_s:

@@ -125,12 +125,12 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id="mocap_late", subject=Subject.MOCAP, what="latency too large", predicate=mocap.mocap_late,
-        thresholds=("mocap_latency_warn_s", "mocap_timeout_s"), hold_time=0.2, ground=_WARN, air=_WARN,
+        thresholds=("mocap_latency_warn_s", "mocap_latency_max_s"), hold_time=0.2, ground=_WARN, air=_WARN,
         message="motion capture is {:.0f} ms late (limit {:.0f} ms)",
     ),
     Rule(
         id="mocap_too_late", subject=Subject.MOCAP, what="latency so large that the poses count as lost",
-        predicate=mocap.mocap_too_late, thresholds=("mocap_latency_warn_s", "mocap_timeout_s"), hold_time=0.1,
+        predicate=mocap.mocap_too_late, thresholds=("mocap_latency_warn_s", "mocap_latency_max_s"), hold_time=0.1,
         ground=_PX4_LANDS, air=_PX4_LANDS, message="motion capture is {:.0f} ms late (limit {:.0f} ms)",
     ),
     Rule(

@@ -217,11 +217,11 @@ def test_a_tether_that_holds_it_brings_it_down(kind: FaultKind) -> None:
     assert {"tether_taut", "tether_snagged"} & set(row["events"])
 
 
-@pytest.mark.parametrize("duration_s", [0.2, None])
+@pytest.mark.parametrize("duration_s", [0.3, None])
 def test_mocap_lost_in_the_middle_of_the_line(duration_s: float | None) -> None:
     row = flown("mocap_loss", "line", None, duration_s, config=CONFIG)
     assert row["outcome"] == "landed"
-    assert row["reacted_s"] <= 0.15
+    assert row["reacted_s"] <= CONFIG.vehicle.safety.mocap_timeout_s + 0.03
     assert row["drift_m"] <= StopModel(CONFIG.vehicle.tether).distance_m(LINE_M_S)
 
 

@@ -131,7 +131,7 @@ class HealthEvaluator:
             return HealthLevel.BAD, "rigid body not tracked"
         if not snapshot.outputs.mocap_trusted:
             return HealthLevel.BAD, "rejected: poses jump or are frozen"
-        if not late_s <= s.mocap_timeout_s:
+        if not late_s <= s.mocap_latency_max_s:
             return HealthLevel.BAD, f"{late_s * 1e3:.0f} ms late by Motive's clock"
         light = _level_by_age(age_s, s.mocap_timeout_s)
         if light is HealthLevel.OK and late_s > s.mocap_latency_warn_s:
