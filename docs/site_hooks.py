@@ -1,4 +1,5 @@
-"""What the site needs beside the pages (MkDocs hooks): files of the repository that pages link to, and headings' names as on GitHub.
+"""What the site needs beside the pages (MkDocs hooks): files of the repository that pages link to, headings' names as on GitHub, and
+how many commits figures are behind the code.
 
 Pages are written to be read in the repository. In the site, a link that leaves docs/ leads to a copy below `repository/`.
 """
@@ -7,7 +8,9 @@ from __future__ import annotations
 
 import posixpath
 import re
+import subprocess
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -15,6 +18,16 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 OUTSIDE = "repository"
+FLIGHT_CODE = (
+    "companion/config/presets",
+    "companion/control",
+    "companion/core",
+    "companion/safety",
+    "companion/sitl_config",
+    "sitl",
+)
+"""What the figures of a flight depend on."""
+_COMMIT = re.compile(r"\bat commit ([0-9a-f]{7,40})\b")
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 
 
@@ -47,7 +60,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links that leave docs/ to the copies; indent what stands in a numbered list as MkDocs wants it."""
+    """Lead links that leave docs/ to the copies; indent what stands in a numbered list as MkDocs wants it; age the figures."""
     uri = page.file.src_uri
     place = uri.removeprefix(f"{OUTSIDE}/") if uri.startswith(f"{OUTSIDE}/") else f"docs/{uri}"
 
@@ -55,7 +68,20 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         linked = posixpath.normpath(posixpath.join(posixpath.dirname(place), link[1]))
         return posixpath.relpath(_uri(linked), posixpath.dirname(uri) or ".")
 
+    root = Path(config.config_file_path).parent
+    markdown = _COMMIT.sub(lambda found: found[0] + _age(found[1], root), markdown)
     return _outside_of_fences(markdown, lambda text: re.sub(r"^ {3}(?=\S)", " " * 4, _LINK.sub(led, text), flags=re.M))
+
+
+@cache
+def _age(commit: str, root: Path) -> str:
+    """` (12 later commits change the code of flights)`; empty if there is none, or without git or the commit."""
+    command = ["git", "rev-list", "--count", f"{commit}..HEAD", "--", *FLIGHT_CODE]
+    try:
+        later = int(subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return f" ({later} later commits change the code of flights)" if later else ""
 
 
 def _uri(path: str) -> str:

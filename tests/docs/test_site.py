@@ -78,6 +78,15 @@ def test_it_loads_nothing_from_a_network(site: Path) -> None:
     assert (site / "search/search_index.json").is_file()
 
 
+def test_figures_say_how_far_they_are_behind_the_code(site: Path) -> None:
+    found = re.findall(r"at commit (\w+)(?: \((\d+) later commits)?", text_of(site / "robustness.html"))
+    assert found
+    for commit, later in found:
+        command = ["git", "rev-list", "--count", f"{commit}..HEAD", "--", "companion/control", "sitl"]
+        counted = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        assert int(later or 0) >= int(counted.stdout or 0)
+
+
 def test_links_within_it_lead_somewhere(site: Path) -> None:
     ids = {file: set(re.findall(r'\bid="([^"]+)"', text_of(file))) for file in site.rglob("*.html")}
     wrong = []
