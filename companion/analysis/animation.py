@@ -63,7 +63,7 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
 
     Args:
         log: log of the flight.
-        summary: its summary: mass of the payload, and the simulated world.
+        summary: summary of the flight, with the payload's mass and the simulated world.
     """
     flying = np.flatnonzero([o.phase_kind in _FLYING for o in log.outputs])
     moving = (log.columns.mocap_position_world_m, log.columns.arm_rad)
@@ -108,7 +108,7 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
 
 
 def _end(log: FlightLog, flying: npt.NDArray[np.intp], scene: Scene) -> int:
-    """Return the index of the last frame: the reference of a landing reaches the floor, below which it goes to detect touch-down."""
+    """Return the index of the last frame, at which the reference of a landing reaches the floor."""
     landing = np.array([log.outputs[k].phase_kind is PhaseKind.LANDING for k in flying])
     low = log.columns.reference_position_world_m[flying, 2] < scene.standing_height_m
     return int(flying[np.argmax(landing & low)] if (landing & low).any() else flying[-1])
@@ -132,7 +132,7 @@ def _times(first_s: float, last_s: float, catch_s: float | None) -> Iterator[tup
 
 
 class _Track:
-    """Poses of vehicle, arm and payload. A missing measurement is replaced by the one before it."""
+    """Poses of vehicle, arm and payload. A missing measurement is replaced by the previous one."""
 
     def __init__(self, log: FlightLog, scene: Scene, caught: int | None, throw_velocity_m_s: Array | None) -> None:
         columns = log.columns

@@ -16,9 +16,9 @@ from companion.model.types import PhaseKind
 
 FIT_MIN_S = 2.0
 PIECE_S = 1.0
-"""Length of an independent piece of data: neighbouring ticks are correlated by the vertical loop, pieces of seconds are not."""
+"""Length of an independent piece of data: the vertical loop correlates neighbouring ticks, but not pieces of seconds."""
 SLOPE_MIN_V = 0.3
-"""Least change of the voltage for which a slope is fitted."""
+"""Smallest change of the voltage for which a slope is fitted."""
 
 
 class HoverFitError(ValueError):
@@ -39,7 +39,7 @@ class HoverFit:
     """Result of the fit; hover thrust is normalised, 0 to 1."""
 
     hover_thrust: float
-    """At `voltage_mean_v`."""
+    """Hover thrust at `voltage_mean_v`."""
     standard_error: float
     """Standard error from noise alone; it does not contain an error of the configured mass."""
     used_s: float
@@ -49,11 +49,11 @@ class HoverFit:
     last_estimate: float | None
     """The flight's own estimate at its end; the same as `configured` if the estimator was off."""
     voltage_mean_v: float | None
-    """None if the autopilot did not report it throughout."""
+    """Mean battery voltage; None if PX4 did not report it throughout."""
     voltage_span_v: float | None
     """Largest minus smallest voltage, V."""
     slope: VoltageSlope | None
-    """None if the voltage is not known or did not change enough."""
+    """Slope over the voltage; None if the voltage is unknown or changed too little."""
 
 
 def fit_hover_thrust(log: FlightLog) -> HoverFit:
@@ -93,7 +93,7 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
 
 
 def _calm(log: FlightLog) -> Array:
-    """Return the valid ticks: duration s, thrust, load as a share of the weight, battery V (NaN if not known)."""
+    """Return the valid ticks: duration s, thrust, load as a share of the weight, battery V (NaN if unknown)."""
     vehicle = log.config.get("vehicle") or {}
     mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
     force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)

@@ -1,4 +1,4 @@
-"""Read a flight log (MCAP), also one that was never closed, into the records of `companion.model`."""
+"""Reads a flight log (MCAP), even an unclosed one, into the records of `companion.model`."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _FORMER_KEY, _KEY = b'"bent_by"', b'"limited_by"'
 
 
 class LogError(Exception):
-    """The file is not a flight log, or not one that can be used for this. The text is one line for the user."""
+    """The file is not a flight log, or not usable for the purpose. The text is one line for the user."""
 
 
 @dataclass(frozen=True)
 class FlightLog:
-    """A flight: three lists of the same length, one entry per recorded tick, in order. Of a long flight ticks may be left out."""
+    """A flight: three lists of equal length with one entry per recorded tick, in order. A long flight may be thinned (`stride`)."""
 
     path: Path
     inputs: tuple[Inputs, ...]
@@ -62,8 +62,8 @@ class FlightLog:
                 None keeps all, which a replay needs.
 
         Raises:
-            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records of another
-                shape. A field that may be None and is missing in an older version is read as None.
+            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records with other
+                fields. A field that may be None and is missing in an older version is read as None.
         """
         rows = _Rows(ticks_max)
         metadata: dict[str, dict[str, str]] = {}
@@ -83,7 +83,7 @@ class FlightLog:
                     closed = True
         except RecordError as error:
             raise LogError(
-                f"{path}: records of another shape ({error}); it was written by {writer(metadata)}, open it with that version"
+                f"{path}: records with other fields ({error}); it was written by {writer(metadata)}, open it with that version"
             ) from None
         except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
@@ -126,7 +126,7 @@ class FlightLog:
 
     @cached_property
     def timing(self) -> Timing:
-        """Return the timing of every recorded tick, also of those that are not kept."""
+        """Return the timing of every recorded tick, kept or not."""
         return self.measured or timing_of(self.rows())
 
     def rows(self) -> Iterator[tuple[Inputs, Outputs, Sent]]:
@@ -191,18 +191,18 @@ class _Rows:
 
     @property
     def measured(self) -> Timing | None:
-        """Return the timing of all ticks, or None if the kept ticks are all."""
+        """Return the timing of all ticks, or None if all ticks are kept."""
         return self._stopwatch.read() if self._stopwatch is not None and self.stride > 1 else None
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Arrays with one row per tick; NaN where a value was not known. World ENU, body FLU."""
+    """Arrays with one row per tick; NaN where a value is unknown. World ENU, body FLU."""
 
     t_s: Array
     mission_t_s: Array
     mocap_position_world_m: Array
-    """From valid frames with an age of `GRADED_POSE_MAX_AGE_S` or less."""
+    """Position from valid frames with an age of `GRADED_POSE_MAX_AGE_S` or less."""
     mocap_attitude_rad: Array
     """Roll, pitch, yaw (ZYX)."""
     mocap_age_s: Array
@@ -260,7 +260,7 @@ def _mcap_records(path: Path) -> Iterator[Any]:
         try:
             yield from StreamReader(file, validate_crcs=True).records
         except InvalidMagic:
-            raise LogError(f"{path}: is no MCAP file; expected a flight log such as flight.mcap") from None
+            raise LogError(f"{path}: is not an MCAP file; expected a flight log such as flight.mcap") from None
         except (EndOfFile, struct.error):
             if file.read(1):
                 raise LogError(f"{path}: damaged before its end") from None

@@ -22,7 +22,7 @@ TARGET = tuple(np.array(row) for row in ([1.0] * 3 + [0.1] * 2, [40.0] * 3 + [0.
 """M_d, K_d and K_p of x, y, z and both joints that every law is graded against: the paper's (tab:control_parameters)."""
 _TARGET_ROWS = [0, 1, 2, 6, 7]
 DESIRED_FORCE_TIME_S = 0.5
-"""Time constant of the desired force of that target: a payload that stays is carried, not answered."""
+"""Time constant of the desired force of that target: a lasting payload is carried instead of yielded to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,9 +138,9 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
     """Return the RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m), against one target for every law.
     None if a part of it was not logged, and for a log with ticks left out.
 
-    dI = M_d e'' + K_d e' + K_p e - e_tau with `TARGET`, the paper's table, whatever the law's own gains: against its own gains a stiff
-    law would look worse by definition. On the joints e_tau is J'(F - F_d), where F_d is F low-passed by `DESIRED_FORCE_TIME_S`; it is 0
-    on the base. Derivatives are central differences, low-passed at 10 Hz without phase shift.
+    dI = M_d e'' + K_d e' + K_p e - e_tau with `TARGET`, the paper's table, whatever the law's own gains: measured by its own gains, a
+    stiff law would look worse by definition. On the joints e_tau is J'(F - F_d), where F_d is F low-passed by `DESIRED_FORCE_TIME_S`;
+    it is 0 on the base. Derivatives are central differences, low-passed at 10 Hz without phase shift.
     """
     if log.stride > 1:
         return None, None  # derivatives need every tick
@@ -240,7 +240,7 @@ def percentiles(durations_s: Array) -> Percentiles | None:
 def slack_m(log: FlightLog) -> Array:
     """Return the tether length minus the distance from the anchor to the attachment point, by motion capture, for each tick.
 
-    NaN on the ground and where it is not known.
+    NaN on the ground and where it is unknown.
     """
     slack = np.full(len(log.inputs), np.nan)
     tether = (log.config.get("vehicle") or {}).get("tether")
@@ -257,7 +257,7 @@ def slack_m(log: FlightLog) -> Array:
 
 
 def min_slack_m(log: FlightLog) -> float | None:
-    """Return the least of `slack_m`; None if it is never known."""
+    """Return the smallest `slack_m`, or None if it is never known."""
     slack = slack_m(log)
     return float(np.nanmin(slack)) if np.isfinite(slack).any() else None
 

@@ -1,4 +1,4 @@
-"""Build self-contained HTML pages: one file with embedded pictures, also for printing."""
+"""Builds self-contained HTML pages: one file with embedded pictures, suitable for printing."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class Page:
     good: bool = True
     """Whether the verdict is good."""
     notes: Sequence[str] = ()
-    """What the reader must know before the figures."""
+    """Notes to read before the figures."""
     badge: str = ""
     """The outcome, beside the title."""
     player_html: str = ""
-    """Element that plays an animation of the flight; inserted as it is."""
+    """HTML element that plays an animation of the flight; inserted unchanged."""
     width_rem: int = 86
     """Largest width of the text."""
 
@@ -81,7 +81,7 @@ def _environment() -> Environment:
 
 
 def _indices(text: str) -> Markup:
-    """Escape the text and show the indices of symbols such as e_p as such."""
+    """Escape the text and format the indices of symbols such as e_p as subscripts."""
     return Markup(_INDEX.sub(r"\1<sub>\2</sub>", str(escape(text))))
 
 

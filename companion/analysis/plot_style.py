@@ -18,9 +18,9 @@ INK = "#22303c"
 SOFT = "#8b98a5"
 CATCH = "#c2255c"
 DASHED = (0, (4, 2))
-"""Line style of a reference, beside what was flown."""
+"""Line style of a reference; the flown motion is solid."""
 COLOURS = ("#0072b2", "#d55e00", "#000000", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a5cc2", "#6b705c", "#a3b18a")
-"""The first six are of Okabe and Ito, "Color Universal Design": distinct with any colour blindness."""
+"""Colours of the plot lines. The first six are by Okabe and Ito, "Color Universal Design", for readers with any colour blindness."""
 
 
 def new_figure(height_in: float) -> Figure:
@@ -40,7 +40,7 @@ def write_svg(figure: Figure, path: Path) -> None:
 
 
 def dress(ax: Any) -> None:
-    """Draw the grid behind the data, no frame above and on the right, and quiet labels."""
+    """Draw the grid behind the data, only the left and lower axes, and small labels."""
     ax.grid(True, color="#e6eaee", lw=0.7)
     ax.set_axisbelow(True)
     ax.tick_params(colors=INK, labelsize=9, length=3)
@@ -54,7 +54,7 @@ def dress(ax: Any) -> None:
 
 
 def figure_legend(figure: Figure, title: str, handles: Sequence[Any], names: Sequence[str], columns: int) -> None:
-    """Write title and legend above the axes; a `$` in a name is shown as such."""
+    """Write title and legend above the axes; a `$` in a name is shown literally."""
     figure.legend(
         handles, [name.replace("$", r"\$") for name in names], loc="outside upper left", ncols=min(columns, len(names)), fontsize=8.5,
         frameon=False, handlelength=2.6, title=title, title_fontproperties={"size": 13, "weight": "bold"}, alignment="left",

@@ -25,7 +25,7 @@ _REFERENCE = "#55626e"
 _SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
 _SERIES_DARK = ("#0b365c", "#7d3d05")  # a reference drawn over its own measurement
 _PHASES_NAMED_MAX = 40
-"""With more phases than this only their kinds are distinguished."""
+"""Number of phases above which only their kinds are distinguished."""
 _PHASES = {
     PhaseKind.TAKEOFF: "#eaf3fb",
     PhaseKind.FLIGHT: "#ffffff",
@@ -48,7 +48,7 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
         return []
     makers: tuple[tuple[str, str, str, Callable[[FlightLog], Figure | None]], ...] = (
         ("tracking", "Tracking", "Position and attitude by motion capture against the reference.", _tracking),
-        ("actuation", "Actuation", "Commands of the law and the values that were sent.", _actuation),
+        ("actuation", "Actuation", "Commands of the law and the values sent.", _actuation),
         ("adaptation", "Adaptation", "Switching gain and its adapted parameters.", _adaptation),
         (
             "load",
@@ -61,7 +61,7 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
         (
             "timing",
             "Timing",
-            "Lateness of the control tick, what ticks and bus reads took, and the two latencies that matter.",
+            "Lateness of the control tick, durations of ticks and bus reads, and the two main latencies.",
             _timing,
         ),
     )
@@ -195,7 +195,7 @@ def _path(log: FlightLog) -> Figure | None:
         if caught is not None:
             ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=CATCH, mew=1.8, label="catch", zorder=4)
         ax.set_ylabel(f"{name} [m]")
-        # A straight path gets room: noise of millimetres is not to look like a slalom.
+        # A straight path gets margins, so that noise of millimetres does not look large.
         low, high = np.nanmin([flown[:, row], wanted[:, row]]), np.nanmax([flown[:, row], wanted[:, row]])
         middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
         ax.set_ylim(middle - half, middle + half)
@@ -293,7 +293,7 @@ def _mark_phases(log: FlightLog, axes: list[Any]) -> None:
                 if start:
                     ax.axvline(begin_s, color="#d5dbe1", lw=0.8, zorder=1)
             name = outputs[start].phase if named else outputs[start].phase_kind.value
-            # A name is written where it fits: about 90 characters fill the whole axis.
+            # A name is written only where it fits: about 90 characters fill the whole axis.
             if (end_s - begin_s) / whole_s > 0.012 * len(name):
                 middle_s = (begin_s + end_s) / 2
                 transform = axes[0].get_xaxis_transform()

@@ -1,4 +1,4 @@
-"""Run the core again on a log's inputs and compare every output bit for bit."""
+"""Runs the core again on a log's inputs and compares every output bit for bit."""
 
 from __future__ import annotations
 
@@ -60,9 +60,7 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
         reason = str(error).splitlines()[0]
         raise LogError(f"{log.path}: the recorded configuration does not fit this version: {reason}") from None
     for k, (inputs, logged) in enumerate(zip(log.inputs, log.outputs, strict=True)):
-        recomputed = from_packet(
-            Outputs, to_packet(core.step(inputs))
-        )  # as a log holds it: 1 in a float's place is 1.0
+        recomputed = from_packet(Outputs, to_packet(core.step(inputs)))  # as in a log, where a float 1 is 1.0
         found = differences(logged, recomputed)
         if found is not None:
             field, old, new = found
@@ -88,7 +86,8 @@ def check_replayable(log: FlightLog) -> str:
         )
     if about.get("records") != fingerprint(Inputs, Outputs, Sent):
         raise LogError(
-            f"{log.path}: its records are not those of today; it was written by {writer(log.metadata)}, replay it with that version"
+            f"{log.path}: its records have other fields than this version's; it was written by "
+            f"{writer(log.metadata)}, replay it with that version"
         )
     config_json = log.config_json
     if config_json is None:

@@ -89,9 +89,9 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
         ("least tether slack", _number(summary["tether"]["min_slack_m"], 2, " m")),
     ]
     if summary.get("catch_confirmed") is False:
-        flight.insert(1, ("catch confirmed", "no, the flight ended too soon after it"))
+        flight.insert(1, ("catch confirmed", "no, the flight ended too soon after the impact"))
     if stride > 1:
-        flight.append(("long flight: graded and drawn is", f"every {stride}th tick"))
+        flight.append(("long flight: graded and drawn", f"every {stride}th tick"))
     timing = [
         (name, *(_number(figures[key], 2) for key in ("p50", "p99", "max")))
         for name, figures in (

@@ -44,7 +44,7 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Everything that moves, at one time."""
+    """Pose of all moving parts at one time."""
 
     position_world_m: Vec3
     attitude_wxyz: Quat
@@ -64,7 +64,7 @@ class Camera:
             target_m: world point in the middle of the frame.
             yaw_rad: horizontal direction of view, counted from world x.
             pitch_rad: angle of the view below the horizon.
-            distance_m: from the eye to the target.
+            distance_m: distance from the eye to the target.
             size_px: width and height of the frame, which shows `VIEW_M` of height at the target.
         """
         cy, sy, cp, sp = math.cos(yaw_rad), math.sin(yaw_rad), math.cos(pitch_rad), math.sin(pitch_rad)
@@ -111,7 +111,7 @@ class Scene:
             KeyError, TypeError: the section lacks a value.
         """
         airframe, arm, tool, tether = vehicle["airframe"], vehicle["arm"], vehicle["tool"], vehicle["tether"]
-        rotor_arm_m = airframe.get("rotor_arm_m", 0.6 * airframe["radius_m"])  # logs before it was in the vehicle file
+        rotor_arm_m = airframe.get("rotor_arm_m", 0.6 * airframe["radius_m"])  # older logs lack it in the vehicle file
         self._hub_m: float = rotor_arm_m * math.sqrt(0.5)
         self._disk_m: float = airframe["radius_m"] - rotor_arm_m
         self._foot_m: float = airframe["ground_clearance_m"]

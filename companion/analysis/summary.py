@@ -1,4 +1,4 @@
-"""summary.json: the contract that outside scripts rely on. Every key is always present; None (null) where a value is not known."""
+"""summary.json: the contract that outside scripts rely on. Every key is always present; None (null) where a value is unknown."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def empty_summary(
     payload_kg: float | None = None,
     recorder: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the summary of a flight that left no log; arguments as for `summarise`."""
+    """Return the summary of a flight that left no log; arguments are those of `summarise`."""
     recorder = recorder or {}
     return {
         "outcome": outcome,
@@ -66,8 +66,8 @@ def summarise(
         log: the flight.
         outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
         controller: adaptive, csc or psc.
-        preset: a built-in one or the name of a user's preset.
-        payload_kg: truth from SITL; None on hardware.
+        preset: built-in preset or name of a user's preset.
+        payload_kg: true mass in SITL; None on hardware.
         recorder: the recorder's own report (samples, dropped, error); None to count from the log.
 
     Returns:
@@ -109,7 +109,7 @@ def summarise(
 
 
 def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
-    """Return the log's configuration, with that of the simulated world if the summary holds it; empty if the log has none."""
+    """Return the log's configuration, with the simulated world's if the summary has it; empty if the log has none."""
     world = summary.get("world")
     if not log.config or not world:
         return log.config
@@ -121,7 +121,7 @@ def world_text(world: dict[str, Any] | None) -> str:
     """Return name, seed and model error of a simulated world on one line; empty for a flight on the vehicle.
 
     Args:
-        world: of a summary or an effective configuration; older ones have no name.
+        world: world of a summary or an effective configuration; older ones have no name.
     """
     if not world:
         return ""

@@ -1,4 +1,4 @@
-"""A table as data: columns say how an item is shown, and the terminal and an HTML page (`page.html`) show the same cells."""
+"""A table as data: columns format an item, and the terminal and an HTML page (`page.html`) show the same cells."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STYLES = {"bad": "red", "warning": "yellow", "critical": "red", "soft": "dim", "
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """How one flight is drawn in the plots; a page shows the line beside the flight's name."""
+    """Line style of one flight in the plots; a page shows the line beside the flight's name."""
 
     colour: str
     dashes: tuple[float, ...] = ()
@@ -39,15 +39,15 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: its title and how it shows an item."""
+    """One column: its title and the format of its items."""
 
     title: str
-    """May have several lines."""
+    """Title, which may have several lines."""
     show: Callable[[Any], str | Cell]
     left: bool = False
     """Align left; numbers are aligned right."""
     kind: str = ""
-    """The kind of every cell that has none of its own."""
+    """Default kind of the cells."""
     line: Line | None = None
 
 
@@ -84,11 +84,11 @@ def table(
     """Show items as a table.
 
     Args:
-        columns: how each item is shown.
-        items: one per row.
-        title: above the table.
-        kind: kind of an item's row, a key of `STYLES` or empty.
-        group: neighbouring items with equal values stand together, with a rule between the groups.
+        columns: columns of the table.
+        items: items, one per row.
+        title: title above the table.
+        kind: returns the kind of an item's row, a key of `STYLES` or empty.
+        group: returns the group of an item; a rule separates neighbouring groups.
         folded: see `Table.folded`.
     """
     rows = []

@@ -1,4 +1,4 @@
-"""Timing of every tick of a flight. It is small enough to keep for all ticks even if only some of the ticks are kept."""
+"""Timing of every tick of a flight. It is small enough to be kept for all ticks even if only some of the ticks are kept."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ class Timing:
     first_tick: int
     last_tick: int
     span_s: float
-    """From the start of the first tick to that of the last."""
+    """Time from the start of the first tick to the start of the last."""
     period_s: float
     """Nominal period of the loop: the median of the ticks' intervals; NaN for less than two ticks."""
     lateness_s: Array
     """Delay of the tick's start after its deadline."""
     joint_read_to_write_s: Array
-    """From the answers of all servos read to the currents written, both by the bus thread, for ticks that wrote currents."""
+    """Time from all servos' answers to the currents written, both in the bus thread, for ticks that wrote currents."""
     mocap_to_setpoint_s: Array
-    """From the mocap datagram to the setpoint sent, for ticks with a new frame that sent a setpoint."""
+    """Time from the mocap datagram to the setpoint sent, for ticks with a new frame that sent a setpoint."""
     wait_for_joints_s: Array
-    """From the tick's start to the joint state's arrival."""
+    """Time from the tick's start to the joint state's arrival."""
     core_s: Array
-    """From the joint state's arrival to the end of the core's step."""
+    """Time from the joint state's arrival to the end of the core's step."""
     send_s: Array
-    """From the end of the core's step to the setpoint sent and the currents handed to the bus thread."""
+    """Time from the end of the core's step until the setpoint is sent and the bus thread has the currents."""
     whole_s: Array
-    """From the tick's start to the setpoint sent and the currents handed to the bus thread."""
+    """Time from the tick's start until the setpoint is sent and the bus thread has the currents."""
     bus_read_s: Array
-    """From the start of the joint read to the answers of all servos read, both by the bus thread, for ticks with a new joint state."""
+    """Time from the start of the joint read to all servos' answers, both in the bus thread, for ticks with a new joint state."""
     bus_cycle_s: Array
-    """From the start of the joint read to the currents computed from it written, both by the bus thread; otherwise as
+    """Time from the start of the joint read until the resulting currents are written, both in the bus thread; same ticks as
     `joint_read_to_write_s`.
     """
 

@@ -1,4 +1,4 @@
-"""The parent's side of a campaign: starts `python -m sitl.campaigns` and reads the results as the flights end."""
+"""Parent side of a campaign: starts `python -m sitl.campaigns` and reads the results as the flights end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 STALL_TIMEOUT_S = 300.0
-"""A flight takes seconds; a campaign without a result for this long hangs."""
+"""Time without a result after which a campaign counts as hung; a flight takes seconds."""
 STOP_TIMEOUT_S = 3.0
 _POLL_S = 0.2
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -24,7 +24,7 @@ Message = dict[str, Any]
 
 
 class CampaignError(Exception):
-    """The campaign cannot go on. The text is one line for the user."""
+    """The campaign cannot continue. The text is one line for the user."""
 
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)

@@ -1,4 +1,4 @@
-"""The one runner of campaigns: fly, summarise, write CSV, JSON and HTML, print. A `Campaign` says what and how."""
+"""Runner of all campaigns: fly, summarise, write CSV, JSON and HTML, print. A `Campaign` defines flights and output."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ Row = dict[str, Any]
 
 
 class Flights(Protocol):
-    """Flights that are being flown."""
+    """Flights in progress."""
 
     def results(self) -> Iterator[Message]:
-        """Yield `{index, row, wall_s}` and more as each flight ends, in any order. Raises `CampaignError` if it cannot go on."""
+        """Yield `{index, row, wall_s}` and more as each flight ends, in any order. Raises `CampaignError` if it cannot continue."""
 
     def ask_to_stop(self) -> None:
         """Make `results` end soon. Safe in a signal handler."""
@@ -41,7 +41,7 @@ class Flights(Protocol):
 
 @dataclass(kw_only=True)
 class Campaign(ABC):
-    """What one campaign flies and how it shows its results."""
+    """Flights of one campaign and the presentation of its results."""
 
     name: ClassVar[str]
     """Name of the command and of its result files."""
@@ -50,7 +50,7 @@ class Campaign(ABC):
     configs: Sequence[SitlConfig]
     """Effective configurations; each flight names one by its position."""
     flights: Sequence[Message]
-    """Each flight as `sitl.campaigns` expects it."""
+    """Each flight in the format of `sitl.campaigns`."""
     command: str
     """The command line, for the record."""
     overrides: Sequence[str] = ()
@@ -79,7 +79,7 @@ class Campaign(ABC):
         return CampaignProcess(self.job(), out / "campaign.log")
 
     def settings(self) -> dict[str, Any]:
-        """Return what was flown, for the record."""
+        """Return the settings of the campaign, for the record."""
         sources = self.configs[0].sources
         return {
             "command": self.command,
@@ -117,7 +117,7 @@ class Campaign(ABC):
         """Write the files that only this campaign has."""
 
     def good(self, rows: Sequence[Row]) -> bool:
-        """Return False to end with exit code 5."""
+        """Return whether the results are good; False ends the command with exit code 5."""
         return True
 
 
@@ -126,9 +126,9 @@ class Flown:
     """The outcome of a whole campaign."""
 
     messages: list[Message]
-    """In the order of the campaign."""
+    """Results of the flights in the order of the campaign."""
     notes: list[str] = field(default_factory=list)
-    """Why results are missing."""
+    """Reasons for missing results."""
     code: int = EXIT_OK
 
     @property
@@ -141,9 +141,9 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
     """Fly the campaign, write its files into `out` and print its results.
 
     Args:
-        campaign: what to fly.
+        campaign: campaign to fly.
         out: an existing folder; stays empty if no flight ended.
-        console: where tables go; None to print the rows and their summary as JSON instead.
+        console: output of the tables; None to print the rows and their summary as JSON instead.
 
     Returns:
         The exit code.
@@ -241,7 +241,7 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     write_page(replace(page, sections=sections, notes=flown.notes), out / f"{campaign.name}.html")
     campaign.write_more(rows, out)
     wall_s = [message["wall_s"] for message in flown.messages]
-    # The last file: where it exists, all the others do.
+    # This file is written last: if it exists, all the others exist.
     whole = {**table, "settings": settings, "versions": used, "notes": flown.notes, "wall_s": wall_s}
     (out / f"{campaign.name}.json").write_text(to_json(whole), encoding="utf-8")
 

@@ -18,20 +18,18 @@ def add_parser(commands: Any) -> None:
         parts, "scan", _TOOLS, yes=False,
         help="find every servo on the bus",
         description="Find every servo at every baud rate and compare it with the vehicle file. Nothing is written to the servos, no "
-        "torque. Exit 0: all is as the vehicle file says; 3: something is not.",
+        "torque. Exit 0: everything matches the vehicle file; 3: something differs.",
     )  # fmt: skip
     scan.add_argument(
-        "--baud", type=int, metavar="RATE", help="try only this baud rate, which takes a second (default: all)"
+        "--baud", type=int, metavar="RATE", help="try only this baud rate, which takes one second (default: all)"
     )
     setup = add_tool(
         parts, "setup", _TOOLS,
         help="set the servos up: id, baud rate, return delay, mode, limits",
-        description="Bring each servo to what the companion needs. Torque is off; the values are shown, confirmed, written and read "
+        description="Write the required settings to each servo. Torque is off; the values are shown, confirmed, written and read "
         "back. Exit 0: all is set up; 3: not.",
     )  # fmt: skip
-    setup.add_argument(
-        "--joint", type=_joint, metavar="N", help="the one servo that is connected is that of joint 1 or 2"
-    )
+    setup.add_argument("--joint", type=_joint, metavar="N", help="the only connected servo belongs to joint 1 or 2")
     add_tool(
         parts, "zero", _TOOLS, yes=False,
         help="find zeros and directions: hold the arm by hand in three poses",
@@ -41,16 +39,16 @@ def add_parser(commands: Any) -> None:
     jog = add_tool(
         parts, "jog", _TOOLS, write="",
         help="move one joint, slowly, by keys",
-        description="Move one joint at a time, at most 20 deg/s, within the joint limits. It stops when the key is released, and when "
-        "anything is in the way. Afterwards the arm is limp: hold it.",
+        description="Move one joint at a time, at most 20 deg/s, within the joint limits. It stops when the key is released, and "
+        "at an obstacle. Afterwards the arm is limp: hold it.",
     )  # fmt: skip
     jog.add_argument("--joint", type=_joint, metavar="N", help="with --to: joint 1 or 2")
-    jog.add_argument("--to", type=float, metavar="DEG", help="move it there, without keys")
+    jog.add_argument("--to", type=float, metavar="DEG", help="target angle of a motion without keys")
     add_tool(
         parts, "friction", _TOOLS,
         help="measure torque constant and friction of both joints",
-        description="Sweep each joint slowly both ways about hanging, and fit torque constant, dry and viscous friction against "
-        "gravity. The arm has to hang free.",
+        description="Sweep each joint slowly in both directions about the hanging pose, and fit torque constant, dry and "
+        "viscous friction against gravity. The arm must hang freely.",
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""`companion broker`: create a broker's users and certificates, and show what a broker permits a login."""
+"""`companion broker`: create a broker's users and certificates, and show a login's permissions at a broker."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def add_parser(commands: Any) -> None:
 
     check = parts.add_parser(
         "check",
-        help="show what a broker permits a login",
+        help="show a login's permissions at a broker",
         description="Connect, subscribe and publish an empty message on every topic. Exit 0: connected; 2: wrong input; 3: no "
         "connection.",
     )
@@ -130,7 +130,8 @@ def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
     ]
     for name in users.vehicles:
         lines += [
-            f"Vehicle {name}: copy {folder}/vehicles/{name} to its computer, say to /etc/companion; owned by the user that flies.",
+            f"Vehicle {name}: copy {folder}/vehicles/{name} to its computer, for example to /etc/companion, "
+            "owned by the user that flies.",
             "Vehicle file:",
             "  ground:",
             f"    topic: {name}",
@@ -155,7 +156,7 @@ def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
         ]
     return [
         *lines,
-        "A folder gives access under its name: copy each only to its computer (scp -rp), and keep ca.key here.",
+        "Each folder contains the credentials of its name: copy each only to its computer (scp -rp), and keep ca.key here.",
     ]
 
 
@@ -187,8 +188,8 @@ def table(found: CheckResult) -> list[str]:
     lines += [f"{right.topic.value:10} {words[right.read]:5} {words[right.write]}" for right in found.rights]
     if any(right.read is None for right in found.rights):
         lines.append("?: subscribing is permitted, but there was no message to receive")
-    lines.append(f"vehicles heard: {', '.join(found.vehicles) or 'none'}")
+    lines.append(f"vehicles present: {', '.join(found.vehicles) or 'none'}")
     command = next(right for right in found.rights if right.topic is Topic.COMMAND)
     if command.write:
-        lines.append("commands pass this broker; the vehicle accepts those that an operator has signed")
+        lines.append("this broker forwards commands; the vehicle accepts those signed by an operator")
     return lines

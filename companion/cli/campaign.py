@@ -1,4 +1,4 @@
-"""What the commands that fly campaigns share: options, the checked configuration, the folder of the results."""
+"""Shared parts of the campaign commands: options, checked configuration, folder of the results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from companion.sitl_config.loader import DEFAULT_WORLD, SitlConfig, load_sitl
 
 DEFAULT_MISSION = "configs/missions/catch.yaml"
 PIPED_WIDTH = 132
-"""Width in columns of a table when standard output is no terminal."""
+"""Width of a table in columns if standard output is not a terminal."""
 CAMPAIGN_WIDTH = 168
 
 
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     """Add the options that all campaigns share.
 
     Args:
-        parser: of the command.
+        parser: parser of the command.
         one_law: whether the campaign flies one control law, for `--controller` and `--preset`.
         world: default of `--world`.
     """
@@ -42,7 +42,7 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     )
     add_world(parser, world)
     parser.add_argument(
-        "--jobs", type=count, metavar="N", help="number of flights at the same time (default: by the cores)"
+        "--jobs", type=count, metavar="N", help="number of flights at the same time (default: by the number of cores)"
     )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, to fly on its workers")
     parser.add_argument("--out", metavar="DIR", help="folder for the results (default: a new one, named by the time)")
@@ -118,7 +118,7 @@ def fly(campaign: Campaign, arguments: argparse.Namespace, parent: str) -> int:
 
 
 def wide_console(width: int = PIPED_WIDTH) -> Console:
-    """Return the console on standard output; into a pipe it has at least `width` columns."""
+    """Return the console on standard output; for a pipe it has at least `width` columns."""
     console = terminal_console()
     if not console.is_terminal:
         console.width = max(console.width, width)
@@ -136,9 +136,9 @@ def why_unusable(folder: Path, result: str) -> str | None:
         if folder.exists() and not folder.is_dir():
             return "is a file; choose a folder"
         if (folder / result).exists():
-            return f"there is a {result} already; choose another folder"
+            return f"contains a {result} already; choose another folder"
         folder.mkdir(parents=True, exist_ok=True)
-        # Permissions do not tell: root may write in spite of them, and nobody may write to a read-only file system.
+        # Permissions are no evidence: root ignores them, and a read-only file system overrides them.
         with tempfile.TemporaryFile(dir=folder):
             return None
     except OSError as error:

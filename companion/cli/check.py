@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> i
     Args:
         arguments: parsed arguments.
         config: configuration loaded from them.
-        problems: why the mission cannot be flown as written.
+        problems: reasons why the mission cannot be flown.
     """
     found = problems(config)
     if arguments.plan_only:
@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> i
     scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
     try:
         rows = _rows(task, tuple(found), scratch, people)
-    except LaunchError as error:  # it names a log, which stays
+    except LaunchError as error:  # it names a log, which is kept
         print_error(f"companion check: {error}")
         return EXIT_REFUSED
     except BaseException:
@@ -147,7 +147,7 @@ async def _look(task: Task, config: FlightConfig, known: Observations, line: _Li
 
 
 def _recorder(config: FlightConfig, scratch: Path) -> str:
-    """Return why a recorder process could not open a log; empty if it could."""
+    """Return why the recorder process could not open a log; empty if it could."""
     try:
         recorder = RecorderProcess.start(
             scratch / "check.mcap", config_json=config.model_dump_json(), epoch_offset_ns=time.time_ns()
@@ -176,7 +176,7 @@ class _Line:
             self._status.update(f"companion check: {escape(text)}")
 
     def world(self, message: dict[str, Any]) -> None:
-        """Show a message of the simulated world while it starts."""
+        """Show a message of the simulated world during its start."""
         if message.get("type") == "progress":
             if self._status is None:
                 print_error(f"companion check: {message['text']}")
@@ -210,9 +210,7 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
             all_of_them = (
                 "all" if len(fine) == len([row for row in group if row.id.startswith(PARAM_ID)]) else "the other"
             )
-            console.print(
-                _line(console, "ok", "parameters", f"{all_of_them} {len(fine)} are as they must be", "docs/px4.md")
-            )
+            console.print(_line(console, "ok", "parameters", f"{all_of_them} {len(fine)} are correct", "docs/px4.md"))
     refused = refusals(rows)
     warned = [row for row in rows if not row.ok and row.level is Level.WARN]
     console.print()
@@ -222,12 +220,12 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
     else:
         verdict.append(f"{len(rows)} checks: the machine may fly.", style="bold green")
     if warned:
-        verdict.append(f" {len(warned)} to look at.", style="yellow")
+        verdict.append(f" {len(warned)} warnings.", style="yellow")
     console.print(verdict, soft_wrap=True)
 
 
 def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, header: bool = False) -> Table:
-    """Return one row of the table. In a row without an expected value the measured value also uses that column's width."""
+    """Return one row of the table. The measured value also uses the column of a missing expected value."""
     width = min(console.width, _WIDTH_MAX)
     title_width = min(_TITLE_WIDTH, width // 3)
     left = max(20, width - _MARK_WIDTH - title_width - 4 * _GAP)
@@ -245,7 +243,7 @@ def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, he
 
 
 def _under(row: Row) -> Padding:
-    """Return what to do, and why, for a row that does not pass."""
+    """Return remedy and reason for a row that does not pass."""
     table = Table.grid(padding=(0, 1, 0, 0))
     if row.fix:
         table.add_row("->", Text(row.fix, style="bold"))

@@ -120,7 +120,7 @@ class _Commander:
             known = station.tracker.vehicles
             if station.link.connected:
                 connected_s = connected_s or time.monotonic()
-                # A flying vehicle has sent a proven message by then, whatever its state message says.
+                # A flying vehicle has sent a proven message by then, regardless of its state message.
                 waited = time.monotonic() - connected_s > LIVE_S
                 names = [self._only] if self._only is not None else station.tracker.present(time.monotonic())
                 if len(names) > 1 and self._command in SAFER_COMMANDS:

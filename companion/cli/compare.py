@@ -14,7 +14,7 @@ from companion.config.document import ConfigError
 from companion.sitl_config.loader import SitlConfig, load_sitl
 
 _OPTIONS = {"world.payload_kg": "--payloads", "world.seed": "--seeds", "world.model_error": "--model-error"}
-"""Options in the place of overrides of keys that the grid sets."""
+"""Options that replace overrides of keys that the grid sets."""
 
 
 def add_parser(commands: Any) -> None:
@@ -23,7 +23,7 @@ def add_parser(commands: Any) -> None:
         "compare",
         help="compare controllers in the fast closed loop",
         description="Fly a grid of controllers, presets, payloads and seeds in the fast closed loop and print the paper's table "
-        "with its printed values beside ours. A crash is a result, not an error.",
+        "with the printed values beside the results. A crash is a result, not an error.",
     )
     parser.add_argument(
         "--payloads", type=_payloads, default=(0.1, 0.2, 0.3), metavar="KG,...", help="default: 0.1,0.2,0.3"
@@ -31,9 +31,11 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--controllers", type=names, default=(), metavar="LAW,...", help=f"default: {','.join(PRESETS)}"
     )
-    parser.add_argument("--presets", type=names, default=(), metavar="NAME,...", help="default: all of each law")
+    parser.add_argument(
+        "--presets", type=names, default=(), metavar="NAME,...", help="default: all presets of each law"
+    )
     parser.add_argument("--seeds", type=count, default=5, metavar="N", help="number of seeds per cell (default: 5)")
-    parser.add_argument("--first-seed", type=count, default=1, metavar="N", help="the first of them (default: 1)")
+    parser.add_argument("--first-seed", type=count, default=1, metavar="N", help="first seed (default: 1)")
     parser.add_argument(
         "--model-error", type=_model_errors, metavar="SHARE,...",
         help="shares by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3, e.g. 0,0.1,0.2,0.3 "
@@ -44,7 +46,7 @@ def add_parser(commands: Any) -> None:
         help="fly the presets of the adaptive law with their adaptation, without it (off), or both ways (default: on)",
     )  # fmt: skip
     parser.add_argument(
-        "--ablation", action="store_true", help="also fly adaptive/recommended with one thing at a time removed"
+        "--ablation", action="store_true", help="also fly adaptive/recommended with one part removed at a time"
     )
     parser.add_argument("--mission", default=DEFAULT_MISSION, metavar="FILE")
     add_options(parser, one_law=False)
@@ -81,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Compare:
-    """Check every configuration before anything flies.
+    """Check every configuration before the first flight.
 
     Raises:
         ConfigError: one line per problem.
@@ -98,7 +100,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         raise ConfigError([f"companion compare: {error}"]) from None
     configs: list[SitlConfig] = []
     for variant in variants:
-        load = load_sitl if configs else checked  # one mission, one vehicle: checked once
+        load = load_sitl if configs else checked  # the same mission and vehicle: checked once
         overrides = (*arguments.overrides, *variant.overrides)
         try:
             configs.append(
@@ -112,7 +114,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
                 )
             )
         except ConfigError as error:
-            # A problem of the first variant is usually one of all; a problem of a later one is its own.
+            # A problem of the first variant usually affects all; a problem of a later one is its own.
             raise ConfigError([f"{variant.label}: {line}" if configs else line for line in error.lines]) from None
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     model_errors = arguments.model_error or (configs[0].world.model_error,)

@@ -1,4 +1,4 @@
-"""`companion faults`: one fault after the other in every phase of a mission, and how each flight ends."""
+"""`companion faults`: each fault in every phase of a mission, and the outcome of each flight."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_parser(commands: Any) -> None:
     """Add `faults` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "faults",
-        help="fly a mission with every fault that the simulated world knows",
+        help="fly a mission with every fault of the simulated world",
         description="Fly a mission in the fast closed loop, or with --wires over real wires, with one fault per flight in every phase. "
         "Exit code 0 only if every flight was completed or landed, no tether was pulled taut by the machine's own motion and nothing "
         "left the room; otherwise 5.",
@@ -31,7 +31,7 @@ def add_parser(commands: Any) -> None:
         "mission", nargs="?", default=DEFAULT_MISSION, help=f"mission file, YAML (default: {DEFAULT_MISSION})"
     )
     parser.add_argument(
-        "--list", action="store_true", help="print the kinds of faults and what their sizes mean; fly nothing"
+        "--list", action="store_true", help="print the kinds of faults and the meaning of their sizes, without a flight"
     )
     kinds = _known(tuple(KINDS), "kind of fault")
     parser.add_argument("--kinds", type=kinds, default=(), metavar="KIND,...", help="default: all; see --list")
@@ -74,10 +74,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Faults:
-    """Check everything before anything flies.
+    """Check everything before the first flight.
 
     Raises:
-        ConfigError: one line per problem, or nothing is left to fly.
+        ConfigError: one line per problem, or no fault is left to fly.
     """
     flights = planned(arguments.kinds, arguments.phases, wires=arguments.wires)
     if not flights:

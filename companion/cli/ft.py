@@ -16,20 +16,20 @@ def add_parser(commands: Any) -> None:
     check = add_tool(
         parts, "check", _TOOLS,
         help="rate, noise, bias; with a known weight scale and direction",
-        description="Watch the force sensor at rest; with --weight then under a known weight on the net. The arm hangs loose. Exit 0: "
-        "nothing is wrong; 3: something is wrong.",
+        description="Measure the force sensor at rest and, with --weight, under a known weight on the net. The arm hangs limp. Exit 0: "
+        "no problem; 3: a problem was found.",
     )  # fmt: skip
     check.add_argument(
         "--weight", type=number(0.1, 5.0, " kg"), metavar="KG", help="mass that the user hangs on the net when prompted"
     )
     tare = add_tool(
         parts, "tare", _TOOLS, write="",
-        help="drift over a minute, and what a flight's own tare removes",
-        description="Watch the empty net. Nothing is written to the sensor without --sensor or --clear. Exit 0: nothing is wrong; 3: "
-        "something is wrong; 4: given up.",
+        help="drift over a minute, and the force that a flight's own tare removes",
+        description="Measure the empty net. Nothing is written to the sensor without --sensor or --clear. Exit 0: no problem; 3: "
+        "a problem was found; 4: cancelled.",
     )  # fmt: skip
     tare.add_argument(
-        "--seconds", type=number(5.0, 600.0, " s"), default=60.0, metavar="N", help="how long (default: 60)"
+        "--seconds", type=number(5.0, 600.0, " s"), default=60.0, metavar="N", help="duration (default: 60)"
     )
     what = tare.add_mutually_exclusive_group()
     what.add_argument("--sensor", action="store_true", help="then make the present reading the sensor's own zero")

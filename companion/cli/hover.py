@@ -22,12 +22,12 @@ def add_parser(commands: Any) -> None:
     parts = hover.add_subparsers(dest="part", required=True, metavar="PART")
     fit = parts.add_parser(
         "fit",
-        help="fit it from a log",
+        help="fit the hover thrust to a log",
         description="Fit the hover thrust of the machine without payload from the calm parts of a flight, and print the lines for "
         "the vehicle file.",
     )
     fit.add_argument("log", type=Path, help="flight.mcap")
-    fit.add_argument("--json", action="store_true", help="print it as JSON, nothing else")
+    fit.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
     fit.set_defaults(run=run)
 
 
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def jsonable(fit: HoverFit) -> dict[str, Any]:
-    """Return the result for scripts; None where a value is not known. Thrust is normalised, 0 to 1."""
+    """Return the result for scripts; None where a value is unknown. Thrust is normalised, 0 to 1."""
     slope = fit.slope
     return {
         "hover_thrust": fit.hover_thrust,
@@ -67,16 +67,16 @@ def jsonable(fit: HoverFit) -> dict[str, Any]:
 def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
     """Return the result as text."""
     at = f" at {fit.voltage_mean_v:.2f} V" if fit.slope else ""
-    told = [
+    compared = [
         f"hover thrust      {fit.hover_thrust:.{_DIGITS}f} ± {fit.standard_error:.{_DIGITS}f} (standard error){at}, "
         f"from {fit.used_s:.1f} s of calm flight"
     ]
     for name, value in (("flight began with", fit.configured), ("flight ended with", fit.last_estimate)):
         relative = _relative(value, fit)
         if value is not None and relative is not None:
-            told.append(f"{name} {value:.{_DIGITS}f}, {100 * relative:+.2f} % of the fitted one")
+            compared.append(f"{name} {value:.{_DIGITS}f}, {100 * relative:+.2f} % of the fitted value")
     return [
-        *told,
+        *compared,
         f"battery           {_battery(fit)}",
         "",
         f"# {vehicle_file}",
@@ -87,7 +87,7 @@ def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
 
 def _battery(fit: HoverFit) -> str:
     if fit.voltage_mean_v is None or fit.voltage_span_v is None:
-        return "voltage not known throughout, no slope fitted"
+        return "voltage not always known, no slope fitted"
     about = f"{fit.voltage_mean_v:.2f} V on average, changed by {fit.voltage_span_v:.2f} V"
     if fit.slope is None:
         return f"{about}; {SLOPE_MIN_V:g} V or more are needed for a slope"

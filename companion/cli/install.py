@@ -39,17 +39,15 @@ def add_parser(commands: Any) -> None:
     """Add `install` to the sub-parsers of `companion`."""
     install = commands.add_parser(
         "install",
-        help="set up the vehicle's computer: service, adapter names and latency, limits, full clock; or undo that",
+        help="set up the vehicle's computer: service, adapter names and latency, limits, full clock; or undo it",
         description="Install companion as a systemd service that waits on the ground for an operator's START, with the settings that "
         "its timing needs; show what is changed, and undo it exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
         "nothing was changed; 4: cancelled.",
     )
     what = install.add_mutually_exclusive_group(required=True)
     what.add_argument("--systemd", action="store_true", help="install")
-    what.add_argument("--undo", action="store_true", help="restore everything as it was before the first --systemd")
-    install.add_argument(
-        "--dry-run", action="store_true", help="only show what would be done, with the content of every file"
-    )
+    what.add_argument("--undo", action="store_true", help="restore the state before the first --systemd")
+    install.add_argument("--dry-run", action="store_true", help="only show the changes, with the content of every file")
     install.add_argument("--yes", action="store_true", help="do not ask for confirmation")
     install.add_argument("--json", action="store_true", help="print only JSON; needs --yes or --dry-run")
     install.add_argument(
@@ -158,7 +156,7 @@ def _undo(arguments: argparse.Namespace, root: Path) -> int:
 
 
 def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tuple[str, ...]]:
-    """Return the checked settings, and lines that explain how they were found.
+    """Return the checked settings, and lines that explain their origin.
 
     Raises:
         ConfigError: the command line or a file is wrong.
@@ -232,7 +230,7 @@ def _seen_by_the_service(option: str, file: str, root: Path) -> str:
 
 
 def _summary(wanted: Plan, found: Changes, live: bool) -> Iterator[tuple[str, str]]:
-    """Yield each path ("" for a command) with a line about what will be done."""
+    """Yield each path ("" for a command) with a line about its change."""
     to_do = set(found.to_do)
     why = {item.path: f": {item.why}" for item in wanted.items}
     for path, entry in found.entries.items():
@@ -258,7 +256,7 @@ def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
 
 
 def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
-    """Yield the steps that are left to the user."""
+    """Yield the remaining steps for the user."""
     arm, force = (
         ("/dev/companion-arm" if settings.arm_serial else None),
         ("/dev/companion-force" if settings.force_serial else None),

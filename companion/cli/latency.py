@@ -1,4 +1,4 @@
-"""`companion latency`: how late motion capture reaches PX4, by taps on the airframe."""
+"""`companion latency`: delay of motion capture to PX4, measured by taps on the airframe."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ def add_parser(commands: Any) -> None:
     """Add `latency` to the sub-parsers of `companion`."""
     latency = add_tool(
         commands, "latency", "companion.commissioning.latency.tools",
-        help="how late motion capture is, by taps on the airframe: EKF2_EV_DELAY",
+        help="measure the delay of motion capture by taps on the airframe: EKF2_EV_DELAY",
         description="Hold the machine up, disarmed, propellers off; a second person taps its frame. IMU and motion capture are "
         "compared. Exit 0: EKF2_EV_DELAY is right; 3: it is not, or cannot be measured.",
         write="write EKF2_EV_DELAY to PX4, which must then be restarted",
     )  # fmt: skip
-    latency.add_argument("--taps", type=number(5, 60, "", int), default=8, metavar="N", help="how many (default: 8)")
+    latency.add_argument(
+        "--taps", type=number(5, 60, "", int), default=8, metavar="N", help="number of taps (default: 8)"
+    )
     latency.add_argument(
         "--seconds",
         type=number(5.0, 600.0, " s"),
         default=90.0,
         metavar="N",
-        help="how long to wait for them (default: 90)",
+        help="time to wait for the taps (default: 90)",
     )

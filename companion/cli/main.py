@@ -96,7 +96,7 @@ def _normalised(argv: list[str]) -> list[str]:
             out += ["--set", word] if out[-1] != "--set" else [word]
         else:
             if in_set and out[-1] == "--set":
-                out.append(word)  # no KEY=VALUE: the loader says so
+                out.append(word)  # not KEY=VALUE: the loader reports it
                 in_set = False
                 continue
             in_set = word == "--set" or word.startswith("--set=")
@@ -116,10 +116,12 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
     fly = commands.add_parser("fly", help="fly a mission", description="Fly a mission, on the vehicle or in SITL.")
     _add_flight_options(fly)
     fly.add_argument(
-        "--sitl", metavar="stub|px4", help="fly in the simulated world: with our stub of PX4, or with a real PX4 (SITL)"
+        "--sitl", metavar="stub|px4", help="fly in the simulated world: with the PX4 stub, or with a real PX4 (SITL)"
     )
-    fly.add_argument("--out", metavar="DIR", help="where log and report go (default: flights/TIME-MISSION)")
-    fly.add_argument("--no-report", action="store_true", help="log and summary only; companion report makes the rest")
+    fly.add_argument("--out", metavar="DIR", help="folder of log and report (default: flights/TIME-MISSION)")
+    fly.add_argument(
+        "--no-report", action="store_true", help="write log and summary only; companion report writes the rest"
+    )
     fly.add_argument(
         "--mqtt", metavar="URL|off", help="broker for telemetry and commands (default: the vehicle file's)"
     )
@@ -144,20 +146,20 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
     check.add_argument(
         "--sitl",
         metavar="stub|px4",
-        help="look at the simulated world's devices, with our stub of PX4 or with a real PX4",
+        help="check the simulated world's devices, with the PX4 stub or a real PX4",
     )
     check.add_argument("--hand", action="store_true", help="then do the guided hand test, for a new set-up")
-    check.add_argument("--json", action="store_true", help="print the rows as JSON, nothing else")
-    check.add_argument("--plan-only", action="store_true", help="look at the mission alone, at no device")
+    check.add_argument("--json", action="store_true", help="print the rows as JSON and nothing else")
+    check.add_argument("--plan-only", action="store_true", help="check only the mission, without devices")
     check.set_defaults(run=_check)
 
     schema = commands.add_parser("schema", help="print the JSON Schema of a file, for editors")
     schema.add_argument("kind", choices=("mission", "vehicle", "controller", "world"))
     schema.set_defaults(run=lambda a: print(schema_json(a.kind)) or EXIT_OK)
 
-    sitl = commands.add_parser("sitl", help="run the simulated world alone, for QGroundControl or a script of your own")
+    sitl = commands.add_parser("sitl", help="run the simulated world alone, for QGroundControl or a user's script")
     _add_flight_options(sitl, mission_default=True)
-    sitl.add_argument("--px4", action="store_true", help="with a real PX4 (SITL) instead of our stub of it")
+    sitl.add_argument("--px4", action="store_true", help="with a real PX4 (SITL) instead of the stub")
     sitl.set_defaults(run=_sitl)
 
     alone = bool(first) and first[0] in {"replay", *commands.choices, *_WITH_MODULES}
@@ -166,7 +168,7 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
             importlib.import_module(f"companion.cli.{name}").add_parser(commands)
 
     replay = commands.add_parser(
-        "replay", help="run the core on a log's inputs; exit 0 if every output is bit-identical"
+        "replay", help="run the core again on a log's inputs; exit 0 if every output is bit-identical"
     )
     replay.add_argument("log", type=Path)
     replay.set_defaults(run=_replay)
@@ -209,7 +211,7 @@ def _problems(config: FlightConfig) -> list[str]:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from companion.cli import check as check_command  # with it comes MAVSDK
+    from companion.cli import check as check_command  # imports MAVSDK
 
     if arguments.sitl not in (None, "stub", "px4"):
         print_error(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
@@ -236,7 +238,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     if arguments.wait_for_start:
         arguments.overrides += ["mission.start.takeoff=by_operator"]
     config = _load(arguments, hardware=arguments.sitl is None)
-    problems = [*_problems(config), *_nobody_could_start(config)]
+    problems = [*_problems(config), *_start_impossible(config)]
     if problems:
         for line in problems:
             print_error(line)
@@ -250,7 +252,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     return run_flight(config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report)
 
 
-def _nobody_could_start(config: FlightConfig) -> list[str]:
+def _start_impossible(config: FlightConfig) -> list[str]:
     """Return why a flight with `--wait-for-start` could never be started, as one line; empty if it could."""
     if config.mission.start.takeoff != "by_operator":
         return []
@@ -260,15 +262,15 @@ def _nobody_could_start(config: FlightConfig) -> list[str]:
     elif not mqtt.commands:
         why = "vehicle.ground.mqtt.commands is false"
     elif not (mqtt.address.tls or mqtt.address.loopback):
-        why = f"vehicle.ground.mqtt.url is {mqtt.url}, and commands are not heard over a plain connection to another computer"
+        why = f"vehicle.ground.mqtt.url is {mqtt.url}, and commands are not accepted over an unencrypted connection to another computer"
     else:
         return []
-    return [f"mission.start.takeoff is by_operator (--wait-for-start), but nobody could command start: {why}"]
+    return [f"mission.start.takeoff is by_operator (--wait-for-start), but start could not be commanded: {why}"]
 
 
 def _sitl(arguments: argparse.Namespace) -> int:
     config = _load(arguments, hardware=False)
-    # In place of this process: signals reach the world itself, and there is nobody whom it could outlive.
+    # It replaces this process, so that signals reach the world itself and it cannot outlive a parent.
     file = os.memfd_create("sitl-config", 0)
     os.write(file, config.model_dump_json().encode())
     command = [sys.executable, "-m", "sitl", "--config", f"/proc/self/fd/{file}"]

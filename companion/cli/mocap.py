@@ -17,17 +17,19 @@ def add_parser(commands: Any) -> None:
     check = add_tool(
         parts, "check", _TOOLS,
         help="check the stream: server, bodies, rate, jitter, latency and lost frames",
-        description="Watch motion capture and report what is wrong. Nothing moves, PX4 is not needed. Exit 0: nothing is wrong; 3: "
-        "something is wrong.",
+        description="Watch motion capture and report problems. Nothing moves; PX4 is not needed. Exit 0: no problem; 3: "
+        "a problem was found.",
     )  # fmt: skip
     check.add_argument(
-        "--seconds", type=number(1.0, 600.0, " s"), default=10.0, metavar="N", help="how long (default: 10)"
+        "--seconds", type=number(1.0, 600.0, " s"), default=10.0, metavar="N", help="duration (default: 10)"
     )
-    check.add_argument("--move", action="store_true", help="the vehicle is carried meanwhile: shows which body it is")
+    check.add_argument("--move", action="store_true", help="carry the vehicle meanwhile, to find its rigid body")
     align = add_tool(
         parts, "align", _TOOLS,
-        help="axes by hand: lift, forward, turn left",
-        description="The guided hand test, and which setting explains its result. Battery in, disarmed, propellers off. Exit 0: the "
-        "axes are right; 3: they are not; 4: given up.",
+        help="find the axes by hand: lift, forward, turn left",
+        description="The guided hand test, and the setting that explains its result. Battery in, disarmed, propellers off. Exit 0: the "
+        "axes are right; 3: they are not; 4: cancelled.",
     )  # fmt: skip
-    align.add_argument("mission", nargs="?", default=MISSION, help=f"its start gives the yaw (default: {MISSION})")
+    align.add_argument(
+        "mission", nargs="?", default=MISSION, help=f"mission whose start gives the yaw (default: {MISSION})"
+    )

@@ -35,12 +35,13 @@ def add_parser(commands: Any) -> None:
     monitor = commands.add_parser(
         "monitor",
         help="watch and command from the ground: a page in the browser, or --text in the terminal",
-        description="Serve a page that shows what vehicles send over MQTT and takes commands; with LOG, a page that plays logs.",
+        description="Serve a page that shows the vehicles' telemetry over MQTT and accepts commands; with LOG, "
+        "a page that replays logs.",
     )
     monitor.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="flight.mcap to view; needs no broker")
     add_broker_options(monitor)
-    monitor.add_argument("--view-only", action="store_true", help="allow no commands from here")
-    monitor.add_argument("--text", action="store_true", help="show it in this terminal instead of a page")
+    monitor.add_argument("--view-only", action="store_true", help="allow no commands from this monitor")
+    monitor.add_argument("--text", action="store_true", help="show the vehicle in this terminal instead of a page")
     monitor.add_argument("--port", type=int, default=PORT, help="port of the page (default: %(default)s; 0: any)")
     monitor.add_argument(
         "--host",
@@ -147,7 +148,7 @@ def _serve(arguments: argparse.Namespace) -> None:
         if arguments.open:
             threading.Thread(
                 target=_open, args=(monitor.url,), daemon=True
-            ).start()  # browsers of terminals stay in there
+            ).start()  # text browsers stay in the terminal
 
     try:
         if arguments.logs:
@@ -162,7 +163,7 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 
 def _read(paths: Sequence[Path]) -> list[ReplayLog]:
-    """Read the logs before anything is served: a log of an hour takes one to two minutes, and Ctrl-C ends it."""
+    """Read the logs before serving: a log of an hour takes one to two minutes, and Ctrl-C ends it."""
     from companion.ground.station.replay_log import read_for_page
 
     logs = []

@@ -1,4 +1,4 @@
-"""Progress bar while a mission is planned and checked. It appears in a terminal if that takes long."""
+"""Progress bar while a mission is planned and checked. It appears in a terminal if planning takes long."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class PlanningProgress:
     """Progress callback for `companion.mission.check.check_mission`.
 
     Args:
-        console: where the bar is drawn; None for standard error. Without a terminal there is no bar.
-        now_s: a clock.
+        console: console of the bar; None for standard error. Without a terminal there is no bar.
+        now_s: clock, s.
     """
 
     def __init__(self, console: Console | None = None, now_s: Clock = time.monotonic) -> None:

@@ -37,20 +37,24 @@ def add_parser(commands: Any) -> None:
     params = parts.add_parser(
         "params",
         help="compare or write parameters",
-        description="Compare the connected PX4's parameters with a file in QGroundControl's format, or write what differs. Exit 0: "
-        "nothing differs (any more); 3: something differs, or could not be written.",
+        description="Compare the connected PX4's parameters with a file in QGroundControl's format, or write the differing values. "
+        "Exit 0: no value differs (after writing); 3: a value differs or could not be written.",
     )
     what = params.add_mutually_exclusive_group(required=True)
     what.add_argument("--diff", action="store_true", help="only compare")
-    what.add_argument("--write", action="store_true", help="write what differs; refused while PX4 is armed")
+    what.add_argument("--write", action="store_true", help="write the differing values; refused while PX4 is armed")
     params.add_argument(
         "file", nargs="?", type=Path, metavar="FILE", help="default: indoor motion capture, configs/px4/"
     )
     where = params.add_mutually_exclusive_group()
-    where.add_argument("--vehicle", metavar="FILE", default=VEHICLE, help=f"whose address to use (default: {VEHICLE})")
+    where.add_argument(
+        "--vehicle", metavar="FILE", default=VEHICLE, help=f"vehicle file with PX4's address (default: {VEHICLE})"
+    )
     where.add_argument("--address", help="MAVSDK's, e.g. udpin://0.0.0.0:14540")
-    params.add_argument("--backup", type=Path, metavar="FILE", help="old values go there (default: px4_TIME.params)")
-    params.add_argument("--json", action="store_true", help="print it as JSON, nothing else")
+    params.add_argument(
+        "--backup", type=Path, metavar="FILE", help="file for the old values (default: px4_TIME.params)"
+    )
+    params.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
     params.set_defaults(run=run)
 
 
@@ -78,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: AutopilotDevice, source: str) -> int:
     from companion.io.px4.driver import (
-        MavsdkAutopilot,  # MAVSDK's library takes a moment to load: not for every command
+        MavsdkAutopilot,  # MAVSDK's library takes a moment to load, so not every command imports it
     )
 
     async with MavsdkAutopilot(device, flight_clock()) as autopilot:
@@ -138,7 +142,7 @@ def _print(
 
 
 def jsonable(comparison: Comparison, result: WriteResult | None, backup: Path | None) -> dict[str, Any]:
-    """Return the result for scripts. `reboot` is null where it is not known; a comparison has no `written`."""
+    """Return the result for scripts. `reboot` is null if unknown; a comparison has no `written`."""
     done: dict[str, Any] = {}
     ok = comparison.same
     if result is not None:
@@ -162,26 +166,26 @@ def jsonable(comparison: Comparison, result: WriteResult | None, backup: Path | 
 
 def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
     """Return the result as text."""
-    told = [
+    shown = [
         f"{d.name:16}  {value_text(d.px4):>12} -> {value_text(d.file)}{'  (after a reboot)' if d.reboot else ''}"
         for d in (comparison.differences if result is None else result.written)
     ]
-    told += [f"{name:16}  PX4 does not have it" for name in comparison.absent]
-    differ = len(told)
-    told += [f"{name:16}  no such serial port in this PX4, left out" for name in comparison.absent_port]
-    told += [
-        f"{d.name:16}  {value_text(d.px4):>12}, measured on each installation, left as it is (the file: {value_text(d.file)})"
+    shown += [f"{name:16}  PX4 does not have it" for name in comparison.absent]
+    differ = len(shown)
+    shown += [f"{name:16}  no such serial port in this PX4, left out" for name in comparison.absent_port]
+    shown += [
+        f"{d.name:16}  {value_text(d.px4):>12}, measured on each installation, left unchanged (the file has {value_text(d.file)})"
         for d in comparison.measured
     ]
     if result is None:
-        told.append("nothing differs" if comparison.same else f"{differ} differ")
-        return told
-    told.append(f"{len(result.written)} of {len(comparison.differences)} written, each read back")
+        shown.append("nothing differs" if comparison.same else f"{differ} differ")
+        return shown
+    shown.append(f"{len(result.written)} of {len(comparison.differences)} written, each read back")
     if result.problem is not None:
-        told.append(result.problem)
+        shown.append(result.problem)
     reboot = [difference.name for difference in result.written if difference.reboot]
     if reboot:
-        told.append(f"reboot PX4: {', '.join(reboot)}")
+        shown.append(f"reboot PX4: {', '.join(reboot)}")
     if any(difference.reboot is None for difference in result.written):
-        told.append("of parameters beyond this project's own it is not known here whether they need a reboot")
-    return told
+        shown.append("it is unknown whether parameters beyond this project's own need a reboot")
+    return shown

@@ -95,11 +95,11 @@ class Graded:
     log: FlightLog
     summary: dict[str, Any]
     note: str | None
-    """Why the summary beside the log was not used; None if it was."""
+    """Why the summary beside the log was not used; None if it was used."""
 
 
 def graded(path: Path) -> Graded:
-    """Read a log and grade it. What only the launcher of the flight knew comes from the summary beside the log.
+    """Read a log and grade it. Facts that only the flight's launcher knew come from the summary beside the log.
 
     Raises:
         LogError: the file is not a log.
@@ -137,7 +137,7 @@ def _known(path: Path, own: dict[str, Any]) -> tuple[dict[str, Any], str | None]
         times = {event["t_s"] for event in known["events"]}
         same = known["loop"]["ticks"] == own["loop"]["ticks"] and times >= {event["t_s"] for event in own["events"]}
     except (KeyError, TypeError):
-        return {}, f"{path}: is no summary of a flight; outcome and payload are not taken from it"
+        return {}, f"{path}: is not a summary of a flight; outcome and payload are not taken from it"
     return (
         (known, None)
         if same
@@ -249,12 +249,12 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 def _folder(asked: str | None, flights: Sequence[Flight]) -> Path:
-    """Return the folder to write to: one that holds no report of other flights."""
+    """Return the output folder, which must not contain a report of other flights."""
     digests = [flight.digest for flight in flights]
     if asked is not None:
         folder = Path(asked)
         if _holds_others(folder, digests):
-            raise _refusal(f"--out {folder}: there is a {RESULT} of other flights already; choose another folder")
+            raise _refusal(f"--out {folder}: contains a {RESULT} of other flights already; choose another folder")
         return folder
     name = "-vs-".join(flight.name.replace("/", "-") for flight in flights)
     if len(name.encode()) > _NAME_BYTES_MAX:

@@ -17,8 +17,8 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "robustness",
         help="fly a mission in many worlds drawn at random",
-        description="Fly a mission in the fast closed loop in worlds drawn at random: payload, throw and catch point, and all that the "
-        "world leaves to its seed. A key of world. that --set sets is not drawn. Exit code 5 if any flight crashed or was lost.",
+        description="Fly a mission in the fast closed loop in worlds drawn at random: payload, throw and catch point, and everything "
+        "that the world's seed draws. A key of world. that --set sets is not drawn. Exit code 5 if any flight crashed or was lost.",
     )
     parser.add_argument("mission", nargs="?", help=f"mission file, YAML (default: {DEFAULT_MISSION})")
     parser.add_argument("--draws", type=count, default=500, metavar="N", help="number of flights (default: 500)")
@@ -45,7 +45,7 @@ def add_parser(commands: Any) -> None:
 
 def _number(text: str) -> int:
     if not text.isdecimal() or len(text) > 9:
-        raise argparse.ArgumentTypeError(f"expected a number from 0 on, got '{text}'")
+        raise argparse.ArgumentTypeError(f"expected a number of 0 or more, got '{text}'")
     return int(text)
 
 
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Robustness:
-    """Check everything before anything flies.
+    """Check everything before the first flight.
 
     Raises:
         ConfigError: one line per problem.
@@ -77,7 +77,7 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
     # The preset of the file belongs to its law.
     preset = arguments.preset or (kept.preset if kept is not None and arguments.controller is None else None)
     law = arguments.controller or (kept.controller if kept is not None else None)
-    # A case holds its whole world.
+    # A case contains its whole world.
     world = arguments.world or ("robustness" if kept is None else "ideal")
     numbers = range(arguments.first, arguments.first + arguments.draws)
     return Robustness(

@@ -39,10 +39,10 @@ class _Brief(GenerateJsonSchema):
 
 
 def schema_json(kind: str) -> str:
-    """JSON Schema (2020-12) of one kind of file, as text without a final newline.
+    """Return the JSON Schema (2020-12) of one kind of file, as text without a final newline.
 
     Raises:
-        KeyError: if the kind is none of `KINDS`.
+        KeyError: the kind is not one of `KINDS`.
     """
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     schema |= KINDS[kind].json_schema(schema_generator=_Brief)

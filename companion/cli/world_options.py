@@ -1,4 +1,4 @@
-"""The options that choose the simulated world, the same in every command that has one."""
+"""Options for the simulated world, shared by all commands that use it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from companion.sitl_config.loader import DEFAULT_WORLD, WORLDS
 
 
 def add_world(parser: argparse.ArgumentParser, default: str | None = DEFAULT_WORLD) -> None:
-    """Add `--world`; without a default it belongs to `companion robustness`."""
+    """Add `--world`; only `companion robustness` has no default."""
     parser.add_argument(
         "--world",
         default=default,

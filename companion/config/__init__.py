@@ -1,1 +1,1 @@
-"""What a user may write down: vehicle, mission, controller and SITL world files, checked on reading."""
+"""Configuration files of the user: vehicle, mission, controller and SITL world, checked on reading."""

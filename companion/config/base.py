@@ -21,7 +21,7 @@ def refuse(title: str, problems: list[tuple[Location, str]]) -> None:
     """Raise the problems that a model validator has found, each at its own location, so that messages name the right line.
 
     Raises:
-        ValidationError: if there is any problem. Pydantic adds the model's own place in the document in front.
+        ValidationError: if there is any problem. Pydantic prepends the model's own location in the document.
     """
     if not problems:
         return

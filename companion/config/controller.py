@@ -18,7 +18,7 @@ Positive4 = tuple[Positive, Positive, Positive, Positive]
 
 
 class _LawConfig(Model):
-    """Settings of every law: the measured force, what is compensated beyond its own terms, and the limits of its commands."""
+    """Settings of every law: the measured force, additional compensation, and the limits of its commands."""
 
     force_lowpass_hz: Positive
     desired_force_time_s: Positive | None = None
@@ -104,13 +104,13 @@ class AdaptiveConfig(_LawConfig):
         for row, (m_d, k_d, phi, k_p) in enumerate(rows):
             if not k_d / m_d - phi > 0:
                 problems.append(
-                    (("damping_kd", row), f"gain_new asks for K_d / M_d > Phi, got {k_d / m_d:g} <= {phi:g}")
+                    (("damping_kd", row), f"gain_new requires K_d / M_d > Phi, got {k_d / m_d:g} <= {phi:g}")
                 )
                 continue
             wanted = (k_d - m_d * phi) * phi
             if abs(wanted - k_p) > 2e-3 * k_p:
                 problems.append(
-                    (("stiffness_kp", row), f"gain_cond asks for (K_d - M_d Phi) Phi = {wanted:g}, got {k_p:g}")
+                    (("stiffness_kp", row), f"gain_cond requires (K_d - M_d Phi) Phi = {wanted:g}, got {k_p:g}")
                 )
         refuse("controller", problems)
         return self
@@ -128,13 +128,13 @@ class CscConfig(_LawConfig):
     inertia_md: Positive8
     """M_d: kg and kg m^2."""
     damping_kd: Positive8
-    """K_d. On the attitude rows it describes the damping of PX4's attitude loop and commands nothing."""
+    """K_d. On the attitude rows it describes the damping of PX4's attitude loop and has no effect on commands."""
     stiffness_kp: Positive8
-    """K_p. On the attitude rows it describes the stiffness of PX4's attitude loop and commands nothing."""
+    """K_p. On the attitude rows it describes the stiffness of PX4's attitude loop and has no effect on commands."""
     external_xyz: NonNegative3 = (1.0, 1.0, 1.0)
-    """Share of the measured F_ext, per world axis, that the base's impedance answers and the model cancels."""
+    """Share of the measured F_ext, per world axis, that enters the base's impedance and that the model cancels."""
     desired_force_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Share of F_d that the base carries. With 0 the base also gives way to a carried payload."""
+    """Share of F_d that the base carries. With 0 the base also yields to a carried payload."""
     model_mass_scale: Positive = 1.0
     """Factor on the masses and inertias of the vehicle file, for studies of a wrong model."""
 

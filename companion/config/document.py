@@ -76,7 +76,7 @@ class Document:
     """A file as read and overridden. It is mutable for the overrides, and used only while a configuration is loaded."""
 
     source: str
-    """Path of the file as the user gave it."""
+    """Path of the file as given by the user."""
     data: dict[str, Data]
     values: dict[Location, Origin] = field(default_factory=dict)
     """Origins of values; a location that is not listed has the origin of its nearest parent."""

@@ -1,6 +1,6 @@
 """Pydantic's errors as one message per problem: origin, key, expected and found value, and a suggestion.
 
-Expectations and known keys are read from the model's own JSON schema, so that they cannot differ from what is checked.
+Expectations and known keys are read from the model's own JSON schema, so that they cannot differ from the checks.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MANY_OPTIONS = 12
 
 @functools.cache
 def schema_of(model: type[Model]) -> _Node:
-    """Return the model's JSON Schema; making it takes longer than all other validation."""
+    """Return the model's JSON Schema; its generation takes longer than all other validation."""
     return model.model_json_schema()
 
 
@@ -60,15 +60,15 @@ def validate(model: type[M], document: Document) -> M | None:
     except ValidationError as error:
         found += _problems(error, schema, document)
         built = None
-    told = {(problem.origin, problem.text.split(": ")[0]) for problem in document.problems}
-    document.problems += [problem for problem in found if (problem.origin, problem.text.split(": ")[0]) not in told]
+    reported = {(problem.origin, problem.text.split(": ")[0]) for problem in document.problems}
+    document.problems += [problem for problem in found if (problem.origin, problem.text.split(": ")[0]) not in reported]
     return None if document.problems else built
 
 
 def _problems(error: ValidationError, schema: _Node, document: Document) -> list[Problem]:
     problems: list[Problem] = []
     meant: set[Location] = set()
-    told: set[Location] = set()
+    reported: set[Location] = set()
     missing: list[tuple[Location, str]] = []
     for detail in error.errors(include_url=False):
         at, node, parent = _walk(schema, detail["loc"])
@@ -84,8 +84,8 @@ def _problems(error: ValidationError, schema: _Node, document: Document) -> list
             else:
                 missing.append((at, describe(node, schema)))
                 continue
-        if at not in told:
-            told.add(at)
+        if at not in reported:
+            reported.add(at)
             problems.append(_value_problem(detail, at, node, schema, document))
     for at, expected in missing:
         if at not in meant:
@@ -162,8 +162,8 @@ def _bounds(node: _Node) -> str:
     if low is not None and high is not None:
         return f" from {low:g} to {high:g}"
     parts = [(">", above), (">=", low), ("<", below), ("<=", high)]
-    told = " and ".join(f"{sign} {bound:g}" for sign, bound in parts if bound is not None)
-    return f" {told}" if told else ""
+    bounds = " and ".join(f"{sign} {bound:g}" for sign, bound in parts if bound is not None)
+    return f" {bounds}" if bounds else ""
 
 
 def _plural(item: str) -> str:

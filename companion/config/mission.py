@@ -1,4 +1,4 @@
-"""The mission file: where the machine starts, what it may do, and the phases it flies.
+"""The mission file: start pose of the machine, motion limits, and the phases of the flight.
 
 Positions are of the body's origin in the world frame (z up, 0 on the floor); angles of the arm are the paper's.
 """
@@ -21,7 +21,7 @@ Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
 class Takeoff(Model):
-    """Climb vertically from where the vehicle stands."""
+    """Climb vertically from the start position."""
 
     type: Literal["takeoff"]
     name: Name | None = None
@@ -59,7 +59,7 @@ class Line(Model):
         if self.arm_deg is None:
             for key in ("arm_delay_s", "arm_duration_s"):
                 if getattr(self, key) is not None:
-                    problems.append(((key,), "says when the arm moves, but arm_deg, where it moves to, is missing"))
+                    problems.append(((key,), "gives the time of an arm motion, but its target arm_deg is missing"))
         else:
             end_s = (self.arm_delay_s or 0.0) + (self.arm_duration_s or 0.0)
             if self.duration_s is not None and (
@@ -171,7 +171,7 @@ class Mission(Model):
     limits: Limits
     catch: Catch | None = None
     repeat: Annotated[int, Field(ge=1, le=1000)] = 1
-    """How often the phases between take-off and landing are flown."""
+    """Number of times that the phases between take-off and landing are flown."""
     phases: Annotated[tuple[Phase, ...], Field(min_length=2, max_length=200)]
 
     @model_validator(mode="after")
@@ -205,7 +205,9 @@ class Mission(Model):
             elif isinstance(phase, Path):
                 for number, point_m in enumerate(phase.through_m):
                     if math.dist(at_m, point_m) < POINTS_APART_M:
-                        text = f"is where the path already is; points must be {POINTS_APART_M:g} m apart or more"
+                        text = (
+                            f"repeats the previous point of the path; points must be {POINTS_APART_M:g} m apart or more"
+                        )
                         problems[("phases", index, "through_m", number)] = text
                     at_m = point_m
         refuse("mission", list(problems.items()))

@@ -92,7 +92,7 @@ class Tool(Model):
     sensor_mass_kg: NonNegative
     """Mass of sensor and mount on the arm's side, which the sensor does not measure."""
     net_mass_kg: NonNegative
-    """Mass of everything on the tool side of the sensor; its weight is subtracted from the readings."""
+    """Mass of all parts on the tool side of the sensor; its weight is subtracted from the readings."""
     net_radius_m: Positive
     sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
     """Sensor frame in the frame of link 2 (x outwards along the link, y along the joint axis), ZYX roll, pitch, yaw."""
@@ -124,7 +124,7 @@ class Tether(Model):
     pull_filter_s: Positive = 0.1
     """Time constant of the low-pass of the force that rotors, gravity and tool do not explain."""
     pull_time_s: NonNegative = 0.8
-    """A shorter pull is a blow."""
+    """Shortest pull that is not treated as a blow."""
     separation_m: Positive = 0.3
     """Distance beyond the length without a pull at which the tether is considered separated."""
     rotor_inner_radius_m: NonNegative = 0.15
@@ -148,8 +148,8 @@ class AutopilotDevice(Model):
     """MAVSDK connection, such as udpin://0.0.0.0:14540 or serial:///dev/ttyAMA0:921600."""
     discovery_timeout_s: Positive = 10.0
     setpoint_path: Literal["direct", "offboard"] = "direct"
-    """How SET_ATTITUDE_TARGET is sent: direct (MAVSDK's MavlinkDirect, only when the flight loop sends) or offboard (MAVSDK's Offboard
-    plugin, whose thread repeats the last setpoint at 20 Hz, also while the flight loop hangs)."""
+    """Path of SET_ATTITUDE_TARGET: direct (MAVSDK's MavlinkDirect, only when the flight loop sends) or offboard (MAVSDK's Offboard
+    plugin, whose thread repeats the last setpoint at 20 Hz, even while the flight loop hangs)."""
 
 
 ANY_INTERFACE = "0.0.0.0"
@@ -212,7 +212,7 @@ class Devices(Model):
 
 
 class Safety(Model):
-    """Limits of the safety rules, and how the vehicle reacts. The rules: docs/safety.md."""
+    """Limits of the safety rules, and times of the reactions. docs/safety.md describes the rules."""
 
     preflight_s: Annotated[float, Field(ge=1, le=60)] = 5.0
     """Time for which all devices are observed before arming."""
@@ -236,8 +236,8 @@ class Safety(Model):
     mocap_frozen_s: Positive = 0.10
     """Time with new frames but an identical pose while the vehicle moves."""
     mocap_inertial_m: Positive = 0.025
-    """Largest distance between a pose and the position predicted by the IMU; above it PX4 lands without motion capture. Sound flights
-    with 10 m/s2 of vibration reached 0.0084. 0.015 finds drags that begin at 0.2 m/s or faster, 0.025 at 0.3 m/s, 0.04 at 0.5 m/s."""
+    """Largest distance between a pose and the position predicted by the IMU; above it PX4 lands without motion capture. Normal flights
+    with 10 m/s2 of vibration reached 0.0084. 0.015 detects drags that begin at 0.2 m/s or faster, 0.025 at 0.3 m/s, 0.04 at 0.5 m/s."""
     mocap_inertial_s: NonNegative = 0.05
     """Hold time of `mocap_inertial_m`."""
     estimate_disagreement_m: Positive = 0.30
@@ -269,7 +269,7 @@ class Safety(Model):
     joint_jump_deg: Positive = 15.0
     """Largest change between two reads beyond what the joint's largest speed explains."""
     joint_rate_max_deg_s: Positive = 700.0
-    """Joint rate that no servo of this kind reaches, even when it is driven from outside."""
+    """Joint rate that no servo of this kind reaches, even if an external force drives it."""
     joint_wall_warn_deg: Positive = 3.0
     joint_wall_max_deg: Positive = 10.0
     """Angle beyond a joint limit."""
@@ -304,7 +304,7 @@ class Safety(Model):
     geofence_tolerance_m: NonNegative = 0.10
     """Distance by which the rotors may leave the room: a mission may use all of it, and tracking has errors."""
     tether_stop_slack_min_m: NonNegative = 0.10
-    """Smallest slack where the vehicle would come to rest."""
+    """Smallest slack at the predicted stop."""
 
     # Reactions
     guardian_timeout_s: Positive = 0.1
@@ -355,9 +355,7 @@ class Vehicle(Model):
         for axis, own in enumerate(self.airframe.inertia_kg_m2):
             others = sum(self.airframe.inertia_kg_m2) - own
             if own > others * (1.0 + 1e-9):
-                text = (
-                    f"expected at most {others:g} kg m^2, the sum of the other two, as of every rigid body, got {own:g}"
-                )
+                text = f"expected at most {others:g} kg m^2, the sum of the other two, as for every rigid body, got {own:g}"
                 problems.append((("airframe", "inertia_kg_m2", axis), text))
         carried_kg = sum(self.arm.link_masses_kg) + self.tool.sensor_mass_kg + self.tool.net_mass_kg
         if carried_kg >= self.airframe.mass_kg:

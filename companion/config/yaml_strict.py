@@ -1,7 +1,7 @@
 """Strict YAML: the 1.2 core schema, no duplicate keys, and the origin of every value.
 
-PyYAML speaks YAML 1.1, where `1e3` is text, `on` is true, `12:30` is 750 and a duplicate key overwrites the first. Here the scalars are
-those of YAML 1.2's core schema (section 10.3.2); duplicate keys, aliases and tags are refused.
+PyYAML implements YAML 1.1, where `1e3` is text, `on` is true, `12:30` is 750 and a duplicate key overwrites the first. Here the scalars
+are those of YAML 1.2's core schema (section 10.3.2); duplicate keys, aliases and tags are refused.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _HEX = re.compile(r"0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)")
 _NAN = re.compile(r"\.(nan|NaN|NAN)")
-_HALF_CHARACTER = "an escape (\\uD800 to \\uDFFF) that is half a character; write the character itself"
+_HALF_CHARACTER = "an escape (\\uD800 to \\uDFFF) for half a character; write the character itself"
 _DIGITS_MAX = 400  # Python refuses to convert integers of more than 4300 digits with an exception of its own.
 
 
@@ -91,7 +91,7 @@ def read_document(path: str | Path, shown_as: str | None = None) -> Document:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise ConfigError([f"{shown}: not readable: {reason}"]) from None
     if len(raw) > SIZE_MAX_BYTES:
-        raise ConfigError([f"{shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; is this a configuration file?"])
+        raise ConfigError([f"{shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; expected a configuration file"])
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -141,9 +141,9 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
         except (
             ValueError,
             OverflowError,
-        ) as error:  # PyYAML converts "\\U0011FFFF" and %YAML 1.999... without a look at them
+        ) as error:  # PyYAML converts "\\U0011FFFF" and %YAML 1.999... without a check
             at = origin(loader.get_mark())
-            raise ConfigError([f"{at}: not YAML: an escape or a number that means nothing ({error})"]) from None
+            raise ConfigError([f"{at}: not YAML: an invalid escape or number ({error})"]) from None
         finally:
             loader.dispose()
     except yaml.reader.ReaderError as error:
@@ -179,7 +179,7 @@ class _Builder:
         if not _is_unicode(text):
             self._refuse(RANK_VALUE, node.start_mark, location, _HALF_CHARACTER)
             return None
-        if node.style is not None:  # quoted or block: text, whatever it looks like
+        if node.style is not None:  # quoted or block scalars are always text
             return text
         try:
             return _scalar(text)
@@ -255,9 +255,7 @@ def _syntax(error: yaml.MarkedYAMLError) -> str:
     if "expected a single document" in (error.context or "") or "but found another document" in problem:
         return "a second document (---); one per file"
     if "mapping values are not allowed here" in problem:
-        return (
-            "a ':' that does not belong here; is the line above complete, is the text quoted, is the indentation right?"
-        )
+        return "an unexpected ':'; check the line above, the quotes and the indentation"
     if "could not find expected ':'" in problem:
         return "a key without ':'"
     if problem.startswith("expected <block end>"):

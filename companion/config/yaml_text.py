@@ -1,4 +1,4 @@
-"""Values as YAML text on one line, for files that a person goes on editing. Pure."""
+"""Values as YAML text on one line, for files that a user continues to edit. Pure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def flow_text(value: Any) -> str:
     """Return a value in flow style, on one line, as `parse_value` reads it back.
 
     Args:
-        value: None, bool, int, float, str, or lists, tuples and dicts of them. A string that is no plain word is quoted, and every
+        value: None, bool, int, float, str, or lists, tuples and dicts of them. A string that is not a plain word is quoted, and every
             character that YAML would fold, break at or strip is escaped.
     """
     if isinstance(value, dict):

@@ -47,8 +47,8 @@ def choose_adapters(
 ) -> tuple[str | None, str | None, tuple[str, ...]]:
     """Return the serial numbers of the arm's and the force sensor's adapter, and one line of explanation for each.
 
-    A serial number that was given is used as it is. Otherwise the only remaining FTDI adapter of the right kind is chosen: a U2D2
-    for the arm, another one for the force sensor. None if no adapter fits, or several do.
+    A given serial number is used unchanged. Otherwise the only remaining FTDI adapter of the right kind is chosen: a U2D2
+    for the arm, another one for the force sensor. The result is None if no adapter or several fit.
     """
     reasons = []
     chosen: dict[str, str | None] = {"arm": arm_serial, "force": force_serial}

@@ -51,7 +51,7 @@ def pending_changes(root: Path, plan: Plan, record: Record | None) -> Changes:
     """Compare the plan with the file system; changes nothing.
 
     Raises:
-        InstallError: a path is blocked, or a file was changed by someone else since it was installed.
+        InstallError: a path is blocked, or a file was changed since its installation.
     """
     old = record or Record()
     entries, now = {}, {}
@@ -89,7 +89,7 @@ def _before(path: str, found: PathState, old: Record) -> PathState:
 
 def changed_by_others(path: str) -> str:
     """Return the message for a file that was changed after the installation."""
-    return f"{path}: was changed since companion install wrote it; restore it or move the file away, then try again"
+    return f"{path}: was changed after its installation; restore it or move the file away, then try again"
 
 
 def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
@@ -141,7 +141,7 @@ def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
             raise InstallError(
                 f"{why}; not restored: {trouble}; correct that, then run: companion install --undo"
             ) from None
-        raise InstallError(f"{why}; everything is as it was before") from None
+        raise InstallError(f"{why}; all changes were reverted") from None
     return True
 
 
@@ -153,10 +153,10 @@ def _roll_back(root: Path, found: Changes, record: Record | None, made: Record) 
             write_state(under_root(root, path), found.now[path])
         except OSError as error:
             if not under_root(root, path).parent.is_dir() and found.now[path].absent:
-                continue  # its folder could not be made
+                continue  # its folder could not be created
             trouble.append(f"{path}: {error.strerror}")
     if trouble:
-        return "; ".join(trouble)  # the record stays, for undo
+        return "; ".join(trouble)  # the record remains for undo
     _remove_users(made, lambda _: None)
     with contextlib.suppress(OSError):
         if record is None:
@@ -171,8 +171,8 @@ def undo(root: Path, report: Report) -> bool:
     """Revert the installation; return False if nothing is installed.
 
     Raises:
-        InstallError: a file was changed by someone else or the service runs, and nothing was reverted; or the undo stopped half way,
-            and running it again continues.
+        InstallError: a file was changed after the installation or the service runs, and nothing was reverted; or the undo was
+            interrupted and can be run again.
     """
     record = load(root)
     if record is None:
@@ -230,7 +230,7 @@ def _take_ownership(root: Path, record: Record, report: Report) -> None:
         shutil.rmtree(config)
         report(f"removed {HOME}/.config: the service's keys")
     owner, group = os.geteuid(), os.getegid()
-    # fwalk follows no symbolic link: the service wrote what is in there.
+    # fwalk follows no symbolic link, because the service wrote the contents.
     for _, folders, files, folder_fd in os.fwalk(home):
         os.fchown(folder_fd, owner, group)
         for name in (*folders, *files):
@@ -328,4 +328,4 @@ def _run(command: Command, report: Report) -> None:
     elif command.needed:
         raise InstallError(f"{command}: {why}")
     else:
-        report(f"failed, the next boot does the same: {command}: {why}")
+        report(f"failed; it runs again at the next boot: {command}: {why}")

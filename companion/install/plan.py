@@ -26,7 +26,7 @@ class Settings:
     """Serial number of the arm's USB adapter; None for no stable device name."""
     force_serial: str | None
     at_boot: bool
-    """The service starts at boot."""
+    """Whether the service starts at boot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Command:
     argv: tuple[str, ...]
     why: str
     needed: bool = False
-    """If the command fails, the installation is rolled back. A command that is not needed is made up for by the next boot."""
+    """Whether a failure of the command rolls the installation back. Otherwise the next boot has the same effect as the command."""
 
     def __str__(self) -> str:
         return " ".join(self.argv)
@@ -95,12 +95,12 @@ def plan(settings: Settings) -> Plan:
 
 
 def isolation(cores: int) -> tuple[str, ...]:
-    """Return advice on reserving cores, for computers with more than two; the program never reserves any itself."""
+    """Return advice on reserving cores on computers with more than two; the installation reserves none."""
     if cores < 3:
         return ()
     rest, own = f"0-{cores - 3}" if cores > 3 else "0", f"{cores - 2},{cores - 1}"
     return (
-        f"Cores: nothing is reserved. Should the report show late ticks, keep cores {own} for the flight:",
+        f"Cores: nothing is reserved. If the report shows late ticks, keep cores {own} for the flight:",
         f"  vehicle file                                   computer: {{cpus: [{own.replace(',', ', ')}]}}",
         f"  /etc/systemd/system.conf.d/50-cores.conf       [Manager] CPUAffinity={rest}",
         "isolcpus= can replace CPUAffinity, but only with real-time scheduling: threads are not balanced between isolated cores.",

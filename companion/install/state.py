@@ -90,10 +90,10 @@ def read_state(path: Path) -> PathState:
 
 
 def write_state(path: Path, state: PathState) -> None:
-    """Write, replace or remove a path, whole or not at all, also through a loss of power.
+    """Write, replace or remove a path atomically, even across a loss of power.
 
     Raises:
-        OSError: it cannot be done; the path is as it was.
+        OSError: the change failed; the path is unchanged.
     """
     if state.link is not None:
         beside = path.with_name(f".{path.name}.companion-new")

@@ -43,12 +43,12 @@ Environment=HOME=/var/lib/{STATE_DIRECTORY} PYTHONUNBUFFERED=1
 
 # A flight that ended is never restarted automatically: an operator checks the vehicle first.
 Restart=no
-# SIGTERM goes to the launcher alone, which lands; to all at once it would end the guardian and cut the log. And when the launcher
-# itself is gone, nobody kills the flight that still lands, or its guardian.
+# SIGTERM goes to the launcher only, which lands; sent to all it would end the guardian and truncate the log. If the launcher
+# itself is gone, the landing flight process and its guardian are not killed.
 KillMode=process
 KillSignal=SIGTERM
 TimeoutStopSec={STOP_TIMEOUT_S}
-# 4: aborted and landed, or never took off; the result of systemctl stop.
+# 4: aborted and landed, or never took off; also the result of systemctl stop.
 SuccessExitStatus=4
 OOMPolicy=continue
 OOMScoreAdjust=-900
@@ -118,7 +118,7 @@ def udev_rules(arm_serial: str | None, force_serial: str | None) -> str:
     """Return the rules for the two USB serial adapters, both with FTDI chips."""
     lines = [
         _HEAD,
-        "# The adapter holds an answer for this long; the driver's default of 16 ms costs three ticks per cycle of the arm's bus.",
+        "# The adapter delays an answer by this time; the driver's default of 16 ms costs three ticks per cycle of the arm's bus.",
         'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"',
     ]
     for name, what, serial in (

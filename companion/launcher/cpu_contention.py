@@ -1,4 +1,4 @@
-"""Detection of a computer that is too busy for a flight, by how long its processes were ready to run without a core.
+"""Detection of a computer that is too busy for a flight, by the time that its processes wait for a core.
 
 A computer whose cores are taken by other programs looks like failing devices: answers arrive late or not at all. The scheduler's
 statistics show the cause.
@@ -17,7 +17,7 @@ from companion.model.check_row import Level
 from companion.model.types import SafetyAction, Severity
 
 WAIT_MAX = 0.15
-"""Share of the time; a process that waits longer than this for a core answers too late."""
+"""Share of the time that a process may wait for a core before it responds too late."""
 WAIT_LATE_MAX, LATE_S = 0.05, 0.005
 """The same limit when ticks are late by `LATE_S` or more."""
 WINDOW_S, SAMPLE_S = 3.0, 0.5
@@ -31,7 +31,7 @@ CAUSED_BY_LATENESS = frozenset({
 ADVICE = "close other programs, or permit real-time priority: docs/raspberry-pi.md, Real time"
 
 CoreWaits = Mapping[int, float]
-"""By thread id: seconds that the thread was ready to run without a core, since it started."""
+"""Time that each thread has waited for a core since its start, s, by thread id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +41,14 @@ class ProcessWait:
     process: str
     """Name of the process, for the message."""
     share: float
-    """Share of the time, 0 to 1, of the thread that waited longest."""
+    """Waiting time of the thread that waited longest, as a share of the time, 0 to 1."""
 
 
 def contention_message(waits: Sequence[ProcessWait], late_s: float) -> str | None:
     """Return one line for the operator if the computer is too busy, else None.
 
     Args:
-        waits: one for each process.
+        waits: waits of each process.
         late_s: 99th percentile of the ticks' lateness; 0 before the first tick.
     """
     worst = max((wait.share for wait in waits), default=0.0)

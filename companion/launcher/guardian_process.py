@@ -16,7 +16,7 @@ from companion.runtime import ipc
 from companion.runtime.subprocesses import holds_traceback, how_it_ended, last_line, remove_file, terminate, write_text
 
 SILENT_S = 5.0
-"""After a takeover the guardian reports twice a second; silent for this long it counts as hung."""
+"""Silence after which the guardian counts as hung; after a takeover it reports twice per second."""
 
 
 class GuardianProcess:
@@ -67,7 +67,7 @@ class GuardianProcess:
         self.events: list[ipc.Message] = []
         self.result: ipc.Message | None = None
         self.open = True
-        """The guardian has not closed its end of the channel."""
+        """Whether the guardian's end of the channel is open."""
         self._heard_s = time.monotonic()
 
     @property
@@ -126,7 +126,7 @@ class GuardianProcess:
         return None
 
     def summary_events(self) -> list[dict[str, Any]]:
-        """Return its events as summary.json lists events."""
+        """Return the guardian's events in the format of summary.json."""
         return [
             {
                 "t_s": event["flight_t_s"],
@@ -141,7 +141,7 @@ def outcome_of(result: ipc.Message | None) -> Outcome:
     """Return the outcome of a flight that the guardian took over.
 
     Args:
-        result: its `guardian_result` message; None if it sent none.
+        result: the guardian's `guardian_result` message; None if it sent none.
     """
     if result is None or not result["landed"]:
         return Outcome.LOST

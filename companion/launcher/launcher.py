@@ -44,8 +44,8 @@ from companion.sitl_config.loader import SitlConfig
 SITL_SETTLE_TIMEOUT_S = 40.0
 """Time for the simulated world to come to rest after the flight process is gone."""
 FLIGHT_SILENT_TIMEOUT_S = 5.0
-"""A flight process that sends nothing for this long hangs, and the guardian has not acted: it does not act on the ground, and may be
-dead. Once the flight process is killed, PX4 lands by its own offboard-loss failsafe.
+"""Silence after which the flight process counts as hung without an action of the guardian, which does not act on the ground and may
+be dead. Once the flight process is killed, PX4 lands by its own offboard-loss failsafe.
 """
 GUARDIAN_EXIT_TIMEOUT_S = 5.0
 """Time for a guardian that is not needed to exit after the flight process is gone."""
@@ -58,18 +58,18 @@ Sitl = Literal["stub", "px4"]
 
 @dataclass
 class FlightResult:
-    """Outcome of a flight and what is known about it."""
+    """Outcome of a flight and its data."""
 
     outcome: Outcome
     recorder: dict[str, Any] | None = None
     world: dict[str, Any] = field(default_factory=dict)
-    """Truth of the simulated world: payload_kg, caught, crashed, ..."""
+    """True state of the simulated world: payload_kg, caught, crashed, ..."""
     events: tuple[dict[str, Any], ...] = ()
-    """Events that the flight process reported, as summary.json lists them. The log holds them too, unless the recorder died."""
+    """Events that the flight process reported in the format of summary.json. The log holds them too, unless the recorder died."""
     guardian_events: tuple[dict[str, Any], ...] = ()
-    """Events of the guardian, as summary.json lists them; empty if it did not take over."""
+    """Events of the guardian in the format of summary.json; empty if it did not take over."""
     lines: tuple[str, ...] = ()
-    """For the user: why the flight was refused, or which process failed and where its log is."""
+    """Lines for the user: why the flight was refused, or which process failed and where its log is."""
 
     @property
     def exit_code(self) -> int:
@@ -118,7 +118,7 @@ class Launcher:
         self._guardian: GuardianProcess | None = None
         self._cpu_contention = CpuContention({})
         self._flying = False
-        """The flight process ticks and sends ten messages a second; false after the flight is over."""
+        """Whether the flight process ticks and sends ten messages per second; False after the flight."""
 
     def request_landing(self) -> None:
         """Request a landing (Ctrl-C); repeated requests change nothing."""
@@ -257,7 +257,7 @@ class Launcher:
 
     @staticmethod
     def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path) -> str:
-        """Return one line: what happened to the flight process, and to the vehicle."""
+        """Return one line on the end of the flight process and of the vehicle's flight."""
         vehicle = {
             Outcome.ABORTED: "the guardian landed the vehicle",
             Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",
@@ -354,7 +354,7 @@ class Launcher:
         self._check_cpu_contention(message)
 
     def _check_cpu_contention(self, message: ipc.Message) -> None:
-        """Report a busy computer next to an event that lateness may have caused."""
+        """Report a busy computer beside an event that lateness may have caused."""
         text = self._cpu_contention.on_message(message, time.monotonic())
         if text is None:
             return

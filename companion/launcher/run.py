@@ -17,7 +17,7 @@ from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.loader import SitlConfig
 
 TICKS_MAX = 60_000
-"""A longer flight (over 5 minutes at 200 Hz) is evaluated and drawn with fewer ticks: one hour at full rate would need 6 GB."""
+"""Max number of evaluated ticks. A flight over 5 minutes is thinned, because one hour at 200 Hz would need 6 GB."""
 
 
 def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:

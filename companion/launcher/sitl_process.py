@@ -17,7 +17,7 @@ from companion.sitl_config.loader import SitlConfig
 
 SITL_READY_TIMEOUT_S = 30.0
 PX4_READY_TIMEOUT_S = 700.0
-"""With a real PX4. The world has its own deadlines for PX4's boot and for a user who starts PX4 by hand."""
+"""Timeout with a real PX4. The world has its own deadlines for PX4's boot and for a user who starts PX4 by hand."""
 PX4_FOLDER = "px4"
 """Folder of a real PX4's files, below the flight's folder."""
 SITL_EXIT_TIMEOUT_S = 5.0
@@ -68,7 +68,7 @@ class SitlProcess:
 
         Args:
             on_message: called with the world's messages until then (type "progress": a line for the user).
-            given_up: polled several times a second; True cancels the wait.
+            given_up: polled several times per second; True cancels the wait.
 
         Raises:
             LaunchError: the world ended, was not ready in time, or the wait was cancelled.
@@ -113,7 +113,7 @@ class SitlProcess:
 
     @property
     def ended(self) -> bool:
-        """The world has closed its end of the pipe: it has exited or is about to."""
+        """Whether the world has closed its end of the pipe, because it has exited or is about to."""
         return self._lines.ended
 
     def _update(self, message: dict[str, Any]) -> None:

@@ -1,1 +1,1 @@
-"""What this project needs of PX4: its parameters, and the files that they are kept in."""
+"""PX4's parameters that this project requires, and their files."""

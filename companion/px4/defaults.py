@@ -1,4 +1,4 @@
-"""PX4's parameters that the simulated PX4 has: names, types (int for INT32, float for REAL32) and the defaults of PX4 1.16.
+"""Parameters of the simulated PX4: names, types (int for INT32, float for REAL32) and the defaults of PX4 1.16.
 
 Airframe and calibration are those of a set-up quadrotor. Names of `world.px4_params` are checked against this table.
 """

@@ -1,7 +1,7 @@
 """Parameter files in QGroundControl's format: tab-separated Vehicle-Id, Component-Id, Name, Value, Type; `#` begins a comment.
 
-Types are MAV_PARAM_TYPE: 6 is INT32, 9 is REAL32; PX4 has no others. The reader takes nothing that QGroundControl would not, and tells
-each mistake with file and line; what the writer writes reads back equal.
+Types are MAV_PARAM_TYPE: 6 is INT32, 9 is REAL32; PX4 has no others. The reader rejects everything that QGroundControl rejects and
+reports each error with file and line. Written values read back equal.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ Value = float | int
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line."""
+    """One line of the file."""
 
     name: str
     value: Value
-    """int for INT32, float in single precision for REAL32."""
+    """Value: int for INT32, float in single precision for REAL32."""
     line: int
     vehicle_id: int = VEHICLE_ID
     component_id: int = COMPONENT_ID
 
 
 def read(path: str | Path) -> dict[str, Value]:
-    """Values by name, in the file's order.
+    """Return the values by name, in the file's order.
 
     Raises:
-        ConfigError: one line per problem, `file:line: what is wrong`.
+        ConfigError: one line per problem, `file:line: problem`.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -80,7 +80,7 @@ def parse(text: str, source: str) -> list[Entry]:
 
 
 class _WrongError(Exception):
-    """What is wrong with a line."""
+    """A line is invalid; the text names the problem."""
 
 
 def _entry(line: str, number: int) -> Entry:
@@ -120,10 +120,10 @@ def _real32(name: str, cell: str) -> float:
 
 
 def single(value: float) -> float:
-    """Rounded to single precision, as PX4 stores it.
+    """Return the value rounded to single precision, as PX4 stores it.
 
     Raises:
-        OverflowError: too large for single precision.
+        OverflowError: the value is too large for single precision.
     """
     if math.isinf(value):
         raise OverflowError("infinite")
@@ -131,14 +131,14 @@ def single(value: float) -> float:
 
 
 def same(one: Value, other: Value) -> bool:
-    """Both are the same parameter value: the same type, and equal as PX4 stores them."""
+    """Return whether both are the same parameter value: the same type, and equal as PX4 stores them."""
     if isinstance(one, int) or isinstance(other, int):
         return isinstance(one, int) and isinstance(other, int) and one == other
     return single(one) == single(other)
 
 
 def value_text(value: Value) -> str:
-    """The fewest digits that read back equal."""
+    """Return the value as text with the fewest digits that read back equal."""
     if isinstance(value, int):
         return str(value)
     stored = single(value)
@@ -158,7 +158,7 @@ def _is(text: str, stored: float) -> bool:
 def text(
     values: Mapping[str, Value], heading: Iterable[str] = (), comments: Mapping[str, Iterable[str]] | None = None
 ) -> str:
-    """A whole file. `heading` and the `comments` before a name are lines without their `#`."""
+    """Return the text of a file. `heading` and the `comments` before a name are lines without their `#`."""
     lines = [_comment(line) for line in heading]
     lines.append(COLUMNS)
     for name, value in values.items():

@@ -1,8 +1,8 @@
-"""Every parameter of PX4 that a flight here depends on: what it must be, why, and what it means if it is not.
+"""PX4 parameters that a flight depends on: required value, reason, and consequence of another value.
 
 One table. The preflight's rows, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/px4.md and the stub's own
 settings are made from it. Names, types and limits are those of PX4 1.16.1 and 1.18 (their parameter metadata); whether a change needs
-a reboot is what PX4 says of it.
+a reboot is taken from PX4's metadata.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ Limits = Callable[[Vehicle], tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """One parameter. Ok is what `ok` lists, or what lies within `limits`, else `value` alone."""
+    """One parameter. Accepted are the values of `ok`, or values within `limits`, else only `value`."""
 
     name: str
     value: Value | None
-    """Goes into the file; its type is PX4's: int for INT32, float for REAL32. None: measured on each vehicle, in no file."""
+    """Value in the file, of PX4's type: int for INT32, float for REAL32. None if it is measured on each vehicle."""
     why: str
-    """What happens to the machine otherwise."""
+    """Consequence of another value."""
     level: Level = Level.REFUSE
     reboot: bool = False
     ok: tuple[int, ...] = ()
     limits: Limits | None = None
     limits_text: str = ""
-    """In words where the limits depend on the vehicle file."""
+    """Limits as text if they depend on the vehicle file."""
     fix: str = ""
-    """Instead of `set it`."""
+    """Remedy, if it is not to set the parameter."""
     hardware: bool = False
-    """Of the serial port TELEM2; looked at only on a serial link, and PX4's simulator does not have all of them."""
+    """Whether it belongs to the serial port TELEM2. It is checked only on a serial link; PX4's simulator lacks some of them."""
     file: bool = True
-    """Part of configs/px4/indoor_mocap.params."""
+    """Whether it is part of configs/px4/indoor_mocap.params."""
     measured: bool = False
-    """Measured on each installation: a value within `limits` that is not PX4's own default is left as it is."""
+    """Whether it is measured on each installation: a value within `limits` that is not PX4's own default is left unchanged."""
     only: str = ""
-    """The only PX4 version that has the parameter; other versions skip it. Empty if all have it."""
+    """The only PX4 version with the parameter; empty if all have it."""
 
     @property
     def integer(self) -> bool:
@@ -60,7 +60,7 @@ class Wanted:
         return isinstance(self.value, int)
 
     def accepts(self, value: Value, vehicle: Vehicle) -> bool:
-        """Return whether this vehicle can fly with the value that PX4 has."""
+        """Return whether this vehicle can fly with PX4's value."""
         if self.ok:
             return value in self.ok
         if self.limits is None:
@@ -84,7 +84,7 @@ class Wanted:
 
 
 NO_VEHICLE: Vehicle = None  # type: ignore[assignment]
-"""For limits that do not look at it."""
+"""Placeholder vehicle for limits that do not depend on it."""
 
 
 def _between(low: float, high: float) -> Limits:
@@ -121,20 +121,18 @@ _CEILING = "0 to `room.z_m` less 0.3"
 GROUPS: dict[str, tuple[Wanted, ...]] = {
     "Estimator: motion capture alone": (
         Wanted("EKF2_EN", 1, "without EKF2 there is no estimate at all"),
-        Wanted(
-            "EKF2_EV_CTRL", 11, "position, height and yaw come from vision; what is left out drifts away", ok=(11, 15)
-        ),
+        Wanted("EKF2_EV_CTRL", 11, "position, height and yaw come from vision; the others would drift", ok=(11, 15)),
         Wanted(
             "EKF2_HGT_REF",
             3,
-            "height would follow the barometer, and rotor wash indoors moves that by a metre",
+            "height would follow the barometer, and rotor wash indoors shifts it by a metre",
             reboot=True,
         ),
-        Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would pull the position estimate out of the room"),
+        Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would shift the position estimate out of the room"),
         Wanted(
             "EKF2_BARO_CTRL",
             0,
-            "the barometer feels the rotors' wash and doors, and is fused against motion capture",
+            "rotor wash and doors disturb the barometer, which is fused against motion capture",
             _WARN,
         ),
         Wanted(
@@ -143,8 +141,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "steel and motors disturb the compass; yaw would switch between it and motion capture",
             reboot=True,
         ),
-        Wanted("EKF2_OF_CTRL", 0, "an optical flow sensor sees the arm move and takes it for its own motion", _WARN),
-        Wanted("EKF2_RNG_CTRL", 0, "a range finder sees arm and net for the floor", _WARN),
+        Wanted("EKF2_OF_CTRL", 0, "an optical flow sensor would mistake the arm's motion for the vehicle's", _WARN),
+        Wanted("EKF2_RNG_CTRL", 0, "a range finder would mistake arm and net for the floor", _WARN),
         Wanted(
             "EKF2_EV_DELAY",
             5.0,
@@ -162,7 +160,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_DELAY_MAX",
             50.0,
-            "ms; the filter runs this far in the past, and its output is predicted to the present: with PX4's 200, and "
+            "ms; the filter lags by this time, and its output is predicted to the present: with PX4's 200, and "
             "0.25 s for the next two, the estimate wanders by 3 to 4 mm",
             _WARN,
             reboot=True,
@@ -255,7 +253,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_FLTT_LOW_ACT",
             1,
-            "3 returns when PX4 estimates that the flight time is used up; with 0 PX4 was seen to leave OFFBOARD for HOLD",
+            "3 returns when PX4 estimates that the flight time is used up; with 0 PX4 has left OFFBOARD for HOLD",
             _WARN,
         ),
         Wanted("GF_ACTION", 2, "3 climbs and returns at PX4's own fence, 4 stops the motors", ok=(0, 1, 2, 5)),

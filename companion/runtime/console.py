@@ -177,7 +177,7 @@ class FlightDisplay:
         warned = [row for row in bad if row["level"] == Level.WARN.value]
         refused = len(bad) - len(warned)
         told = f"{len(rows)} checks: " + (f"{refused} refused" if refused else "ok")
-        self._line("preflight", told + (f", {len(warned)} to look at" if warned else ""), "red" if refused else "green")
+        self._line("preflight", told + (f", {len(warned)} warnings" if warned else ""), "red" if refused else "green")
         for row in warned:
             self._line("", Row(**{**row, "level": Level.WARN}).line(), "yellow")
 
@@ -218,7 +218,11 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
     if summary.get("payload_kg") is not None:
         facts.add_row("payload", f"{summary['payload_kg']:g} kg (known to the simulated world only)")
     catch = summary.get("catch_t_s")
-    doubt = "" if summary.get("catch_confirmed") is not False else ", not confirmed: the flight ended too soon after it"
+    doubt = (
+        ""
+        if summary.get("catch_confirmed") is not False
+        else ", not confirmed: the flight ended too soon after the impact"
+    )
     facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
     loop = summary.get("loop") or {}
     if loop.get("ticks"):

@@ -1,4 +1,4 @@
-"""CPU cores: which are usable, and how other processes stay off the cores that are reserved for the flight process."""
+"""CPU cores: finds the usable ones and keeps other processes off the cores that are reserved for the flight process."""
 
 from __future__ import annotations
 

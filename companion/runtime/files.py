@@ -1,4 +1,4 @@
-"""Writing a file whole: a reader finds the old content or the new, never a part of either."""
+"""Atomic writing of a file: a reader finds the old or the new content, never a part."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def write_whole(
     replace: bool = True,
     durable: bool = False,
 ) -> None:
-    """Write a file through a temporary file in the same folder; a failure leaves no part behind.
+    """Write a file through a temporary file in the same folder, so that a failure leaves no partial file.
 
     Args:
         path: the file.
@@ -28,8 +28,8 @@ def write_whole(
         durable: wait until the content is on the medium, so that it survives a loss of power.
 
     Raises:
-        FileExistsError: the file exists and `replace` is False; it is left as it is.
-        OSError: the file cannot be written; an existing one is left as it is.
+        FileExistsError: the file exists and `replace` is False; it is left unchanged.
+        OSError: the file cannot be written; an existing one is left unchanged.
     """
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 GIL_SWITCH_S = 0.0005
-"""Interpreter switch interval: how long the bus thread waits for a computing tick. Python's default of 5 ms is a whole period."""
+"""Interpreter switch interval, for which the bus thread waits for a computing tick. Python's default of 5 ms is a whole period."""
 FLIGHT_PRIORITY = 50
 GUARDIAN_PRIORITY = 60
-"""Above the flight process, so that the guardian runs even if the flight process spins."""
+"""Priority of the guardian, above the flight process, so that it runs even if the flight process spins."""
 WORLD_PRIORITY = 40
-"""Priority of the simulated world, below the flight process that it must not disturb."""
+"""Priority of the simulated world, below the flight process, which it must not disturb."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # <bits/mman.h>, the same numbers on x86 and ARM
 _CAP_IPC_LOCK = 14  # <linux/capability.h>
@@ -108,7 +108,7 @@ _NOT_LOCKED = "memory not locked"
 def _set_fifo(priority: int) -> str | None:
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        # Every thread: the tick waits for the bus thread, and what MAVSDK's threads receive is what it flies on.
+        # Every thread, because the tick waits for the bus thread and uses data that MAVSDK's threads receive.
         for thread in _threads():
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.sched_setscheduler(thread, policy, os.sched_param(priority))

@@ -1,6 +1,6 @@
-"""What can be made to go wrong in the simulated world: the kinds of faults, what their size means, and one planted fault.
+"""Faults of the simulated world: their kinds, the meaning of their size, and one injected fault.
 
-One table for everybody: the world plants by it, `companion faults --list` prints it, docs/faults.md shows it.
+One table: the world injects from it, `companion faults --list` prints it, docs/faults.md shows it.
 """
 
 from __future__ import annotations
@@ -64,18 +64,18 @@ class Kind:
     """One kind of fault."""
 
     what: str
-    """What happens, in words."""
+    """Description of the fault."""
     size: str | None = None
-    """What the size means; None: the kind has none."""
+    """Meaning of the size; None if the kind has no size."""
     unit: str = ""
     default: float | None = None
-    """Size if none is given."""
+    """Default of the size."""
     named_by: tuple[str, ...] = ()
-    """Events that name the fault, or its consequence."""
+    """Events that name the fault or its consequence."""
     phases: tuple[FlightPhase, ...] = IN_FLIGHT
-    """Where a campaign plants it."""
+    """Phases in which a campaign injects it."""
     process: bool = False
-    """Of a process of the companion, not of the world."""
+    """Whether the fault is in a process of the companion and not in the world."""
 
 
 _MOCAP_GONE = ("mocap_lost", "mocap_invalid", "mocap_too_late")
@@ -94,7 +94,7 @@ _GUARDIAN = ("guardian_took_over",)
 
 KINDS: dict[FaultKind, Kind] = {
     "mocap_loss": Kind("no frame leaves the motion-capture machine", named_by=_MOCAP_GONE),
-    "mocap_occluded": Kind("frames come, but the body is not seen in them", named_by=_MOCAP_GONE),
+    "mocap_occluded": Kind("frames arrive, but the body is not tracked", named_by=_MOCAP_GONE),
     "mocap_jump": Kind(what="poses are shifted sideways", size="shift", unit="m", default=0.3, named_by=_MOCAP_WRONG),
     "mocap_drag": Kind(
         what="poses are dragged sideways, further with every frame",
@@ -104,13 +104,13 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=_MOCAP_WRONG,
     ),
     "mocap_swap": Kind(
-        what="poses are those of another body that lies on the floor",
+        what="poses are those of another body on the floor",
         size="distance to it",
         unit="m",
         default=1.0,
         named_by=_MOCAP_WRONG,
     ),
-    "mocap_freeze": Kind("frames go on with the same pose", named_by=(*_MOCAP_WRONG, *_MOCAP_GONE)),
+    "mocap_freeze": Kind("frames continue with the same pose", named_by=(*_MOCAP_WRONG, *_MOCAP_GONE)),
     "mocap_latency": Kind(
         what="frames come later",
         size="additional latency",
@@ -121,16 +121,16 @@ KINDS: dict[FaultKind, Kind] = {
     "mocap_rate": Kind(
         what="fewer frames", size="frames a second", unit="Hz", default=30.0, named_by=("mocap_slow", *_MOCAP_GONE)
     ),
-    "link_loss": Kind("the MAVLink link is dead both ways", named_by=_PX4_GONE),
+    "link_loss": Kind("the MAVLink link is dead in both directions", named_by=_PX4_GONE),
     "link_delay": Kind(
-        what="the MAVLink link is slow both ways",
+        what="the MAVLink link is slow in both directions",
         size="delay each way",
         unit="s",
         default=0.05,
         named_by=("link_late", *_PX4_GONE, *_MOCAP_WRONG, "gate"),
     ),
     "autopilot_reboot": Kind(
-        what="PX4 restarts: rotors off, disarmed, its clock at zero; from a height that is a fall",
+        what="PX4 restarts: rotors off, disarmed, its clock at zero; in the air the vehicle falls",
         size="time to boot",
         unit="s",
         default=2.0,
@@ -141,10 +141,10 @@ KINDS: dict[FaultKind, Kind] = {
         "PX4 refuses OFFBOARD, and leaves it", named_by=("offboard_refused", "offboard_left"), phases=PHASES
     ),
     "arming_refused": Kind("PX4 refuses to arm", named_by=("arming_refused",), phases=("ground",)),
-    "servo_loss": Kind("a servo neither hears nor answers", named_by=_ARM_GONE),
-    "servo_overload": Kind("a servo reports overload and lets go", named_by=("servo_error", "arm_let_go")),
+    "servo_loss": Kind("a servo neither receives nor answers", named_by=_ARM_GONE),
+    "servo_overload": Kind("a servo reports overload and releases its torque", named_by=("servo_error", "arm_let_go")),
     "servo_hot": Kind(
-        what="a servo is hot; above 80 degC it lets go",
+        what="a servo is hot; above 80 degC it releases its torque",
         size="temperature",
         unit="degC",
         default=78.0,
@@ -160,7 +160,7 @@ KINDS: dict[FaultKind, Kind] = {
     "bus_noise": Kind(
         what="packets on the servo bus are damaged", size="share of them", unit="", default=0.3, named_by=_ARM_GONE
     ),
-    "force_loss": Kind("the force sensor falls silent", named_by=("force_lost",)),
+    "force_loss": Kind("the force sensor stops sending", named_by=("force_lost",)),
     "force_stuck": Kind("the force sensor repeats its last reading", named_by=("force_stuck",)),
     "force_bias": Kind(
         what="the force sensor's zero moves",
@@ -187,7 +187,7 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=(*_WEAK, "too_fast", "geofence_near", "tether_short"),
     ),
     "tether_taut": Kind(
-        what="the tether jams: no more of it comes out",
+        what="the tether jams: its free length cannot grow",
         size="slack left",
         unit="m",
         default=0.1,
@@ -203,7 +203,7 @@ KINDS: dict[FaultKind, Kind] = {
     ),
     "tether_cut": Kind("the tether parts", named_by=("tether_separated",)),
     "payload_missed": Kind(
-        what="the throw goes beside the net", size="aside", unit="m", default=0.4, named_by=(), phases=("catch",)
+        what="the throw misses the net", size="aside", unit="m", default=0.4, named_by=(), phases=("catch",)
     ),
     "payload_double": Kind(
         what="a second payload is thrown into the net",
@@ -221,7 +221,7 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("catch", "servo_overload", *_WEAK),
         phases=("catch",),
     ),
-    "disk_full": Kind("nothing more can be written to the log", named_by=("recorder_drops",), process=True),
+    "disk_full": Kind("the log cannot be written any more", named_by=("recorder_drops",), process=True),
     "clock_step": Kind(
         what="the clock of the motion-capture machine steps",
         size="step",
@@ -233,7 +233,7 @@ KINDS: dict[FaultKind, Kind] = {
     "stall_loop": Kind(
         "a blocking call on the event loop", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
     ),
-    "hold_gil": Kind("the interpreter's lock is held for good", named_by=_GUARDIAN, process=True),
+    "hold_gil": Kind("the interpreter's lock is held permanently", named_by=_GUARDIAN, process=True),
     "stop_flight": Kind(
         "SIGSTOP to the flight process", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
     ),
@@ -252,25 +252,25 @@ KINDS: dict[FaultKind, Kind] = {
 
 
 class Fault(Model):
-    """One planted fault: when, for how long, how large. Kinds and sizes: docs/faults.md."""
+    """One injected fault: start, duration and size. docs/faults.md describes kinds and sizes."""
 
     kind: FaultKind
     t_s: NonNegative | None = None
-    """Seconds since what `after` says; absent: as `phase` says."""
+    """Seconds since the event of `after`. If it is absent, `phase` determines the start."""
     after: Literal["start", "arming", "catch"] = "arming"
-    """The world's start, the rotors' arming or the catch."""
+    """Event from which `t_s` counts: the world's start, the rotors' arming or the catch."""
     phase: FlightPhase | None = None
-    """Instead of `t_s`: in the middle of that part of the mission, or just after the catch."""
+    """Alternative to `t_s`: the middle of this part of the mission, or the time just after the catch."""
     duration_s: Positive | None = None
-    """Absent: for good."""
+    """Duration. If it is absent, the fault is permanent."""
     size: float | None = Field(default=None)
-    """Absent: the kind's default."""
+    """Size. If it is absent, the kind's default is used."""
     servo: Literal[1, 2] = 1
-    """Of faults of one servo."""
+    """Servo of a fault of one servo."""
 
     @property
     def magnitude(self) -> float:
-        """The size, or the kind's default; 0 of a kind that has none."""
+        """Size, or the kind's default; 0 for a kind without a size."""
         default = KINDS[self.kind].default
         return self.size if self.size is not None else default if default is not None else 0.0
 
@@ -278,7 +278,7 @@ class Fault(Model):
     def _whole(self) -> Self:
         problems: list[tuple[Location, str]] = []
         if (self.t_s is None) == (self.phase is None):
-            problems.append((("t_s",), "give either t_s or phase, so that the world knows when"))
+            problems.append((("t_s",), "give either t_s or phase for the start of the fault"))
         kind = KINDS[self.kind]
         if self.size is not None and kind.size is None:
             problems.append((("size",), f"a {self.kind} has no size; leave it out"))

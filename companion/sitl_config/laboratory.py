@@ -1,4 +1,4 @@
-"""What laboratories differ by: numbers of a world file that are distributions, and the signs of the model error, drawn by the seed."""
+"""Differences between laboratories, drawn by the seed: numbers of a world file that are distributions, and signs of the model error."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Range(Model):
         return (mean - NORMAL_ENDS * sigma, mean + NORMAL_ENDS * sigma)
 
     def sample(self, seed: int) -> float:
-        """Draw the number, with six digits; it depends on nothing but the seed and the key."""
+        """Draw the number, with six digits; it depends on the seed and the key only."""
         rng = _generator(seed, self.key)
         low, high = self.ends
         if isinstance(self.distribution, Uniform):
@@ -85,10 +85,10 @@ class Range(Model):
 
 
 class Laboratory(Model):
-    """The file of a world and the numbers that it leaves to the seed."""
+    """The file of a world and the numbers that the seed draws."""
 
     name: str = "ideal"
-    """A built-in world, or a file as the user gave it."""
+    """Built-in world, or file as given by the user."""
     ranges: tuple[Range, ...] = ()
 
     def drawn(self, world: World) -> dict[str, Any]:
@@ -108,14 +108,14 @@ def _generator(seed: int, key: str) -> np.random.Generator:
 
 
 def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, Any]:
-    """Return a copy of a world's plain data with a sample in the place of each range.
+    """Return a copy of a world's plain data with each range replaced by a sample.
 
-    The same seed is the same laboratory: adding or removing a range changes no other sample.
+    The same seed gives the same laboratory; adding or removing a range changes no other sample.
 
     Args:
-        data: plain data of a world. A range whose place it lacks (a section that is null, a shorter list) is left out.
-        ranges: what to draw.
-        seed: of the world.
+        data: plain data of a world. A range at a missing location (a section that is null, a shorter list) is left out.
+        ranges: ranges to draw.
+        seed: seed of the world.
     """
     return _filled(data, [(one.at, one.sample(seed)) for one in ranges])
 
@@ -165,7 +165,7 @@ def take_ranges(document: Document) -> tuple[Range, ...]:
 
 
 def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World:
-    """Draw and validate a world. Both ends of every range must be valid, so that a file is refused whatever the seed.
+    """Draw and validate a world. Both ends of every range must be valid, so that the seed does not decide whether a file is refused.
 
     Raises:
         ConfigError: one message per problem.
@@ -181,7 +181,7 @@ def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World
         lines = problem_lines(list(everywhere))
         for name, problems in zip(("lower", "upper"), at_ends, strict=True):
             lines += [
-                f"{line} at the {name} end of what is drawn" for line in problem_lines(list(problems - everywhere))
+                f"{line} at the {name} end of the drawn range" for line in problem_lines(list(problems - everywhere))
             ]
         if lines:
             raise ConfigError(lines)
@@ -196,7 +196,7 @@ def _distribution(value: dict[str, Any]) -> Uniform | Normal:
     """Parse a distribution.
 
     Raises:
-        ValueError: it is none; the text is for the user.
+        ValueError: the value is not a distribution; the text is for the user.
     """
     if len(value) != 1:
         raise ValueError(f"{_EXPECTED}, got a mapping with {len(value)} keys")

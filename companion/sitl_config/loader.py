@@ -18,15 +18,15 @@ WORLD_DIRECTORY = Path(__file__).parent / "worlds"
 WORLDS = tuple(sorted(path.stem for path in WORLD_DIRECTORY.glob("*.yaml")))
 """Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
-"""The world of a simulated flight or campaign for which none is named."""
+"""Default world of a simulated flight or campaign."""
 
 
 class SitlConfig(FlightConfig):
-    """A flight's configuration and the truth of its simulated world. The flight process and the core are given `flight`."""
+    """A flight's configuration and the true state of its simulated world. The flight process and the core receive only `flight`."""
 
     world: World = World()
     laboratory: Laboratory = Laboratory()
-    """Where the world comes from; its ranges are drawn in `world`."""
+    """Source of the world; its ranges are drawn in `world`."""
 
     @property
     def flight(self) -> FlightConfig:
@@ -44,7 +44,7 @@ def load_sitl(
     hardware: bool = False,
     world: str = DEFAULT_WORLD,
 ) -> SitlConfig:
-    """Read, override, draw and check everything; arguments as for `load_flight`, with overrides of `world.` as well.
+    """Read, override, draw and check everything; arguments are those of `load_flight`, with overrides of `world.` as well.
 
     Args:
         world: a built-in world, or a file.

@@ -1,4 +1,4 @@
-"""The truth of the simulated world, which the flight does not know. Set as `--set world.KEY=VALUE`."""
+"""True parameters of the simulated world, unknown to the flight. Set them with `--set world.KEY=VALUE`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 def _each_axis_once(names: tuple[str, str, str]) -> tuple[str, str, str]:
     if {name[-1] for name in names} != {"x", "y", "z"}:
-        raise ValueError(f"each of x, y and z once, with or without a minus, got {list(names)}")
+        raise ValueError(f"expected each of x, y and z once, with or without a minus, got {list(names)}")
     return names
 
 
@@ -44,7 +44,7 @@ def _px4_has_them(params: dict[str, float]) -> dict[str, float]:
         if isinstance(PX4_DEFAULTS[name], int) and value != int(value):
             raise ValueError(f"{name} is an INT32, got {value:g}")
         if abs(value) >= (2**31 if isinstance(PX4_DEFAULTS[name], int) else REAL32_MAX):
-            raise ValueError(f"{name} does not hold {value:g}")
+            raise ValueError(f"{name} cannot hold {value:g}")
     return params
 
 
@@ -120,15 +120,15 @@ class World(Model):
     net_weight_kg: Annotated[float, Field(ge=0, le=5)] = 0.0
     """Mass that hangs from the centre of the net while the force sensor is read, for its calibration."""
     net_weight_t_s: NonNegative = 8.0
-    """Time from the first reading until the mass hangs there."""
+    """Time from the first reading until the mass is attached."""
     joint_friction_nm: NonNegative = 0.04
     """Constant friction of each joint; with `servo_mechanics` that section's friction acts instead."""
     joint_damping_nms: NonNegative = 0.02
-    """Viscous friction of each joint, N m s/rad; the same holds."""
+    """Viscous friction of each joint, N m s/rad; replaced by `servo_mechanics` as well."""
     servos: tuple[Servo, Servo] | None = None
     """null for the defaults of `Servo`."""
     arm_hand: bool = False
-    """Whether the arm is held while it has no torque, and moved as `companion arm zero` asks: on whenever the servos' LEDs go on."""
+    """Whether a simulated user holds the limp arm and moves it as `companion arm zero` requests, whenever the servos' LEDs go on."""
     wind_m_s: Vector3 = (0.0, 0.0, 0.0)
     mass_error: RelativeError = 0.0
     """Relative error of the vehicle file's base mass against the truth."""
@@ -144,7 +144,7 @@ class World(Model):
     """A push on the net, for tests of the impedance."""
     natnet_version: Literal["3.0", "4.1"] = "4.1"
     mocap_axes: SignedAxes = ("x", "y", "z")
-    """True axes of the streamed x, y and z, such as "-y". A left-handed set stands for a misconfigured server."""
+    """True axes of the streamed x, y and z, such as "-y". A left-handed set represents a misconfigured server."""
     mocap_body_yaw_deg: float = 0.0
     """Error of the rigid body's streamed yaw."""
     mocap_body_tilt_deg: Vector2 = (0.0, 0.0)
@@ -182,7 +182,7 @@ class World(Model):
 
     @property
     def thr_mdl_fac(self) -> float:
-        """PX4's THR_MDL_FAC: of `px4_params`, else of `rotors` if that effect is on, else 0, for rotors that are linear."""
+        """PX4's THR_MDL_FAC: from `px4_params`, else from `rotors` if that effect is on, else 0 for linear rotors."""
         return self.px4_params.get("THR_MDL_FAC", self.rotors.thr_mdl_fac if self.rotors.on else 0.0)
 
     def overridden_px4_params(self) -> dict[str, float | int]:

@@ -113,7 +113,7 @@ def test_the_printed_command_flies_the_same_world() -> None:
         (row(0, 0.01), Kept(outcome=Outcome.ABORTED, caught=True), None),
         (row(0, None, "crashed"), Kept(outcome=Outcome.ABORTED, caught=True), "crashed"),
         (row(0, None, "crashed"), Kept(outcome=Outcome.CRASHED, caught=True), "crashed"),
-        (row(0, 0.01, caught=False), Kept(outcome=Outcome.COMPLETED, caught=True, e_p_m=0.04), "not caught any more"),
+        (row(0, 0.01, caught=False), Kept(outcome=Outcome.COMPLETED, caught=True, e_p_m=0.04), "no longer caught"),
         (row(0, 0.01), Kept(outcome=Outcome.COMPLETED, caught=False, e_p_m=0.04), None),
     ],
 )

@@ -146,7 +146,7 @@ def test_a_bad_flight_with_a_fault_is_shown_and_is_exit_code_5(monkeypatch: pyte
             ("landed", ""), ("crashed", "crashed")
         ]  # fmt: skip
     page = Page(Path("out/faults.html"))
-    assert "1 of 2 flights did what no flight may do." in page.text
+    assert "1 of 2 flights violated a safety requirement." in page.text
     assert page.tags.count("tr") == (1 + 1) + (1 + 2), "the bad one, then both"
     assert "script" not in page.tags
 
@@ -186,7 +186,7 @@ def test_draws_are_written_as_table_and_cases_and_a_crash_is_exit_code_5(monkeyp
     names = {"draws.csv", "robustness.json", "robustness.html", "worst.yaml", "distribution.png"}
     assert {path.name for path in Path("out").iterdir()} == names
     assert Path("kept.yaml").read_text().count("- name:") == 10
-    assert "The worst of draws 3 to 14, seed 1." in Path("out/worst.yaml").read_text()
+    assert "These are the worst of draws 3 to 14, seed 1." in Path("out/worst.yaml").read_text()
     with open("out/draws.csv", newline="", encoding="utf-8") as file:
         read = list(csv.DictReader(file))
     assert len(read) == 12
@@ -216,7 +216,7 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
         (("compare", "--set", "controller.rho_maxx=2"), r"^--set controller\.rho_maxx: unknown key"),
         (("compare", "--mission", "nofile.yaml"), r"^nofile\.yaml: no such file$"),
         (("compare", "--out", ""), r"^companion compare: --out .*empty"),
-        (("compare", "--out", "taken"), r"^companion compare: --out taken: there is a compare\.json already"),
+        (("compare", "--out", "taken"), r"^companion compare: --out taken: contains a compare\.json already"),
         (("faults", "--kinds", "mocap_los"), r"there is no kind of fault 'mocap_los'; did you mean 'mocap_loss'\?"),
         (("faults", "--phases", "lunch"), r"there is no phase 'lunch'"),
         (("faults", "--set", "world.faults=[]"), r"the campaign sets it; use --kinds and --phases"),

@@ -277,7 +277,7 @@ def test_whatever_else_differs_is_said_on_top(changes: dict[str, Any], caution: 
         ]
     comparison = compare([made("A"), made("B", config=config, **changes)])
     assert caution in comparison.cautions
-    assert "and so does what is listed below" in comparison.fair
+    assert "and so do the settings below" in comparison.fair
 
 
 def test_different_missions_are_not_marked_better_or_worse_but_their_timing_is() -> None:
@@ -476,7 +476,7 @@ def test_a_comparison_of_other_flights_is_never_overwritten(flights: Path, capsy
     capsys.readouterr()
     assert main(["report", WHOLE, SHORT, "--out", "x"]) == EXIT_BAD_INPUT
     assert capsys.readouterr().err == (
-        "companion report: --out x: there is a side_by_side.json of other flights already; choose another folder\n"
+        "companion report: --out x: contains a side_by_side.json of other flights already; choose another folder\n"
     )
     assert contents(flights / "x") == held
     assert main(["report", WHOLE, GAINS, "--out", "x"]) == EXIT_OK
@@ -509,7 +509,7 @@ def test_json_is_printed_alone_and_nothing_is_written(flights: Path, capsys: pyt
     ("words", "line"),
     [
         ((WHOLE, "nofile.mcap"), r"nofile\.mcap: cannot be read: No such file or directory"),
-        (("flights/whole/summary.json", WHOLE), r"flights/whole/summary\.json: is no MCAP file; .*"),
+        (("flights/whole/summary.json", WHOLE), r"flights/whole/summary\.json: is not an MCAP file; .*"),
         ((WHOLE, "damaged.mcap"), r"damaged\.mcap: damaged: .*"),
         ((WHOLE, "flights"), r"flights: cannot be read: Is a directory"),
         ((WHOLE,) * 7, r"companion report: 7 logs: expected at most 6, .*"),

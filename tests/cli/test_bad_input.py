@@ -264,7 +264,7 @@ def test_bad_file(sandbox: Sandbox, companion: Command, case: str, command: str)
 def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox, companion: Command) -> None:
     (sandbox.cwd / "out").mkdir()
     (sandbox.cwd / "out/flight.mcap").write_bytes(b"an earlier flight")
-    assert_refused(sandbox, companion, FLY, (r"--out out: there is a flight\.mcap already; choose another folder",))
+    assert_refused(sandbox, companion, FLY, (r"--out out: contains a flight\.mcap already; choose another folder",))
 
 
 def test_the_good_files_that_the_bad_ones_are_made_of_pass(sandbox: Sandbox) -> None:

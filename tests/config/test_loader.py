@@ -118,7 +118,7 @@ BAD_MISSION = [
     (
         "    arm_deg: [100.0, 60.0]      # unfolded by 6.0 s\n",
         "",
-        [f"{CATCH}:39:21: phases[2].arm_duration_s: says when the arm moves, but arm_deg, where it moves to, is missing"],
+        [f"{CATCH}:39:21: phases[2].arm_duration_s: gives the time of an arm motion, but its target arm_deg is missing"],
     ),
     (
         "preset: recommended",
@@ -190,7 +190,7 @@ BAD_VEHICLE = [
     ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole machine, but arm and tool alone weigh 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
-    ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2, the sum of the other two, as of every rigid body, got 0.05"]),
+    ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2, the sum of the other two, as for every rigid body, got 0.05"]),
     ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
     ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: each core once, got 2 twice in [2, 3, 2]"]),
     ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),
@@ -232,8 +232,8 @@ BAD_OVERRIDES = [
     ("mission.phases=[]", "--set mission.phases: expected a list of at least 2, got []"),
     ("mission.vehicle=none.yaml", "--set mission.vehicle: vehicle: none.yaml: no such file"),
     ("controller.rho_max=0", "--set controller.rho_max: expected a number > 0, got 0"),
-    ("controller.stiffness_kp[2]=90", "--set controller.stiffness_kp[2]: gain_cond asks for (K_d - M_d Phi) Phi = 144, got 90"),
-    ("controller.damping_kd[0]=3", "--set controller.damping_kd[0]: gain_new asks for K_d / M_d > Phi, got 3 <= 4"),
+    ("controller.stiffness_kp[2]=90", "--set controller.stiffness_kp[2]: gain_cond requires (K_d - M_d Phi) Phi = 144, got 90"),
+    ("controller.damping_kd[0]=3", "--set controller.damping_kd[0]: gain_new requires K_d / M_d > Phi, got 3 <= 4"),
 ]  # fmt: skip
 
 

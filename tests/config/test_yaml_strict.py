@@ -46,10 +46,7 @@ BAD = [
     ("a: [1, 2\n", ["f.yaml:2:1: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"]),
     (
         "a: b: c\n",
-        [
-            "f.yaml:1:5: not YAML: a ':' that does not belong here; is the line above complete, is the text quoted, "
-            "is the indentation right?"
-        ],
+        ["f.yaml:1:5: not YAML: an unexpected ':'; check the line above, the quotes and the indentation"],
     ),
     ("a: 1\nb\n", ["f.yaml:3:1: not YAML: a key without ':'"]),
     ("a: &x [1]\nb: *x\n", ["f.yaml:2:4: not YAML: aliases (*name) are not accepted; write the value out"]),
@@ -129,7 +126,7 @@ def test_byte_order_mark_is_accepted(tmp_path: Path) -> None:
 def test_too_large_a_file(tmp_path: Path) -> None:
     path = tmp_path / "f.yaml"
     path.write_bytes(b"#" * (SIZE_MAX_BYTES + 1))
-    with pytest.raises(ConfigError, match=r"^f\.yaml: larger than 256 KiB; is this a configuration file"):
+    with pytest.raises(ConfigError, match=r"^f\.yaml: larger than 256 KiB; expected a configuration file"):
         read_document(path, "f.yaml")
 
 

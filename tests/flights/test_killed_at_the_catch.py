@@ -48,7 +48,9 @@ def test_a_catch_that_the_flight_could_not_confirm_is_in_the_summary(fault: str)
     assert summary["catch_confirmed"] is False
     out = io.StringIO()
     print_result(Console(file=out, width=200), summary, Path(), None)
-    assert f"t = {summary['catch_t_s']:.2f} s, not confirmed: the flight ended too soon after it" in out.getvalue()
+    assert (
+        f"t = {summary['catch_t_s']:.2f} s, not confirmed: the flight ended too soon after the impact" in out.getvalue()
+    )
 
 
 @pytest.mark.parametrize("after_s", [0.05, 0.2, 0.3, 0.6])

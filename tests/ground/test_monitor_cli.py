@@ -124,9 +124,9 @@ def test_mistakes(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str])
     for arguments, why in (
         ([str(tmp_path / "nofile.mcap")], "nofile.mcap: cannot be read: No such file"),
         ([str(damaged)], f"{damaged}: damaged"),
-        ([str(foreign)], f"{foreign}: is no MCAP file"),
+        ([str(foreign)], f"{foreign}: is not an MCAP file"),
         ([str(empty)], f"{empty}: is empty"),
-        ([str(log), str(foreign)], f"{foreign}: is no MCAP file"),
+        ([str(log), str(foreign)], f"{foreign}: is not an MCAP file"),
         ([str(log), "--text"], "--text shows a running flight"),
         (["--port", "70000"], "--port 70000: expected 0 to 65535"),
         (["--cert", str(cert)], "--cert and --key must be given together"),

@@ -170,7 +170,7 @@ def test_a_full_disk_half_way_leaves_everything_as_it_was(
     assert install(root) == EXIT_REFUSED
     assert tree(root) == before
     [line] = capsys.readouterr().err.splitlines()
-    assert line == "companion install: /etc/x: No space left on device; everything is as it was before"
+    assert line == "companion install: /etc/x: No space left on device; all changes were reverted"
 
 
 def test_interrupted_half_way_everything_is_as_it_was(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

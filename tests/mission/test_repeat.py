@@ -197,6 +197,6 @@ def test_a_path_that_begins_where_the_last_repetition_ended_is_refused() -> None
     document = mission("circuit").model_dump(mode="json")
     document["phases"][2:4] = [{"type": "path", "through_m": [[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.0, 1.0]]}]
     assert Mission.model_validate(document).repeat == 1
-    with pytest.raises(ValidationError, match="is where the path already is") as refused:
+    with pytest.raises(ValidationError, match="repeats the previous point of the path") as refused:
         Mission.model_validate({**document, "repeat": 2})
     assert [error["loc"] for error in refused.value.errors()] == [("phases", 2, "through_m", 0)]

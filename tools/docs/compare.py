@@ -22,13 +22,13 @@ from companion.config.loader import load_flight
 from tools.docs.tables import flown_by, markdown, write_page
 
 MISSION = Path(__file__).parents[2] / "configs/missions/catch.yaml"
-"""Any mission: only the controller of its configuration is used."""
+"""Mission of the loaded configuration, of which only the controller is used."""
 Results = dict[str, Any]
 """A compare.json."""
 AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned")
-"""Presets with nothing beyond what the law's paper describes; all others have the extras."""
+"""Presets that contain only what the law's paper describes; all others have additional compensation."""
 IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"}
-"""The variants whose figures the paper prints, with the paper's name of the law."""
+"""Variants with figures in the paper, by the paper's name of the law."""
 ABLATION_KG = 0.2
 """Payload of the table of ablations."""
 _E_P = "rms.{}.e_p_m"
@@ -44,7 +44,7 @@ _ABLATION_FIGURES = (*_FIGURES[:3], ("e_alpha after, deg", "rms.post.e_alpha_deg
 
 
 def merged(files: Sequence[Results]) -> list[Row]:
-    """Return the rows of all files, each with the line `flown_by` that names its command and commit. A flight that several files hold
+    """Return the rows of all files, each with the line `flown_by` that names its command and commit. A flight in several files
     is taken from the last of them.
 
     Raises:
@@ -115,7 +115,7 @@ def ablation_markdown(groups: Iterable[Group]) -> str:
 
 
 def differences_markdown(groups: Sequence[Group]) -> str:
-    """Return how the figures of the laws that the paper prints differ from the printed ones, as a list."""
+    """Return the differences from the figures printed in the paper, as a list."""
     lines = []
     for part, word in (("pre", "before"), ("post", "after")):
         for label, name in IN_PAPER.items():
@@ -144,8 +144,8 @@ def differences_markdown(groups: Sequence[Group]) -> str:
     return "\n".join(lines)
 
 
-def told_markdown() -> str:
-    """Return what each built-in preset uses of the vehicle, and what it estimates in flight."""
+def knowledge_markdown() -> str:
+    """Return the vehicle parameters that each built-in preset uses, and those that it estimates in flight."""
     named = [(law, preset) for law, presets in PRESETS.items() for preset in presets]
     configs = [load_flight(MISSION, controller_law=law, preset=preset).controller for law, preset in named]
     head = ("law/preset", *(title for title, _ in _TOLD), "adapted or estimated in flight")
@@ -265,7 +265,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
         "model error": _with_source(model_error_markdown(by_error), by_error),
         "adaptation": _with_source(adaptation_markdown(paired), paired),
         "ablation": _with_source(ablation_markdown(ablated), ablated),
-        "told": told_markdown(),
+        "told": knowledge_markdown(),
     }
 
 

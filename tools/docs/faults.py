@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="tools.docs.faults")
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, nargs="?", help="faults.json of a campaign")
-    parser.add_argument("--name", default="campaign", help="of the table that the results go to (default: campaign)")
+    parser.add_argument("--name", default="campaign", help="name of the table for the results (default: campaign)")
     arguments = parser.parse_args(argv)
     kinds, name = kinds_markdown(), arguments.name
     if arguments.results is None:

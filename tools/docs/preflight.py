@@ -1,4 +1,4 @@
-"""The tables of docs/preflight.md, made from the checks themselves: `python -m tools.docs.preflight docs/preflight.md`."""
+"""Writes the tables of docs/preflight.md from the checks: `python -m tools.docs.preflight docs/preflight.md`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def checks_table(checks: Sequence[Check]) -> str:
 
 
 def tables() -> dict[str, str]:
-    """By the names of their places."""
+    """Return the tables by name."""
     return {name: checks_table(checks) for name, checks in ROOMS.items()}
 
 

@@ -22,7 +22,7 @@ _WIDTH = 110
 
 
 def indoor_mocap_text() -> str:
-    """configs/px4/indoor_mocap.params."""
+    """Return the text of configs/px4/indoor_mocap.params."""
     comments: dict[str, list[str]] = {}
     for title, group in GROUPS.items():
         inside = [wanted for wanted in group if wanted.file and wanted.value is not None]
@@ -36,9 +36,9 @@ def indoor_mocap_text() -> str:
         "PX4 1.16 and 1.18, a quadrotor indoors on motion capture, without GPS.",
         "",
         "Load it in QGroundControl (Vehicle setup > Parameters > Tools > Load from file), or with",
-        "companion px4 params --write, which writes only what differs and keeps the old values in a file.",
+        "companion px4 params --write, which writes only differing values and saves the old ones in a file.",
         "",
-        f"Not in here: MPC_THR_HOVER, which is measured on each vehicle, and {RADIO}, because {NO_RADIO} switches the",
+        f"Not included: MPC_THR_HOVER, which is measured on each vehicle, and {RADIO}, because {NO_RADIO} switches the",
         f"pilot's radio off ({NO_RADIO_FILE}, for vehicles without a radio).",
         "",
     ]
@@ -46,7 +46,7 @@ def indoor_mocap_text() -> str:
 
 
 def no_radio_text() -> str:
-    """configs/px4/no_radio.params."""
+    """Return the text of configs/px4/no_radio.params."""
     return params_file.text(
         {RADIO: NO_RADIO},
         ["Only for vehicles without a radio: PX4 then ignores sticks and mode switch.", ""],
@@ -75,7 +75,7 @@ def table_markdown() -> str:
 
 
 def main(root: Path) -> None:
-    """Write everything below `root`."""
+    """Write all files below `root`."""
     text = indoor_mocap_text()
     PACKAGED.write_text(text, encoding="utf-8")
     (root / "configs/px4/indoor_mocap.params").write_text(text, encoding="utf-8")

@@ -16,14 +16,14 @@ from companion.cli.schema import KINDS
 
 Schema = dict[str, Any]
 _INTRO = {
-    "mission": "One flight: where the machine starts, what it may do, and its phases in order. How they are flown: [mission "
-    "files](../missions.md).",
-    "vehicle": "One machine: what it weighs and measures, its devices, tether, room and limits. What the limits of `safety` "
-    "do: [safety](../safety.md).",
-    "controller": "One control law with its gains; which of the three it is says `law`. The law as built: [the control "
-    "law](../control-law.md).",
-    "world": "What is true in the simulated world, whatever the companion believes: a file for `--world`, or "
-    "`--set world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, that the "
+    "mission": "One flight: start pose of the machine, motion limits, and phases in order. [Mission files](../missions.md) explains "
+    "the phases.",
+    "vehicle": "One machine: masses and dimensions, devices, tether, room and limits. [Safety](../safety.md) explains the limits of "
+    "`safety`.",
+    "controller": "One control law with its gains; `law` selects one of three. [The control law](../control-law.md) describes the "
+    "implementation.",
+    "world": "True parameters of the simulated world, unknown to the companion: a file for `--world`, or `--set "
+    "world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, that the "
     "seed draws. With examples: [the laboratory](../world.md), [the simulated world](../sitl.md#knobs).",
 }
 _UNITS = {
@@ -33,11 +33,11 @@ _UNITS = {
     "counts": "counts", "count": "counts",
 }  # fmt: skip
 _NO_UNIT = {"row_weights_s"}
-"""Names whose end only looks like a unit."""
+"""Key names whose ending is not a unit although it looks like one."""
 
 
 def unit(key: str) -> str:
-    """The unit that a key's name ends with; empty: it names none."""
+    """Return the unit at the end of a key's name, or an empty text."""
     words = key.split("_")
     for first in range(1, len(words)):
         found = _UNITS.get("_".join(words[first:]))
@@ -47,10 +47,10 @@ def unit(key: str) -> str:
 
 
 def page(kind: str) -> str:
-    """The reference page of one kind of file.
+    """Return the reference page of one kind of file.
 
     Raises:
-        KeyError: if the kind is none of `KINDS`.
+        KeyError: the kind is not one of `KINDS`.
     """
     schema = KINDS[kind].json_schema()
     lines = [
@@ -58,10 +58,10 @@ def page(kind: str) -> str:
         "",
         _INTRO[kind],
         "",
-        "Keys carry their unit in their name. `companion schema "
+        "The name of a key contains its unit. `companion schema "
         + kind
-        + "` prints the same for editors. What keys ask of each",
-        "other is checked when the file is read, and reported with file, line and column.",
+        + "` prints the same for editors. Conditions between",
+        "keys are checked when the file is read, and errors are reported with file, line and column.",
     ]
     definitions: dict[str, Schema] = schema.get("$defs", {})
     queue: list[tuple[str, Schema]] = list(_members("", schema, definitions)) if _choices(schema) else [("", schema)]
@@ -84,7 +84,7 @@ def _choices(schema: Schema) -> list[Schema]:
 
 
 def _members(path: str, value: Schema, definitions: dict[str, Schema]) -> Iterator[tuple[str, Schema]]:
-    """Records that stand below a key, each once, with the path that leads to them."""
+    """Return the records below a key, each once, with their paths."""
     seen: set[str] = set()
     for reference, suffix in _references(value):
         name = reference.rpartition("/")[2]
@@ -106,7 +106,7 @@ def _references(value: Schema, suffix: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _tag(model: Schema) -> str:
-    """The word that tells this record from the others that may stand in its place."""
+    """Return the word that distinguishes this record from its alternatives."""
     for key in ("type", "law"):
         word = model.get("properties", {}).get(key, {}).get("const")
         if word is not None:
@@ -174,7 +174,7 @@ def _type(value: Schema, definitions: dict[str, Schema]) -> str:
 
 
 def _range(value: Schema) -> str:
-    """Bounds of a value or of each of its components, where they all have the same."""
+    """Return the bounds of a value, or the common bounds of its components."""
     for choice in _choices(value):
         if choice.get("type") != "null":
             return _range(choice)
@@ -207,7 +207,7 @@ def write(folder: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Exit code of `python -m tools.docs.reference DIR`; the reason of a failure on standard error."""
+    """Write the pages and return the exit code; print the reason of a failure on standard error."""
     if len(arguments) != 1:
         print("expected one folder: python -m tools.docs.reference docs/reference", file=sys.stderr)
         return 2

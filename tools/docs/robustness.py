@@ -15,7 +15,7 @@ from tools.docs.tables import flown_by, write_results
 
 
 def result_markdown(results: dict[str, Any]) -> str:
-    """Return how many flights ended how, and the distribution of the position error after the catch."""
+    """Return the number of flights by outcome, and the distribution of the position error after the catch."""
     rows, settings, summary = results["rows"], results["settings"], results["summary"]
     errors_mm = [1000.0 * row["e_p_m"] for row in graded(rows)]
     outcomes = ", ".join(

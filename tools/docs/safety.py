@@ -1,4 +1,4 @@
-"""The tables of docs/safety.md, made from the code: `python -m tools.docs.safety docs/safety.md` writes them in their places."""
+"""Writes the tables of docs/safety.md from the code: `python -m tools.docs.safety docs/safety.md`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TIMES = LadderTimes(1.0, 1.0)
 
 
 def _default(key: str) -> str:
-    """`key` = default of a threshold, or only the key if it has no default."""
+    """Return a threshold as "`key` = default", or only the key if it has no default."""
     section, _, name = key.rpartition(".")
     model = _SECTIONS.get(f"{section}." if section else "")
     default: Any = model.model_fields[name].default if model is not None else None
@@ -39,12 +39,12 @@ def _action(action: SafetyAction | None) -> str:
 
 
 def _message(rule: Rule) -> str:
-    """The message with `...` for its values."""
+    """Return the message with `...` for its values."""
     return re.sub(r"\{[^}]*\}", "...", rule.message)
 
 
 def monitors_table() -> str:
-    """One row per rule, in the order of the code within each subject."""
+    """Return the table of rules: one row per rule, in the order of the code within each subject."""
     rows = [
         "| id | what is found | thresholds | hold time | on the ground | in the air | message |",
         "|---|---|---|---|---|---|---|",
@@ -67,13 +67,13 @@ def monitors_table() -> str:
 
 
 def after(state: SafetyAction, event_id: str, asks: SafetyAction) -> SafetyAction:
-    """Where the ladder stands after an event, by the ladder itself."""
+    """Return the safety state after an event, computed by the ladder itself."""
     event = Event(t_s=0.0, id=event_id, severity=Severity.INFO, action=asks, text="")
     return update(SupervisorState(state, "before", 0.0), [event], 0.0, _TIMES).action
 
 
 def ladder_table() -> str:
-    """Every state x every event in the air: the state after it. Events with the same effect share a row."""
+    """Return the table of the state after every event in every state in the air. Events with the same effect share a row."""
     states = list(SafetyAction)
     events = [(rule.id, rule.air) for rule in RULES if rule.air is not None]
     events += [(notice.id, notice.action) for notice in (RETRACT_DONE, NO_ROOM_TO_STAY)]
@@ -99,12 +99,12 @@ def ladder_table() -> str:
 
 
 def notices_table() -> str:
-    """One row per notice."""
+    """Return the table of notices, one row each."""
     return "\n".join(["| id | when |", "|---|---|", *(f"| `{notice.id}` | {notice.when} |" for notice in NOTICES)])
 
 
 def tables() -> dict[str, str]:
-    """By the names of their places."""
+    """Return the tables by name."""
     return {"monitors": monitors_table(), "notices": notices_table(), "ladder": ladder_table()}
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 
 def written(text: str, tables: Mapping[str, str]) -> str:
-    """Return the page with these tables in their places.
+    """Return the page with these tables inserted.
 
     Raises:
-        ValueError: the place of a table is not marked in the page.
+        ValueError: the page does not mark the location of a table.
     """
     for name, table in tables.items():
         begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->\n"
@@ -49,7 +49,7 @@ def flown_by(results: Mapping[str, Any]) -> str:
         results: the JSON file of `companion compare`, `robustness` or `faults`.
 
     Raises:
-        KeyError: the file was written by a version that did not note its command.
+        KeyError: the file was written by a version that did not record its command.
     """
     commit = results["versions"].get("git", "unknown")
     dirty = " with changes" if commit.endswith("-dirty") else ""
@@ -61,12 +61,12 @@ def write_results(page: Path, file: Path, tables_of: Callable[[dict[str, Any]], 
     """Write the tables of a results file into the page.
 
     Args:
-        page: with the place of each table marked.
+        page: page with marked locations of the tables.
         file: JSON of a campaign.
-        tables_of: makes the tables, by name; may raise KeyError or ValueError.
+        tables_of: returns the tables by name; may raise KeyError or ValueError.
 
     Returns:
-        An exit code; the reason goes to standard error.
+        An exit code. The reason of a failure is printed on standard error.
     """
     try:
         tables = tables_of(json.loads(file.read_text(encoding="utf-8")))

@@ -2,7 +2,7 @@
 
 A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome, error,
 catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,
-torque_activity_nm. A figure is None if its part of the flight was not flown to the end: errors on the way to a crash say nothing about
+torque_activity_nm. A figure is None if its part of the flight was not flown to the end: errors before a crash do not characterise
 the controller.
 """
 
@@ -20,7 +20,7 @@ from companion.campaigns.runner import Row, flat
 
 COMPLETED = "completed"
 MISSED = "missed"
-"""A failure in `Group.failures`: the flight was completed without a catch."""
+"""Key of `Group.failures` for flights completed without a catch."""
 FIGURES = (
     *(f"rms.{part}.{key}" for part in ("pre", "post") for key in ("e_p_m", "e_q_deg", "e_alpha_deg")),
     "impedance_error.position_n",
@@ -57,7 +57,7 @@ class Group:
 
     @property
     def label(self) -> str:
-        """`law/preset`."""
+        """Label of the variant, `law/preset`."""
         return f"{self.controller}/{self.preset}"
 
     def values(self, name: str) -> list[float]:
@@ -81,12 +81,12 @@ class Group:
 
     @property
     def failure_text(self) -> str:
-        """`crashed 2 of 5`; empty if there was no failure."""
+        """Failures as text, such as `crashed 2 of 5`; empty without a failure."""
         return ", ".join(f"{what} {count} of {len(self.rows)}" for what, count in self.failures.items())
 
     @property
     def printed(self) -> PrintedFlight | None:
-        """The paper's figures."""
+        """Figures printed in the paper."""
         return None if is_ablation(self.preset) else printed(self.controller, self.payload_kg)
 
     def jsonable(self) -> dict[str, Any]:

@@ -34,7 +34,7 @@ _COMPLIANCE = (
     ("final_abs_e_z_m", "final |e_z|", "m", 4),
     ("torque_activity_nm", "torque\nactivity", "N m", 4),
 )
-"""Shown beside the errors, which a stiff or a chattering arm can make look good."""
+"""Figures of compliance beside the errors, because a stiff or chattering arm can have small errors."""
 
 
 @dataclass(kw_only=True)
@@ -50,7 +50,7 @@ class Compare(Campaign):
     model_errors: Sequence[float] = (0.0,)
 
     def settings(self) -> dict[str, Any]:
-        """Return what was flown, for the record."""
+        """Return the settings of the campaign, for the record."""
         return {
             **super().settings(),
             "payloads_kg": list(self.payloads_kg),
@@ -129,12 +129,12 @@ def print_tables(groups: Sequence[Group], console: Console) -> None:
 
 
 def tracking_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
-    """Return the paper's table, each figure with the printed one beside it."""
+    """Return the paper's table, each figure beside the printed one."""
     columns = []
     for part, word in _PARTS.items():
         for key, title, unit, digits in (_E_P, _E_Q):
             name = f"rms.{part}.{key}"
-            # A failure takes the place of the figures that it cost.
+            # A failure replaces the figures that it prevents.
             ours = _ours(name, f"{word}\n{title}", unit, digits, p95, failures=(part, key) == ("post", "e_p_m"))
             columns += [ours, _paper(part, key, digits)]
     return _table("Tracking before and after the catch", columns, groups)

@@ -30,11 +30,11 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "lead off": ("controller.feedforward_lead_s=0",),
     "arm inertia and friction off": ("controller.arm_inertia_nominal=false", "controller.arm_friction_share=0"),
 }
-"""What an ablation removes from `ABLATED`, as overrides. The attitude rows stay masked: PX4 closes that loop."""
+"""Overrides of each ablation of `ABLATED`. The attitude rows stay masked: PX4 closes that loop."""
 
 
 def is_ablation(preset: str) -> bool:
-    """Whether the name is that of a preset from which something was removed."""
+    """Return whether the preset is an ablation."""
     return LESS in preset
 
 
@@ -50,14 +50,14 @@ class Variant:
 
     controller: str
     preset: str
-    """The name in the table: a preset, or a preset minus what was removed from it."""
+    """Name in the table: a preset, or a preset with the removed part."""
     base_preset: str
     """The preset to load."""
     overrides: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
-        """`law/preset`."""
+        """Label of the variant, `law/preset`."""
         return f"{self.controller}/{self.preset}"
 
 
@@ -70,13 +70,13 @@ def variants_of(
 ) -> list[Variant]:
     """Return the lines of the table.
 
-    A law that has some of the requested presets flies those; a law that has none of them flies all of its own.
+    A law flies those of the requested presets that it has, or all of its own if it has none of them.
 
     Args:
         available: presets of each law.
         controllers: requested laws; empty for all.
         presets: requested presets; empty for all.
-        ablation: add `ABLATED` with one thing at a time removed.
+        ablation: add variants of `ABLATED`, each with one part removed.
         adaptation: of `ADAPTATION`: fly the presets of the adaptive law as they are, without their adaptation, or both.
 
     Raises:
@@ -96,7 +96,7 @@ def variants_of(
     for law in laws:
         chosen = [preset for preset in available[law] if preset in presets] or list(available[law])
         if ablation and law == ABLATED[0] and ABLATED[1] not in chosen:
-            chosen.append(ABLATED[1])  # an ablation means something only beside the whole preset
+            chosen.append(ABLATED[1])  # an ablation is compared with the complete preset
         for preset in chosen:
             adaptive = law == ABLATED[0]
             less = list(ABLATIONS) if ablation and (law, preset) == ABLATED else []

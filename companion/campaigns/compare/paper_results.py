@@ -1,4 +1,4 @@
-"""What the paper prints: its table "Tracking Performance Comparison in terms of RMS errors" (paper.tex, RMS_table)."""
+"""Results printed in the paper: its table "Tracking Performance Comparison in terms of RMS errors" (paper.tex, RMS_table)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PrintedFlight:
     """The controller's name in the head of the table."""
     pre: Printed
     post: Printed | None
-    """None is printed as "Crashed"."""
+    """Figures after the catch; None where the paper prints "Crashed"."""
 
 
 _CSC, _PSC, _PROPOSED = "CSC, Cataldi et al.", "PSC, Wang et al.", "proposed"
@@ -44,9 +44,9 @@ TABLE: dict[tuple[str, float], PrintedFlight] = {
     ("adaptive", 0.2): PrintedFlight(_PROPOSED, Printed(0.0906, 2.6097), Printed(0.1654, 3.1190)),
     ("adaptive", 0.3): PrintedFlight(_PROPOSED, Printed(0.0726, 2.6866), Printed(0.1728, 3.2031)),
 }
-"""By law and payload in kg. Each is a single flight with the paper's hardware."""
+"""Results by law and payload in kg, each of a single flight with the paper's hardware."""
 
 
 def printed(controller: str, payload_kg: float) -> PrintedFlight | None:
-    """Return what the paper prints for a law and a payload; None if it prints nothing."""
+    """Return the paper's results for a law and a payload, or None if it has none."""
     return TABLE.get((controller, round(payload_kg, 6)))

@@ -45,12 +45,12 @@ _PANES = (
 
 
 def write_pictures(messages: Sequence[Message], groups: Sequence[Group], out: Path) -> list[Picture]:
-    """Draw everything that there is data for.
+    """Draw every plot for which there is data.
 
     Args:
         messages: results of the flights; a `series` {t_s, e_p_m, e_q_deg, alpha_deg[2], alpha_reference_deg[2], catch_t_s} is
             drawn over time.
-        groups: their rows, aggregated.
+        groups: aggregated rows of the flights.
         out: folder for the PNG files.
     """
     written = []
@@ -111,7 +111,7 @@ def _courses(title: str, messages: Sequence[Message], colours: dict[str, str]) -
 
 
 def _top(messages: Sequence[Message], key: str) -> float:
-    """Return the upper limit of an axis of errors; an incomplete flight is cut off before it hides the others."""
+    """Return the upper limit of an axis of errors; the errors of an incomplete flight are cut off if they would hide the others."""
     courses = [(_array(m["series"][key]), m["row"]["outcome"] == COMPLETED) for m in messages]
     peaks = [(float(np.nanmax(values)), completed) for values, completed in courses if np.isfinite(values).any()]
     if not peaks:

@@ -37,7 +37,7 @@ class Faults(Campaign):
         return WireFlights(self.planned, self.wires, self.configs[0], out, self.jobs or default_jobs())
 
     def settings(self) -> dict[str, Any]:
-        """Return what was flown, for the record."""
+        """Return the settings of the campaign, for the record."""
         return {**super().settings(), "controller": self.configs[0].sources.controller, "where": self._where}
 
     @property
@@ -63,10 +63,10 @@ class Faults(Campaign):
         }
 
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
-        """Return the bad flights, then all of them."""
+        """Return the bad flights, followed by all flights."""
         bad = [row for row in rows if not good(row)]
         explained = (
-            "Times are in s from the begin of the fault. Height: the least while the machine was meant to be up. Slack: the least of "
+            "Times are in s from the start of the fault. Height: the least while the machine was meant to be up. Slack: the least of "
             "the tether. Drift: from the abort to the place of landing, or the largest error of a mission that went on."
         )
         sections = [Section("All flights", tables=[flights_table(rows, details=True)], text=explained)]
@@ -76,9 +76,9 @@ class Faults(Campaign):
             "Fault campaign",
             f"{self.configs[0].sources.mission} · {len(rows)} flights {self._where} · world {self.world} · {counted(rows)}",
             sections,
-            f"{len(bad)} of {len(rows)} flights did what no flight may do."
+            f"{len(bad)} of {len(rows)} flights violated a safety requirement."
             if bad
-            else "No flight did what it must not do.",
+            else "No flight violated a safety requirement.",
             good=not bad,
         )
 
@@ -103,7 +103,7 @@ def extreme(rows: Sequence[Row], key: str, pick: Callable[[list[float]], float])
 
 
 def shown_size(row: Row) -> str:
-    """Return the size with its unit, and the duration if that is another quantity."""
+    """Return the size with its unit, and the duration if it is a separate quantity."""
     if row["size"] is None:
         return ""
     text = f"{row['size']:g} {row['unit']}".strip()
@@ -112,7 +112,7 @@ def shown_size(row: Row) -> str:
 
 
 def size_meaning(size: str | None, unit: str) -> str:
-    """Return what the size of a kind of fault means: `shift, m`."""
+    """Return the meaning of the size of a kind of fault, such as `shift, m`."""
     return "" if size is None else f"{size}, {unit}" if unit else size
 
 
@@ -120,7 +120,7 @@ def flights_table(rows: Sequence[Row], *, details: bool = False) -> Table:
     """Return one line per flight.
 
     Args:
-        rows: of the flights.
+        rows: rows of the flights.
         details: add a column with problems and events.
     """
 

@@ -1,4 +1,4 @@
-"""Judges a flight with a fault: how it ended, how soon it was detected, and whether it did something that no flight may do.
+"""Judges a flight with a fault: its outcome, the time to detection, and violations of safety requirements.
 
 A row holds the results of one flight, as `companion faults --json` prints it; docs/faults.md describes its keys.
 """
@@ -23,10 +23,10 @@ COLUMNS = (
 )  # fmt: skip
 GOOD = ("completed", "landed")
 TAUT_N = 0.5
-"""Tension above which the tether is taut; less is noise of the contact solver."""
+"""Tension above which the tether is taut; smaller values are noise of the contact solver."""
 STOPPING_S = 1.0
 OUTWARD_M = 0.15
-"""Limit of the way outward on a taut tether, from `STOPPING_S` after the reaction on."""
+"""Limit of the distance outward on a taut tether, counted from `STOPPING_S` after the reaction."""
 HARD_M_S = 1.8
 """Sink rate at the floor above which a landing counts as a crash."""
 NEAR_FLOOR_M = 0.1
@@ -48,7 +48,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """What the companion decided in one tick."""
+    """Decision of the companion in one tick."""
 
     t_s: float
     kind: PhaseKind
@@ -57,7 +57,7 @@ class Tick:
 
 
 def ticks_of(outputs: Iterable[Outputs]) -> list[Tick]:
-    """Return what the companion decided in each tick of a flight."""
+    """Return the companion's decision in each tick of a flight."""
     return [
         Tick(o.t_s, o.phase_kind, o.action, o.reference.position_world_m if o.reference is not None else None)
         for o in outputs
@@ -141,7 +141,7 @@ def _impact_m_s(course: Sequence[Point], standing_m: float) -> float:
 
 
 def _over_s(ticks: Sequence[Tick]) -> float:
-    """Return the time of the touchdown after the flight; later events are no reaction to the fault."""
+    """Return the time of the touchdown after the flight; later events are not a reaction to the fault."""
     flew = False
     for tick in ticks:
         flew = flew or tick.kind not in (PhaseKind.GROUND, PhaseKind.DONE)
@@ -155,7 +155,7 @@ def _after(begun_s: float | None, event: Event | None) -> float | None:
 
 
 def _min_height_m(flown: FaultFlight, course: Sequence[Point]) -> float | None:
-    """Return the least height while the machine was meant to be up: from the fault or the end of the take-off to the landing."""
+    """Return the smallest height in planned flight: from the fault or the end of the take-off to the landing."""
     up = [
         tick.t_s for tick in flown.ticks if tick.kind is PhaseKind.FLIGHT and tick.action.rank < SafetyAction.LAND.rank
     ]
@@ -186,16 +186,16 @@ def _drift_m(flown: FaultFlight, course: Sequence[Point], abort: Event | None) -
 def _problems(
     row: Row, variant: Variant, phase: FlightPhase, course: Sequence[Point], abort: Event | None, vehicle: Vehicle
 ) -> list[str]:
-    """Return what the flight did that no flight may do."""
+    """Return the safety requirements that the flight violated."""
     found = []
     if row["outcome"] not in GOOD and not (row["outcome"] == "refused" and phase == "ground"):
         found.append(str(row["outcome"]))
     if row["error"] is not None:
-        found.append("error of its own")
+        found.append("internal error")
     if not course and phase != "ground":
         found.append("the fault never began")
     if variant.kind not in _PULLS_BY_ITSELF and any(point.tension_n > TAUT_N for point in course):
-        found.append("tether taut by its own motion")
+        found.append("tether made taut by its own motion")
     elif variant.kind == "tether_taut" and abort is not None and _outward_m(course, abort) > OUTWARD_M:
         found.append("outward on a taut tether")
     if any(_outside(point.position_world_m, vehicle) for point in course):
@@ -204,7 +204,7 @@ def _problems(
 
 
 def _outward_m(course: Sequence[Point], abort: Event) -> float:
-    """Return how much further from the anchor it went once it had time to stop."""
+    """Return the additional distance from the anchor after the time to stop, m."""
     slack = [point.slack_m for point in course if point.t_s >= abort.t_s + STOPPING_S]
     return slack[0] - min(slack) if slack else 0.0
 

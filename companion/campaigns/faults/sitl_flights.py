@@ -26,7 +26,7 @@ from companion.sitl_config.loader import SitlConfig
 
 FLIGHT_TIMEOUT_S = 240.0
 LEAVE_TIMEOUT_S = 60.0
-"""From the request to land to the end of the process."""
+"""Time from the request to land to the end of the process."""
 WITNESS = "world.json"
 """File in the flight's folder with the record of a simulated world that has faults."""
 NEAR_FRAMES = 3
@@ -40,7 +40,7 @@ class WireFlights:
     Args:
         flights: the faults.
         options: arguments of `companion fly` that all flights share, the mission first.
-        config: effective configuration, for the judgement.
+        config: effective configuration, for the evaluation.
         out: folder in which every flight gets a folder of its own.
         jobs: number of flights at the same time.
     """
@@ -68,7 +68,7 @@ class WireFlights:
         self.ask_to_stop()
 
     def ask_to_stop(self) -> None:
-        """Make the vehicles in the air land and start no other flight. Safe in a signal handler."""
+        """Land the vehicles in the air and start no further flight. Safe in a signal handler."""
         self._stop_asked = True
         for process in tuple(self._running):
             process.send_signal(signal.SIGINT)
@@ -78,7 +78,7 @@ class WireFlights:
         with ThreadPoolExecutor(self._jobs) as pool:
             waiting = {pool.submit(self._fly, n, variant, phase) for n, (variant, phase) in enumerate(self._flights)}
             while waiting:
-                # With a timeout, so that a signal that asks to stop is handled meanwhile.
+                # With a timeout, so that a stop signal is handled meanwhile.
                 done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
                 yield from (message for future in done if (message := future.result()) is not None)
 
@@ -102,7 +102,7 @@ class WireFlights:
             return None
         if code == EXIT_BAD_INPUT or code is None:
             last = (self._out / f"{folder.name}.txt").read_text(encoding="utf-8", errors="replace").strip()
-            record = _lost("it did not end" if code is None else last.rpartition("\n")[2])
+            record = _lost("the process did not end" if code is None else last.rpartition("\n")[2])
         else:
             record = flown(folder, self._config)
         row = row_of(variant, phase, record, self._config.vehicle)
@@ -111,7 +111,7 @@ class WireFlights:
 
     @staticmethod
     def _wait(process: subprocess.Popen[bytes]) -> int | None:
-        """Return its exit code; None if it had to be killed."""
+        """Return the process's exit code, or None if it had to be killed."""
         for timeout_s, number in ((FLIGHT_TIMEOUT_S, signal.SIGINT), (LEAVE_TIMEOUT_S, signal.SIGKILL)):
             try:
                 return process.wait(timeout_s)
@@ -160,7 +160,7 @@ def flown(folder: Path, config: FlightConfig) -> FaultFlight:
 
 
 def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], begun_s: float) -> float:
-    """Return the flight clock minus the world's clock, by the motion-capture frame nearest to the fault that both sides know."""
+    """Return the flight clock minus the world's clock, by the motion-capture frame nearest to the fault in both records."""
     stamps = {i.mocap.frame_number: i.mocap.stamp_s for i in inputs if i.mocap is not None}
     for number, world_s in sorted(frames, key=lambda frame: abs(frame[1] - begun_s)):
         for near in range(number, number + NEAR_FRAMES):
@@ -170,7 +170,7 @@ def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], beg
 
 
 def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:
-    """Return the core's events from the log, and from the summary those of the guardian and of a core whose recorder died."""
+    """Return the core's events from the log; those of the guardian, or of a core without its recorder, come from the summary."""
     found = [event for o in log.outputs for event in o.events] if log is not None else []
     known = {event.id for event in found}
     for event in summary["events"]:

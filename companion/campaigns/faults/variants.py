@@ -11,13 +11,13 @@ from companion.sitl_config.faults import KINDS, PHASES, FaultKind, FlightPhase
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One kind and size of fault, in whatever phase."""
+    """One kind and size of fault, for any phase."""
 
     kind: FaultKind
     size: float | None = None
-    """None for a kind without a size."""
+    """Size of the fault; None for a kind without a size."""
     duration_s: float | None = None
-    """None if the fault lasts to the end of the flight."""
+    """Duration of the fault; None if it lasts to the end of the flight."""
 
     @property
     def phases(self) -> tuple[FlightPhase, ...]:
@@ -94,7 +94,7 @@ VARIANTS: tuple[Variant, ...] = (
     *_durations("kill_guardian", None),
     *_sizes("pilot_takeover", 3.0),
 )
-"""What a campaign flies in the fast loop, each in every phase of its kind."""
+"""Faults of a campaign in the fast loop, each in every phase of its kind."""
 
 WIRES: tuple[tuple[Variant, FlightPhase], ...] = (
     (Variant("mocap_loss", None, 0.1), "line"),
@@ -123,11 +123,11 @@ WIRES: tuple[tuple[Variant, FlightPhase], ...] = (
     (Variant("stall_loop"), "return"),
     (Variant("pilot_takeover", 3.0), "line"),
 )
-"""What `--wires` flies over real wires."""
+"""Faults of `--wires`, over real wires."""
 
 
 def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False) -> list[tuple[Variant, FlightPhase]]:
-    """Return what to fly, in the order of the table.
+    """Return the faults to fly, in the order of the table.
 
     Args:
         kinds: requested kinds; empty for all.

@@ -26,7 +26,7 @@ class Robustness(Campaign):
     csv_name = "draws.csv"
 
     mission: str
-    """Mission file, as the user named it."""
+    """Mission file as named by the user."""
     seed: int
     """Seed of the draws."""
     cases: Sequence[Case] = ()
@@ -47,7 +47,7 @@ class Robustness(Campaign):
         return {**super().job(), "seed": self.seed, "fixed": fixed}
 
     def settings(self) -> dict[str, Any]:
-        """Return what was flown, for the record."""
+        """Return the settings of the campaign, for the record."""
         law, preset = self.law
         own = {"mission": self.mission, "controller": law, "preset": preset}
         return {**super().settings(), **own, "seed": None if self.cases else self.seed, "cases": self.cases_file}
@@ -57,7 +57,7 @@ class Robustness(Campaign):
         return str(row["name"])
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return outcomes, catches, the distribution of the error and what it depends on."""
+        """Return outcomes, catches, the distribution of the error and its correlations."""
         return {
             "summary": {
                 "flights": len(rows),
@@ -71,7 +71,7 @@ class Robustness(Campaign):
         }
 
     def csv_row(self, row: Row) -> Mapping[str, Any]:
-        """Return the results, then what was drawn."""
+        """Return the results, followed by the drawn values."""
         results = {key: value for key, value in row.items() if key not in ("world", "events")}
         return {**results, "events": " ".join(row["events"]), **drivers(row["world"])}
 
@@ -100,7 +100,7 @@ class Robustness(Campaign):
         return [Picture(path, title, caption)] if write_distribution(rows, title, path) else []
 
     def write_more(self, rows: Sequence[Row], out: Path) -> None:
-        """Write the worst flights as cases, and those to keep."""
+        """Write the worst flights, and those to keep, as cases."""
         self._write_cases(worst(rows), out / "worst.yaml")
         if self.keep is not None:
             self._write_cases(rows if self.cases else worst(rows), Path(self.keep))
@@ -119,7 +119,7 @@ class Robustness(Campaign):
         hardest = worst(rows)[0]["world"]
         keys = hardest if self.cases else {key: hardest[key] for key in DRAWN}
         line = fly_command(self.mission, law, preset, self.configs[0].laboratory.name, keys, self.overrides)
-        console.print(f"the worst one over real wires:\n{line}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"to fly the worst one over real wires:\n{line}", highlight=False, markup=False, soft_wrap=True)
 
     def good(self, rows: Sequence[Row]) -> bool:
         """Return whether every flight ended safely."""
@@ -139,19 +139,19 @@ class Robustness(Campaign):
         if self.cases:
             return flights_table(rows, self.cases)
         hardest = worst(rows)
-        # The names that the worst flights have in worst.yaml.
+        # Names of the worst flights in worst.yaml.
         names = [case.name for case in as_cases(hardest)]
         return flights_table([{**row, "name": name} for row, name in zip(hardest, names, strict=True)])
 
     def _write_cases(self, rows: Sequence[Row], path: Path) -> None:
         law, preset = self.law
         remark = (
-            "The worlds that were hardest for this law in the fast loop, with its results.\n"
+            "The hardest worlds for this law in the fast loop, with the results.\n"
             f"To fly them again: companion robustness --cases {path.name} (--case NAME for one; --keep FILE to keep the new results)."
         )
         if not self.cases:
             first, last = self.flights[0]["number"], self.flights[-1]["number"]
-            remark += f"\nThe worst of draws {first} to {last}, seed {self.seed}."
+            remark += f"\nThese are the worst of draws {first} to {last}, seed {self.seed}."
         cases = Cases(mission=self.mission, controller=law, preset=preset, cases=as_cases(rows))
         write_cases(cases, path, remark)
 
@@ -182,10 +182,10 @@ def thirds_table(rows: Sequence[Row]) -> Table:
 
 
 def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
-    """Return one line per flight: its result and what was drawn.
+    """Return one line per flight: its result and the drawn values.
 
     Args:
-        rows: of the flights.
+        rows: rows of the flights.
         cases: the cases flown, each under the name of its row; empty for draws.
     """
 

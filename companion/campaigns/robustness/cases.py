@@ -1,4 +1,4 @@
-"""Named cases: worlds that were hard to fly in, with the results they had when they were kept, in a YAML file."""
+"""Named cases: difficult worlds with their recorded results, in a YAML file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from companion.sitl_config.world import World
 WORSE_THAN_KEPT = 1.25
 """Largest allowed ratio of a case's error to its kept error."""
 _HARD_FROM = 0.4
-"""Share of the way from the middle of a range to its hard end at which a name mentions the quantity."""
+"""Share of the distance from the middle of a range to its hard end from which on a name mentions the quantity."""
 _WORDS = (
     # key, middle and hard end of its range, word
     ("setpoint_delay_s", 0.03, 0.06, "slow_setpoints"),
@@ -36,12 +36,12 @@ _WORDS = (
 
 
 class Kept(Model):
-    """The results of a case when it was kept."""
+    """Recorded results of a case."""
 
     outcome: Outcome
     caught: bool
     e_p_m: NonNegative | None = None
-    """RMS after the catch, or of the whole flight if nothing was caught; absent if the mission was not completed."""
+    """RMS error after the catch, or of the whole flight without a catch; absent if the mission was not completed."""
 
 
 class Case(Model):
@@ -66,7 +66,7 @@ class Cases(Model):
     cases: tuple[Case, ...]
 
     def named(self, names: Sequence[str]) -> tuple[Case, ...]:
-        """Return the cases of these names in the order of the file; all of them for no names.
+        """Return the cases of these names in the order of the file, or all cases without names.
 
         Raises:
             ConfigError: there is no such case.
@@ -97,7 +97,7 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
     """Write a file that `read_cases` reads.
 
     Args:
-        cases: what to write.
+        cases: cases to write.
         path: YAML file.
         remark: comment lines at the head of the file.
     """
@@ -136,7 +136,7 @@ def name_of(world: Mapping[str, Any]) -> str:
     drawn = drivers(world)
 
     def hardness(key: str, middle: float, end: float) -> float:
-        """Return 0 at the middle of the range, 1 at its hard end."""
+        """Return the difficulty: 0 at the middle of the range, 1 at its hard end."""
         value = drawn[key]
         return 0.0 if value is None else (value - middle) / (end - middle)
 
@@ -175,14 +175,14 @@ def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
 
 
 def worse_than(row: Row, kept: Kept) -> str | None:
-    """Return the results that are worse than when the case was kept; None if none are."""
+    """Return the results that are worse than the recorded ones, or None."""
     outcome, why = row["outcome"], row["why"] or row["error"] or "no event gives a reason"
     if outcome != kept.outcome.value and outcome != Outcome.COMPLETED.value:
         return f"{outcome} ({why}), kept as {kept.outcome.value}"
     if outcome not in SAFE:
         return f"{outcome} ({why})"
     if kept.caught and not row["caught"]:
-        return "the payload was not caught any more"
+        return "the payload was no longer caught"
     if kept.e_p_m is not None and row["e_p_m"] is not None and row["e_p_m"] > WORSE_THAN_KEPT * kept.e_p_m:
         return f"e_p {row['e_p_m']:.4f} m, more than {WORSE_THAN_KEPT:g} times the kept {kept.e_p_m:.4f} m"
     return None

@@ -1,4 +1,4 @@
-"""Flights in worlds drawn at random: what was drawn, how the position error is distributed and what it depends on.
+"""Flights in worlds drawn at random: drawn values, distribution of the position error and its correlations.
 
 A row holds the results of one flight, as `companion robustness --json` prints it; docs/robustness.md describes its keys.
 """
@@ -24,7 +24,7 @@ _SEVERITY = {Outcome.CRASHED.value: 4, Outcome.LOST.value: 3, Outcome.REFUSED.va
 DRIVERS: dict[str, str] = {
     "payload_kg": "payload, kg",
     "throw_speed_m_s": "horizontal throw speed, m/s",
-    "throw_from_deg": "thrown from, deg off the line",
+    "throw_from_deg": "throw direction, deg off the line",
     "descent_m_s": "descent at the catch, m/s",
     "catch_x_m": "catch point, m along the line",
     "hover_thrust_error": "hover-thrust error",
@@ -41,11 +41,11 @@ DRIVERS: dict[str, str] = {
 
 
 DRAWN = ("payload_kg", "throw_velocity_m_s", "catch_at_m", "seed")
-"""Keys of the world that the campaign draws; the file of the world draws the others."""
+"""Keys of the world that the campaign draws; the world file draws the others."""
 
 
 def drivers(world: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return what was drawn, by the keys of `DRIVERS`; None where a quantity does not apply.
+    """Return the drawn values by the keys of `DRIVERS`; None where a quantity does not apply.
 
     Args:
         world: the world of a row.
@@ -79,7 +79,7 @@ def sensor_of(row: Row) -> str:
 
 
 def graded(rows: Sequence[Row]) -> list[Row]:
-    """Return the flights that caught the payload and were completed: only they count for the distribution of e_p."""
+    """Return the completed flights with a catch, which alone count for the distribution of e_p."""
     return [
         row for row in rows if row["outcome"] == Outcome.COMPLETED.value and row["caught"] and row["e_p_m"] is not None
     ]

@@ -1,4 +1,4 @@
-"""The plot of a robustness campaign: the distribution of e_p over random draws and what it depends on.
+"""The plot of a robustness campaign: the distribution of e_p over random draws and its correlations.
 
 Needs matplotlib (extra `analysis`).
 """
@@ -27,7 +27,7 @@ def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
 
     Args:
         rows: rows of all flights.
-        title: what was flown.
+        title: title of the plot.
         path: PNG file.
     """
     flown = graded(rows)
@@ -82,7 +82,7 @@ def _bars(ax: Any, found: Sequence[tuple[str, float]]) -> None:
         return
     shown = list(found[:BARS])[::-1]
     ax.barh(range(len(shown)), [value for _, value in shown], color=SOFT, height=0.7)
-    # Labels stand beside zero: left of the axis they would take half of the width.
+    # Labels are placed beside zero, because left of the axis they would take half of the width.
     for at, (key, value) in enumerate(shown):
         left = value > 0
         ax.text(

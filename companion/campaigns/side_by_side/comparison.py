@@ -1,4 +1,4 @@
-"""Compares flights by logs and summaries: what was flown, differing settings, all figures, and whether the comparison is fair."""
+"""Compares flights by logs and summaries: flown missions, differing settings, all figures, and the fairness of the comparison."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARKED_FROM = 0.05
 
 
 class NotAlignable(Exception):
-    """A flight lacks the requested moment; one line for the user."""
+    """A flight lacks the requested event; one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Figure:
     """One figure of summary.json for every flight; None where it was not measured."""
 
     key: str
-    """Dotted, as in summary.json."""
+    """Dotted key of summary.json."""
     label: str
     digits: int
     values: tuple[float | None, ...]
@@ -52,7 +52,7 @@ class Comparison:
     """Reasons to read the figures with care; empty if there are none."""
     notes: tuple[str, ...]
     about: tuple[tuple[str, tuple[str, ...]], ...]
-    """What was flown: the name of each fact and its text for each flight."""
+    """Facts about the flights: the name of each fact and its text for each flight."""
     settings: tuple[Setting, ...]
     """Settings that differ."""
     addresses: tuple[Setting, ...]
@@ -69,7 +69,7 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
     ("rms.pre.e_alpha_deg", "arm error before the catch, RMS [deg]", 2, "flight"),
     ("rms.post.e_p_m", "position error after the catch, RMS [m]", 4, "flight"),
     ("rms.post.e_q_deg", "attitude error after the catch, RMS [deg]", 2, "flight"),
-    ("rms.post.e_alpha_deg", "arm error after the catch, RMS [deg]", 2, ""),  # the arm is meant to comply
+    ("rms.post.e_alpha_deg", "arm error after the catch, RMS [deg]", 2, ""),  # the arm must comply
     ("final_e_z_m", "height error at the end [m]", 4, ""),
     ("impedance_error.position_n", "impedance error, position [N]", 3, ""),
     ("impedance_error.arm_nm", "impedance error, arm [N m]", 4, ""),
@@ -99,11 +99,11 @@ def compare(flights: Sequence[Flight], align: Align | None = None) -> Comparison
     """Compare two or more flights with the first of them.
 
     Args:
-        flights: in the order of the report.
+        flights: flights in the order of the report.
         align: zero of the common time axis; None for the catch if every flight has one, else the take-off, else the start.
 
     Raises:
-        NotAlignable: a flight lacks this moment.
+        NotAlignable: a flight lacks this event.
     """
     chosen, notes = _alignment(flights, align)
     settings, addresses = settings_of([flight.config for flight in flights])

@@ -1,4 +1,4 @@
-"""One flight of a side-by-side report: its summary and the arrays that are drawn. The ticks of its log are not kept in memory."""
+"""One flight of a side-by-side report: its summary and the arrays to draw. The ticks of its log are not kept in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
 
 @dataclass(frozen=True)
 class Course:
-    """Time series of a flight: one row per tick read, NaN where a value is not known. World ENU; times on the flight clock."""
+    """Time series of a flight: one row per tick read, NaN where a value is unknown. World ENU; times on the flight clock."""
 
     t_s: Array
     flying: metrics.Mask
@@ -35,7 +35,7 @@ class Course:
     flown_world_m: Array
     reference_world_m: Array
     lateness_s: Array
-    """Lateness of every recorded tick, also of those that were skipped when reading."""
+    """Lateness of every recorded tick, kept or not."""
     catch: int | None
     """Row of the first catch."""
     takeoff_s: float | None
@@ -98,7 +98,7 @@ class Flight:
     letter: str
     name: str
     path: str
-    """Log file, as the user named it."""
+    """Log file as named by the user."""
     digest: str
     """SHA-256 of the log file; equal for the same log given twice."""
     summary: dict[str, Any]

@@ -1,4 +1,4 @@
-"""side_by_side.html: what was flown, which settings differ, all figures, the plots and the events."""
+"""side_by_side.html: facts about the flights, differing settings, all figures, the plots and the events."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_html(comparison: Comparison, pictures: Sequence[Picture], path: Path) 
         tables.append(_settings(comparison, comparison.addresses, title))
     marked = (
         f"Below each value: its difference from A. A figure is marked if it differs from A's by more than {100 * MARKED_FROM:.0f} %, "
-        "and only where a smaller value is certainly better. Single flights are no statistics: companion compare flies many."
+        "and only where a smaller value is certainly better. Single flights have no statistical weight; companion compare flies many."
     )
     events = _events(comparison)
     sections = [
@@ -93,7 +93,7 @@ def _figure(figure: Figure, n: int) -> Cell:
         shown = "0" if difference == 0 else "≈ 0"
     elif first:
         ratio = (first + difference) / first
-        # A percentage above 900 or of a figure that changed its sign is of no use.
+        # A percentage above 900, or of a figure with changed sign, is useless.
         if ratio >= 10:
             shown += f" ({ratio:.0f}\u00a0times)"
         elif ratio >= 0:

@@ -44,7 +44,7 @@ LINES = tuple(
         strict=False,
     )
 )
-"""How each flight is drawn, by its position."""
+"""Line styles of the flights, by position."""
 _EVENT_MARKS = {"info": ("|", 7.0), "warning": ("^", 6.0), "critical": ("X", 7.5)}
 _NAME_SHARE = 0.0074
 """Width of one character of an event's name, as a share of the axis."""
@@ -54,7 +54,7 @@ _SEVERITY = {"warning": 1, "critical": 2}
 
 
 def write_pictures(comparison: Comparison, out_dir: Path) -> list[Picture]:
-    """Write everything that there is data for as PNG into `out_dir`, under names that the plots of a single flight do not have."""
+    """Write every plot for which there is data as PNG into `out_dir`, under names that differ from a single flight's plots."""
     zero = {"catch": "the catch", "takeoff": "the take-off command", "start": "the first tick of the log"}[
         comparison.align
     ]
@@ -179,7 +179,7 @@ def _lane(ax: Any, comparison: Comparison) -> None:
 
 
 def _names(ax: Any, events: list[tuple[float, str, str]], height: float, low: float, high: float) -> None:
-    """Name each crowd of marks by its most severe event, where the name covers no other mark."""
+    """Name each group of marks by its most severe event if the name covers no other mark."""
     crowds: list[list[tuple[float, str, str]]] = []
     for event in events:
         if crowds and event[0] - crowds[-1][-1][0] < _CROWD_SHARE * (high - low):

@@ -24,7 +24,7 @@ _ADDRESSES = frozenset(
 )
 """Keys that the simulated world sets anew for each flight."""
 _NOT_SETTINGS = ("sources.phases", "sources.overrides")
-"""Where values came from; the values have keys of their own."""
+"""Keys with the origin of values; the values have keys of their own."""
 
 _NAMES = ("sources.", "mission.vehicle")
 """Names of files; their content has keys of its own."""
@@ -45,7 +45,7 @@ class Setting:
 
 
 def simulated(config: dict[str, Any]) -> bool:
-    """Return whether the flight was simulated: its arm is at a pseudo-terminal, which a USB adapter never is."""
+    """Return whether the flight was simulated: its arm is connected to a pseudo-terminal."""
     devices = _part(_part(config, "vehicle"), "devices")
     return str(_part(devices, "arm").get("port", "")).startswith("/dev/pts/")
 
@@ -59,7 +59,7 @@ def payload_kg(flight: Flight) -> float | None:
 
 
 def settings_of(configs: Sequence[dict[str, Any]]) -> tuple[list[Setting], list[Setting]]:
-    """Return the settings that differ, and separately the differing addresses that the simulated world chose.
+    """Return the differing settings, and separately the differing addresses chosen by the simulated world.
 
     The section `world` of a flight on the vehicle has no meaning and is left out.
     """
@@ -75,14 +75,14 @@ def settings_of(configs: Sequence[dict[str, Any]]) -> tuple[list[Setting], list[
         if key.startswith(_NOT_SETTINGS) or (all(present) and all(_same(value, values[0]) for value in values)):
             continue
         if not any(values) and any(other.startswith((f"{key}.", f"{key}[")) for other in keys):
-            continue  # empty in one flight; the keys below it show what another flight has there
+            continue  # empty in one flight; the keys below it show the values of another flight
         chosen = key in _ADDRESSES and all(in_world)
         (addresses if chosen else settings).append(Setting(key, values, present))
     return settings, addresses
 
 
 def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[str, list[str], bool]:
-    """Return one sentence on how the flights differ, the reasons for care, and whether all flew the same mission."""
+    """Return one sentence on the differences, the cautions, and whether all flights flew the same mission."""
     kinds: dict[str, list[Setting]] = {}
     for setting in settings:
         if not setting.key.startswith(_NAMES):
@@ -106,9 +106,7 @@ def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[st
     elif not cautions:
         fair = f"Only the law or its gains differ ({_count(law)})."
     else:
-        fair = (
-            f"The law or its gains differ ({_count(law)}), and so does what is listed below: the figures show the sum."
-        )
+        fair = f"The law or its gains differ ({_count(law)}), and so do the settings below: the figures show the combined effect."
     failed = [f"{flight.letter} ({flight.summary['outcome']})" for flight in flights if not flight.completed]
     if failed:
         cautions.append(f"Not completed: {', '.join(failed)}. RMS figures of an incomplete mission are not marked.")
@@ -118,7 +116,7 @@ def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[st
 
 
 def text_of(value: Any) -> str:
-    """Return a value as in a configuration file."""
+    """Return a value in the format of a configuration file."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -153,7 +151,7 @@ def _caution(flights: Sequence[Flight], kind: str, settings: Sequence[Setting]) 
 
 
 def _circumstances(flights: Sequence[Flight], payload_told: bool) -> list[str]:
-    """Return the differences that no configuration holds."""
+    """Return the differences outside the configurations."""
     out: list[str] = []
 
     def differ(what: str, texts: Sequence[str]) -> None:

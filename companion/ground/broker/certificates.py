@@ -33,7 +33,7 @@ def make_authority(now: datetime.datetime) -> Pair:
     """Return a new authority, ECDSA P-256, valid for `AUTHORITY_DAYS`.
 
     Args:
-        now: with time zone.
+        now: present time with time zone.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("companion broker authority")
@@ -52,7 +52,7 @@ def make_server(authority: Pair, hosts: Sequence[str], days: int, now: datetime.
         authority: the signing authority.
         hosts: names and addresses of the broker.
         days: validity, at most that of the authority.
-        now: with time zone.
+        now: present time with time zone.
 
     Raises:
         CertificateError: the authority is invalid, its key does not match, or it expires earlier.

@@ -1,4 +1,4 @@
-"""Permissions of a login at a broker, found by trying: connect, subscribe, publish an empty message, and see what arrives."""
+"""Permissions of a login at a broker, found by trial: connect, subscribe, publish an empty message, and receive."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TopicRights:
 
     topic: Topic
     read: bool | None
-    """None if subscribing is allowed but no message was there to be read."""
+    """None if subscribing is allowed but no message was available."""
     write: bool
 
 
@@ -50,8 +50,8 @@ def check(access: BrokerAccess, vehicle: str | None = None) -> CheckResult:
 
     Args:
         access: broker, login, certificates.
-        vehicle: vehicle whose topics are written to; its readers, and the vehicle itself on ``command``, count one rejected message
-            each. None for a name that no vehicle has.
+        vehicle: vehicle whose topics are tested; each of its readers, and the vehicle itself on ``command``, counts one rejected
+            message. None for a name that no vehicle has.
 
     Raises:
         CheckError: no connection, or no answer.

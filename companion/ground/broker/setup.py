@@ -61,7 +61,7 @@ class BrokerUsers:
 
 
 def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
-    """Create the folder, whole or not at all.
+    """Create the folder completely or not at all.
 
     Args:
         folder: absolute path; must not exist, or be empty.
@@ -96,7 +96,7 @@ def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: dateti
     """Create a new key and certificate of the broker, signed by the same authority: no other computer needs a new file.
 
     Args:
-        folder: as `create` made it.
+        folder: folder made by `create`.
         hosts: names and addresses of the broker; empty for those of the old certificate.
         days: validity of the new certificate.
         now: with time zone.

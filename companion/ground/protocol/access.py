@@ -22,7 +22,7 @@ class BrokerAccess:
 
     @property
     def trusted(self) -> bool:
-        """Whether nobody between here and the broker can read or change messages: the broker is on this computer, or TLS is used."""
+        """Whether messages to the broker are protected: the broker is on this computer, or TLS is used."""
         return self.address.loopback or self.address.tls
 
 

@@ -1,11 +1,11 @@
-"""Signed commands: how the ground station makes one, and how the vehicle verifies it.
+"""Signed commands: created by the ground station, verified by the vehicle.
 
 A command is signed with its operator's key, end to end: even if everything between ground and vehicle (broker, logins, TLS) fails or
-is open, nobody commands the vehicle without a key. The signature is HMAC-SHA256 (RFC 2104) over `canonical`.
+is open, the vehicle accepts no command without a key. The signature is HMAC-SHA256 (RFC 2104) over `canonical`.
 
-A signature does not prove that a command is meant now. So the vehicle also checks that the command names this flight (session), is
-recent by the vehicle's own flight clock (which the ground takes from proven `Stream` messages), is new (nonce) and within a rate
-limit. A message without a valid signature changes none of this state, so nobody without a key can have a genuine command refused.
+A signature does not prove that a command is current. So the vehicle also checks that the command names this flight (session), is recent
+by the vehicle's own flight clock (which the ground takes from proven `Stream` messages), is new (nonce) and within a rate limit. A
+message without a valid signature changes none of this state, so a sender without a key cannot cause a genuine command to be refused.
 
 A command that was refused once is never accepted later, whatever the reason was.
 """
@@ -87,7 +87,7 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """The command is genuine, recent, new, of this flight, and its operator may give it."""
+    """The command is genuine, recent, new, of this flight, and its operator is allowed to give it."""
 
     command: Command
 
@@ -194,7 +194,7 @@ class _History:
         self._accepted: dict[str, float] = {}
         """Nonces of accepted commands, with the flight clock at which each becomes stale. Bounded by the rate limit."""
         self._refused: dict[str, float] = {}
-        """The same for refused commands, at most `REFUSED_MAX`."""
+        """Nonces of refused commands, at most `REFUSED_MAX`, with the same flight clock."""
         self._closed_range_t_s = {False: _NOTHING, True: _NOTHING}
         """Oldest and newest time of refused commands whose nonces were not kept: no command from this range is accepted. Commands from
         the future (True) have a range of their own, so that they do not block the time between now and then.
@@ -263,7 +263,7 @@ class Verifier:
         """Verify one message; never raises, whatever the payload.
 
         Args:
-            payload: as received.
+            payload: received bytes.
             retained: the broker had kept the message: its age is unknown, and later subscribers would receive it again.
             now_t_s: flight clock, s; None before it starts. The time never goes back: of two calls the later time counts.
         """

@@ -110,8 +110,8 @@ class Connection(aiomqtt.Client):
         return str(refused[0]) if refused else None
 
     async def publish_message(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> str | None:
-        """Publish and wait until the broker has the message (QoS 1) or the socket has taken it (QoS 0); return None, or why the broker
-        refuses.
+        """Publish and wait until the broker has the message (QoS 1) or the socket has accepted it (QoS 0); return None, or why the
+        broker refuses.
 
         Raises:
             aiomqtt.MqttError: the connection is lost, or there was no answer within `answer_s`.

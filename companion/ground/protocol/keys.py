@@ -202,7 +202,7 @@ def default_operators_file() -> Path:
         ConfigError: the user has no home folder.
     """
     named = os.environ.get("XDG_CONFIG_HOME", "")
-    if named.startswith("/"):  # others count as not set: XDG Base Directory Specification
+    if named.startswith("/"):  # a relative path counts as not set: XDG Base Directory Specification
         return Path(named) / "companion/operators.yaml"
     try:
         return Path.home() / ".config/companion/operators.yaml"
@@ -235,7 +235,7 @@ def write_private(path: Path, data: bytes) -> None:
     """Write a new file of mode 0600; it appears whole or not at all.
 
     Raises:
-        FileExistsError: the file exists; it is left as it is.
+        FileExistsError: the file exists; it is left unchanged.
         OSError: the file cannot be written.
     """
     write_whole(path, data, mode=0o600, replace=False, durable=True)

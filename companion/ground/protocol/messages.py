@@ -211,7 +211,7 @@ class Timing(Record, frozen=True, kw_only=True):
     mocap_to_setpoint_ms: float | None = None
     joint_read_to_write_ms: float | None = None
     core_ms: float
-    """From inputs read to decision made, `Sent.core_s - Sent.joint_read_s`."""
+    """Time from the inputs to the core's decision, `Sent.core_s - Sent.joint_read_s`."""
     missed: int
     """Ticks of this session that began at least one period late."""
     dropped: int
@@ -219,11 +219,11 @@ class Timing(Record, frozen=True, kw_only=True):
     whole_ms: float | None = None
     """From the start of the tick to the last output, the later of `Sent.setpoint_sent_s` and `Sent.current_sent_s`."""
     bus_read_ms: float | None = None
-    """One read of all servos, by the bus thread."""
+    """Duration of one read of all servos by the bus thread."""
 
 
 class Stream(Record, frozen=True, kw_only=True):
-    """``stream``, 20 Hz. Position and attitude are motion capture's, or PX4's while that is lost."""
+    """``stream``, 20 Hz. Position and attitude are from motion capture, or from PX4 while motion capture is lost."""
 
     v: int
     session: str
@@ -306,9 +306,9 @@ class Ack(Record, frozen=True, kw_only=True):
     operator: str
     command: CommandName
     accepted: bool
-    """The command took effect, or its effect was already there."""
+    """The command took effect, or the requested state was reached before."""
     text: str
-    """What was done, or why nothing was."""
+    """What was done, or why the command was refused."""
     t_s: float
     phase: str
     action: str
@@ -355,7 +355,7 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
 
 
 def vehicle_of(topic: str) -> tuple[str, Topic] | None:
-    """Return (vehicle, topic) of a full topic name, or None if it is not one of a vehicle."""
+    """Return (vehicle, topic) of a full topic name, or None if it is not a vehicle's topic."""
     parts = topic.split("/")
     if len(parts) != 3 or parts[0] != ROOT or not parts[1]:
         return None

@@ -1,7 +1,7 @@
 """Proofs that a vehicle adds to its messages for each operator whose key it holds: HMAC-SHA256 (RFC 2104), cut to 128 bits.
 
-The stream carries one proof per operator, an ack that of the operator who sent the command. A ground station with a key dates its
-commands by proven messages only, so another sender at the broker cannot make it sign a command for a future time.
+The stream carries one proof per operator, an ack only the proof of the operator who sent the command. A ground station with a key dates
+its commands by proven messages only, so another sender at the broker cannot make it sign a command for a future time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Signer:
 
 
 def with_proofs(stream: Stream, vehicle: str, keys: Iterable[bytes]) -> Stream:
-    """Return the stream message with one proof for each key, in their order."""
+    """Return the stream message with one proof per key, in the order of the keys."""
     text = _text(_STREAM_DOMAIN, vehicle, replace(stream, proofs=()))
     return replace(stream, proofs=tuple(_proof(text, key) for key in keys))
 
@@ -56,7 +56,7 @@ def ack_proven(ack: Ack, vehicle: str, key: bytes) -> bool:
 
 
 def _text(domain: str, vehicle: str, record: Stream | Ack) -> bytes:
-    """The text under a proof. It is part of the protocol: the JSON is what `json.dumps` writes, whatever codec carries the message."""
+    """Return the proven text. Its JSON, as `json.dumps` writes it, is part of the protocol, whatever codec carries the message."""
     message = json.dumps(to_jsonable(record), allow_nan=False, separators=(",", ":"))
     return f"{domain}\n{vehicle}\n{message}\n".encode()
 

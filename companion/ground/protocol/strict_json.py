@@ -1,4 +1,4 @@
-"""Strict JSON from the network: rejects what two parsers could read differently, and numbers outside the range of the protocol."""
+"""Strict JSON from the network: rejects ambiguous data, which two parsers could read differently, and numbers out of range."""
 
 from __future__ import annotations
 

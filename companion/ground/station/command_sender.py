@@ -27,7 +27,7 @@ NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {FALLBACK_ADVICE
 def signer_of(
     access: BrokerAccess, operators_file: str | None, operator: str | None, *, view_only: bool = False
 ) -> Signer | str:
-    """Return the operator who commands from here, or why nobody can.
+    """Return the operator who commands from this station, or the reason why commands are not possible.
 
     Args:
         access: the broker; over an unencrypted connection to another computer the vehicle accepts no commands.
@@ -89,7 +89,7 @@ class CommandSender:
     Args:
         link: connection to the broker.
         tracker: session and clock of each vehicle.
-        signer: the operator, or why there is none.
+        signer: the operator, or the reason why there is none.
     """
 
     def __init__(self, link: Link, watch: VehicleTracker, signer: Signer | str) -> None:
@@ -106,11 +106,11 @@ class CommandSender:
 
     @property
     def view_only_reason(self) -> str | None:
-        """Why no commands can be sent from here, or None if they can."""
+        """Reason why this station cannot send commands; None if it can."""
         return self._signer if isinstance(self._signer, str) else None
 
     def on_ack(self, ack: Ack) -> None:
-        """Process an `Ack`; those to this operator have been proven by `VehicleTracker`."""
+        """Process an `Ack`; `VehicleTracker` has verified those for this operator."""
         answer = self._waiting.get(ack.nonce)
         if answer is not None and not answer.done():
             answer.set_result(ack)
@@ -121,9 +121,9 @@ class CommandSender:
         A newer command for the same vehicle, or a new flight, ends the attempts of an older command.
 
         Args:
-            vehicle: its name.
-            command: the command.
-            notify: called with every attempt that is sent and every one that fails.
+            vehicle: name of the vehicle.
+            command: command to send.
+            notify: called with every sent and every failed attempt.
             hold: number of the hold that a RESUME ends, as the operator saw it; None for the hold of the newest message.
 
         Returns:
@@ -166,10 +166,10 @@ class CommandSender:
         nonces: list[str],
         notify: Notify,
     ) -> str | None:
-        """Make one attempt of at most `ANSWER_S`; return None if the answer has arrived, else what went wrong."""
+        """Make one attempt of at most `ANSWER_S`; return None if the answer has arrived, else the failure."""
         known = self._tracker.vehicles.get(vehicle)
         proven = None if known is None else known.proven
-        if proven is None or proven.session != session:  # it was known when the command was given
+        if proven is None or proven.session != session:  # the vehicle was known when the command was given
             return f"a new flight of {vehicle} has started"
         t_ms, ends = proven.now_ms(time.monotonic()), 0
         if command is CommandName.RESUME:
@@ -194,7 +194,7 @@ class CommandSender:
         return None
 
     def _problem(self, vehicle: str) -> str | None:
-        """Return why a command cannot be made or would not be accepted, or None.
+        """Return why a command cannot be created or would be rejected, or None.
 
         Unproven messages never block a command while proven ones arrive.
         """
@@ -210,8 +210,8 @@ class CommandSender:
         if known.proven is not None:
             return None
         if known.stream is None:
-            return f"no message from {vehicle} has arrived yet, so no command can be dated; {FALLBACK_ADVICE}"
-        text = "it does not have this key, or another program sends under its name"
+            return f"no message from {vehicle} has arrived, so a command cannot be dated; {FALLBACK_ADVICE}"
+        text = "the vehicle does not have this key, or another program uses its name"
         return f"no message from {vehicle} is proven for {self.operator}: {text}; {FALLBACK_ADVICE}"
 
 

@@ -1,7 +1,7 @@
 """Distributes messages of the vehicles to viewers. The JSON text of a message is built once for all viewers; no I/O here.
 
 Each viewer has a bounded outbox. Of the stream only the newest message of each vehicle is kept; all other messages are kept in
-order. A viewer that does not read them in time is disconnected: a viewer that lost events must not believe that there were none.
+order. A viewer that does not read them in time is disconnected: a lost event would otherwise go unnoticed.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Outbox:
         self._closed.set()
 
     async def wait_closed(self) -> None:
-        """Wait until the viewer is to be disconnected."""
+        """Wait for the request to disconnect the viewer."""
         await self._closed.wait()
 
     async def take(self) -> list[str]:
@@ -153,7 +153,7 @@ class Hub:
 
 
 def envelope(received: ReceivedRecord) -> str:
-    """Return a record as JSON for viewers. It is built from the record, not from the payload, so that nothing unknown is passed on."""
+    """Return a record as JSON for viewers. It is built from the record, not from the payload, so that no unknown data is passed on."""
     data: dict[str, Any] = {"kind": received.topic.value, "vehicle": received.vehicle}
     if received.age_s is not None:
         data["age_s"] = round(received.age_s, 3)

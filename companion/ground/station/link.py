@@ -30,7 +30,7 @@ class BrokerRefused(Exception):
 
 
 class Link:
-    """Receives from one broker and publishes to it, reconnecting as often as needed.
+    """Receives from one broker and publishes to it, reconnecting when necessary.
 
     Args:
         access: settings of the broker.
@@ -69,7 +69,7 @@ class Link:
                 for topic, qos in self._topics:  # one after another, so that retained messages arrive in this order
                     refusal = await client.subscribe_topic(topic, qos)
                     if refusal is not None:
-                        raise aiomqtt.MqttError(f"it does not let us read {topic}: {refusal}")
+                        raise aiomqtt.MqttError(f"the broker does not permit to read {topic}: {refusal}")
                 self._client, pause_s, self._was_connected = client, _PAUSE_MIN_S, True
                 self._changed(True, f"connected to {self._access.address}")
                 await client.wait_broken()
@@ -93,7 +93,7 @@ class Link:
         try:
             refusal = await self._client.publish_message(topic, payload, qos=1)
         except aiomqtt.MqttError as error:
-            raise LinkError(f"the broker did not take the command: {error_text(error)}") from None
+            raise LinkError(f"the broker did not accept the command: {error_text(error)}") from None
         if refusal is not None:
             raise LinkError(f"the broker refused it: {refusal}")
 

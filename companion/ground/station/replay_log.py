@@ -1,4 +1,4 @@
-"""A flight's log as the page plays it: the messages that the vehicle would have published, 20 a second."""
+"""A flight's log for replay on the page: the messages that the vehicle would have published, 20 per second."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from companion.model.codec import to_json
 from companion.model.types import Vec3
 
 STREAMS_MAX = 12_000
-"""Ten minutes at 20 Hz; longer logs are shown at a lower rate."""
+"""Max number of stream messages: ten minutes at 20 Hz; longer logs are shown at a lower rate."""
 TICKS_MAX = 60_000
 _GZIP_LEVEL = 5
 

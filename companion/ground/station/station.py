@@ -22,7 +22,7 @@ class Station:
 
     Args:
         access: settings of the broker.
-        signer: the operator who commands from here, or why nobody can.
+        signer: the operator who commands from this station, or the reason why commands are not possible.
         only: name of the one vehicle to track; None for all.
         on_record: called with every record.
         on_change: called when the connection changes, with one line for display.

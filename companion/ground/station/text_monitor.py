@@ -1,4 +1,4 @@
-"""`companion monitor --text`: the vehicle in a terminal, also over SSH; without a terminal one line a second."""
+"""`companion monitor --text`: the vehicle in a terminal, also over SSH; without a terminal it prints one line per second."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class _Screen:
         self._notices: deque[Notice] = deque(maxlen=10)
         self._chosen: str | None = None
         self._unconfirmed: tuple[CommandName, float, tuple[object, ...]] | None = None
-        """Command that waits for its key to be pressed again, since when, and its target at that time (`_target`)."""
+        """Command that waits for confirmation by a second key press, the start of the wait, and its target at that time (`_target`)."""
         self._keys: deque[str] = deque(maxlen=KEYS_MAX)
         self._pressed = asyncio.Event()
 

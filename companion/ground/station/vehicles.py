@@ -1,7 +1,7 @@
-"""State of the vehicles as a ground station knows it: the newest record of each kind and each flight's clock. No I/O.
+"""State of the vehicles in a ground station: the newest record of each kind and each flight's clock. No I/O.
 
-A ground station with an operator's key tells stream messages that the vehicle has proven (`companion.ground.protocol.proof`) from
-messages that anyone may have sent. Only proven messages date commands; while they arrive, unproven ones are rejected.
+A ground station with an operator's key distinguishes stream messages with the vehicle's proof (`companion.ground.protocol.proof`)
+from messages that anyone may have sent. Only proven messages date commands; while they arrive, unproven ones are rejected.
 """
 
 from __future__ import annotations
@@ -42,12 +42,14 @@ class ReceivedRecord:
     topic: Topic
     record: Any
     age_s: float | None = None
-    """Of a `Stream`: its delay beyond that of the fastest recent message; None for other records."""
+    """Delay of a `Stream` beyond that of the fastest recent message; None for other records."""
 
 
 @dataclass(slots=True)
 class ProvenState:
-    """Session, flight clock and hold of proven stream messages, from which commands are made. Only `VehicleTracker` changes it."""
+    """State from stream messages with a valid proof: session, flight clock and hold for new commands. Only `VehicleTracker` changes
+    it.
+    """
 
     session: str
     wall_s: float
@@ -83,12 +85,12 @@ class Vehicle:
     events: Events | None = None
     stream: Stream | None = None
     stream_received_s: float | None = None
-    """Local monotonic clock."""
+    """Local monotonic clock at which the newest stream message arrived."""
     received_s: float = 0.0
     clock: FlightClock = field(default_factory=FlightClock)
     """Estimate of the flight clock, for the age of the displayed data."""
     proven: ProvenState | None = None
-    """None if no stream message was proven for this ground station's operator."""
+    """None if no stream message had a proof for this ground station's operator."""
 
     def stream_age_s(self, now_s: float) -> float | None:
         """Return the time since the newest stream message, or None if none has arrived in this session."""
@@ -110,7 +112,7 @@ class VehicleTracker:
 
     Args:
         only: name of the one vehicle to track; None for all.
-        signer: the operator who commands from here; None if nobody does, and then nothing can be proven.
+        signer: the operator who commands from this station; None without one, and no proof can then be checked.
     """
 
     def __init__(self, only: str | None = None, signer: Signer | None = None) -> None:
@@ -127,7 +129,7 @@ class VehicleTracker:
 
         Args:
             topic: full name.
-            payload: as received.
+            payload: received bytes.
             retained: the broker had kept the message: its age is unknown.
             now_s: local monotonic clock.
         """
@@ -144,9 +146,9 @@ class VehicleTracker:
             if isinstance(record, State) and record.vehicle != name:
                 raise MessageError(f"is of vehicle {record.vehicle!r:.60}")
             if isinstance(record, Ack) and not self._is_genuine(record, name):
-                raise MessageError("is not proven by the vehicle")
+                raise MessageError("has no valid proof of the vehicle")
             if isinstance(record, Stream) and not retained and not self._accept_stream(name, record, now_s):
-                raise MessageError("is not proven by the vehicle, unlike earlier ones")
+                raise MessageError("has no valid proof of the vehicle, unlike earlier ones")
         except MessageError as error:
             self.rejected += 1
             self.rejected_text = f"{topic!r:.80}: {error}"
@@ -174,15 +176,15 @@ class VehicleTracker:
         )
 
     def _is_genuine(self, ack: Ack, name: str) -> bool:
-        """Whether an ack is proven if it is for this operator; acks for others cannot be checked here."""
+        """Return whether an ack for this operator has a valid proof; acks for others cannot be checked and are accepted."""
         signer = self._signer
         return signer is None or ack.operator != signer.operator or ack_proven(ack, name, signer.key)
 
     def _accept_stream(self, name: str, stream: Stream, now_s: float) -> bool:
         """Store the state that a proven stream message carries; return False if the message must not be displayed.
 
-        A message of another flight is accepted if that flight is the later one by the vehicle's wall clock, or if the flight proven
-        before has fallen silent. So a recording of an earlier flight cannot replace a running one.
+        A message of another flight is accepted if that flight is the later one by the vehicle's wall clock, or if the earlier
+        flight no longer sends. So a recording of an earlier flight cannot replace a running one.
         """
         known = self.vehicles.get(name)
         proven = known.proven if known is not None else None
@@ -198,7 +200,7 @@ class VehicleTracker:
             )
             self._vehicle(name, now_s).proven = proven
         elif stream.t_s <= proven.t_s:
-            return False  # a replayed message: the vehicle sends none without a new tick
+            return False  # a replayed message, because the vehicle sends only with a new tick
         proven.wall_s, proven.t_s, proven.hold, proven.received_s = stream.wall_s, stream.t_s, stream.hold or 0, now_s
         proven.clock.add(stream.t_s, now_s)
         return True

@@ -2,7 +2,7 @@
 
 WebSocket at ``/ws``, JSON text. Server to page:
 
-    {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first message; again when the token came late
+    {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first message; again if the token came late
     {"kind": "broker", "connected", "text", "rejected"?, "rejected_text"?}           connection to the broker; rejected messages
     {"kind": "state" | "scene" | "preflight" | "events" | "ack", "vehicle", "data"}  records of `companion.ground.protocol.messages`
     {"kind": "stream", "vehicle", "age_s", "data"}                                   age_s: delay until it reached the server
@@ -55,7 +55,7 @@ TOKEN_WAIT_S = 1.0
 """Time for the page to send its token, so that one hello is enough."""
 HEARTBEAT_S = 6.0
 SEND_S = 10.0
-"""A viewer that reads nothing for this long is disconnected."""
+"""Time without a read after which a viewer is disconnected."""
 CLOSE_S = 1.0
 _SEND_BUFFER_BYTES = 65536
 """Kernel send buffer per viewer; a larger one would delay the data."""
@@ -110,7 +110,7 @@ class Monitor:
 
     @property
     def view_only_reason(self) -> str | None:
-        """Why no viewer can command through this server, or None if those with the token can."""
+        """Reason why no viewer can command through this server; None if viewers with the token can."""
         if self._commands is None:
             return "this is the replay of a log"
         if self._commands.view_only_reason is not None:
@@ -248,7 +248,7 @@ Listening = Callable[[Monitor], None]
 async def serve_live(
     serving: ServerSettings, access: BrokerAccess, signer: Signer | str, only: str | None, listening: Listening
 ) -> None:
-    """Serve what the vehicles publish, until cancelled.
+    """Serve the vehicles' messages until cancelled.
 
     Raises:
         WebError: the server cannot listen.
@@ -301,7 +301,7 @@ class _Session:
             self._token = message.get("token")
         outbox = self._monitor.add_viewer(self._token)
         if outbox is None:
-            return CloseReason(1013, f"there are {VIEWERS_MAX} viewers already")
+            return CloseReason(1013, f"the limit of {VIEWERS_MAX} viewers is reached")
         try:
             await until_first(self._listen(outbox), self._send(outbox), outbox.wait_closed())
         finally:

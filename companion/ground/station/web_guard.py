@@ -1,4 +1,4 @@
-"""Access control of the monitor's web server. Pure; nothing that a browser sends is trusted.
+"""Access control of the monitor's web server. Pure; no data from a browser is trusted.
 
 Listening on loopback alone is no protection: any web page in the user's browser can reach http://127.0.0.1, through a host name of
 its own (DNS rebinding) or across origins (WebSockets have no same-origin policy). So the Host header must name this computer, the
@@ -54,7 +54,7 @@ def host_allowed(host_header: str | None, listens_on: str) -> bool:
     """Whether a Host header names this server.
 
     Args:
-        host_header: as received.
+        host_header: received Host header.
         listens_on: value of --host. If it stands for every address (0.0.0.0, ::), any address and this computer's own name are
             allowed: an attacker's page can only use a host name.
     """

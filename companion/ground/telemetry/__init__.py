@@ -1,1 +1,1 @@
-"""Telemetry records of a flight, built from its ticks: what the vehicle publishes and what a replayed log shows. Pure."""
+"""Telemetry records of a flight, built from its ticks, for publication and for the replay of a log. Pure."""

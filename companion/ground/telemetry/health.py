@@ -24,13 +24,13 @@ UNKNOWN_S = -math.inf
 
 @dataclass(slots=True)
 class WorstAges:
-    """The largest ages of some ticks, s; `UNKNOWN_S` where there was nothing to measure."""
+    """The largest ages of some ticks, s; `UNKNOWN_S` without a measurement."""
 
     vehicle_s: float = UNKNOWN_S
-    """Oldest of position, attitude and IMU from PX4."""
+    """Age of the oldest of position, attitude and IMU sample from PX4."""
     heartbeat_s: float = UNKNOWN_S
     mocap_s: float = UNKNOWN_S
-    """Since the datagram arrived."""
+    """Age since the datagram's arrival."""
     arm_s: float = UNKNOWN_S
     force_s: float = UNKNOWN_S
     lateness_s: float = UNKNOWN_S
@@ -67,7 +67,7 @@ class Snapshot:
     ages: WorstAges
     """Largest ages of the last second."""
     mocap_rate_hz: float | None
-    """Frames in the last second; None if it is not known yet."""
+    """Frames in the last second; None if unknown."""
     missed: int
     dropped: int
     """Lost records of the whole session."""
@@ -75,7 +75,7 @@ class Snapshot:
 
 
 class HealthEvaluator:
-    """Evaluates the health of all devices by one vehicle file."""
+    """Evaluates the health of all devices by the limits of one vehicle file."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._s = vehicle.safety

@@ -32,7 +32,7 @@ from companion.model.flight_stage import Stage
 from companion.model.types import ControlLog, Inputs, Outputs, Quat, Reference, SafetyAction, Sent, TetherState, Vec3
 
 _TOUCHDOWN = Stage.TOUCHDOWN.value
-"""On the ground the reference lies below the floor, which is no tracking error."""
+"""Phases on the ground, where the reference below the floor is not a tracking error."""
 WAITS_FOR_START = Stage.READY.value
 """`Outputs.phase` of a flight that is ready and waits for START."""
 TEXT_MAX = 300
@@ -97,14 +97,14 @@ class StreamBuilder:
             )
 
     def add_line(self, t_s: float, severity: str, source: str, text: str, *, replace_last: bool = False) -> None:
-        """Add a line that is no event of the core: a text of PX4 or the guardian, or a notice of the telemetry.
+        """Add a line from a source other than the core: PX4, the guardian or the telemetry.
 
         Args:
             t_s: flight clock.
             severity: value of `companion.model.types.Severity`.
             source: sender, used as the line's id.
             text: cut to `TEXT_MAX` characters.
-            replace_last: replace the last line of the same source, so that a repeated line displaces no other.
+            replace_last: replace the last line of the same source, so that repetitions do not displace other lines.
         """
         mission_t_s = self._newest[1].mission_t_s if self._newest is not None else 0.0
         if replace_last:
@@ -123,7 +123,7 @@ class StreamBuilder:
         )
 
     def events_message(self) -> Events:
-        """Return the events that are kept."""
+        """Return the stored events."""
         return Events(v=VERSION, session=self._session, count=self.count, lines=tuple(map(_finite_line, self.events)))
 
     def build(self, wall_s: float, *, dropped: int = 0, recorder_error: str | None = None) -> Stream:
@@ -135,7 +135,7 @@ class StreamBuilder:
             recorder_error: why recording stopped, or None.
 
         Raises:
-            LookupError: there was no tick yet.
+            LookupError: no tick has been added.
         """
         if self._newest is None:
             raise LookupError("no tick yet")
@@ -231,8 +231,8 @@ def replay(
         config: configuration of the flight.
         session: any session id.
         epoch_offset_s: wall clock at zero of the flight clock.
-        rate_hz: of the messages; halved as often as a long flight would exceed `max_records`.
-        max_records: at least 2.
+        rate_hz: rate of the messages; halved until a long flight fits into `max_records`.
+        max_records: max number of messages, at least 2.
         max_events: number of newest events to keep.
 
     Returns:

@@ -1,1 +1,1 @@
-"""Sections of the simulated world: one effect of a laboratory each, with its switch and its parameters."""
+"""Sections of the simulated world: one module per effect of a laboratory, with its switch and its parameters."""

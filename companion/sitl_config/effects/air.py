@@ -6,7 +6,7 @@ from companion.config.base import Model, NonNegative, Positive
 
 
 class Air(Model):
-    """Gusts on the base. They grow with the rotors' thrust, and are zero while nothing spins."""
+    """Gusts on the base. They grow with the rotors' thrust, and are zero while the rotors stand still."""
 
     on: bool = False
     """Whether this effect acts."""
@@ -14,7 +14,7 @@ class Air(Model):
     """RMS of the force along each axis in hover far from the floor (e: 0.1 to 0.4)."""
     torque_rms_nm: NonNegative = 0.03
     """RMS of the torque about each horizontal axis in hover far from the floor. Vertical gusts that hit the four rotors independently
-    give `force_rms_n` times the rotors' lever, 0.23 m; gusts that hit all alike give 0 (e: between the two)."""
+    give `force_rms_n` times the rotors' lever, 0.23 m; gusts that hit all four equally give 0 (e: between the two)."""
     correlation_time_s: Positive = 0.3
     """Correlation time; the corner frequency of the spectrum is 1 / (2 pi `correlation_time_s`), 0.5 Hz (e: 0.1 to 0.5, which is
     0.3 to 2 Hz)."""

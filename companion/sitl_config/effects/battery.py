@@ -6,7 +6,7 @@ from companion.config.base import Model, NonNegative, Positive
 
 
 class Battery(Model):
-    """True battery: four lithium-polymer cells. Its capacity is what hovering draws in `world.battery_life_s`."""
+    """True battery: four lithium-polymer cells. Its capacity is the charge that a hover of `world.battery_life_s` draws."""
 
     on: bool = False
     """Whether this effect acts."""

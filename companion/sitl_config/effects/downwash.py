@@ -6,7 +6,9 @@ from companion.config.base import Model, NonNegative, Positive
 
 
 class Downwash(Model):
-    """The four wakes and what hangs in them. The radius of a rotor is `rotors.radius_m`, whether or not that effect acts."""
+    """The four wakes and their drag on arm, net and payload. The radius of a rotor is `rotors.radius_m`, whether or not that effect
+    acts.
+    """
 
     on: bool = False
     """Whether this effect acts."""

@@ -11,9 +11,9 @@ class ForceSensor(Model):
     on: bool = False
     """Whether this effect acts."""
     resolution_n: NonNegative = 0.2
-    """Smallest step of a force reading; 0 for the step on the wire. (m) 0.2 for the RFT40-SA01, (e) the same for ours."""
+    """Smallest step of a force reading; 0 for the step on the wire. (m) 0.2 for the RFT40-SA01, (e) the same for this sensor."""
     resolution_nm: NonNegative = 0.008
-    """Smallest step of a torque reading; 0 for the step on the wire. (m) 0.008 for the RFT40-SA01, (e) the same for ours."""
+    """Smallest step of a torque reading; 0 for the step on the wire. (m) 0.008 for the RFT40-SA01, (e) the same for this sensor."""
     cross_talk: Fraction = 0.02
     """Largest share of one axis's load that another axis shows, each relative to its capacity (200 N, 4 N m). The seed draws each of
     the 30 shares between minus and plus this. (e) 0.02-0.03."""

@@ -1,4 +1,4 @@
-"""Section `machine` of the simulated world: how the built machine differs from the vehicle file."""
+"""Section `machine` of the simulated world: differences of the built machine from the vehicle file."""
 
 from __future__ import annotations
 

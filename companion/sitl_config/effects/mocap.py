@@ -18,7 +18,7 @@ class Mocap(Model):
     on: bool = False
     """Whether this effect acts."""
     pivot_offset_m: Vector3 = (0.008, -0.006, 0.01)
-    """Position of the rigid body's pivot in the body frame; the vehicle file says that it is the body's origin. (e) 5 to 20 mm: the
+    """Position of the rigid body's pivot in the body frame; the vehicle file assumes the body's origin. (e) 5 to 20 mm: the
     pivot is placed by eye or by a marker, and the centre of mass moves with the battery."""
     body_yaw_deg: float = 1.0
     """Error of the streamed yaw: the rigid body was created askew; added to `mocap_body_yaw_deg`. (e)"""
@@ -32,7 +32,7 @@ class Mocap(Model):
     """Standard deviation per axis of the position error while some markers are hidden. (p) Merriaux et al., "A Study of Vicon System
     Positioning Performance", Sensors 17 (2017): below 2 mm in motion, 0.15 mm at rest."""
     wobble_deg: NonNegative = 0.3
-    """The same for the attitude: the position error over the distance of the markers, 0.2 to 0.4 m. (e)"""
+    """Standard deviation per axis of the attitude error then: the position error over the distance of the markers, 0.2 to 0.4 m. (e)"""
     wobble_s: Positive = 1.0
     """Time for which markers are hidden; the error rises and falls like sin^2. (e)"""
     wobble_every_s: Positive = 8.0

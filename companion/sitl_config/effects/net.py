@@ -1,4 +1,4 @@
-"""The section `net`: how a payload enters, settles and swings in the net."""
+"""Section `net` of the simulated world: entry, settling and swing of a payload in the net."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ class Net(Model):
     """Speed at which the mesh and the hoop return a payload over the speed at which it arrived (e)."""
     pocket: Fraction = 0.5
     """Share of the payload's distance from the centre, where it enters, that remains when it has settled: 0 if it slides to the
-    middle of the bag, 1 if the mesh forms a pocket where it entered (e)."""
+    middle of the bag, 1 if the mesh forms a pocket at the point of entry (e)."""
     swing_damping_ratio: Positive = 0.15
     """Damping ratio of the settled payload's swing (e)."""

@@ -1,4 +1,4 @@
-"""Section `servo_mechanics` of the simulated world: what lies between the goal current of a servo and the torque on its link."""
+"""Section `servo_mechanics` of the simulated world: the mechanics between a servo's goal current and the torque on its link."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field
 from companion.config.base import Model, NonNegative, Positive, RelativeError
 
 GEAR_MIN_DEG_PER_NM = 0.15
-"""A stiffer gear would oscillate against the lightest rotor and link faster than the physics step of 2 ms represents."""
+"""Stiffest gear; a stiffer one would oscillate against the lightest rotor and link too fast for the physics step of 2 ms."""
 Share = Annotated[float, Field(ge=0, lt=0.5)]
 
 
@@ -29,14 +29,14 @@ class ServoMechanics(Model):
     current_loop_s: NonNegative = 0.003
     """Time constant of the current loop; 0 for none (e: ROBOTIS discloses only that the loop runs much faster than 1 kHz)."""
     friction_nm: NonNegative = 0.015
-    """Coulomb friction without load, beside `stiction_nm`, N m (p, scaled: MX-64 0.031, MX-106 0)."""
+    """Coulomb friction without load, in addition to `stiction_nm`, N m (p, scaled: MX-64 0.031, MX-106 0)."""
     stiction_nm: NonNegative = 0.025
     """Additional friction without load at rest, which decays with the speed, N m (p, scaled: MX-64 0.012, MX-106 0.037)."""
     load_friction: Share = 0.005
     """Additional Coulomb friction over the load of the gear, which is the difference between the motor's torque and the link's external
     torque: twice the torque that the servo holds (p: MX-64 0, MX-106 0.009, XL330 0.07)."""
     load_stiction: Share = 0.2
-    """The same at rest; it decays with the speed (p: MX-64 0.234, MX-106 0.222, XL330 0.07)."""
+    """Additional stiction over the load of the gear, which decays with the speed (p: MX-64 0.234, MX-106 0.222, XL330 0.07)."""
     stribeck_rad_s: Positive = 1.6
     """Speed of the joint at which the share 1/e of the stiction is left (p: MX-64 1.52, MX-106 1.62)."""
     stribeck_exponent: Annotated[float, Field(ge=0.5, le=4)] = 1.33

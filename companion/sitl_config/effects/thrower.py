@@ -1,4 +1,4 @@
-"""The section `thrower`: the scatter of a person's throws."""
+"""Section `thrower` of the simulated world: scatter of a person's throws."""
 
 from __future__ import annotations
 
