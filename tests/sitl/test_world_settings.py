@@ -32,7 +32,9 @@ ON_WIRES_ONLY = {
 }
 """Settings without a meaning in the fast closed loop, and why."""
 
-UNTIL_S = EARLY_S, _, _ = 1.05, 2.2, 7.0
+TARE_S = 0.1
+"""In the fast loop, instead of the flight's second: nothing but noise happens meanwhile."""
+UNTIL_S = EARLY_S, _, _ = 0.15, 1.3, 6.1
 """Flight times in the fast loop: until the servos give torque, until the rotors turn, and including the catch.
 
 A pair flies until its first difference. Shorter flights are tried first, unless other pairs share the usual world.
@@ -65,8 +67,10 @@ class Watched(list[Any]):
 
 
 @pytest.fixture(autouse=True)
-def _ends_at_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A flight with faults that is ended in the air is not followed to the floor."""
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wait before take-off is short, and a flight with faults that is ended in the air is not followed to the floor."""
+    monkeypatch.setattr("companion.model.flight_stage.TARE_S", TARE_S)
+    monkeypatch.setattr("companion.mission.settled.SETTLED_S", TARE_S)
     monkeypatch.setattr("sitl.fast.loop.SETTLE_S", 0.0)
 
 
@@ -126,11 +130,34 @@ def test_it_changes_a_flight_in_the_fast_loop(pair: Pair) -> None:
         assert differ, f"world.{pair.setting} does nothing in the fast loop"
 
 
-EFFECTS = {name for name, info in World.model_fields.items() if "on" in getattr(info.annotation, "model_fields", {})}
-"""Sections of the world that are given as a whole to the part of the world that acts by them."""
-_OF_EFFECTS = {field(pair).partition(".")[0]: pair for pair in reversed(PAIRS)}
-SENT = [pair for pair in PAIRS if (name := field(pair).partition(".")[0]) not in EFFECTS or pair is _OF_EFFECTS[name]]
-"""Both loops share world and plant: one setting of an effect shows that its section arrives."""
+OF_DEVICES = (
+    *(
+        "payload_kg",
+        "seed",
+        "hover_thrust_error",
+        "rotor_lag_s",
+        "setpoint_delay_s",
+        "arm_delay_s",
+        "arm_hand",
+        "hand_t_s",
+    ),
+    *(
+        "push.t_s",
+        "mocap_",
+        "natnet_version",
+        "gyro_noise",
+        "force_noise",
+        "servos.",
+        "battery_",
+        "px4_params",
+        "faults.t_s",
+    ),
+    *("imu.on", "rotors.on", "battery.on", "servo_mechanics.on", "faults.kind", "faults.size link_delay"),
+    *("faults.size bus_noise", "faults.size clock_step", "faults.size autopilot_reboot"),
+)
+"""How settings begin that are tried on the wires: those of the devices, and some that show that `Plant` and `Faults` get theirs."""
+SENT = [pair for pair in PAIRS if pair.setting.startswith(OF_DEVICES) and pair.acts < 2]
+"""Both loops give the world's settings as a whole to one `Plant` and one `Faults`: what these do is seen in the fast loop."""
 
 
 @pytest.mark.parametrize("pair", SENT, ids=lambda pair: pair.setting)
