@@ -15,20 +15,32 @@ from sitl.fast.loop import FastFlight, FastResult
 from sitl.server import Ports, Sitl, start_of
 from sitl.world.plant import Plant
 from sitl.world.world import World
+from tests.support import SHORT_CATCH
 
 ROOT = Path(__file__).parents[2]
-CATCH_S, PERIOD_S = 6.5, 15.0
-"""Time of the first catch of catch.yaml, and time between two catches."""
+CATCH_S, PERIOD_S, KEEP_S = 2.45, 5.0, 1.0
+"""Time of the first catch of `TO_AND_FRO`, time between two catches, and time in the net."""
+TO_AND_FRO = (
+    'mission.phases=[{"type": "takeoff", "height_m": 0.5, "duration_s": 1.5},'
+    ' {"type": "line", "name": "catch", "to_m": [0.4, 0, 0.5], "duration_s": 2}, {"type": "hold", "duration_s": 1},'
+    ' {"type": "line", "to_m": [-0.2, 0, 0.5], "duration_s": 2}, {"type": "land", "speed_m_s": 0.35}]',
+    f"world.keep_s={KEEP_S}",
+)
+"""The short catch, flown there and back: it may be repeated."""
 
 
 def configured(*overrides: str, mission: str = "catch") -> SitlConfig:
     return load_sitl(ROOT / f"configs/missions/{mission}.yaml", overrides=overrides)
 
 
-@cache
-def flown(*overrides: str, mission: str = "catch") -> tuple[FastResult, World]:
-    flight = FastFlight(configured(*overrides, mission=mission))
+def flown(config: SitlConfig) -> tuple[FastResult, World]:
+    flight = FastFlight(config)
     return flight.run(limit_s=200.0), flight.plant.world
+
+
+@cache
+def repeated(*overrides: str) -> tuple[FastResult, World]:
+    return flown(load_sitl(SHORT_CATCH, overrides=(*TO_AND_FRO, *overrides)))
 
 
 def events(result: FastResult) -> list[tuple[str, float]]:
@@ -42,7 +54,7 @@ def at(result: FastResult, mission_t_s: float) -> Outputs:
 
 
 def test_three_repetitions_catch_three_throws() -> None:
-    result, world = flown("mission.repeat=3", "world.throws=3")
+    result, world = repeated("mission.repeat=3", "world.throws=3")
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert (world.payload.throws, world.payload.catches, world.payload.missed) == (3, 3, False)
     said = events(result)
@@ -53,13 +65,13 @@ def test_three_repetitions_catch_three_throws() -> None:
     assert caught == pytest.approx([CATCH_S + number * PERIOD_S for number in range(3)], abs=0.15)
     left = [t_s for name, t_s in said if name == "payload_left"]
     for before_s, left_s in zip(caught, left, strict=False):
-        assert before_s + 6.0 + 0.5 <= left_s < before_s + 6.0 + 1.0, "keep_s after the catch it is taken out"
+        assert before_s + KEEP_S + 0.5 <= left_s < before_s + KEEP_S + 1.0, "keep_s after the catch it is taken out"
     assert world.payload.caught_t_s is not None
     assert result.outputs[-1].mission_t_s > CATCH_S + 2 * PERIOD_S
 
 
 def test_each_catch_is_flown_as_well_as_the_first() -> None:
-    result, _ = flown("mission.repeat=3", "world.throws=3")
+    result, _ = repeated("mission.repeat=3", "world.throws=3")
     worst = []
     for number in range(3):
         since_s = CATCH_S + number * PERIOD_S
@@ -67,14 +79,14 @@ def test_each_catch_is_flown_as_well_as_the_first() -> None:
             max(
                 math.dist(inputs.mocap.position_world_m, outputs.reference.position_world_m)
                 for inputs, outputs in zip(result.inputs, result.outputs, strict=True)
-                if inputs.mocap and outputs.reference and since_s <= outputs.mission_t_s < since_s + 3.0
+                if inputs.mocap and outputs.reference and since_s <= outputs.mission_t_s < since_s + 2.0
             )
         )
     assert max(worst[1:]) < 1.5 * worst[0]
 
 
 def test_the_phase_says_which_repetition_it_is() -> None:
-    result, _ = flown("mission.repeat=3", "world.throws=3")
+    result, _ = repeated("mission.repeat=3", "world.throws=3")
     assert at(result, 1.0).phase == "take-off"
     assert at(result, CATCH_S).phase == "catch (1 of 3)"
     assert at(result, CATCH_S + 2 * PERIOD_S).phase == "catch (3 of 3)"
@@ -82,16 +94,15 @@ def test_the_phase_says_which_repetition_it_is() -> None:
 
 
 def test_one_throw_is_one_throw_however_often_it_passes() -> None:
-    result, world = flown("mission.repeat=2")
+    result, world = repeated("mission.repeat=2")
     assert (world.payload.throws, world.payload.catches) == (1, 1)
     assert [name for name, _ in events(result)] == ["takeoff", "catch", "touchdown"], "it stays in the net"
 
 
 def test_after_a_miss_the_next_pass_is_thrown_at() -> None:
     """The first throw goes beside the net; `missed` and `caught_t_s` are about that one."""
-    result, world = flown(
-        "mission.repeat=2", "world.throws=2", "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 12, size: 0.5}]"
-    )
+    missed = "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 12, size: 0.5}]"
+    result, world = flown(configured("mission.repeat=2", "world.throws=2", missed))
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert (world.payload.throws, world.payload.catches, world.payload.missed, world.payload.caught_t_s) == (
         2,
@@ -103,14 +114,13 @@ def test_after_a_miss_the_next_pass_is_thrown_at() -> None:
 
 
 def test_a_dropped_payload_is_thrown_again() -> None:
-    _, world = flown(
-        "mission.repeat=2", "world.throws=2", "world.faults=[{kind: payload_dropped, t_s: 1, after: catch}]"
-    )
+    dropped = "world.faults=[{kind: payload_dropped, t_s: 0.5, after: catch}]"
+    _, world = repeated("mission.repeat=2", "world.throws=2", dropped)
     assert (world.payload.throws, world.payload.catches) == (2, 2)
 
 
 def test_the_committed_soak_mission_catches_in_the_fast_loop() -> None:
-    result, world = flown("mission.repeat=1", mission="soak")
+    result, world = flown(configured("mission.repeat=1", mission="soak"))
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert (world.payload.throws, world.payload.catches) == (1, 1)
 
