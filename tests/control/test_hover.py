@@ -113,19 +113,13 @@ def test_it_is_bounded(thrust: float, bound: float) -> None:
 # -- whole flights in the fast loop ----------------------------------------------------------------------------------------------
 
 
-def flown(error: float, adapt: bool = True, preset: str = "recommended", faults: str = "[]") -> FastResult:
-    return _flown(error, adapt, preset, faults)
-
-
-@cache
-def _flown(error: float, adapt: bool, preset: str, faults: str) -> FastResult:
-    """`cache` tells a default from the same value given, so all are given."""
-    result = FastFlight(configured(error, adapt, preset, faults)).run()
+def flown(error: float, adapt: bool = True, faults: str = "[]") -> FastResult:
+    result = FastFlight(configured(error, adapt, faults)).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     return result
 
 
-def configured(error: float, adapt: bool, preset: str, faults: str = "[]") -> SitlConfig:
+def configured(error: float, adapt: bool, faults: str = "[]") -> SitlConfig:
     """Without the law's own disturbance observer, which would make good for a wrong hover thrust by itself."""
     overrides = (
         "controller.disturbance_time_xyz_s=[0, 0, 0]",
@@ -133,12 +127,12 @@ def configured(error: float, adapt: bool, preset: str, faults: str = "[]") -> Si
         f"vehicle.airframe.hover_thrust_adapt={str(adapt).lower()}",
         f"world.faults={faults}",
     )
-    return load_sitl("configs/missions/catch.yaml", preset=preset, overrides=overrides)
+    return load_sitl("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
 
 
 @cache
 def true_hover_thrust() -> float:
-    return FastFlight(configured(0.0, True, "recommended")).plant.world.hover_command
+    return FastFlight(configured(0.0, True)).plant.world.hover_command
 
 
 def height_errors_m(result: FastResult, from_s: float) -> list[float]:
@@ -153,21 +147,17 @@ def height_errors_m(result: FastResult, from_s: float) -> list[float]:
 @pytest.mark.parametrize("error", [-0.1, 0.1])
 def test_a_wrong_parameter_is_flown_out(error: float) -> None:
     """10 % would be 5 cm of height for ever; from 4 s on it is below 2 cm, catch and payload included."""
-    assert max(abs(e) for e in height_errors_m(flown(error), 4.0)) < 0.02
-    assert max(abs(e) for e in height_errors_m(flown(error, adapt=False), 4.0)) > 0.04
-
-
-@pytest.mark.parametrize(("preset", "error"), [("paper", 0.1), ("recommended", -0.1), ("recommended", 0.1)])
-def test_the_log_tells_what_was_used_and_it_ends_near_the_truth(preset: str, error: float) -> None:
-    result = flown(error, preset=preset)
+    result = flown(error)
+    assert max(abs(e) for e in height_errors_m(result, 4.0)) < 0.02
     used = [outputs.control.hover_thrust for outputs in result.outputs if outputs.control]
     assert used[0] == pytest.approx(true_hover_thrust() * (1.0 + error))
     assert used[-1] == pytest.approx(true_hover_thrust(), rel=0.01)
 
 
 def test_switched_off_it_stays_at_the_parameter() -> None:
-    used = {o.control.hover_thrust for o in flown(0.1, adapt=False).outputs if o.control}
-    assert used == {true_hover_thrust() * 1.1}
+    result = flown(0.1, adapt=False)
+    assert {o.control.hover_thrust for o in result.outputs if o.control} == {true_hover_thrust() * 1.1}
+    assert max(abs(e) for e in height_errors_m(result, 4.0)) > 0.04
 
 
 def test_a_catch_without_force_sensor_does_not_move_it() -> None:

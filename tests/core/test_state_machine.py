@@ -16,6 +16,7 @@ from companion.model.flight_stage import Stage
 from companion.model.types import Event, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
+from tests.support import SHORT_CATCH
 
 
 def plain(value: object) -> object:
@@ -48,8 +49,7 @@ def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(m
     monkeypatch.setattr(flight_core, "transition", twice)
     landing = ("world.faults=[{kind: mocap_loss, phase: line}]",)
     outcomes = [
-        FastFlight(load_sitl("configs/missions/catch.yaml", overrides=overrides)).run().outputs[-1].outcome
-        for overrides in ((), landing)
+        FastFlight(load_sitl(SHORT_CATCH, overrides=overrides)).run().outputs[-1].outcome for overrides in ((), landing)
     ]
     assert outcomes == [Outcome.COMPLETED, Outcome.ABORTED]
     assert stages >= {

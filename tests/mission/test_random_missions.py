@@ -43,5 +43,5 @@ def test_what_is_refused_says_what_where_and_how_to_change_it(rows: list[Row]) -
     assert {row.number: row.failures for row in refused if row.failures} == {}
 
 
-def test_a_mission_is_drawn_from_its_number_alone() -> None:
-    assert fly(3, PHASES_MAX) == fly(3, PHASES_MAX)
+def test_a_mission_is_drawn_from_its_number_alone(rows: list[Row]) -> None:
+    assert fly(rows[3].number, PHASES_MAX) == rows[3]
