@@ -36,8 +36,6 @@ _FIGURES = (
     ("e_p before, m", _E_P.format("pre"), 3),
     ("e_p after, m", _E_P.format("post"), 3),
     ("peak e_p, m", "peak_e_p_m", 3),
-    ("e_q before, deg", "rms.pre.e_q_deg", 1),
-    ("e_q after, deg", "rms.post.e_q_deg", 1),
     ("arm impedance, N m", "impedance_error.arm_nm", 2),
 )
 _ABLATION_FIGURES = (*_FIGURES[:3], ("e_alpha after, deg", "rms.post.e_alpha_deg", 1), _FIGURES[-1])
@@ -71,7 +69,7 @@ def laws_markdown(groups: Sequence[Group]) -> str:
         [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES)] for group in groups
     ]
     if any(map(_paper, groups)):
-        head.append("printed: e_p before / after")
+        head.append("printed e_p, m")
         rows = [[*row, _paper(group)] for row, group in zip(rows, groups, strict=True)]
     return markdown(head, rows)
 
@@ -208,6 +206,10 @@ def _error_cell(group: Group | None) -> str:
         return ""
     text = spread_text(group.spread(_E_P.format("post")), 3) or "–"
     return f"{text}; {_completed(group)}" if group.failures else text
+
+
+def _attitude(group: Group) -> str:
+    return " / ".join(spread_text(group.spread(f"rms.{part}.e_q_deg"), 1, p95=False) or "–" for part in ("pre", "post"))
 
 
 def _paper(group: Group) -> str:
