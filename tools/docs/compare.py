@@ -156,14 +156,11 @@ def _observer(c: ControllerConfig) -> bool:
 
 
 _TOLD: tuple[tuple[str, Callable[[ControllerConfig], bool]], ...] = (
-    ("mass, hover thrust", lambda c: True),
-    ("arm lengths", lambda c: True),
     ("gravity of the arm", lambda c: not isinstance(c, AdaptiveConfig) or c.arm_gravity_nominal),
     ("inertia of the arm", lambda c: not isinstance(c, AdaptiveConfig) or c.arm_inertia_nominal),
     ("inertia of the base, coupling", lambda c: isinstance(c, CscConfig)),
     ("joint friction", lambda c: c.arm_friction_share > 0),
     ("lag of thrust or attitude", lambda c: _observer(c) or c.feedforward_lead_s > 0 or isinstance(c, PscConfig)),
-    ("force fed forward", lambda c: any(c.force_feedforward_xyz)),
 )  # fmt: skip
 
 

@@ -261,7 +261,7 @@ def _paired(pairs: Sequence[Pairs]) -> Figure:
     payloads = sorted({one.payload_kg for one in pairs})
     columns = min(3, len(panels))
     rows = math.ceil(len(panels) / columns)
-    figure = new_figure(1.2 + 3.2 * rows)
+    figure = new_figure(1.0 + 3.6 * rows)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     every = [value for one in pairs for pair in one.off_on for value in pair if math.isfinite(value)]
     low, high = 0.8 * min(every), 1.4 * max(every)
@@ -279,7 +279,10 @@ def _paired(pairs: Sequence[Pairs]) -> Figure:
                 off, on = (np.minimum([pair[j] for pair in one.off_on], high) for j in range(2))
                 ax.plot(off, on, "os^Dv*P"[k % 7], ms=4, mew=0, color=COLOURS[k], alpha=0.7, clip_on=False, zorder=3,
                         label=f"{one.payload_kg:g} kg: better in {one.better} of {len(one.off_on)}, p = {one.p_value:.2g}")  # fmt: skip
-        ax.legend(loc="upper left", fontsize=7.5, frameon=False, handletextpad=0.2, borderpad=0.1)
+        # Below the axes: points of failed flights lie on the frame.
+        ax.legend(
+            loc="upper left", bbox_to_anchor=(0.0, -0.16), fontsize=7.5, frameon=False, handletextpad=0.2, borderpad=0.1
+        )
     for ax in axes.flat:
         ax.set_box_aspect(1)
     axes[0, 0].set_xlim(low, high)
